@@ -1,0 +1,1 @@
+"""What talks to hardware: motion axes, cameras, light sources. Imports nothing else of ours."""

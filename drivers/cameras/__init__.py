@@ -1,0 +1,1 @@
+"""Cameras: one module for each family; the module's name is its kind in YAML."""

@@ -1,0 +1,1 @@
+"""Everything that needs no hardware: Mueller algebra, instrument models, reduction, diagnosis, reports."""

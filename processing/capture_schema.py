@@ -1,0 +1,204 @@
+"""Layout of a capture file, and its creation with all space allocated up front (docs/capture-format.md).
+
+Both writers use it: `acquisition` state by state from the bench, `process import` from files of others.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+SCHEMA_VERSION = 1
+
+Status = Literal["running", "complete", "aborted", "failed"]
+SampleKind = Literal["air", "mirror", "mueller", "unknown"]
+
+#: One row of /entry/states a state; filled when the state is taken.
+STATE_COLUMNS: dict[str, Any] = {
+    "done": np.uint8,
+    "exposure_s": np.float64,
+    "host_time_s": np.float64,
+    "camera_time_ns": np.int64,
+    "frame_id": np.int64,
+    "retakes": np.int32,
+    "saturated_fraction": np.float64,
+    "near_black_fraction": np.float64,
+    "monitor": np.float64,
+}
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Sample(_Part):
+    """What stood at the centre. `mueller` (16 numbers, row-major) goes with kind "mueller".
+
+    Air and mirror are known up to one throughput for each pixel.
+    """
+
+    kind: SampleKind = "unknown"
+    name: str = ""
+    mueller: tuple[float, ...] | None = None
+
+
+class Detector(_Part):
+    """Noise-relevant constants of the detector; counts are right-aligned to `bits`.
+
+    variance in counts^2 = (counts - black_level) / gain_e_per_count + (read_noise_e / gain_e_per_count)^2.
+    None means not known: error bars then come from the residual, and say so.
+    """
+
+    black_level_counts: float = 0.0
+    gain_e_per_count: float | None = Field(default=None, gt=0)
+    read_noise_e: float | None = Field(default=None, ge=0)
+    full_well_e: float | None = Field(default=None, gt=0)
+    bits: int | None = None
+
+
+class CaptureHeader(_Part):
+    """Everything about a capture that is known before its first state."""
+
+    title: str
+    simulated: bool
+    mode: str
+    wavelength_nm: float
+    omega_deg: float | None = None
+    illumination: str | None = None
+    sample: Sample = Sample()
+    detector: Detector = Detector()
+    channels: tuple[str, ...] = ("camera",)
+    mosaic: tuple[tuple[str, ...], ...] | None = None
+    instrument_yaml: str = ""
+    plan_yaml: str = ""
+    rig_yaml: str = ""
+    camera_settings_json: str = "{}"
+    devices_json: str = "{}"
+    versions: dict[str, str] = {}
+    seed: int | None = None
+
+
+def create_layout(
+    h5: h5py.File,
+    header: CaptureHeader,
+    target_deg: dict[str, NDArray[np.float64]],
+    role: tuple[str, ...],
+    frame_shape: tuple[int, int],
+    dtype: Any,
+    start_time: str,
+) -> None:
+    """Create every group and dataset of a capture, fixed shape, uncompressed, space allocated early.
+
+    Parameters
+    ----------
+    h5 : file open for writing, empty.
+    target_deg : for each axis, target angles (N,) in degrees.
+    role : N roles: "dark", "flat", "air" or "sample".
+    frame_shape : (rows, columns) of one frame of one channel.
+    dtype : of the frames; uint16 from a camera, floating for imported fluxes.
+    start_time : ISO 8601.
+    """
+    n, c = len(role), len(header.channels)
+    h5.attrs["default"] = "entry"
+    h5.attrs["umov_schema"] = SCHEMA_VERSION
+    entry = _group(h5, "entry", "NXentry")
+    entry.attrs["default"] = "data"
+    entry.attrs["simulated"] = header.simulated
+    entry.attrs["status"] = "running"
+    for key in ("title", "mode"):
+        entry[key] = getattr(header, key)
+    entry["start_time"] = start_time
+    entry.attrs["header_json"] = header.model_dump_json()
+
+    instrument = _group(entry, "instrument", "NXinstrument")
+    beam = _group(instrument, "beam", "NXbeam")
+    _quantity(beam, "incident_wavelength", header.wavelength_nm, "nm")
+    if header.omega_deg is not None:
+        _quantity(instrument, "omega_deg", header.omega_deg, "degree")
+    for axis, target in target_deg.items():
+        positioner = _group(instrument, axis, "NXpositioner")
+        positioner["name"] = axis
+        _column(positioner, "value", n, np.float64, np.nan).attrs["units"] = "degree"
+        _column(positioner, "raw_value", n, np.float64, np.nan).attrs["units"] = "count"
+        positioner.create_dataset("target_value", data=np.asarray(target, dtype=np.float64)).attrs["units"] = "degree"
+    detector = _group(instrument, "detector", "NXdetector")
+    frames = _allocated(detector, "data", (n, c, *frame_shape), dtype, chunks=(1, 1, *frame_shape))
+    frames.attrs["long_name"] = "counts (state, channel, row, column)"
+    detector["channels"] = [name.encode() for name in header.channels]
+    for key in ("black_level_counts", "gain_e_per_count", "read_noise_e", "full_well_e", "bits"):
+        value = getattr(header.detector, key)
+        if value is not None:
+            detector[key] = value
+
+    sample = _group(entry, "sample", "NXsample")
+    sample["name"] = header.sample.name or header.sample.kind
+
+    states = _group(entry, "states", "NXcollection")
+    states["role"] = [r.encode() for r in role]
+    for name, kind in STATE_COLUMNS.items():
+        _column(states, name, n, kind, np.nan if np.issubdtype(kind, np.floating) else 0)
+
+    for name, text in (
+        ("plan", header.plan_yaml),
+        ("rig", header.rig_yaml),
+        ("instrument_model", header.instrument_yaml),
+    ):
+        note = _group(entry, name, "NXnote")
+        note["type"] = "application/yaml"
+        note["data"] = text
+    data = _group(entry, "data", "NXdata")
+    data.attrs["signal"] = "data"
+    data["data"] = h5py.SoftLink("/entry/instrument/detector/data")
+    # Written at sealing, in space that exists already: status, end time, ledger, statistics, messages.
+    closing = _group(entry, "closing", "NXcollection")
+    _allocated(closing, "json", (256 * 1024,), np.uint8, chunks=None)
+
+
+def write_closing(h5: h5py.File, status: Status, closing_json: str) -> None:
+    """Write the closing record (end time, time ledger, stream statistics, messages) and the status.
+
+    A record that does not fit is cut in its `messages`, which is said in the record by the caller.
+    """
+    box = h5["entry/closing/json"]
+    raw = np.frombuffer(closing_json.encode(), dtype=np.uint8)
+    if raw.size > box.shape[0]:
+        raise ValueError(f"closing record of {raw.size} bytes does not fit in {box.shape[0]}")
+    padded = np.zeros(box.shape, dtype=np.uint8)
+    padded[: raw.size] = raw
+    box[...] = padded
+    h5["entry"].attrs.modify("status", status)
+
+
+def _group(parent: h5py.Group, name: str, nx_class: str) -> h5py.Group:
+    group = parent.create_group(name)
+    group.attrs["NX_class"] = nx_class
+    return group
+
+
+def _quantity(parent: h5py.Group, name: str, value: float, units: str) -> None:
+    parent[name] = float(value)
+    parent[name].attrs["units"] = units
+
+
+def _column(parent: h5py.Group, name: str, n: int, dtype: Any, fill: Any) -> h5py.Dataset:
+    column = _allocated(parent, name, (n,), dtype, chunks=None)
+    column[...] = np.full(n, fill, dtype=dtype)
+    return column
+
+
+def _allocated(
+    parent: h5py.Group, name: str, shape: tuple[int, ...], dtype: Any, chunks: tuple[int, ...] | None
+) -> h5py.Dataset:
+    # Early allocation: a full disc fails here, never in the middle of a run (promises.md, "HDF5, as measured").
+    create = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    create.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    create.set_fill_time(h5py.h5d.FILL_TIME_NEVER if chunks else h5py.h5d.FILL_TIME_IFSET)
+    if chunks:
+        create.set_chunk(chunks)
+    space = h5py.h5s.create_simple(shape)
+    kind = h5py.h5t.py_create(np.dtype(dtype), logical=True)
+    return h5py.Dataset(h5py.h5d.create(parent.id, name.encode(), kind, space, dcpl=create))

@@ -1,0 +1,1 @@
+"""Where each pixel looks: camera, shapes, scattering angles."""

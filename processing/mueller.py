@@ -1,0 +1,118 @@
+"""Mueller matrices of ideal elements, and the algebra between Jones, Mueller and coherency matrices.
+
+Convention (../shared/conventions.md): decreasing phase, angles counter-clockwise from +x as seen looking
+into the beam, Pauli order s0 = 1, s1 = diag(1, -1), s2 = [[0, 1], [1, 0]], s3 = [[0, i], [-i, 0]].
+Angles are in radians here; every function broadcasts over leading axes and returns (..., 4, 4).
+"""
+
+from __future__ import annotations
+
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+IDEAL_DEPOLARIZER: NDArray[np.float64] = np.diag([1.0, 0.0, 0.0, 0.0])
+IDEAL_MIRROR: NDArray[np.float64] = np.diag([1.0, 1.0, -1.0, -1.0])
+
+PAULI: NDArray[np.complex128] = np.array(
+    [[[1, 0], [0, 1]], [[1, 0], [0, -1]], [[0, 1], [1, 0]], [[0, 1j], [-1j, 0]]], dtype=complex
+)
+
+# vec(J) (x) vec(J)^* = TO_COHERENCY . vec(M): built once from M_ab = 1/2 tr(s_a J s_b J^H).
+_TO_MUELLER = 0.5 * np.einsum("aji,bkl->abikjl", PAULI, PAULI).reshape(16, 16)
+_TO_COHERENCY = np.linalg.inv(_TO_MUELLER)
+
+
+def _assemble(rows: list[list[FloatArray]]) -> FloatArray:
+    shape = np.broadcast_shapes(*(np.shape(x) for row in rows for x in row))
+    out = np.empty((*shape, 4, 4))
+    for i, row in enumerate(rows):
+        for j, x in enumerate(row):
+            out[..., i, j] = x
+    return out
+
+
+def rotation(angle: ArrayLike) -> FloatArray:
+    """Mueller rotation R such that an element turned by `angle` is R(angle) M R(-angle)."""
+    t = 2 * np.asarray(angle, dtype=float)
+    c, s, o, z = np.cos(t), np.sin(t), np.ones_like(t), np.zeros_like(t)
+    return _assemble([[o, z, z, z], [z, c, -s, z], [z, s, c, z], [z, z, z, o]])
+
+
+def retarder(azimuth: ArrayLike, retardance: ArrayLike) -> FloatArray:
+    """Linear retarder with its fast axis at `azimuth` (conventions.md, "Mueller calculus")."""
+    t = 2 * np.asarray(azimuth, dtype=float)
+    d = np.asarray(retardance, dtype=float)
+    t, d = np.broadcast_arrays(t, d)
+    c, s, cd, sd = np.cos(t), np.sin(t), np.cos(d), np.sin(d)
+    o, z = np.ones_like(c), np.zeros_like(c)
+    return _assemble(
+        [
+            [o, z, z, z],
+            [z, c * c + s * s * cd, c * s * (1 - cd), -s * sd],
+            [z, c * s * (1 - cd), s * s + c * c * cd, c * sd],
+            [z, s * sd, -c * sd, cd],
+        ]
+    )
+
+
+def diattenuator(azimuth: ArrayLike, t_max: ArrayLike, t_min: ArrayLike) -> FloatArray:
+    """Linear diattenuator that transmits `t_max` along `azimuth` and `t_min` across it (intensities)."""
+    t = 2 * np.asarray(azimuth, dtype=float)
+    hi, lo = np.asarray(t_max, dtype=float), np.asarray(t_min, dtype=float)
+    t, hi, lo = np.broadcast_arrays(t, hi, lo)
+    c, s = np.cos(t), np.sin(t)
+    a, b, g = (hi + lo) / 2, (hi - lo) / 2, np.sqrt(hi * lo)
+    z = np.zeros_like(c)
+    return _assemble(
+        [
+            [a, b * c, b * s, z],
+            [b * c, a * c * c + g * s * s, (a - g) * c * s, z],
+            [b * s, (a - g) * c * s, a * s * s + g * c * c, z],
+            [z, z, z, g],
+        ]
+    )
+
+
+def polarizer(azimuth: ArrayLike, extinction: ArrayLike = 0.0) -> FloatArray:
+    """Linear polarizer with its transmission axis at `azimuth`; it carries its factor 1/2.
+
+    `extinction` is the intensity leak T_min / T_max (0 = ideal).
+    """
+    return diattenuator(azimuth, 1.0, extinction)
+
+
+def circular_retarder(retardance: ArrayLike) -> FloatArray:
+    """Circular retarder: turns linear polarization by half of `retardance`, counter-clockwise."""
+    return rotation(np.asarray(retardance, dtype=float) / 2)
+
+
+def from_jones(jones: ArrayLike) -> FloatArray:
+    """Mueller-Jones matrix of Jones matrices (..., 2, 2): M_ab = 1/2 tr(s_a J s_b J^H)."""
+    j = np.asarray(jones, dtype=complex)
+    return coherency_to_mueller(_outer_vec(j))
+
+
+def _outer_vec(jones: ComplexArray) -> ComplexArray:
+    v = jones.reshape(*jones.shape[:-2], 4)
+    return v[..., :, None] * v[..., None, :].conj()
+
+
+def coherency(mueller: ArrayLike) -> ComplexArray:
+    """Coherency matrix vec(J) vec(J)^H summed over the ensemble, of Mueller matrices (..., 4, 4).
+
+    Hermitian with trace 2 m00; not normalized. vec is row-major: (J00, J01, J10, J11).
+    """
+    m = np.asarray(mueller)
+    h = m.reshape(*m.shape[:-2], 16) @ _TO_COHERENCY.T
+    return h.reshape(*m.shape[:-2], 4, 4)
+
+
+def coherency_to_mueller(h: ArrayLike) -> FloatArray:
+    """Mueller matrix of a coherency matrix; the inverse of `coherency`."""
+    h = np.asarray(h, dtype=complex)
+    m = h.reshape(*h.shape[:-2], 16) @ _TO_MUELLER.T
+    return np.asarray(m.real.reshape(*h.shape[:-2], 4, 4))

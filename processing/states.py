@@ -1,0 +1,69 @@
+"""State tables: which angles, exposure and role each state of a measurement has."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Role = Literal["dark", "flat", "air", "sample"]
+
+#: RGB950's own table (conventions.md, "Instrument"): tG = 9 n degrees, tA = 4.91 tG.
+RGB950_STATES = 40
+RGB950_STEP_DEG = 9.0
+RGB950_RATIO = 4.91
+
+
+@dataclass(frozen=True)
+class StateTable:
+    """Immutable rows of a measurement.
+
+    Attributes
+    ----------
+    angles_deg : mapping of axis name to array (N,), target angles in degrees.
+    exposure_s : array (N,), seconds.
+    role : tuple of N roles.
+    repeats : array (N,), frames averaged for the state.
+    """
+
+    angles_deg: Mapping[str, NDArray[np.float64]]
+    exposure_s: NDArray[np.float64]
+    role: tuple[Role, ...]
+    repeats: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        n = len(self.role)
+        for name, column in {
+            **self.angles_deg,
+            "exposure_s": self.exposure_s,
+            "repeats": self.repeats,
+        }.items():
+            if np.shape(column) != (n,):
+                raise ValueError(f"state table: column {name!r} has shape {np.shape(column)}, expected ({n},)")
+            if not np.all(np.isfinite(column)):
+                raise ValueError(f"state table: column {name!r} has a value that is not a finite number")
+
+    def __len__(self) -> int:
+        return len(self.role)
+
+
+def rotating_retarders(
+    exposure_s: float,
+    states: int = RGB950_STATES,
+    step_deg: float = RGB950_STEP_DEG,
+    ratio: float = RGB950_RATIO,
+    repeats: int = 1,
+    axes: tuple[str, str] = ("psg", "psa"),
+) -> StateTable:
+    """Equal steps of the generator retarder, the analyzer retarder turning `ratio` times as far."""
+    sample: Role = "sample"
+    psg = step_deg * np.arange(states, dtype=float)
+    return StateTable(
+        angles_deg={axes[0]: psg, axes[1]: ratio * psg},
+        exposure_s=np.full(states, float(exposure_s)),
+        role=(sample,) * states,
+        repeats=np.full(states, repeats, dtype=np.int64),
+    )

@@ -1,0 +1,1 @@
+"""Emulated controllers: one module for each kind, speaking the bytes of the real one."""
