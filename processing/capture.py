@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from processing.capture_schema import SCHEMA_VERSION, CaptureHeader
+from processing.errors import ProcessError
 from processing.instrument import InstrumentModel
 from processing.yaml_file import parse_yaml
 
 
-class CaptureError(Exception):
+class CaptureError(ProcessError):
     """A capture cannot be used; the message says what was expected, what was found and what to do."""
 
 

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from processing import mueller
+from processing.errors import ProcessError
 from processing.yaml_file import load_yaml
 
 Row = NDArray[np.float64]
@@ -23,7 +24,7 @@ Row = NDArray[np.float64]
 Dispersive = float | dict[float, float]
 
 
-class WavelengthError(Exception):
+class WavelengthError(ProcessError):
     """The instrument model has no value for the wavelength asked for."""
 
 

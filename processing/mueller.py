@@ -7,7 +7,6 @@ Angles are in radians here; every function broadcasts over leading axes and retu
 
 from __future__ import annotations
 
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

@@ -11,10 +11,12 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
+from processing.errors import ProcessError
+
 Model = TypeVar("Model", bound=BaseModel)
 
 
-class ConfigError(Exception):
+class ConfigError(ProcessError):
     """A configuration file cannot be used; the message names file, line and key."""
 
 

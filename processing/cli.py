@@ -1,0 +1,37 @@
+"""The `process` command: everything from a capture file onwards."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import typer
+
+from processing.command_line import run
+from processing.commands import reduce
+
+app = typer.Typer(
+    name="process",
+    help="Captures to Mueller and Stokes images, reflectance, coherency eigenvalues and reports.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+# One line a module that brings commands. It must not import anything heavy at its top: `--help` is fast.
+reduce.register(app)
+
+
+@app.callback()
+def _process() -> None:
+    # A callback keeps `process NAME` a group of commands even while there is only one of them.
+    pass
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Entry point of `process`; ends in SystemExit."""
+    run(app, argv)
+
+
+if __name__ == "__main__":
+    main()
