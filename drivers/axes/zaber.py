@@ -1,0 +1,289 @@
+"""Zaber rotary stages over Zaber ASCII (firmware 6/7), message ids and checksums on.
+
+Facts: shared/instruments.md 2.1. Unverified on hardware: the unit of speed and acceleration, which word goes with
+which rejection, and that a rotary position does not wrap at a turn.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from dataclasses import dataclass
+from typing import Literal
+
+from pydantic import Field
+
+from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
+from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
+from drivers.serial_link import LineRegistry, SerialLink, Transcript, line_framer
+
+VELOCITY_UNIT = 1.6384  # native velocity per microstep/s (unverified)
+ACCELERATION_UNIT = 1.6384 / 10_000  # native acceleration per microstep/s^2 (unverified)
+# Limits as large as this are those of a rotary stage that has none.
+NO_LIMIT = 1_000_000_000
+
+# The vendor's flags (zaber-motion, ascii/warning_flags.py), in our words.
+FLAGS = {
+    "FF": "critical system error",
+    "FN": "peripheral not supported",
+    "FZ": "peripheral inactive",
+    "FH": "hardware emergency stop",
+    "FV": "driver over- or undervoltage",
+    "FO": "driver disabled",
+    "FC": "current inrush error",
+    "FM": "motor temperature error",
+    "FD": "driver disabled",
+    "FQ": "encoder error",
+    "FI": "index error",
+    "FA": "analog encoder synchronization error",
+    "FR": "overdrive limit exceeded",
+    "FB": "stalled and stopped, with recovery failed",
+    "FP": "excessive twist",
+    "FT": "excessive drive temperature",
+    "FE": "limit error",
+    "FS": "stalled and stopped",
+    "WR": "no reference position",
+    "WH": "not homed since a change",
+    "WL": "unexpected limit trigger",
+    "WP": "invalid calibration",
+    "WV": "voltage out of range",
+    "WT": "temperature high",
+    "WM": "displaced when stationary",
+    "WS": "stalled with recovery",
+    "NI": "movement interrupted",
+    "NC": "manual control",
+}
+_REPLY = re.compile(r"@(\d\d) (\d) (\d\d) (OK|RJ) (IDLE|BUSY) (--|[A-Z0-9]{2}) ([^:]*):([0-9A-F]{2})")
+
+
+class Config(AxisConfig):
+    """A Zaber axis in a rig file. Give `serial_number`: addresses are the order of the wiring."""
+
+    kind: Literal["zaber"] = "zaber"
+    address: int | None = Field(default=None, ge=1, le=99)
+    serial_number: int | None = None
+    axis: int = Field(default=1, ge=1, le=9, description="axis of a controller with several")
+    counts_per_turn: float | None = Field(
+        default=None, gt=0, description="microsteps per turn, for a stage that does not report limit.cycle.dist"
+    )
+    baudrate: int = 115_200
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """A reply with a valid checksum."""
+
+    address: int
+    axis: int
+    message_id: int
+    accepted: bool
+    busy: bool
+    flag: str
+    data: str
+
+
+def checksum(text: str) -> str:
+    """Two's complement of the low byte of the sum of all characters, two upper-case hex digits."""
+    return f"{-sum(text.encode('ascii')) & 0xFF:02X}"
+
+
+def parse_reply(frame: bytes) -> Reply | None:
+    """Read a reply line; None if it is not a whole reply with a valid checksum."""
+    text = frame.decode("ascii", "replace")
+    match = _REPLY.fullmatch(text)
+    if match is None or checksum(text[1:-3].replace("\ufffd", "?")) != match[8]:
+        return None
+    return Reply(
+        int(match[1]), int(match[2]), int(match[3]), match[4] == "OK", match[5] == "BUSY", match[6], match[7]
+    )
+
+
+class ZaberLine:
+    """One chain of devices: sends commands, gives each reply to its request by address, axis and id."""
+
+    def __init__(self, port: str, baudrate: int, reply_s: float, transcript: Transcript | None) -> None:
+        self.link = SerialLink(port, baudrate, line_framer, transcript=transcript)
+        self.reply_s = reply_s
+        self._message_id = 0
+
+    def close(self) -> None:
+        """Close the port."""
+        self.link.close()
+
+    def send(self, address: int, axis: int, words: str) -> int:
+        """Write a command and return its message id; takes no lock."""
+        self._message_id = self._message_id % 99 + 1
+        message_id = self._message_id
+        body = f"{address} {axis} {message_id:02d} {words}".rstrip()
+        self.link.write(f"/{body}:{checksum(body)}\n".encode("ascii"))
+        return message_id
+
+    def ask(self, address: int, axis: int, words: str, *, repeat: bool) -> Reply:
+        """Send a command and return its reply.
+
+        Parameters
+        ----------
+        repeat : bool
+            Ask a second time, after a purge, if no valid reply came. For questions only, never for a command.
+
+        Raises
+        ------
+        CommandRejected, ReplyTimeout, ReplyError
+        """
+        with self.link.lock:
+            reply, seen = self._exchange(address, axis, words)
+            if reply is None and repeat:
+                reply, seen = self._exchange(address, axis, words)
+        asked = f"Zaber {self.link.port} device {address}, {words or 'status'!r}"
+        if reply is None and seen:
+            raise ReplyError(
+                asked, f"no valid reply, but {seen[:3]}", "Check the cable and that every address occurs only once"
+            )
+        if reply is None:
+            raise ReplyTimeout(
+                asked, f"nothing within {self.reply_s} s", "Check power, cable, address and the device's protocol"
+            )
+        if not reply.accepted:
+            raise CommandRejected(asked, f"rejected: {reply.data}", "Check the state of the device and the command")
+        return reply
+
+    def _exchange(self, address: int, axis: int, words: str) -> tuple[Reply | None, list[bytes]]:
+        seen: list[bytes] = []
+        message_id = self.send(address, axis, words)
+        deadline_s = time.monotonic() + self.reply_s
+        while (frame := self.link.read_frame(deadline_s)) is not None:
+            reply = parse_reply(frame)
+            if reply is not None and (reply.address, reply.axis, reply.message_id) == (address, axis, message_id):
+                return reply, seen
+            # Alerts (!), extra info (#), late replies and noise.
+            seen.append(frame)
+        self.link.purge()
+        return None, seen
+
+    def ask_all(self, words: str, quiet_s: float = 0.25) -> list[Reply]:
+        """Ask every device on the chain and collect the replies until the line is quiet."""
+        replies: list[Reply] = []
+        with self.link.lock:
+            message_id = self.send(0, 0, words)
+            deadline_s = time.monotonic() + self.reply_s
+            while (frame := self.link.read_frame(deadline_s)) is not None:
+                reply = parse_reply(frame)
+                if reply is not None and reply.message_id == message_id:
+                    replies.append(reply)
+                    deadline_s = time.monotonic() + quiet_s
+        return replies
+
+
+class ZaberAxis(MotionAxis):
+    """One axis of a Zaber device."""
+
+    _reply_is_checked = True
+
+    def __init__(self, name: str, config: Config, line: ZaberLine, lines: LineRegistry) -> None:
+        super().__init__(name, config)
+        self.config: Config = config
+        self._line, self._lines = line, lines
+        self._address, serial_number = self._find()
+        turn = config.counts_per_turn or float(self._get("limit.cycle.dist"))
+        self.counts_per_deg = turn / 360.0
+        self.speed_deg_s = float(self._get("maxspeed")) / VELOCITY_UNIT / self.counts_per_deg
+        self.acceleration_deg_s2 = float(self._get("accel")) / ACCELERATION_UNIT / self.counts_per_deg
+        self._home_speed_deg_s = float(self._get("limit.approach.maxspeed")) / VELOCITY_UNIT / self.counts_per_deg
+        self._device_min_deg = self._limit("limit.min")
+        self._device_max_deg = self._limit("limit.max")
+        self._identity = AxisIdentity(
+            kind="zaber",
+            model=f"device id {self._ask('get deviceid', axis=0).data}",
+            serial_number=serial_number,
+            firmware=self._ask("get version", axis=0).data,
+            port=config.port,
+            address=str(self._address),
+        )
+
+    def _find(self) -> tuple[int, str]:
+        """Return address and serial number of the device that the rig file means."""
+        config, serials = self.config, self._line.ask_all("get system.serial")
+        found = {reply.address: reply.data for reply in serials if reply.accepted}
+        listed = ", ".join(f"address {address}: serial {serial}" for address, serial in sorted(found.items()))
+        asked = f"axis {self.name}, find Zaber device on {config.port}"
+        if not found:
+            raise ReplyTimeout(asked, "no device answers", "Check power, cable and that the chain speaks Zaber ASCII")
+        if len(found) < len(serials):
+            raise WrongDevice(asked, f"two devices have one address ({listed})", "Renumber the chain")
+        wanted = [
+            (address, serial)
+            for address, serial in sorted(found.items())
+            if config.address in (None, address) and str(config.serial_number or serial) == serial
+        ]
+        if len(wanted) != 1:
+            rule = f"address {config.address}, serial_number {config.serial_number}"
+            raise WrongDevice(
+                asked, f"{len(wanted)} devices match {rule}; found {listed}", "Correct the rig file or the wiring"
+            )
+        return wanted[0]
+
+    def describe(self) -> AxisIdentity:
+        return self._identity
+
+    def _ask(self, words: str, *, axis: int | None = None, repeat: bool = True) -> Reply:
+        return self._line.ask(self._address, self.config.axis if axis is None else axis, words, repeat=repeat)
+
+    def _get(self, setting: str) -> int:
+        data = self._ask(f"get {setting}").data
+        if not re.fullmatch(r"-?\d+(\.\d+)?", data):
+            raise ReplyError(f"axis {self.name}, get {setting}", f"not a number: {data!r}", "Check the firmware version")
+        return round(float(data))
+
+    def _limit(self, setting: str) -> float | None:
+        counts = self._get(setting)
+        return None if abs(counts) >= NO_LIMIT else counts / self.counts_per_deg
+
+    def _do_read_counts(self) -> int:
+        return self._get("pos")
+
+    def _flags(self) -> list[str]:
+        words = self._ask("warnings").data.split()
+        return words[1:]
+
+    def _do_is_homed(self) -> bool:
+        return "WR" not in self._flags()
+
+    def _do_is_moving(self) -> bool:
+        return self._ask("").busy
+
+    def _do_start_move(self, counts: float) -> None:
+        self._ask(f"move abs {round(counts)}", repeat=False)
+
+    def _do_start_home(self) -> None:
+        self._ask("home", repeat=False)
+
+    def _do_stop(self) -> None:
+        self._line.send(self._address, self.config.axis, "stop")
+
+    def _do_check_fault(self) -> None:
+        faults = [flag for flag in self._flags() if flag.startswith("F")]
+        if faults:
+            words = ", ".join(f"{flag} {FLAGS.get(flag, '')}".strip() for flag in faults)
+            raise CommandRejected(
+                f"axis {self.name}, state", f"fault {words}", "Remove the cause; the vendor's manual lists the flags"
+            )
+
+    def _do_warnings(self) -> list[str]:
+        return [f"{flag} {FLAGS.get(flag, 'unknown flag')}" for flag in self._flags()]
+
+    def _do_close(self) -> None:
+        self._lines.release(self.config.port)
+
+
+def open(name: str, config: Config, lines: LineRegistry) -> ZaberAxis:
+    """Open one axis; reads its identity, limits and speed and moves nothing."""
+    line = lines.take(
+        config.port,
+        ZaberLine,
+        lambda transcript: ZaberLine(config.port, config.baudrate, config.reply_s or 0.5, transcript),
+    )
+    try:
+        return ZaberAxis(name, config, line, lines)
+    except BaseException:
+        lines.release(config.port)
+        raise

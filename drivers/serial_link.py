@@ -1,0 +1,312 @@
+"""Serial lines: one owner with one lock for each port, bounded waits, whole frames, a transcript on demand."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol, Self, TypeVar
+
+import serial
+
+from drivers.errors import DeviceError, PermissionRefused, PortBusy, PortLost, PortNotFound
+
+# A framer takes one whole frame off the front of the buffer, or returns None until there is one.
+Framer = Callable[[bytearray], bytes | None]
+
+# No protocol here has a longer frame; noise without an end is dropped beyond it.
+LONGEST_FRAME = 1024
+# Reads wait in slices, so that a deadline is met to within one slice.
+READ_SLICE_S = 0.02
+
+
+def line_framer(buffer: bytearray) -> bytes | None:
+    """Take one text line off the buffer, without its CR and LF; empty lines are skipped."""
+    while True:
+        end = buffer.find(b"\n")
+        if end < 0:
+            if len(buffer) > LONGEST_FRAME:
+                buffer.clear()
+            return None
+        line = bytes(buffer[:end]).strip(b"\r\n")
+        del buffer[: end + 1]
+        if line:
+            return line
+
+
+class Transcript:
+    """Writes every byte on the wire to a text file, one line for each write and read."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("a", encoding="ascii")
+        self._lock = threading.Lock()
+
+    def note(self, mark: str, data: bytes) -> None:
+        """Add a line: monotonic time in seconds, `>>` sent or `<<` received, the bytes as text and hex."""
+        text = data.decode("ascii", "backslashreplace").encode("unicode_escape").decode("ascii")
+        with self._lock:
+            self._file.write(f"{time.monotonic():.4f} {mark} {text} [{data.hex(' ')}]\n")
+            self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class SerialLink:
+    """An open port that reads whole frames.
+
+    Opening takes the port for this process alone, drops what waits in it and sends nothing.
+
+    Parameters
+    ----------
+    port : str
+        Device path, ``/dev/serial/by-id`` path or ``socket://host:port``.
+    baudrate : int
+        Bits per second.
+    framer : callable
+        Takes one frame off the buffer.
+    xonxoff, rtscts : bool
+        Flow control.
+    transcript : Transcript, optional
+        Where to log the wire.
+
+    Raises
+    ------
+    PortNotFound, PortBusy, PermissionRefused
+        With the path, the holder or the owning group.
+    """
+
+    def __init__(
+        self,
+        port: str,
+        baudrate: int,
+        framer: Framer,
+        *,
+        xonxoff: bool = False,
+        rtscts: bool = False,
+        transcript: Transcript | None = None,
+    ) -> None:
+        self.port = port
+        # One exchange at a time; a stop does not wait for it.
+        self.lock = threading.RLock()
+        self._write_lock = threading.Lock()
+        self._framer = framer
+        self._buffer = bytearray()
+        self._transcript = transcript
+        self._serial: Any = _open_port(port, baudrate, xonxoff, rtscts)
+        self.purge(0.0)
+
+    def write(self, data: bytes) -> None:
+        """Send bytes; does not take `lock`, so that a stop can overtake a wait for a reply."""
+        with self._write_lock, self._lost_port_named():
+            if self._transcript is not None:
+                self._transcript.note(">>", data)
+            self._serial.write(data)
+
+    def read_frame(self, deadline_s: float) -> bytes | None:
+        """Return the next whole frame, or None if none is complete at `deadline_s` (monotonic time)."""
+        while True:
+            frame = self._framer(self._buffer)
+            if frame is not None:
+                return frame
+            left_s = deadline_s - time.monotonic()
+            with self._lost_port_named():
+                waiting = self._serial.in_waiting
+                if waiting == 0 and left_s <= 0:
+                    return None
+                data = self._serial.read(max(1, waiting))
+            if data and self._transcript is not None:
+                self._transcript.note("<<", data)
+            self._buffer += data
+
+    def purge(self, quiet_s: float = 0.05) -> None:
+        """Drop everything received until the line has been quiet for `quiet_s` (at most ten times as long)."""
+        start_s = quiet_since_s = time.monotonic()
+        with self._lost_port_named():
+            self._serial.reset_input_buffer()
+            self._buffer.clear()
+            while time.monotonic() - quiet_since_s < quiet_s and time.monotonic() - start_s < 10 * quiet_s:
+                if self._serial.read(max(1, self._serial.in_waiting)):
+                    quiet_since_s = time.monotonic()
+
+    def set_rts(self, level: bool) -> None:
+        """Set the RTS line; a pseudo-terminal has none, which is fine."""
+        try:
+            self._serial.rts = level
+        except OSError as error:
+            if error.errno not in (errno.ENOTTY, errno.EINVAL):
+                raise
+
+    def close(self) -> None:
+        """Give the port back."""
+        with contextlib.suppress(OSError, serial.SerialException):
+            self._serial.close()
+        if self._transcript is not None:
+            self._transcript.close()
+
+    @contextlib.contextmanager
+    def _lost_port_named(self) -> Any:
+        try:
+            yield
+        except (OSError, serial.SerialException, TypeError) as error:
+            # pyserial raises TypeError when another thread has closed the port during a read.
+            raise PortLost(
+                f"use port {self.port}", f"it is gone ({error})", "Check cable and power, then start again"
+            ) from error
+
+
+def _open_port(port: str, baudrate: int, xonxoff: bool, rtscts: bool) -> Any:
+    asked = f"open port {port}"
+    if "://" not in port:
+        if not Path(port).exists():
+            raise PortNotFound(asked, "there is no such port", _ports_hint())
+        others = [who for pid, who in port_holders(port) if pid != os.getpid()]
+        if others:
+            raise PortBusy(asked, f"it is in use by {', '.join(others)}", "End that program; nothing was sent")
+    try:
+        options: dict[str, Any] = {} if "://" in port else {"exclusive": True}
+        return serial.serial_for_url(
+            port, baudrate=baudrate, timeout=READ_SLICE_S, write_timeout=2.0, xonxoff=xonxoff, rtscts=rtscts, **options
+        )
+    except (serial.SerialException, OSError, ValueError) as error:
+        number = getattr(error, "errno", None)
+        if number in (errno.EACCES, errno.EPERM):
+            raise PermissionRefused(
+                asked, f"this user may not; {_owner(port)}", "Join that group and log in again"
+            ) from error
+        if number in (errno.EWOULDBLOCK, errno.EAGAIN, errno.EBUSY):
+            holders = [who for _, who in port_holders(port)]
+            named = ", ".join(holders) or "a program that this user may not see"
+            raise PortBusy(asked, f"it is in use by {named}", "End that program; nothing was sent") from error
+        raise PortNotFound(asked, str(error), _ports_hint()) from error
+
+
+def port_holders(port: str) -> list[tuple[int, str]]:
+    """Find the processes that have a device open, as (pid, "name (pid N)"); touches no device.
+
+    Only processes that this user may look into are seen.
+    """
+    wanted = os.path.realpath(port)
+    holders = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            held = any(os.readlink(entry) == wanted for entry in (process / "fd").iterdir())
+            if held:
+                name = (process / "comm").read_text().strip()
+                holders.append((int(process.name), f"{name} (pid {process.name})"))
+        except OSError:
+            continue
+    return holders
+
+
+def _owner(port: str) -> str:
+    import grp
+
+    status = os.stat(port)
+    try:
+        group = grp.getgrgid(status.st_gid).gr_name
+    except KeyError:
+        group = str(status.st_gid)
+    return f"it belongs to group {group}"
+
+
+def _ports_hint() -> str:
+    from serial.tools.list_ports import comports
+
+    names = [f"{entry.device} ({entry.description})" for entry in comports()]
+    by_id = sorted(str(path) for path in Path("/dev/serial/by-id").glob("*"))
+    found = ", ".join(names + by_id) or "none"
+    return f"Serial ports found: {found}. Correct `port` in the rig file or plug the device in"
+
+
+class Line(Protocol):
+    """What a driver keeps for each port: something that can be closed."""
+
+    def close(self) -> None:
+        """Close the port."""
+
+
+L = TypeVar("L", bound=Line)
+
+
+class LineRegistry:
+    """One owner for each port, shared by all axes on that line; closes what is left when it is closed.
+
+    Parameters
+    ----------
+    transcript_folder : Path, optional
+        Folder that gets one transcript of the wire for each port.
+    """
+
+    def __init__(self, transcript_folder: Path | None = None) -> None:
+        self._folder = transcript_folder
+        self._lines: dict[str, tuple[Line, int]] = {}
+        self._lock = threading.Lock()
+
+    def take(self, port: str, kind: type[L], make: Callable[[Transcript | None], L]) -> L:
+        """Return the line on `port`, made by `make` if it is not open yet; give it back with `release`.
+
+        Raises
+        ------
+        PortBusy
+            The port is already open here for another protocol.
+        """
+        key = _port_key(port)
+        with self._lock:
+            line, users = self._lines.get(key, (None, 0))
+            if line is None:
+                line = make(self._transcript(key))
+            if not isinstance(line, kind):
+                raise PortBusy(
+                    f"open port {port}",
+                    f"this rig already uses it for {type(line).__name__}",
+                    "Give each kind of controller its own port in the rig file",
+                )
+            self._lines[key] = (line, users + 1)
+            return line
+
+    def release(self, port: str) -> None:
+        """Give a line back; the last user closes it."""
+        key = _port_key(port)
+        with self._lock:
+            line, users = self._lines.pop(key, (None, 0))
+            if line is None:
+                return
+            if users > 1:
+                self._lines[key] = (line, users - 1)
+            else:
+                line.close()
+
+    def close(self) -> None:
+        """Close every line that is still open."""
+        with self._lock:
+            lines = [line for line, _ in self._lines.values()]
+            self._lines.clear()
+        for line in lines:
+            with contextlib.suppress(DeviceError):
+                line.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _transcript(self, key: str) -> Transcript | None:
+        if self._folder is None:
+            return None
+        self._folder.mkdir(parents=True, exist_ok=True)
+        name = "".join(letter if letter.isalnum() else "_" for letter in key).strip("_")
+        return Transcript(self._folder / f"{name}.log")
+
+
+def _port_key(port: str) -> str:
+    return port if "://" in port else os.path.realpath(port)
