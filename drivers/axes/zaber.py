@@ -93,9 +93,7 @@ def parse_reply(frame: bytes) -> Reply | None:
     match = _REPLY.fullmatch(text)
     if match is None or checksum(text[1:-3].replace("\ufffd", "?")) != match[8]:
         return None
-    return Reply(
-        int(match[1]), int(match[2]), int(match[3]), match[4] == "OK", match[5] == "BUSY", match[6], match[7]
-    )
+    return Reply(int(match[1]), int(match[2]), int(match[3]), match[4] == "OK", match[5] == "BUSY", match[6], match[7])
 
 
 class ZaberLine:
@@ -231,7 +229,9 @@ class ZaberAxis(MotionAxis):
     def _get(self, setting: str) -> int:
         data = self._ask(f"get {setting}").data
         if not re.fullmatch(r"-?\d+(\.\d+)?", data):
-            raise ReplyError(f"axis {self.name}, get {setting}", f"not a number: {data!r}", "Check the firmware version")
+            raise ReplyError(
+                f"axis {self.name}, get {setting}", f"not a number: {data!r}", "Check the firmware version"
+            )
         return round(float(data))
 
     def _limit(self, setting: str) -> float | None:

@@ -18,7 +18,9 @@ from simulators.serve import ServeOptions
 VELOCITY_UNIT = 1.6384
 ACCELERATION_UNIT = 1.6384 / 10_000
 
-_COMMAND = re.compile(r"/(?P<numbers>(?:\s*\d+(?=[\s:]|$)){0,3})\s*(?P<words>[^:]*?)\s*(?::(?P<checksum>[0-9A-Fa-f]{2}))?")
+_COMMAND = re.compile(
+    r"/(?P<numbers>(?:\s*\d+(?=[\s:]|$)){0,3})\s*(?P<words>[^:]*?)\s*(?::(?P<checksum>[0-9A-Fa-f]{2}))?"
+)
 
 
 def checksum(text: str) -> str:

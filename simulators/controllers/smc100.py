@@ -1,0 +1,277 @@
+"""Newport SMC100 and CONEX controllers on one line: the state machine, its refusals and its error memory."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from simulators.clock import Clock
+from simulators.emulator import EmulatedAxis, Emulator
+from simulators.faults import FaultSchedule
+from simulators.serve import ServeOptions
+
+ERROR_TEXTS = {
+    "@": "No error",
+    "A": "Unknown message code or floating point controller address",
+    "C": "Parameter missing or out of range",
+    "D": "Command not allowed",
+    "G": "Displacement out of limits",
+    "H": "Command not allowed in NOT REFERENCED state",
+    "J": "Command not allowed in DISABLE state",
+    "K": "Command not allowed in READY state",
+    "L": "Command not allowed in HOMING state",
+    "M": "Command not allowed in MOVING state",
+}
+_COMMAND = re.compile(r"(\d*)([A-Za-z]{2})(.*)")
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+
+
+class Refused(Exception):
+    """The controller refuses the command; the message is the letter for its error memory."""
+
+
+@dataclass
+class SMC100Controller:
+    """One controller with its stage.
+
+    Attributes
+    ----------
+    address : int
+    axis : EmulatedAxis
+    version, stage : str
+        What ``VE`` and ``ID?`` answer.
+    restart_s : float
+        Simulated time that a reset takes.
+    """
+
+    address: int
+    axis: EmulatedAxis
+    version: str = "SMC100CC 2.0.1"
+    stage: str = "URS150CC"
+    restart_s: float = 1.0
+    error: str = "@"
+    disabled: bool = False
+    busy_before: bool = False
+    came_by: int = 0x0A
+    target_deg: float = 0.0
+    silent_until_s: float = 0.0
+
+    def state(self) -> int:
+        """State code as ``TS`` shows it."""
+        axis = self.axis
+        moving = axis.is_moving()
+        if moving and axis.homing:
+            self.came_by = 0x32
+            return 0x1E
+        if not axis.homed:
+            return 0x0A if self.came_by >= 0x32 else self.came_by
+        if moving:
+            self.came_by = 0x33
+            return 0x28
+        if self.disabled:
+            return 0x3C
+        return self.came_by if self.came_by >= 0x32 else 0x32
+
+    def run(self, letters: str, value: str) -> str | None:
+        """Do one command; return the reply's value, or None where the real one answers nothing.
+
+        Raises
+        ------
+        Refused
+            With the letter of the error.
+        """
+        handlers: dict[str, Callable[[str], str | None]] = {
+            "VE": lambda _: " " + self.version,
+            "ID": self._id,
+            "TS": lambda _: f"0000{self.state():02X}",
+            "TE": self._take_error,
+            "TB": lambda letter: f"{letter or self.error} {ERROR_TEXTS.get(letter or self.error, 'Unknown')}",
+            "TP": lambda _: f"{self.axis.position_deg():.5f}",
+            "TH": lambda _: f"{self.target_deg:.5f}",
+            "SL": self._left_limit,
+            "SR": self._right_limit,
+            "VA": self._velocity,
+            "AC": self._acceleration,
+            "PA": self._absolute,
+            "PR": self._relative,
+            "PT": self._move_time,
+            "OR": self._home,
+            "ST": self._stop,
+            "MM": self._enable,
+            "RS": self._reset,
+        }
+        if letters not in handlers:
+            raise Refused("A")
+        return handlers[letters](value)
+
+    def _id(self, value: str) -> str:
+        if value != "?":
+            raise Refused("D")
+        return self.stage
+
+    def _take_error(self, _: str) -> str:
+        error, self.error = self.error, "@"
+        return error
+
+    def _setting(self, value: str, now: float | None, low: float, high: float) -> tuple[str | None, float]:
+        """Answer a question or return the new value of a setting."""
+        if value == "?":
+            return f"{now:g}", 0.0
+        new = _number(value)
+        if not low <= new <= high:
+            raise Refused("C")
+        if self.state() in (0x1E, 0x28):
+            raise Refused("L" if self.state() == 0x1E else "M")
+        return None, new
+
+    def _left_limit(self, value: str) -> str | None:
+        answer, new = self._setting(value, self.axis.min_deg, -1e6, 0.0)
+        if answer is None:
+            self.axis.min_deg = new
+        return answer
+
+    def _right_limit(self, value: str) -> str | None:
+        answer, new = self._setting(value, self.axis.max_deg, 0.0, 1e6)
+        if answer is None:
+            self.axis.max_deg = new
+        return answer
+
+    def _velocity(self, value: str) -> str | None:
+        answer, new = self._setting(value, self.axis.speed_deg_s, 1e-6, 1e4)
+        if answer is None:
+            self.axis.speed_deg_s = new
+        return answer
+
+    def _acceleration(self, value: str) -> str | None:
+        answer, new = self._setting(value, self.axis.acceleration_deg_s2, 1e-6, 1e6)
+        if answer is None:
+            self.axis.acceleration_deg_s2 = new
+        return answer
+
+    def _refuse_unless_ready(self) -> None:
+        state = self.state()
+        refusals = {0x1E: "L", 0x28: "M", 0x3C: "J"}
+        if state < 0x1E:
+            raise Refused("H")
+        if state in refusals:
+            raise Refused(refusals[state])
+
+    def _absolute(self, value: str) -> str | None:
+        if value == "?":
+            return f"{self.target_deg:.5f}"
+        target_deg = _number(value)
+        self._refuse_unless_ready()
+        if not self.axis.within(target_deg):
+            raise Refused("G")
+        self.target_deg = target_deg
+        self.axis.move_to(target_deg)
+        return None
+
+    def _relative(self, value: str) -> str | None:
+        return self._absolute(f"{self.axis.position_deg() + _number(value):.9f}")
+
+    def _move_time(self, value: str) -> str:
+        distance = abs(_number(value))
+        return f"{distance / self.axis.speed_deg_s + self.axis.speed_deg_s / self.axis.acceleration_deg_s2:g}"
+
+    def _home(self, _: str) -> None:
+        state = self.state()
+        if state >= 0x1E:
+            raise Refused({0x1E: "L", 0x28: "M", 0x3C: "J"}.get(state, "K"))
+        self.target_deg = 0.0
+        self.axis.home()
+
+    def _stop(self, _: str) -> None:
+        self.axis.stop()
+        self.target_deg = self.axis.position_deg()
+
+    def _enable(self, value: str) -> str | None:
+        if value == "?":
+            return f"{self.state():02X}"
+        if value not in ("0", "1"):
+            raise Refused("C")
+        state = self.state()
+        if state < 0x1E:
+            raise Refused("H")
+        if state in (0x1E, 0x28):
+            raise Refused("L" if state == 0x1E else "M")
+        self.disabled = value == "0"
+        self.came_by = 0x34
+        return None
+
+    def _reset(self, _: str) -> None:
+        self.axis.lose_reference()
+        self.disabled, self.error, self.came_by = False, "@", 0x0A
+        self.silent_until_s = self.axis.clock.now_s() + self.restart_s
+
+
+def _number(value: str) -> float:
+    if not _NUMBER.fullmatch(value):
+        raise Refused("C")
+    return float(value)
+
+
+class SMC100Emulator(Emulator):
+    """Controllers on one line; `true_deg(i)` belongs to the i-th controller."""
+
+    def __init__(
+        self, controllers: Sequence[SMC100Controller], clock: Clock, faults: FaultSchedule | None = None
+    ) -> None:
+        super().__init__([controller.axis for controller in controllers], clock, faults)
+        self.controllers = {controller.address: controller for controller in controllers}
+        self._buffer = bytearray()
+
+    def _do_receive(self, data: bytes) -> None:
+        for byte in data:
+            if byte in b"\r\n":
+                line, self._buffer = bytes(self._buffer), bytearray()
+                # Blanks mean nothing anywhere in a command.
+                text = line.decode("latin-1").replace(" ", "")
+                if text:
+                    self._command(text)
+            elif len(self._buffer) < 256:
+                self._buffer.append(byte)
+
+    def _command(self, text: str) -> None:
+        match = _COMMAND.fullmatch(text)
+        if match is None:
+            return
+        self._apply_faults()
+        number, letters, value = match[1], match[2].upper(), match[3]
+        if number in ("", "0"):
+            # A stop without an address goes to all.
+            chosen = list(self.controllers.values()) if letters == "ST" else []
+        else:
+            chosen = [self.controllers[int(number)]] if int(number) in self.controllers else []
+        for controller in chosen:
+            if self.clock.now_s() < controller.silent_until_s:
+                continue
+            try:
+                answer = controller.run(letters, value)
+            except Refused as refusal:
+                controller.error = str(refusal)
+                continue
+            if answer is not None:
+                self._reply(f"{controller.address}{letters}{answer}\r\n".encode("latin-1"))
+
+    def _do_make_foreign(self, reply: bytes) -> bytes:
+        text = reply.decode("latin-1")
+        match = re.match(r"\d+", text)
+        address = int(match[0]) if match else 0
+        return f"{address % 31 + 1}{text[len(str(address)) :]}".encode("latin-1")
+
+
+def make(options: ServeOptions) -> SMC100Emulator:
+    """One controller at address 1 that is NOT REFERENCED, with travel from 0 to 180 degrees."""
+    controllers = []
+    low, high = options.limits_deg or (0.0, 180.0)
+    for index in range(options.axes or 1):
+        controller = SMC100Controller(index + 1, options.axis(low, high, 25.0))
+        if options.model is not None:
+            controller.version = f"{options.model} 2.0.1"
+        controllers.append(controller)
+    return SMC100Emulator(controllers, options.clock, options.faults)
+
+
+SERVES = {"smc100": make}
