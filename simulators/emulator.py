@@ -240,8 +240,8 @@ class Emulator(ABC):
     def _do_make_foreign(self, reply: bytes) -> bytes:
         """Make of a reply one that belongs to another device or request."""
 
-    def _do_advance(self) -> None:
-        """Send what became due with time; most protocols send nothing on their own."""
+    def _do_advance(self) -> None:  # noqa: B027 - most protocols have nothing to do here
+        """Send what became due with time."""
 
     def _do_next_event_s(self) -> float | None:
         """Simulated time of the next such message."""

@@ -95,7 +95,7 @@ class PtyPort:
                     else:
                         self.emulator.receive(data)
                 pending = self._send(pending + self.emulator.take_output())
-        except BaseException as error:
+        except BaseException as error:  # noqa: BLE001 - raised again by close()
             # Kept for close(), which raises it in the thread that owns the port.
             self._error = error
 

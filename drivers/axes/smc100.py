@@ -116,7 +116,8 @@ class SMC100Line:
     def _exchange(
         self, address: int, command: str, value: re.Pattern[str], reply_s: float
     ) -> tuple[str | None, list[bytes]]:
-        link, seen = self.link, []
+        link = self.link
+        seen: list[bytes] = []
         # Replies carry no id: one that waits here already belongs to an earlier question.
         link.purge(0.0)
         self.send(address, command)

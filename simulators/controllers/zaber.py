@@ -245,7 +245,7 @@ class ZaberEmulator(Emulator):
             return
         self._apply_faults()
         numbers = [int(number) for number in match["numbers"].split()]
-        address, axis = (numbers + [0, 0])[:2]
+        address, axis = [*numbers, 0, 0][:2]
         message_id = f"{numbers[2]:02d} " if len(numbers) == 3 else ""
         for device in self.devices:
             if address in (0, device.address):
