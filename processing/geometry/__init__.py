@@ -1,1 +1,1 @@
-"""Where each pixel looks: camera, shapes, scattering angles."""
+"""From pixels to scattering geometry: cameras, surfaces, instrument frames and Rusinkiewicz angles."""

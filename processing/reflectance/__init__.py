@@ -1,1 +1,1 @@
-"""Reflectance models: one module for each; the module's name is its kind in YAML."""
+"""Reflectance models: one file a kind, found by folder (`base.kinds`)."""

@@ -1,0 +1,145 @@
+"""Directions at surface points, and the transverse axes to which their Mueller matrices refer.
+
+World frame: origin at the centre of rotation, y up, camera on +z (conventions.md, "Frames"). Each beam has
+x = unit(up cross k) and y = k cross x, k being its propagation. With up = y these are the instrument frames
+that a measured Mueller image is in; with up = n they are the paper's normal-based ones, which turn with the
+surface (trap 1); with up = s, normal to the plane of wi and wo, they are the frames of a renderer's table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from processing import mueller
+from processing.geometry import rusinkiewicz
+
+FloatArray = NDArray[np.float64]
+
+WORLD_UP: FloatArray = np.array([0.0, 1.0, 0.0])
+
+
+def unit(v: ArrayLike) -> FloatArray:
+    """Vectors (..., 3) at unit length; a zero vector stays zero."""
+    a = np.asarray(v, dtype=np.float64)
+    length = np.sqrt(np.einsum("...i,...i->...", a, a))[..., None]
+    return np.asarray(np.divide(a, length, out=np.zeros_like(a), where=length > 0))
+
+
+def dot(a: ArrayLike, b: ArrayLike) -> FloatArray:
+    """Scalar products over the last axis."""
+    return np.asarray(np.einsum("...i,...i->...", np.asarray(a), np.asarray(b)))
+
+
+def cross(a: ArrayLike, b: ArrayLike) -> FloatArray:
+    """Vector products over the last axis (several times faster than numpy's general one)."""
+    u, v = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
+    out = np.empty(u.shape)
+    out[..., 0] = u[..., 1] * v[..., 2] - u[..., 2] * v[..., 1]
+    out[..., 1] = u[..., 2] * v[..., 0] - u[..., 0] * v[..., 2]
+    out[..., 2] = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+    return out
+
+
+@dataclass(frozen=True)
+class ScatteringGeometry:
+    """Unit vectors at surface points.
+
+    Attributes
+    ----------
+    normal, to_source, to_camera : (..., 3), outward normal n, and wi, wo from the point.
+    up : (3,) or (..., 3), the direction that fixes the transverse axes of both beams.
+    """
+
+    normal: FloatArray
+    to_source: FloatArray
+    to_camera: FloatArray
+    up: FloatArray = field(default_factory=WORLD_UP.copy)
+
+    @cached_property
+    def half(self) -> FloatArray:
+        """h, unit half vector of wi and wo."""
+        return unit(self.to_source + self.to_camera)
+
+    @cached_property
+    def angles(self) -> rusinkiewicz.Angles:
+        """theta_h, theta_d, phi_d in radians."""
+        return rusinkiewicz.angles(self.normal, self.to_source, self.to_camera)
+
+    @cached_property
+    def s_axis(self) -> FloatArray:
+        """s = unit(h cross wi); where source and camera coincide any transverse axis serves, `up` is taken."""
+        s = cross(self.half, self.to_source)
+        length = np.sqrt(dot(s, s))
+        alike = length < 1e-9
+        if np.any(alike):
+            up = np.broadcast_to(self.up, s.shape)
+            s = np.where(alike[..., None], up - self.half * dot(up, self.half)[..., None], s)
+        return unit(s)
+
+    @property
+    def axes_in(self) -> tuple[FloatArray, FloatArray]:
+        """x, y of the generator's beam, ki = -wi."""
+        return transverse_axes(-self.to_source, self.up)
+
+    @property
+    def axes_out(self) -> tuple[FloatArray, FloatArray]:
+        """x, y of the analyzer's beam, ko = wo."""
+        return transverse_axes(self.to_camera, self.up)
+
+    def with_up(self, up: ArrayLike) -> ScatteringGeometry:
+        """The same directions, referred to other transverse axes."""
+        return ScatteringGeometry(self.normal, self.to_source, self.to_camera, np.asarray(up, dtype=np.float64))
+
+    def reversed(self) -> ScatteringGeometry:
+        """Source and camera exchanged (for reciprocity)."""
+        return ScatteringGeometry(self.normal, self.to_camera, self.to_source, self.up)
+
+    def __getitem__(self, index: Any) -> ScatteringGeometry:
+        """The points that `index` picks (any numpy index of the leading axes)."""
+        up = self.up if self.up.ndim == 1 else self.up[index]
+        return ScatteringGeometry(self.normal[index], self.to_source[index], self.to_camera[index], up)
+
+
+@dataclass(frozen=True)
+class GeometryImage:
+    """Scattering geometry of the pixels of an image that see the object.
+
+    Attributes
+    ----------
+    mask : (rows, columns), pixels that see a lit point of the object.
+    points : geometry of those pixels, in row-major order, N = mask.sum().
+    """
+
+    mask: NDArray[np.bool_]
+    points: ScatteringGeometry
+
+    def fill(self, values: ArrayLike, outside: float = np.nan) -> NDArray[np.floating]:
+        """Image (rows, columns, ...) of values (N, ...); `outside` elsewhere."""
+        v = np.asarray(values)
+        out = np.full((*self.mask.shape, *v.shape[1:]), outside, dtype=v.dtype)
+        out[self.mask] = v
+        return out
+
+
+def transverse_axes(k: FloatArray, up: FloatArray = WORLD_UP) -> tuple[FloatArray, FloatArray]:
+    """x = unit(up cross k) and y = k cross x for propagation directions k (..., 3)."""
+    x = unit(cross(up, k))
+    return x, cross(k, x)
+
+
+def change_frames(m: ArrayLike, geometry: ScatteringGeometry, up: ArrayLike) -> FloatArray:
+    """Mueller matrices (..., 4, 4) given in the geometry's axes, referred to the axes that `up` fixes."""
+    target = geometry.with_up(up)
+    turn_in = _turn(-geometry.to_source, geometry.axes_in[0], target.axes_in[0])
+    turn_out = _turn(geometry.to_camera, geometry.axes_out[0], target.axes_out[0])
+    return np.asarray(mueller.rotation(-turn_out) @ np.asarray(m, dtype=np.float64) @ mueller.rotation(turn_in))
+
+
+def _turn(k: FloatArray, x_from: FloatArray, x_to: FloatArray) -> FloatArray:
+    # Counter-clockwise angle about k, that is, as seen looking into the beam.
+    return np.asarray(np.arctan2(dot(k, cross(x_from, x_to)), dot(x_from, x_to)))

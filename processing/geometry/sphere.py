@@ -1,0 +1,35 @@
+"""A sphere in front of a pinhole camera: which pixels see it, and the normal there."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+FloatArray = NDArray[np.float64]
+
+
+class Sphere(BaseModel):
+    """A sphere of known radius; `centre_mm` is its offset from the centre of rotation."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["sphere"] = "sphere"
+    radius_mm: float = Field(gt=0)
+    centre_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def intersect(
+        self, origin_mm: FloatArray, rays: FloatArray, omega_deg: float
+    ) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
+        """Nearest hits of rays (..., 3): mask (...), points (N, 3) in mm and outward normals (N, 3)."""
+        del omega_deg  # a sphere at the centre looks the same at any arm angle
+        centre = np.asarray(self.centre_mm)
+        to_centre = centre - np.asarray(origin_mm)
+        along = rays @ to_centre
+        gap = along * along - (to_centre @ to_centre - self.radius_mm**2)
+        hit = (gap > 0) & (along > 0)
+        t = along[hit] - np.sqrt(gap[hit])
+        points = np.asarray(origin_mm) + rays[hit] * t[:, None]
+        return hit, points, (points - centre) / self.radius_mm

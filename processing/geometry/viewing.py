@@ -1,0 +1,67 @@
+"""Camera, source and object together: the scattering geometry of every pixel at an arm angle."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from processing.geometry.flat import Flat
+from processing.geometry.frames import GeometryImage, ScatteringGeometry, dot, unit
+from processing.geometry.pinhole import PinholeCamera
+from processing.geometry.sphere import Sphere
+from processing.yaml_file import load_yaml
+
+FloatArray = NDArray[np.float64]
+
+Shape = Annotated[Sphere | Flat, Field(discriminator="kind")]
+
+
+class ViewingGeometry(BaseModel):
+    """Where camera, source and object stand. The source's distance is from the centre of rotation."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    camera: PinholeCamera
+    source_distance_mm: float = Field(gt=0)
+    shape: Shape
+
+    @classmethod
+    def load(cls, path: Path | str) -> ViewingGeometry:
+        """Read a geometry file. Raises ConfigError with file, line and key."""
+        return load_yaml(path, cls)
+
+    def source_position_mm(self, omega_deg: float) -> FloatArray:
+        """(sin W, 0, cos W) times the source's distance."""
+        w = np.deg2rad(omega_deg)
+        return self.source_distance_mm * np.array([np.sin(w), 0.0, np.cos(w)])
+
+    def at(
+        self,
+        omega_deg: float,
+        rows: int | None = None,
+        columns: int | None = None,
+        block: slice = slice(None),
+    ) -> GeometryImage:
+        """Geometry of each pixel that sees a lit point.
+
+        Parameters
+        ----------
+        omega_deg : angle between camera and source, degrees.
+        rows, columns : image size; default, the camera's own.
+        block : rows of the image to work out.
+        """
+        camera = self.camera
+        if rows is not None and columns is not None:
+            camera = camera.resized(rows, columns)
+        eye = camera.position_mm
+        hit, points, normal = self.shape.intersect(eye, camera.rays(block), omega_deg)
+        to_source = unit(self.source_position_mm(omega_deg) - points)
+        to_camera = unit(eye - points)
+        lit = (dot(normal, to_source) > 0) & (dot(normal, to_camera) > 0)
+        mask = hit.copy()
+        mask[hit] = lit
+        return GeometryImage(mask, ScatteringGeometry(normal[lit], to_source[lit], to_camera[lit]))

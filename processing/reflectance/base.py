@@ -1,0 +1,105 @@
+"""What every reflectance model offers, and how a file names one: its `kind` is a module of this folder."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
+
+from processing.geometry.frames import ScatteringGeometry
+from processing.yaml_file import ConfigError, load_yaml
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+ENTRY_POINT_GROUP = "umov.reflectance"
+
+
+class ReflectanceModel(Protocol):
+    """A model of the dominant Mueller-Jones matrix. Both results are in the axes that the geometry states."""
+
+    @property
+    def wavelengths_nm(self) -> tuple[float, ...]:
+        """Wavelengths at which the material is given."""
+        ...
+
+    def jones(self, geometry: ScatteringGeometry, wavelength_nm: float) -> ComplexArray:
+        """Jones matrices (..., 2, 2), not normalized."""
+        ...
+
+    def mueller_jones(self, geometry: ScatteringGeometry, wavelength_nm: float) -> FloatArray:
+        """Mueller-Jones matrices (..., 4, 4) with element 00 equal to 1."""
+        ...
+
+
+class _Header(BaseModel):
+    model_config = ConfigDict(extra="allow")
+    kind: str
+
+
+def normalized_mueller(jones: ComplexArray) -> FloatArray:
+    """Mueller-Jones matrices (..., 4, 4) of Jones matrices (..., 2, 2), divided by their element 00.
+
+    M_ab = 1/2 tr(s_a J s_b J^H), written out (the general product costs three times as much).
+    """
+    j00, j01, j10, j11 = (jones[..., i, k] for i in (0, 1) for k in (0, 1))
+    a, b, c, d = (z.real**2 + z.imag**2 for z in (j00, j01, j10, j11))
+    scale = 2.0 / (a + b + c + d)
+    out = np.empty((*j00.shape, 4, 4))
+    out[..., 0, 0] = 1.0
+    out[..., 0, 1] = 0.5 * scale * (a - b + c - d)
+    out[..., 1, 0] = 0.5 * scale * (a + b - c - d)
+    out[..., 1, 1] = 0.5 * scale * (a - b - c + d)
+    top, bottom = j00 * j01.conj(), j10 * j11.conj()
+    out[..., 0, 2], out[..., 0, 3] = scale * (top + bottom).real, -scale * (top + bottom).imag
+    out[..., 1, 2], out[..., 1, 3] = scale * (top - bottom).real, -scale * (top - bottom).imag
+    left, right = j00 * j10.conj(), j01 * j11.conj()
+    out[..., 2, 0], out[..., 3, 0] = scale * (left + right).real, scale * (left + right).imag
+    out[..., 2, 1], out[..., 3, 1] = scale * (left - right).real, scale * (left - right).imag
+    diagonal, anti = j00 * j11.conj(), j01 * j10.conj()
+    out[..., 2, 2], out[..., 3, 3] = scale * (diagonal + anti).real, scale * (diagonal - anti).real
+    out[..., 3, 2], out[..., 2, 3] = scale * (diagonal + anti).imag, scale * (anti - diagonal).imag
+    return out
+
+
+@cache
+def kinds() -> dict[str, type[BaseModel]]:
+    """Model classes by kind: each module of this folder that has a class `Model`, then plug-ins."""
+    import processing.reflectance as folder
+
+    found: dict[str, type[BaseModel]] = {}
+    for info in pkgutil.iter_modules(folder.__path__):
+        module = importlib.import_module(f"processing.reflectance.{info.name}")
+        if hasattr(module, "Model"):
+            found[info.name] = module.Model
+    for entry in entry_points(group=ENTRY_POINT_GROUP):
+        found[entry.name] = entry.load()
+    return found
+
+
+def load_reflectance(path: Path | str) -> Any:
+    """The ReflectanceModel that a material file describes. Raises ConfigError with file, line and key."""
+    header = load_yaml(path, _Header)
+    if header.kind not in kinds():
+        raise ConfigError(
+            f"{path}: kind: no reflectance model {header.kind!r}; there are: {', '.join(sorted(kinds()))}"
+        )
+    return load_yaml(path, kinds()[header.kind])
+
+
+def constants_at(constants: dict[float, Any], wavelength_nm: float, name: str) -> Any:
+    """The entry within 0.5 nm of a wavelength; nothing is interpolated. Raises ConfigError."""
+    for key, value in constants.items():
+        if abs(key - wavelength_nm) < 0.5:
+            return value
+    known = ", ".join(f"{k:g}" for k in constants)
+    raise ConfigError(
+        f"material {name!r} is given at {known} nm, not at {wavelength_nm:g} nm. Use a material file that has it."
+    )

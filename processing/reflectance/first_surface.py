@@ -1,0 +1,45 @@
+"""First-surface reflection alone: Fresnel at the facet halfway between source and camera (paper Sec. III-B)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from processing.geometry.frames import ScatteringGeometry
+from processing.reflectance import fresnel
+from processing.reflectance.base import ComplexArray, FloatArray, constants_at, normalized_mueller
+
+
+class Constants(BaseModel):
+    """Complex refractive index ratio n + i k at one wavelength."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    n: float = Field(gt=0)
+    k: float = Field(default=0.0, ge=0)
+
+
+class Model(BaseModel):
+    """Fresnel reflection; the surface's normal plays no part."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["first_surface"] = "first_surface"
+    name: str
+    source: str | None = None
+    constants: dict[float, Constants]
+
+    @property
+    def wavelengths_nm(self) -> tuple[float, ...]:
+        """Wavelengths at which the material is given."""
+        return tuple(self.constants)
+
+    def jones(self, geometry: ScatteringGeometry, wavelength_nm: float) -> ComplexArray:
+        """Jones matrices (..., 2, 2)."""
+        c: Constants = constants_at(self.constants, wavelength_nm, self.name)
+        return fresnel.jones(geometry, complex(c.n, c.k))
+
+    def mueller_jones(self, geometry: ScatteringGeometry, wavelength_nm: float) -> FloatArray:
+        """Mueller-Jones matrices (..., 4, 4), element 00 equal to 1."""
+        return normalized_mueller(self.jones(geometry, wavelength_nm))

@@ -1,0 +1,59 @@
+"""First surface plus polarized diffuse reflection, added as Jones matrices (paper Secs. III-B to III-D)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from processing.geometry.frames import ScatteringGeometry
+from processing.reflectance import fresnel
+from processing.reflectance.base import ComplexArray, FloatArray, constants_at, normalized_mueller
+
+
+class Constants(BaseModel):
+    """The four constants of a material at one wavelength: n + i k, and the weight a sin^b(theta_h)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    n: float = Field(gt=0)
+    k: float = Field(default=0.0, ge=0)
+    a: float
+    b: float = Field(gt=0)
+
+
+def diffuse_jones(geometry: ScatteringGeometry) -> ComplexArray:
+    """diag(1, -1) R(phi_d) diag(1, 0) R(-phi_d), (..., 2, 2); radial about the point where theta_h = 0 (trap 3)."""
+    phi = geometry.angles.phi_d
+    c, s = np.cos(phi), np.sin(phi)
+    out = np.empty((*phi.shape, 2, 2), dtype=complex)
+    out[..., 0, 0], out[..., 0, 1] = c * c, c * s
+    out[..., 1, 0], out[..., 1, 1] = -c * s, -s * s
+    return out
+
+
+class Model(BaseModel):
+    """J = F + a sin^b(theta_h) S."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["polarized_diffuse"] = "polarized_diffuse"
+    name: str
+    source: str | None = None
+    constants: dict[float, Constants]
+
+    @property
+    def wavelengths_nm(self) -> tuple[float, ...]:
+        """Wavelengths at which the material is given."""
+        return tuple(self.constants)
+
+    def jones(self, geometry: ScatteringGeometry, wavelength_nm: float) -> ComplexArray:
+        """Jones matrices (..., 2, 2)."""
+        c: Constants = constants_at(self.constants, wavelength_nm, self.name)
+        weight = c.a * np.sin(geometry.angles.theta_h) ** c.b
+        return fresnel.jones(geometry, complex(c.n, c.k)) + weight[..., None, None] * diffuse_jones(geometry)
+
+    def mueller_jones(self, geometry: ScatteringGeometry, wavelength_nm: float) -> FloatArray:
+        """Mueller-Jones matrices (..., 4, 4), element 00 equal to 1."""
+        return normalized_mueller(self.jones(geometry, wavelength_nm))

@@ -1,0 +1,43 @@
+"""The triply degenerate (TD) Mueller matrix: a Mueller-Jones matrix and an ideal depolarizer (paper Eq. 1)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.floating]
+
+
+def mueller_matrix(m0: ArrayLike, xi0: ArrayLike, m00: ArrayLike = 1.0) -> FloatArray:
+    """M = 4 M00/3 [(xi0 - 1/4) m0 + (1 - xi0) mID].
+
+    Parameters
+    ----------
+    m0 : (..., 4, 4), dominant Mueller-Jones matrix, its element 00 equal to 1.
+    xi0 : (...), largest coherency eigenvalue; 1/4 is the ideal depolarizer, 1 is m0 alone.
+    m00 : (...), throughput for unpolarized light.
+    """
+    m = np.asarray(m0)
+    xi, t = np.asarray(xi0), np.asarray(m00)
+    out = np.asarray(m * ((4.0 * t / 3.0) * (xi - 0.25))[..., None, None])
+    out[..., 0, 0] += (4.0 * t / 3.0) * (1.0 - xi)
+    return out
+
+
+def coefficients(xi0: ArrayLike, m00: ArrayLike = 1.0) -> tuple[FloatArray, FloatArray]:
+    """alpha_0 and alpha_ID, the weights of m0 and of the ideal depolarizer (paper, Eq. for alpha)."""
+    xi, t = np.asarray(xi0, dtype=float), np.asarray(m00, dtype=float)
+    return np.asarray(4 * t / 3 * (xi - 0.25)), np.asarray(4 * t / 3 * (1 - xi))
+
+
+def from_coefficients(alpha_0: ArrayLike, alpha_id: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """xi0 and M00 of the two weights, in the form without a singularity at alpha_ID = 0 or xi0 = 1/4 (trap 5)."""
+    a, b = np.asarray(alpha_0, dtype=float), np.asarray(alpha_id, dtype=float)
+    total = a + b
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray((a + b / 4) / total), total
+
+
+def depolarization_index(xi0: ArrayLike) -> FloatArray:
+    """|4 xi0 - 1| / 3 of a TD matrix; not monotonic below xi0 = 1/4 (trap 22)."""
+    return np.asarray(np.abs(4 * np.asarray(xi0, dtype=float) - 1) / 3)
