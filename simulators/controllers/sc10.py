@@ -1,0 +1,88 @@
+"""Thorlabs SC10 shutter controller: echo, answer, prompt; a toggle for the enable state, an interlock input."""
+
+from __future__ import annotations
+
+from simulators.clock import Clock
+from simulators.emulator import Emulator
+from simulators.faults import FaultSchedule
+from simulators.serve import ServeOptions
+
+PROMPT = b"> "
+
+
+class SC10Emulator(Emulator):
+    """The shutter box. `interlock_tripped` is the door contact; while it is set the blade is shut.
+
+    Parameters
+    ----------
+    blade_s : float
+        Simulated time that the blade takes.
+    """
+
+    def __init__(self, clock: Clock, faults: FaultSchedule | None = None, blade_s: float = 0.01) -> None:
+        super().__init__([], clock, faults)
+        self.blade_s = blade_s
+        self.interlock_tripped = False
+        self._mode = 1
+        self._enabled = False
+        self._changed_s = -1e9
+        self._buffer = bytearray()
+
+    def is_open(self) -> bool:
+        """True if light passes now."""
+        with self._lock:
+            return self._blade_open()
+
+    def trip(self, tripped: bool) -> None:
+        """Open (True) or close the interlock circuit; an open one disables the shutter."""
+        with self._lock:
+            self.interlock_tripped = tripped
+            if tripped and self._enabled:
+                self._enabled = False
+                self._changed_s = self.clock.now_s()
+
+    def _blade_open(self) -> bool:
+        arrived = self.clock.now_s() >= self._changed_s + self.blade_s
+        return self._enabled if arrived else not self._enabled
+
+    def _do_receive(self, data: bytes) -> None:
+        self._buffer += data
+        while (end := self._buffer.find(b"\r")) >= 0:
+            command = bytes(self._buffer[:end]).strip(b"\n")
+            del self._buffer[: end + 1]
+            self._apply_faults()
+            answer = self._answer(command.decode("ascii", "replace"))
+            self._reply(command + b"\r" + (answer.encode() + b"\r" if answer else b"") + PROMPT)
+
+    def _answer(self, command: str) -> str:
+        match command.lower():
+            case "id?":
+                return "THORLABS SC10 VERSION 1.07"
+            case "ens?":
+                return str(int(self._enabled))
+            case "closed?":
+                return str(int(not self._blade_open()))
+            case "interlock?":
+                return str(int(self.interlock_tripped))
+            case "mode?":
+                return str(self._mode)
+            case "ens":
+                if not self.interlock_tripped:
+                    self._enabled = not self._enabled
+                    self._changed_s = self.clock.now_s()
+                return ""
+            case "mode=1" | "mode=2" | "mode=3" | "mode=4" | "mode=5":
+                self._mode = int(command[-1])
+                return ""
+        return "Command error CMD_NOT_DEFINED"
+
+    def _do_make_foreign(self, reply: bytes) -> bytes:
+        return b"closed?\r1\r" + PROMPT
+
+
+def make(options: ServeOptions) -> SC10Emulator:
+    """One shutter box, shut, its interlock circuit closed."""
+    return SC10Emulator(options.clock, options.faults)
+
+
+SERVES = {"sc10": make}
