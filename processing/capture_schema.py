@@ -21,6 +21,7 @@ SampleKind = Literal["air", "mirror", "mueller", "unknown"]
 STATE_COLUMNS: dict[str, Any] = {
     "done": np.uint8,
     "exposure_s": np.float64,
+    "repeats": np.int32,
     "host_time_s": np.float64,
     "camera_time_ns": np.int64,
     "frame_id": np.int64,
@@ -140,7 +141,8 @@ def create_layout(
     states = _group(entry, "states", "NXcollection")
     states["role"] = [r.encode() for r in role]
     for name, kind in STATE_COLUMNS.items():
-        _column(states, name, n, kind, np.nan if np.issubdtype(kind, np.floating) else 0)
+        empty = np.nan if np.issubdtype(kind, np.floating) else int(name == "repeats")
+        _column(states, name, n, kind, empty)
 
     for name, text in (
         ("plan", header.plan_yaml),
