@@ -1,0 +1,103 @@
+"""The simulated scene against what the paper says of the real one, and its ideal samples."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import minimum_filter
+
+from processing import mueller
+from processing.yaml_file import ConfigError
+from simulators.scene import Scene, SceneError
+
+SIZE = 301
+
+
+@pytest.fixture(scope="module")
+def sphere(configs) -> Scene:
+    return Scene.load(configs / "scenes/red_sphere.yaml")
+
+
+def linear_diattenuation(m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        d1, d2 = m[..., 0, 1] / m[..., 0, 0], m[..., 0, 2] / m[..., 0, 0]
+    return np.hypot(d1, d2), np.rad2deg(0.5 * np.arctan2(d2, d1)) % 180
+
+
+def test_psi_stays_within_45_degrees_of_vertical_at_451_nm(sphere):
+    m = sphere.mueller_image(35, 451, SIZE, SIZE)
+    mask = sphere.truth(35, 451, SIZE, SIZE).mask
+    psi = linear_diattenuation(m)[1][mask]
+    assert np.abs(psi - 90).max() < 45
+    # At 662 nm the diffuse term wins away from the specular point, so there it does not hold.
+    psi = linear_diattenuation(sphere.mueller_image(35, 662, SIZE, SIZE))[1][mask]
+    assert np.abs(psi - 90).max() > 80
+
+
+def test_two_neutral_points_on_the_horizontal_line_either_side_of_specular_at_662_nm(sphere):
+    truth = sphere.truth(35, 662, SIZE, SIZE)
+    m0 = sphere.material.mueller_jones(truth.geometry.points, 662)
+    size = truth.geometry.fill(np.hypot(m0[:, 0, 1], m0[:, 0, 2]))
+    filled = np.nan_to_num(size, nan=9.0)
+    minima = np.argwhere((filled == minimum_filter(filled, 9)) & (filled < 0.05))
+    theta_h = truth.geometry.fill(truth.geometry.points.angles.theta_h)
+    row, column = np.unravel_index(np.nanargmin(theta_h), theta_h.shape)
+    assert len(minima) == 2
+    assert np.abs(minima[:, 0] - row).max() <= 1
+    left, right = sorted(minima[:, 1])
+    assert left < column - 10 < column + 10 < right
+
+
+def test_ideal_samples(configs):
+    air = Scene.load(configs / "scenes/air.yaml")
+    mirror = Scene.load(configs / "scenes/mirror.yaml")
+    np.testing.assert_array_equal(air.mueller_image(180, 662, 3, 2), np.tile(np.eye(4), (3, 2, 1, 1)))
+    np.testing.assert_array_equal(mirror.mueller_image(5, 662, 3, 2), np.tile(mueller.IDEAL_MIRROR, (3, 2, 1, 1)))
+    with pytest.raises(SceneError, match="180"):
+        air.mueller_image(35, 662, 3, 2)
+    with pytest.raises(SceneError, match="edge-on"):
+        mirror.mueller_image(180, 662, 3, 2)
+
+
+@pytest.mark.parametrize("name", ["red_sphere", "red_flat"])
+@pytest.mark.parametrize("wavelength", [451, 662])
+def test_every_pixel_is_physical_with_the_stated_largest_eigenvalue(configs, name, wavelength):
+    scene = Scene.load(configs / f"scenes/{name}.yaml")
+    m = scene.mueller_image(50, wavelength, 40, 48)
+    truth = scene.truth(50, wavelength, 40, 48)
+    assert m.dtype == np.float32
+    assert np.all(m[~truth.mask] == 0)
+    inside = m[truth.mask].astype(float)
+    values = np.linalg.eigvalsh(mueller.coherency(inside)) / (2 * inside[:, 0, 0])[:, None]
+    np.testing.assert_allclose(values[:, 3], truth.xi0[truth.mask], atol=2e-6)
+    np.testing.assert_allclose(values[:, :3], (1 - values[:, 3:]) / 3 * np.ones(3), atol=2e-6)
+    np.testing.assert_allclose(inside[:, 0, 0], truth.m00[truth.mask], rtol=1e-6)
+
+
+def test_a_surface_that_is_not_triply_degenerate_keeps_its_largest_eigenvalue_and_m00(sphere):
+    spec = sphere.spec.model_copy(
+        update={"surface": {662: sphere.spec.surface[662].model_copy(update={"eigenvalue_deviation": 0.09})}}
+    )
+    scene = Scene(spec, sphere.material)
+    truth = scene.truth(35, 662, 60, 60)
+    m = scene.mueller_image(35, 662, 60, 60)[truth.mask].astype(float)
+    values = np.linalg.eigvalsh(mueller.coherency(m)) / (2 * m[:, 0, 0])[:, None]
+    np.testing.assert_allclose(values[:, 3], truth.xi0[truth.mask], atol=2e-6)
+    np.testing.assert_allclose(m[:, 0, 0], truth.m00[truth.mask], rtol=1e-6)
+    assert values.min() > 0
+    deviation = values[:, 2] - (1 - values[:, 3]) / 3
+    assert 0.06 < deviation.max() < 0.0901
+
+
+def test_wavelength_and_bounds_are_checked(sphere, configs, tmp_path):
+    with pytest.raises(ConfigError, match="524"):
+        sphere.mueller_image(35, 524, 10, 10)
+    text = (configs / "scenes/red_sphere.yaml").read_text().replace("base: 0.50", "base: 0.90")
+    bad = tmp_path / "scene.yaml"
+    bad.write_text(text)
+    with pytest.raises(ConfigError, match="exceeds 1"):
+        Scene.load(bad)
+
+
+def test_rows_in_blocks_equal_the_image_at_once(sphere, monkeypatch):
+    whole = sphere.mueller_image(35, 662, 50, 40)
+    monkeypatch.setattr("simulators.scene.BLOCK_PIXELS", 120)
+    np.testing.assert_array_equal(sphere.mueller_image(35, 662, 50, 40), whole)
