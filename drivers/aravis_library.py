@@ -1,0 +1,143 @@
+"""Getting at Aravis: the late import, which cameras answer, and the network interface a camera is reached by."""
+
+from __future__ import annotations
+
+import fcntl
+import ipaddress
+import socket
+import struct
+from pathlib import Path
+from typing import Any
+
+from drivers.errors import CameraBusy, CameraError, CameraNotFound
+
+_SIOCGIFADDR = 0x8915
+# GigE Vision bootstrap register: address of the application that controls the camera (optional for cameras).
+_PRIMARY_APPLICATION_IP = 0x0A14
+
+
+def load_aravis() -> tuple[Any, type[Exception]]:
+    """Import Aravis and return its module and GLib's exception class.
+
+    Raises
+    ------
+    CameraError
+        `gi` or the Aravis typelib is not installed.
+    """
+    try:
+        import gi
+
+        gi.require_version("Aravis", "0.8")
+        from gi.repository import Aravis, GLib
+    except (ImportError, ValueError) as error:
+        raise CameraError(
+            "import Aravis",
+            str(error),
+            "Install Debian's python3-gi and gir1.2-aravis-0.8 and run ./lab again, which exposes gi to this Python",
+        ) from error
+    return Aravis, GLib.Error
+
+
+def list_cameras(aravis: Any) -> list[dict[str, str]]:
+    """Ask which cameras are there; takes about one second.
+
+    Returns
+    -------
+    list of dict
+        Keys `id`, `vendor`, `model`, `serial_number` and `address` of each camera that answered.
+    """
+    aravis.update_device_list()
+    return [
+        {
+            "id": aravis.get_device_id(i) or "",
+            "vendor": aravis.get_device_vendor(i) or "",
+            "model": aravis.get_device_model(i) or "",
+            "serial_number": aravis.get_device_serial_nbr(i) or "",
+            "address": aravis.get_device_address(i) or "",
+        }
+        for i in range(aravis.get_n_devices())
+    ]
+
+
+def open_camera(name: str, device: str | None, aravis: Any, glib_error: type[Exception]) -> Any:
+    """Open a camera by id, serial number or IP address and take control of it.
+
+    Parameters
+    ----------
+    name : str
+        Name of the camera in messages.
+    device : str or None
+        None takes the only camera there is.
+
+    Returns
+    -------
+    Aravis.Camera
+
+    Raises
+    ------
+    CameraNotFound
+        Nothing answers to that name, or None was given and there is not exactly one; what was found is listed.
+    CameraBusy
+        Another program controls it.
+    """
+    key = device if device is not None and _is_address(device) else _find(name, device, aravis)
+    try:
+        camera = aravis.Camera.new(key)
+    except glib_error as error:
+        raise _not_found(name, device, list_cameras(aravis), str(error.message)) from error  # type: ignore[attr-defined]
+    link = camera.get_device()
+    if isinstance(link, aravis.GvDevice) and not link.is_controller():
+        raise CameraBusy(
+            f"open camera {name} ({key})",
+            f"{_holder(link, glib_error)} controls it already",
+            "Close the other program; after a crash a camera frees itself within some seconds",
+        )
+    return camera
+
+
+def _find(name: str, device: str | None, aravis: Any) -> str:
+    found = list_cameras(aravis)
+    matching = [c for c in found if device is None or device in (c["id"], c["serial_number"], c["address"])]
+    if len(matching) != 1:
+        raise _not_found(name, device, found, "")
+    return matching[0]["id"]
+
+
+def _not_found(name: str, device: str | None, found: list[dict[str, str]], detail: str) -> CameraNotFound:
+    seen = ", ".join(f"{c['id']} (serial {c['serial_number']}, at {c['address']})" for c in found) or "no camera"
+    return CameraNotFound(
+        f"open camera {name} ({device or 'the only one'})",
+        f"found {seen}" + (f"; {detail}" if detail else ""),
+        "Check power and cable, and that the interface is in the camera's subnet"
+        if not found
+        else "Set `device` in the rig file to one of those",
+    )
+
+
+def _holder(link: Any, glib_error: type[Exception]) -> str:
+    try:
+        number = int(link.read_register(_PRIMARY_APPLICATION_IP))
+    except glib_error:
+        number = 0
+    return f"a program at {ipaddress.IPv4Address(number)}" if number else "another program"
+
+
+def _is_address(text: str) -> bool:
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return False
+    return True
+
+
+def interface_of(address: str) -> tuple[str, int] | None:
+    """Name and MTU in bytes of the network interface that has an IPv4 address; None if none has it."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        for _, name in socket.if_nameindex():
+            try:
+                reply = fcntl.ioctl(probe, _SIOCGIFADDR, struct.pack("256s", name.encode()[:15]))
+            except OSError:
+                continue
+            if socket.inet_ntoa(reply[20:24]) == address:
+                return name, int(Path(f"/sys/class/net/{name}/mtu").read_text())
+    return None

@@ -1,0 +1,374 @@
+"""A camera that gives whole frames, each of a known exposure, and says what became of the others.
+
+A capture is a sequence of triggered exposures. Between two of them nothing is exposed, so a setting that is
+changed there holds for the whole of the next frame. Frames that belong to no exposure asked for are thrown away
+and counted; frames that did not arrive whole are never handed out.
+"""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from drivers.errors import CameraError, FrameLost
+
+log = logging.getLogger(__name__)
+
+
+class CameraSettings(BaseModel):
+    """What a camera is set to. None leaves a setting as it is; a region of None is the full sensor.
+
+    `Camera.configure` takes one and returns another, filled with what was read back.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    exposure_s: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    gain_db: float | None = Field(default=None, allow_inf_nan=False)
+    black_level: float | None = Field(default=None, allow_inf_nan=False, description="in the camera's own unit")
+    pixel_format: str | None = Field(default=None, description="the camera's name, for example Mono12p")
+    width: int | None = Field(default=None, gt=0)
+    height: int | None = Field(default=None, gt=0)
+    offset_x: int | None = Field(default=None, ge=0)
+    offset_y: int | None = Field(default=None, ge=0)
+    binning: int | None = Field(default=None, gt=0, description="the same along both axes")
+    packet_size: int | None = Field(default=None, gt=0, description="GigE Vision packet with its headers, bytes")
+    frame_average: int | None = Field(default=None, gt=0, description="exposures averaged into one frame")
+    trigger: Literal["software", "hardware"] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One whole frame.
+
+    Attributes
+    ----------
+    pixels : ndarray of uint16, shape (height, width)
+        Counts, right-aligned to the camera's real bits; owned by the frame, read-only.
+    frame_id : int
+        The camera's number of the frame; of the last one where several were averaged.
+    camera_time_ns : int
+        The camera's own clock, in nanoseconds from its own zero.
+    host_time_s : float
+        Unix time at which the software trigger was sent; with a hardware trigger, at which the first packet came.
+    complete : bool
+        Always True for a frame that a camera hands out.
+    """
+
+    pixels: NDArray[np.uint16]
+    frame_id: int
+    camera_time_ns: int
+    host_time_s: float
+    complete: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class StreamStatistics:
+    """What became of the frames since the camera was opened.
+
+    Attributes
+    ----------
+    completed, failures, underruns : int
+        Buffers that the transport filled whole, gave up on, or had none for.
+    missing_packets, resent_packets : int
+        Packets that never came, and packets that came on request.
+    retakes : int
+        Exposures repeated because their frame was lost.
+    stale_discarded : int
+        Whole frames thrown away because they belong to no exposure asked for.
+    """
+
+    completed: int = 0
+    failures: int = 0
+    underruns: int = 0
+    missing_packets: int = 0
+    resent_packets: int = 0
+    retakes: int = 0
+    stale_discarded: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class CameraIdentity:
+    """Which camera answered, over which interface, and how its pixels are laid out.
+
+    `pixel_format_code` is the code as the camera sends it; `shift` is how many empty low bits were removed.
+    """
+
+    kind: str
+    vendor: str
+    model: str
+    serial_number: str
+    firmware: str
+    address: str
+    interface: str
+    interface_mtu: int | None
+    packet_size: int | None
+    sensor_width: int
+    sensor_height: int
+    pixel_format: str
+    pixel_format_code: int
+    bits: int
+    shift: int
+    polarized: bool
+    library: str
+
+
+class Exposure:
+    """One exposure under way, made by `Camera.trigger`."""
+
+    def __init__(self, camera: Camera, earlier: _Average | None) -> None:
+        self._camera = camera
+        self._earlier = earlier
+        self._exposed = False
+
+    def wait_exposed(self) -> None:
+        """Wait until the light for this exposure has been collected; the bench may move from then on.
+
+        The frame may still be on its way.
+
+        Raises
+        ------
+        CameraLost
+            The camera stopped answering.
+        """
+        if not self._exposed:
+            self._camera._do_wait_exposed()
+            self._exposed = True
+
+    def frame(self) -> Frame:
+        """Wait for the transfer and return the frame of this exposure.
+
+        Nothing is retaken here, because after `wait_exposed` the bench may have moved: the caller goes back to
+        the state and captures again.
+
+        Raises
+        ------
+        FrameLost
+            The frame did not arrive whole; nothing of it is kept.
+        CameraLost
+            The camera stopped answering.
+        """
+        self.wait_exposed()
+        frame = self._camera._do_frame()
+        if self._earlier is None:
+            return frame
+        self._earlier.add(frame)
+        return self._earlier.result()
+
+
+class _Average:
+    """Mean of several frames; a pixel that was saturated once stays saturated, so that masks still see it."""
+
+    def __init__(self, full_scale: int) -> None:
+        self._full_scale = full_scale
+        self._frames = 0
+
+    def add(self, frame: Frame) -> None:
+        if self._frames == 0:
+            self._sum = frame.pixels.astype(np.uint32)
+            self._saturated = frame.pixels >= self._full_scale
+            self._host_time_s = frame.host_time_s
+        else:
+            self._sum += frame.pixels
+            self._saturated |= frame.pixels >= self._full_scale
+        self._frames += 1
+        self._last = frame
+
+    def result(self) -> Frame:
+        mean = ((self._sum + self._frames // 2) // self._frames).astype(np.uint16)
+        mean[self._saturated] = self._full_scale
+        mean.flags.writeable = False
+        return Frame(mean, self._last.frame_id, self._last.camera_time_ns, self._host_time_s)
+
+
+class Camera(ABC):
+    """One camera. Public methods check and count; what a camera family does itself is in the `_do_` hooks.
+
+    Parameters
+    ----------
+    name : str
+        Name in the rig file, used in messages.
+    retakes : int
+        How often `capture` repeats an exposure whose frame was lost.
+    """
+
+    def __init__(self, name: str, retakes: int) -> None:
+        self.name = name
+        self._allowed_retakes = retakes
+        self._retakes = 0
+        self._settings: CameraSettings | None = None
+        self._closed = False
+
+    # --- settings ----------------------------------------------------------------------------------------
+
+    @property
+    def settings(self) -> CameraSettings:
+        """The settings as last read back.
+
+        Raises
+        ------
+        CameraError
+            `configure` was not called yet.
+        """
+        if self._settings is None:
+            raise CameraError(
+                f"camera {self.name}", "it was not configured yet", "Call configure() before the first exposure"
+            )
+        return self._settings
+
+    @property
+    @abstractmethod
+    def bits(self) -> int:
+        """Real bits of a pixel."""
+
+    @property
+    def full_scale(self) -> int:
+        """Largest count a pixel can have; a pixel there is saturated."""
+        return (1 << self.bits) - 1
+
+    def configure(self, settings: CameraSettings) -> CameraSettings:
+        """Set the camera and return its settings as read back.
+
+        An exposure that is still under way is waited for and its frame thrown away, so no later frame can be one
+        of the old settings.
+
+        Raises
+        ------
+        SettingRefused
+            Out of the camera's limits, not available there, or read back different by more than its step.
+        CameraLost
+            The camera stopped answering.
+        """
+        self._require_open()
+        self._settings = None
+        self._settings = self._do_configure(settings)
+        log.info("camera %s is set to %s", self.name, self._settings.model_dump(exclude_none=True))
+        return self._settings
+
+    # --- frames ------------------------------------------------------------------------------------------
+
+    def trigger(self) -> Exposure:
+        """Start an exposure and return at once.
+
+        With `frame_average` n it returns when the last of n exposures has started. With a hardware trigger the
+        camera is armed, and the exposure starts with the signal.
+
+        Raises
+        ------
+        FrameLost
+            One of the earlier frames of an average was lost in every try.
+        CameraLost
+            The camera stopped answering.
+        """
+        self._require_open()
+        frames = self.settings.frame_average or 1
+        earlier = _Average(self.full_scale) if frames > 1 else None
+        if earlier is not None:
+            for _ in range(frames - 1):
+                earlier.add(self._whole_frame(None))
+        self._do_trigger()
+        return Exposure(self, earlier)
+
+    def capture(self, count: int = 1) -> list[Frame]:
+        """Take whole frames one after another while nothing moves; lost ones are taken again.
+
+        Raises
+        ------
+        FrameLost
+            A frame was lost in every try.
+        CameraLost
+            The camera stopped answering.
+        """
+        self._require_open()
+        average = self.settings.frame_average or 1
+        frames = []
+        for _ in range(count):
+            mean = _Average(self.full_scale) if average > 1 else None
+            for _ in range(average):
+                frame = self._whole_frame(mean)
+            frames.append(frame if mean is None else mean.result())
+        return frames
+
+    def _whole_frame(self, mean: _Average | None) -> Frame:
+        for attempt in range(self._allowed_retakes + 1):
+            self._do_trigger()
+            try:
+                self._do_wait_exposed()
+                frame = self._do_frame()
+            except FrameLost as error:
+                lost = error
+                if attempt < self._allowed_retakes:
+                    self._retakes += 1
+                    log.warning(
+                        "camera %s: retake %d of %d: %s", self.name, attempt + 1, self._allowed_retakes, error.came_back
+                    )
+                continue
+            if mean is not None:
+                mean.add(frame)
+            return frame
+        raise FrameLost(
+            lost.asked,
+            f"{lost.came_back}; {self._allowed_retakes + 1} tries in a row failed",
+            "Check cable, packet size and network load (acquire doctor measures the packet loss)",
+        ) from lost
+
+    # --- state -------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def describe(self) -> CameraIdentity:
+        """Which camera this is and how it is connected."""
+
+    def statistics(self) -> StreamStatistics:
+        """What became of the frames since the camera was opened."""
+        return self._do_statistics(self._retakes)
+
+    @abstractmethod
+    def temperature_c(self) -> float | None:
+        """Temperature of the camera in degrees Celsius; None where it has no sensor."""
+
+    def close(self) -> None:
+        """Stop and release the camera. Closing twice is harmless."""
+        if not self._closed:
+            self._closed = True
+            self._do_close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise CameraError(f"camera {self.name}", "it was closed", "Open it again")
+
+    # --- hooks of a camera family ------------------------------------------------------------------------
+
+    @abstractmethod
+    def _do_configure(self, settings: CameraSettings) -> CameraSettings: ...
+
+    @abstractmethod
+    def _do_trigger(self) -> None:
+        """Get rid of every frame that is not the coming one, then start an exposure."""
+
+    @abstractmethod
+    def _do_wait_exposed(self) -> None: ...
+
+    @abstractmethod
+    def _do_frame(self) -> Frame:
+        """Wait for the frame of the last exposure; raise FrameLost if it does not come whole."""
+
+    @abstractmethod
+    def _do_statistics(self, retakes: int) -> StreamStatistics: ...
+
+    @abstractmethod
+    def _do_close(self) -> None: ...

@@ -1,0 +1,191 @@
+"""GenICam features by their standard (SFNC) and their older names, written within their limits and read back.
+
+Cameras accept values that they do not keep: on Aravis' own camera an exposure of 1e12 us was taken and read back
+as 3.57e9. So limits are checked before a value is written, and what is read back decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from drivers.errors import CameraError, CameraLost, SettingRefused
+
+# The SFNC name first, then what cameras before SFNC 2 call it.
+EXPOSURE_US = ("ExposureTime", "ExposureTimeAbs")
+GAIN_DB = ("Gain", "GainAbs")
+GAIN_RAW = ("GainRaw",)
+BLACK_LEVEL = ("BlackLevel", "BlackLevelAbs", "BlackLevelRaw")
+TEMPERATURE_C = ("DeviceTemperature", "TemperatureAbs")
+SENSOR_WIDTH = ("SensorWidth", "WidthMax")
+SENSOR_HEIGHT = ("SensorHeight", "HeightMax")
+SERIAL_NUMBER = ("DeviceSerialNumber", "DeviceID")
+FIRMWARE = ("DeviceFirmwareVersion", "DeviceVersion")
+
+
+class Features:
+    """The features of one camera.
+
+    Parameters
+    ----------
+    name : str
+        Name of the camera in messages.
+    aravis, glib_error :
+        The Aravis module and GLib's exception class, which are imported late.
+    camera :
+        The open `Aravis.Camera`.
+    """
+
+    def __init__(self, name: str, aravis: Any, glib_error: type[Exception], camera: Any) -> None:
+        self._name = name
+        self._aravis = aravis
+        self._glib_error = glib_error
+        self._camera = camera
+        self._device = camera.get_device()
+
+    @contextmanager
+    def asking(self, what: str) -> Iterator[None]:
+        """Turn an error of Aravis inside the block into one of ours; `what` says what was asked."""
+        try:
+            yield
+        except self._glib_error as error:
+            codes = self._aravis.DeviceError
+            gone = (codes.TIMEOUT, codes.NOT_CONNECTED, codes.NOT_CONTROLLER, codes.TRANSFER_ERROR)
+            quark = self._aravis.device_error_quark()
+            if self.control_is_lost() or any(error.matches(quark, code) for code in gone):  # type: ignore[attr-defined]
+                raise self.lost(what, str(error.message)) from error  # type: ignore[attr-defined]
+            raise CameraError(
+                f"camera {self._name}, {what}",
+                str(error.message),  # type: ignore[attr-defined]
+                "Look the feature up in the camera's manual, or with `arv-tool-0.8 features`",
+            ) from error
+
+    def control_is_lost(self) -> bool:
+        """True once a GigE Vision camera no longer obeys us; Aravis' heartbeat finds that out."""
+        return isinstance(self._device, self._aravis.GvDevice) and not self._device.is_controller()
+
+    def lost(self, what: str, came_back: str) -> CameraLost:
+        """Make the error for a camera that is gone."""
+        return CameraLost(
+            f"camera {self._name}, {what}",
+            f"the camera does not answer or obeys another program ({came_back})",
+            "Check its power and cable and that no other program opens it, then open it again",
+        )
+
+    def find(self, names: tuple[str, ...]) -> str | None:
+        """The first of the names that this camera has available now."""
+        return next((name for name in names if self._camera.is_feature_available(name)), None)
+
+    def number(self, names: tuple[str, ...]) -> float | None:
+        """Read a number by any of its names; None where the camera has none of them."""
+        name = self.find(names)
+        if name is None:
+            return None
+        with self.asking(f"read {name}"):
+            if self._is_float(name):
+                return float(self._camera.get_float(name))
+            return float(self._camera.get_integer(name))
+
+    def text(self, names: tuple[str, ...]) -> str:
+        """Read a text by any of its names; empty where the camera has none of them."""
+        name = self.find(names)
+        if name is None:
+            return ""
+        with self.asking(f"read {name}"):
+            return str(self._camera.get_string(name))
+
+    def set_number(self, names: tuple[str, ...], value: float, floor: float = 0.0) -> float:
+        """Write a number within its limits and return what was read back.
+
+        Parameters
+        ----------
+        names : tuple of str
+            Names to look for, the standard one first.
+        value : float
+            Rounded for a feature of whole numbers.
+        floor : float
+            Largest harmless difference where the feature states no step of its own.
+
+        Raises
+        ------
+        SettingRefused
+            No such feature, out of its limits, or read back different by more than its step (or `floor`, or 0.1 %).
+        """
+        name = self.find(names)
+        if name is None:
+            raise self._refused(f"set {names[0]} to {value:g}", "this camera has no such feature")
+        with self.asking(f"set {name} to {value:g}"):
+            if self._is_float(name):
+                low, high = self._camera.get_float_bounds(name)
+                step = max(self._step(name), floor, 1e-3 * abs(value))
+                self._check_limits(name, value, low, high)
+                self._camera.set_float(name, value)
+                back = float(self._camera.get_float(name))
+            else:
+                low, high = self._camera.get_integer_bounds(name)
+                value, step = round(value), 0
+                self._check_limits(name, value, low, high)
+                self._camera.set_integer(name, value)
+                back = float(self._camera.get_integer(name))
+        if not abs(back - value) <= step:
+            raise self._refused(f"set {name} to {value:g}", f"it reads back {back:g}")
+        return back
+
+    def set_choice(self, name: str, value: str) -> None:
+        """Choose one entry of an enumeration and read it back.
+
+        Raises
+        ------
+        SettingRefused
+            The camera has no such entry or reads back another.
+        """
+        with self.asking(f"set {name} to {value}"):
+            entries = list(self._camera.dup_available_enumerations_as_strings(name))
+            if value not in entries:
+                raise self._refused(f"set {name} to {value}", f"this camera offers {', '.join(entries)}")
+            self._camera.set_string(name, value)
+            back = self._camera.get_string(name)
+        if back != value:
+            raise self._refused(f"set {name} to {value}", f"it reads back {back}")
+
+    def switch_off(self, name: str) -> None:
+        """Switch a yes-or-no feature or an automatic mode off, where the camera has it."""
+        if not self._camera.is_feature_available(name):
+            return
+        if isinstance(self._device.get_feature(name), self._aravis.GcEnumeration):
+            self.set_choice(name, "Off")
+            return
+        with self.asking(f"switch {name} off"):
+            self._camera.set_boolean(name, False)
+            if self._camera.get_boolean(name):
+                raise self._refused(f"switch {name} off", "it stays on")
+
+    def flag(self, name: str) -> bool:
+        """Read a yes-or-no feature that the camera is known to have."""
+        with self.asking(f"read {name}"):
+            return bool(self._camera.get_boolean(name))
+
+    def command(self, name: str) -> None:
+        """Execute a command feature."""
+        with self.asking(f"execute {name}"):
+            self._camera.execute_command(name)
+
+    def _is_float(self, name: str) -> bool:
+        return isinstance(self._device.get_feature(name), self._aravis.GcFloat)
+
+    def _step(self, name: str) -> float:
+        try:
+            # The smallest positive double stands for no step.
+            return float(self._camera.get_float_increment(name))
+        except self._glib_error:
+            return 0.0
+
+    def _check_limits(self, name: str, value: float, low: float, high: float) -> None:
+        if not low <= value <= high:
+            raise self._refused(f"set {name} to {value:g}", f"its limits are {low:g} to {high:g} now")
+
+    def _refused(self, what: str, came_back: str) -> SettingRefused:
+        return SettingRefused(
+            f"camera {self._name}, {what}", came_back, "Change the setting in the plan or the rig file"
+        )

@@ -1,0 +1,210 @@
+"""Pixel formats: what a camera's format code means in memory, and how to get right-aligned counts out of it.
+
+Codes are those of the GenICam Pixel Format Naming Convention (PFNC) and, for the polarization cameras whose
+makers have their own, of public code that uses them. In every code bits 16 to 23 hold the bits that a pixel
+occupies. A code that is not listed here is refused: the layout would be a guess.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import UnknownPixelFormat
+
+# "plain": one or two bytes a pixel, little-endian. "p": bits packed end to end, lowest bit first (PFNC).
+# "packed": two pixels in three bytes, high bits outside, low nibbles in the middle byte (GigE Vision).
+Layout = Literal["plain", "p", "packed"]
+
+
+@dataclass(frozen=True, slots=True)
+class PixelFormat:
+    """One way to lay out a monochrome image in memory.
+
+    Attributes
+    ----------
+    name : str
+        The camera's name for it (SFNC `PixelFormat` entry).
+    code : int
+        32-bit PFNC code.
+    bits : int
+        Bits that carry the value: 8, 10, 12, 14 or 16.
+    layout : {"plain", "p", "packed"}
+        How pixels share bytes.
+    polarized : bool
+        True where the maker marks the format as the raw mosaic of a polarization sensor.
+    """
+
+    name: str
+    code: int
+    bits: int
+    layout: Layout = "plain"
+    polarized: bool = False
+
+    @property
+    def bits_in_memory(self) -> int:
+        """Bits that one pixel occupies: bits 16 to 23 of the code."""
+        return self.code >> 16 & 0xFF
+
+    def payload_bytes(self, width: int, height: int) -> int:
+        """Bytes of an image without padding."""
+        return (width * height * self.bits_in_memory + 7) // 8
+
+    def decode(self, memory: NDArray[np.uint8], width: int, height: int, shift: int = 0) -> NDArray[np.uint16]:
+        """Copy an image out of a transfer buffer as right-aligned counts.
+
+        Parameters
+        ----------
+        memory : ndarray of uint8
+            At least `payload_bytes(width, height)` bytes; not kept.
+        width, height : int
+            Image size in pixels.
+        shift : int
+            Empty bits below the value, where a camera left-aligns its data in a wider word (Mono16).
+
+        Returns
+        -------
+        ndarray of uint16, shape (height, width)
+            New memory that shares nothing with the buffer.
+
+        Raises
+        ------
+        ValueError
+            The buffer is too short.
+        """
+        size = self.payload_bytes(width, height)
+        if memory.size < size:
+            raise ValueError(f"{self.name}, {width} x {height}: needs {size} bytes, the buffer has {memory.size}")
+        pixels = _decode(self, memory[:size], width * height)
+        if shift:
+            pixels >>= np.uint16(shift)
+        return pixels.reshape(height, width)
+
+    def encode(self, pixels: NDArray[np.uint16]) -> NDArray[np.uint8]:
+        """Lay out an image as a camera would send it: the inverse of `decode` with no shift.
+
+        Raises
+        ------
+        ValueError
+            A value needs more than `bits` bits.
+        """
+        flat = np.ascontiguousarray(pixels, dtype=np.uint16).ravel()
+        if flat.size and int(flat.max()) >> self.bits:
+            raise ValueError(f"{self.name} holds {self.bits} bits, the image has a value of {int(flat.max())}")
+        return _encode(self, flat)
+
+
+def _decode(fmt: PixelFormat, memory: NDArray[np.uint8], count: int) -> NDArray[np.uint16]:
+    if fmt.layout == "plain":
+        source = memory if fmt.bits_in_memory == 8 else memory.view("<u2")
+        return source.astype(np.uint16)
+    if fmt.bits == 12:
+        return _decode_12(memory, count, gigevision=fmt.layout == "packed")
+    # Mono10p and Mono10Packed are rare: unpacking bit by bit is slow and plain to read.
+    if fmt.layout == "packed":
+        padded = np.zeros(-(-count // 2) * 3, np.uint16)
+        padded[: memory.size] = memory
+        first, middle, last = padded.reshape(-1, 3).T
+        pixels = np.empty(2 * first.size, np.uint16)
+        pixels[0::2] = first << 2 | middle & 0x3
+        pixels[1::2] = last << 2 | middle >> 4 & 0x3
+        return pixels[:count]
+    bits = np.unpackbits(memory, bitorder="little")[: count * fmt.bits].reshape(count, fmt.bits)
+    values: NDArray[np.uint16] = np.zeros(count, np.uint16)
+    for bit in range(fmt.bits):
+        values |= bits[:, bit].astype(np.uint16) << np.uint16(bit)
+    return values
+
+
+def _decode_12(memory: NDArray[np.uint8], count: int, *, gigevision: bool) -> NDArray[np.uint16]:
+    pairs = -(-count // 2)
+    if memory.size < 3 * pairs:
+        memory = np.append(memory, np.uint8(0))
+    triples = memory.reshape(pairs, 3)
+    first, middle, last = triples[:, 0], triples[:, 1].astype(np.uint16), triples[:, 2]
+    pixels = np.empty(2 * pairs, np.uint16)
+    even, odd = pixels[0::2], pixels[1::2]
+    if gigevision:
+        even[:] = first
+        even <<= 4
+        even |= middle & 0xF
+        odd[:] = last
+        odd <<= 4
+        odd |= middle >> 4
+    else:
+        even[:] = middle & 0xF
+        even <<= 8
+        even |= first
+        odd[:] = last
+        odd <<= 4
+        odd |= middle >> 4
+    return pixels[:count]
+
+
+def _encode(fmt: PixelFormat, flat: NDArray[np.uint16]) -> NDArray[np.uint8]:
+    if fmt.layout == "plain":
+        return flat.astype(np.uint8) if fmt.bits_in_memory == 8 else flat.astype("<u2").view(np.uint8)
+    size = fmt.payload_bytes(flat.size, 1)
+    if fmt.layout == "p":
+        bits = flat[:, np.newaxis] >> np.arange(fmt.bits, dtype=np.uint16) & 1
+        return np.packbits(bits.astype(np.uint8).ravel(), bitorder="little")[:size]
+    if flat.size % 2:
+        flat = np.append(flat, np.uint16(0))
+    low = fmt.bits - 8
+    triples = np.empty((flat.size // 2, 3), np.uint8)
+    triples[:, 0] = flat[0::2] >> low
+    triples[:, 1] = flat[0::2] & ((1 << low) - 1) | (flat[1::2] & ((1 << low) - 1)) << 4
+    triples[:, 2] = flat[1::2] >> low
+    return triples.ravel()[:size]
+
+
+PIXEL_FORMATS: tuple[PixelFormat, ...] = (
+    # PFNC and GigE Vision.
+    PixelFormat("Mono8", 0x01080001, 8),
+    PixelFormat("Mono10", 0x01100003, 10),
+    PixelFormat("Mono10Packed", 0x010C0004, 10, "packed"),
+    PixelFormat("Mono10p", 0x010A0046, 10, "p"),
+    PixelFormat("Mono12", 0x01100005, 12),
+    PixelFormat("Mono12Packed", 0x010C0006, 12, "packed"),
+    PixelFormat("Mono12p", 0x010C0047, 12, "p"),
+    PixelFormat("Mono14", 0x01100025, 14),
+    PixelFormat("Mono16", 0x01100007, 16),
+    # Lucid, from one public header that lists its codes; the layout is that of the Mono format of the same name
+    # (unverified on hardware).
+    PixelFormat("PolarizeMono8", 0x81080001, 8, polarized=True),
+    PixelFormat("PolarizeMono12", 0x81100008, 12, polarized=True),
+    PixelFormat("PolarizeMono12Packed", 0x810C0006, 12, "packed", polarized=True),
+    PixelFormat("PolarizeMono12p", 0x810C0047, 12, "p", polarized=True),
+    PixelFormat("PolarizeMono16", 0x81100007, 16, polarized=True),
+    # The Imaging Source, from its own public IC4 bindings and its Aravis example.
+    PixelFormat("PolarizedMono8", 0x8108000A, 8, polarized=True),
+    PixelFormat("PolarizedMono12p", 0x810C000B, 12, "p", polarized=True),
+    PixelFormat("PolarizedMono12Packed", 0x810C0010, 12, "packed", polarized=True),
+    PixelFormat("PolarizedMono16", 0x8110000C, 16, polarized=True),
+)
+_BY_CODE = {fmt.code: fmt for fmt in PIXEL_FORMATS}
+_BY_NAME = {fmt.name: fmt for fmt in PIXEL_FORMATS}
+
+
+def pixel_format(name_or_code: str | int) -> PixelFormat:
+    """Look up a format by the camera's name or by its code.
+
+    Raises
+    ------
+    UnknownPixelFormat
+        Not in `PIXEL_FORMATS`, including the processed outputs (angle, degree of polarization, colour) of
+        polarization cameras, which are not intensities.
+    """
+    code = name_or_code & 0xFFFFFFFF if isinstance(name_or_code, int) else None
+    found = _BY_NAME.get(str(name_or_code)) if code is None else _BY_CODE.get(code)
+    if found is None:
+        shown = str(name_or_code) if code is None else f"code 0x{code:08x} ({code >> 16 & 0xFF} bits a pixel)"
+        raise UnknownPixelFormat(
+            f"pixel format {shown}",
+            "its layout in memory is not known here",
+            "Choose one of " + ", ".join(fmt.name for fmt in PIXEL_FORMATS),
+        )
+    return found
