@@ -96,6 +96,22 @@ class Capture:
         """Counts (channels, rows, columns) of one state done, as stored."""
         return np.asarray(self._frames[int(self.done[state]), :, rows, :])
 
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the counts as stored."""
+        dtype: np.dtype[Any] = self._frames.dtype
+        return dtype
+
+    @property
+    def integer_counts(self) -> bool:
+        """Whether frames are whole counts (a camera), not floating numbers (imported fluxes)."""
+        return self.dtype.kind in "ui"
+
+    def read_block(self, states: NDArray[np.int64], rows: slice, out: NDArray[Any]) -> None:
+        """Fill `out` (len(states), channels, rows, columns) with counts of states done, as stored."""
+        for k, state in enumerate(states):
+            self._frames.read_direct(out, np.s_[int(self.done[state]), :, rows, :], np.s_[k])
+
     def row_blocks(self, pixels: int = 1 << 17) -> Iterator[slice]:
         """Row slices of about `pixels` pixels, an even number of rows each (mosaics stay whole)."""
         height, width = self.frame_shape

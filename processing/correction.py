@@ -1,0 +1,157 @@
+"""From raw counts to signal: black, flat, bad and saturated pixels, block by block."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntFlag
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.capture import Capture, CaptureError
+from processing.noise import NoiseModel
+
+
+class Mask(IntFlag):
+    """Bits of `pixel_mask` in every product; 0 is a good pixel."""
+
+    SATURATED = 1  # some state was at the top of the range and was left out
+    NOT_FINITE = 2  # some state has no number there
+    BAD = 4  # listed as a bad pixel
+    NOT_DETERMINED = 8  # too few states are left
+
+    @classmethod
+    def meaning(cls) -> str:
+        """The bits in words, for the file."""
+        return ", ".join(f"{flag.value} = {flag.name.lower().replace('_', ' ')}" for flag in cls if flag.name)
+
+
+@dataclass(frozen=True)
+class Correction:
+    """What is subtracted, divided out and left out.
+
+    Attributes
+    ----------
+    black : counts; a number, or (channels, rows, columns) from dark states.
+    dark_frames : how many dark frames `black` is the mean of; 0 for a number.
+    flat : relative response (channels, rows, columns), mean 1; None for none.
+    bad : (rows, columns) bool; None for none.
+    saturation : counts from which on a pixel is saturated; None if the range is not known.
+    source : in words, for the facts and the console.
+    warnings : what the user should know.
+    """
+
+    black: float | NDArray[np.float32]
+    dark_frames: int
+    source: str
+    flat: NDArray[np.float32] | None = None
+    bad: NDArray[np.bool_] | None = None
+    saturation: float | None = None
+    warnings: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, capture: Capture, bad: NDArray[np.bool_] | None = None) -> Correction:
+        """What the capture itself offers: dark states, else the header's black level, else nothing (and says so)."""
+        detector = capture.header.detector
+        warnings: list[str] = []
+        dark = capture.dark
+        black: float | NDArray[np.float32]
+        if dark is not None:
+            black, dark_frames = dark.astype(np.float32), int(capture.states_with("dark").size)
+            source = f"mean of {dark_frames} dark state(s)"
+        else:
+            black, dark_frames = detector.black_level_counts, 0
+            source = f"black level {black:g} counts from the header"
+            if black == 0.0:
+                source = "no black was subtracted"
+                warnings.append(
+                    "no dark states and no black level in the capture: nothing was subtracted, and a pedestal would "
+                    "show as depolarization. Take dark states, or import with --black-level."
+                )
+        saturation = None
+        if detector.bits is not None and capture.integer_counts:
+            saturation = float(2**detector.bits - 1)
+        return cls(black, dark_frames, source, _flat(capture, black), bad, saturation, tuple(warnings))
+
+
+def _flat(capture: Capture, black: float | NDArray[np.float32]) -> NDArray[np.float32] | None:
+    states = capture.states_with("flat")
+    if states.size == 0:
+        return None
+    total = np.zeros((capture.channels, *capture.frame_shape))
+    for k in states:
+        total += capture.frames(int(k))
+    response = total / states.size - black
+    with np.errstate(invalid="ignore", divide="ignore"):
+        response /= np.nanmean(response, axis=(1, 2), keepdims=True)
+    if not np.all(np.isfinite(response)) or np.mean(response <= 0) > 0.01:
+        raise CaptureError(
+            f"{capture.path}: the flat states are no brighter than the black; retake them or leave them out."
+        )
+    return np.maximum(response, 1e-3).astype(np.float32)
+
+
+class BlockReader:
+    """Corrected signal of the sample states, tile by tile, with the mask filled in passing."""
+
+    def __init__(self, capture: Capture, states: NDArray[np.int64], correction: Correction) -> None:
+        self.capture, self.states, self.correction = capture, states, correction
+        self._buffer: NDArray[np.generic] | None = None
+        self._rows = slice(0, 0)
+        self._black: NDArray[np.float32] | np.float32 = np.float32(0)
+        self._gain: NDArray[np.float32] | None = None
+        self._bad: NDArray[np.bool_] | None = None
+
+    def read(self, rows: slice) -> NDArray[np.generic]:
+        """Counts (states, channels, pixels) of a row block as stored; the memory is used again by the next call."""
+        height, width = rows.stop - rows.start, self.capture.frame_shape[1]
+        channels = self.capture.channels
+        shape = (len(self.states), channels, height, width)
+        if self._buffer is None or self._buffer.size < math.prod(shape):
+            self._buffer = np.empty(math.prod(shape), self.capture.dtype)
+        block = self._buffer[: math.prod(shape)].reshape(shape)
+        self.capture.read_block(self.states, rows, block)
+        black, flat, bad = self.correction.black, self.correction.flat, self.correction.bad
+        if isinstance(black, np.ndarray):
+            self._black = np.ascontiguousarray(black[:, rows].reshape(channels, -1))
+        else:
+            self._black = np.float32(black)
+        self._gain = None if flat is None else 1.0 / flat[:, rows].reshape(channels, -1)
+        self._bad = None if bad is None else bad[rows].reshape(-1)
+        return block.reshape(len(self.states), channels, -1)
+
+    def load(
+        self, frames: NDArray[np.generic], start: int, stop: int, out: NDArray[np.float32], mask: NDArray[np.uint8]
+    ) -> NDArray[np.float32] | None:
+        """Fill `out` (states, channels, stop - start) with signal, flag the mask; returns what `signal` returns."""
+        raw = frames[:, :, start:stop]
+        flags = mask[start:stop]
+        level = self.correction.saturation
+        if level is not None:
+            flags[raw.max(axis=(0, 1)) >= level] |= np.uint8(Mask.SATURATED)
+        if raw.dtype.kind == "f":
+            flags[~np.isfinite(raw).all(axis=(0, 1))] |= np.uint8(Mask.NOT_FINITE)
+        if self._bad is not None:
+            flags[self._bad[start:stop]] |= np.uint8(Mask.BAD)
+        return self.signal(raw, slice(start, stop), out)
+
+    def signal(
+        self, raw: NDArray[np.generic], pixels: slice | NDArray[np.int64], out: NDArray[np.float32]
+    ) -> NDArray[np.float32] | None:
+        """Fill `out` with counts minus black over flat; returns 1 / flat (channels, pixels), None without one."""
+        np.copyto(out, raw, casting="unsafe")
+        if isinstance(self._black, np.ndarray):
+            out -= self._black[:, pixels]
+        elif self._black:
+            out -= self._black
+        if self._gain is None:
+            return None
+        gain = self._gain[:, pixels]
+        out *= gain
+        return gain
+
+    def black_variance(self, noise: NoiseModel) -> float:
+        """Variance, counts^2, of the black that is subtracted from every state alike."""
+        frames = self.correction.dark_frames
+        return noise.floor / frames if frames else 0.0

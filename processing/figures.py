@@ -1,0 +1,133 @@
+"""Figures of products: Mueller images as 4 x 4 panels, Stokes images, single maps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.errors import ProcessError
+from processing.product import Product
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Longest side of a panel in pixels; larger images are thinned before drawing, which changes no file.
+PANEL_PIXELS = 600
+SIMULATED = "SIMULATED"
+
+
+def draw_product(path: Path, figure: Path) -> None:
+    """Draw a product into a PNG, SVG or PDF file, by its kind.
+
+    Raises
+    ------
+    ProcessError : there is no figure for that kind, or the file's ending is unknown.
+    """
+    with Product(path) as product:
+        drawn = product_figure(product)
+    try:
+        drawn.savefig(figure, dpi=150)
+    except (ValueError, OSError) as error:
+        raise ProcessError(f"figure {figure} cannot be written: {error}") from error
+
+
+def product_figure(product: Product) -> Figure:
+    """Matplotlib figure of a product; raises ProcessError for a kind without one."""
+    if product.kind == "mueller":
+        elements = thin(product.get("mueller"))
+        return mueller_figure(elements, _title(product), product.simulated)
+    if product.kind == "stokes":
+        maps = {name: thin(product.get(name)) for name in ("s0", "dolp", "aolp_deg")}
+        return stokes_figure(maps, _title(product), product.simulated)
+    raise ProcessError(f"{product.path}: no figure is defined for a {product.kind} image.")
+
+
+def mueller_figure(elements: NDArray[Any], title: str, simulated: bool) -> Figure:
+    """4 x 4 panels of M / m00 (4, 4, rows, columns), one diverging scale symmetric about zero, one colour bar.
+
+    The scale is the largest magnitude apart from m00 (99.5 % of the pixels), at most 1; the m00 panel shows m00
+    over its own 99.5 % so that the object can be recognised, and is drawn in grey.
+    """
+    from matplotlib.figure import Figure
+
+    m00 = elements[0, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        normalized = np.where(m00 > 0, elements / m00, np.nan)
+    rest = np.abs(normalized.reshape(16, *m00.shape)[1:])
+    limit = float(np.clip(_percentile(rest, 99.5), 1e-6, 1.0))
+    figure = Figure(figsize=(9.5, 8.6 * max(0.45, m00.shape[0] / max(m00.shape[1], 1)) + 0.8), layout="constrained")
+    panels = figure.subplots(4, 4)
+    shown: Any = None
+    for i in range(4):
+        for j in range(4):
+            panel = panels[i, j]
+            panel.set_xticks([])
+            panel.set_yticks([])
+            panel.set_title(f"$m_{{{i}{j}}}$", fontsize=9, pad=2)
+            if i == j == 0:
+                panel.imshow(m00, cmap="gray", vmin=0, vmax=max(_percentile(m00, 99.5), 1e-30))
+                continue
+            shown = panel.imshow(normalized[i, j], cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
+    figure.colorbar(shown, ax=panels, shrink=0.8, label="$m_{ij}/m_{00}$ (grey: $m_{00}$ alone)")
+    _entitle(figure, title, simulated)
+    return figure
+
+
+def stokes_figure(maps: dict[str, NDArray[Any]], title: str, simulated: bool) -> Figure:
+    """S0 (grey), degree of linear polarization, and its angle on a cyclic colour map."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 4.2), layout="constrained")
+    s0, dolp, aolp = figure.subplots(1, 3)
+    _map(figure, s0, maps["s0"], "$S_0$", cmap="gray", vmin=0, vmax=_percentile(maps["s0"], 99.5))
+    _map(figure, dolp, maps["dolp"], "degree of linear polarization", cmap="viridis", vmin=0, vmax=1)
+    _map(figure, aolp, maps["aolp_deg"], "angle of linear polarization / degrees", cmap="twilight", vmin=0, vmax=180)
+    _entitle(figure, title, simulated)
+    return figure
+
+
+def map_figure(panels: Sequence[tuple[str, NDArray[Any], dict[str, Any]]], title: str, simulated: bool) -> Figure:
+    """Maps side by side; each is (label, values (rows, columns), keywords of imshow such as cmap, vmin, vmax)."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(0.6 + 4.3 * len(panels), 4.2), layout="constrained")
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axis, (label, values, keywords) in zip(axes, panels, strict=True):
+        _map(figure, axis, values, label, **keywords)
+    _entitle(figure, title, simulated)
+    return figure
+
+
+def thin(image: NDArray[Any]) -> NDArray[Any]:
+    """Every k-th row and column, so that the longer side is at most PANEL_PIXELS."""
+    step = max(1, -(-max(image.shape[-2:]) // PANEL_PIXELS))
+    return image[..., ::step, ::step]
+
+
+def _map(figure: Figure, axis: Any, values: NDArray[Any], label: str, **keywords: Any) -> None:
+    shown = axis.imshow(values, interpolation="nearest", **keywords)
+    axis.set_title(label, fontsize=10)
+    axis.set_xticks([])
+    axis.set_yticks([])
+    figure.colorbar(shown, ax=axis, shrink=0.85)
+
+
+def _entitle(figure: Figure, title: str, simulated: bool) -> None:
+    figure.suptitle(
+        f"{SIMULATED}   {title}" if simulated else title, color="darkred" if simulated else "black", fontsize=11
+    )
+
+
+def _title(product: Product) -> str:
+    header = product.header
+    omega = "" if header.omega_deg is None else f", Omega {header.omega_deg:g} degrees"
+    return f"{header.title}: {header.wavelength_nm:g} nm{omega}"
+
+
+def _percentile(values: NDArray[Any], percent: float) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.percentile(finite, percent)) if finite.size else 1.0

@@ -1,0 +1,153 @@
+"""Read states.csv: one row per state, with errors that name line and column."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.errors import ProcessError
+
+ROLES = ("sample", "air", "dark", "flat")
+CHANNEL_PREFIX = "channel_"
+
+
+class ImportFailed(ProcessError):
+    """Data measured elsewhere cannot be made into a capture."""
+
+
+@dataclass(frozen=True)
+class StatesFile:
+    """Contents of states.csv, in the order of its `state` column.
+
+    Attributes
+    ----------
+    path : of the file.
+    line : line number of each state, for messages.
+    angles_deg : axis name to (N,); NaN in dark and flat states that have none.
+    role : N roles; "sample" unless a `role` column says otherwise.
+    time_s, exposure_s : (N,) or None.
+    files : N paths or None.
+    channels : channel name to (N,) flux; empty if there are none.
+    """
+
+    path: Path
+    line: tuple[int, ...]
+    angles_deg: dict[str, NDArray[np.float64]]
+    role: tuple[str, ...]
+    time_s: NDArray[np.float64] | None
+    exposure_s: NDArray[np.float64] | None
+    files: tuple[Path, ...] | None
+    channels: dict[str, NDArray[np.float64]]
+
+    def __len__(self) -> int:
+        return len(self.role)
+
+
+def read_states(path: Path, axes: Sequence[str]) -> StatesFile:
+    """Read a states file (CSV with a header line).
+
+    Parameters
+    ----------
+    axes : names that must have a column (the instrument's axes); any other column that is not one of `state`, `role`,
+        `time_s`, `exposure_s`, `file` or `channel_<name>` is an axis too. A suffix `_deg` is left away.
+
+    Raises
+    ------
+    ImportFailed : not readable, a column is missing or given twice, a number is none, a state number is repeated.
+    """
+    header, rows = _table(path)
+    names = [_axis_name(h) for h in header]
+    twice = sorted({n for n in names if names.count(n) > 1})
+    if twice:
+        raise ImportFailed(f"{path}:1: column given twice: {', '.join(twice)}")
+    missing = [n for n in ("state", *axes) if n not in names]
+    if missing:
+        raise ImportFailed(
+            f"{path}:1: no column {', '.join(missing)}. Found: {', '.join(header)}. Every state needs its number and "
+            "the angle in degrees of each axis that the instrument turns."
+        )
+    columns = {name: [row[k] for _, row in rows] for k, name in enumerate(names)}
+    lines = [line for line, _ in rows]
+    order = _order(path, lines, columns["state"])
+    lines = [lines[k] for k in order]
+    columns = {name: [values[k] for k in order] for name, values in columns.items()}
+    role = _roles(path, lines, columns)
+    special = {"state", "role", "file", "time_s", "exposure_s"}
+    numbers = {n: _numbers(path, lines, n, columns[n], role) for n in names if n not in ("state", "role", "file")}
+    files = tuple(path.parent / text for text in columns["file"]) if "file" in columns else None
+    return StatesFile(
+        path=path,
+        line=tuple(lines),
+        angles_deg={n: v for n, v in numbers.items() if n not in special and not n.startswith(CHANNEL_PREFIX)},
+        role=role,
+        time_s=numbers.get("time_s"),
+        exposure_s=numbers.get("exposure_s"),
+        files=files,
+        channels={n.removeprefix(CHANNEL_PREFIX): v for n, v in numbers.items() if n.startswith(CHANNEL_PREFIX)},
+    )
+
+
+def _table(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file)
+            header = [h.strip() for h in next(reader, [])]
+            rows = [(reader.line_num, [c.strip() for c in row]) for row in reader if any(c.strip() for c in row)]
+    except OSError as error:
+        raise ImportFailed(f"{path}: cannot be read ({error.strerror})") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ImportFailed(f"{path}: is not a CSV text file ({error})") from error
+    if not header or not rows:
+        raise ImportFailed(f"{path}: needs a header line and one row per state; found {len(rows)} rows")
+    for line, row in rows:
+        if len(row) != len(header):
+            raise ImportFailed(f"{path}:{line}: {len(row)} columns, the header has {len(header)}")
+    return header, rows
+
+
+def _axis_name(header: str) -> str:
+    return header.removesuffix("_deg")
+
+
+def _order(path: Path, lines: list[int], states: list[str]) -> list[int]:
+    seen: dict[int, int] = {}
+    for line, text in zip(lines, states, strict=True):
+        if not text.isdecimal():
+            raise ImportFailed(f"{path}:{line}: column state: {text!r} is not a whole number")
+        number = int(text)
+        if number in seen:
+            raise ImportFailed(f"{path}:{line}: state {number} is given already in line {seen[number]}")
+        seen[number] = line
+    return sorted(range(len(states)), key=lambda k: int(states[k]))
+
+
+def _roles(path: Path, lines: list[int], columns: dict[str, list[str]]) -> tuple[str, ...]:
+    if "role" not in columns:
+        return ("sample",) * len(lines)
+    roles = tuple(text or "sample" for text in columns["role"])
+    for line, role in zip(lines, roles, strict=True):
+        if role not in ROLES:
+            raise ImportFailed(f"{path}:{line}: column role: {role!r} is none of {', '.join(ROLES)}")
+    return roles
+
+
+def _numbers(path: Path, lines: list[int], name: str, texts: list[str], role: tuple[str, ...]) -> NDArray[np.float64]:
+    out = np.empty(len(texts))
+    for k, text in enumerate(texts):
+        if not text and role[k] in ("dark", "flat"):
+            out[k] = np.nan
+            continue
+        try:
+            out[k] = float(text)
+        except ValueError:
+            out[k] = np.nan
+        if not math.isfinite(out[k]):
+            shown = repr(text) if text else "an empty cell"
+            raise ImportFailed(f"{path}:{lines[k]}: column {name}: {shown} is not a finite number")
+    return out
