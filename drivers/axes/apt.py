@@ -1,0 +1,239 @@
+"""Thorlabs APT controllers over their binary protocol: K10CR1, and KDC101 with a PRM1-Z8 stage.
+
+Facts: shared/instruments.md 2.4. A plain serial port is enough on Linux, no vendor's driver. States are read, the
+messages at the end of a motion are not relied on: they go missing on real units (PnPQ#104). Counts per degree and
+the units of speed and acceleration are those of qmi and pylablib.
+"""
+
+from __future__ import annotations
+
+import logging
+import struct
+import time
+from dataclasses import dataclass
+from typing import Literal
+
+from pydantic import Field
+
+from drivers.apt_frames import REPLY_NAMES, apt_framer, long_message, short_message
+from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
+from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
+from drivers.serial_link import LineRegistry, SerialLink, Transcript
+
+log = logging.getLogger(__name__)
+
+MOVING_BITS = 0b1111_0000 | 1 << 9  # moving and jogging either way, homing
+HOMING, HOMED = 1 << 9, 1 << 10
+MOTION_ERROR, CURRENT_LIMIT, ERROR, ENABLED = 1 << 14, 1 << 24, 1 << 30, 1 << 31
+PRM1_Z8_STAGE = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """Counts per degree, per degree/s and per degree/s^2."""
+
+    position: float
+    velocity: float
+    acceleration: float
+
+
+_KDC_CLOCK = 2048 / 6e6
+PRM1_Z8 = Scale(1919.6418578623391, 1919.6418578623391 * 65536 * _KDC_CLOCK, 1919.6418578623391 * 65536 * _KDC_CLOCK**2)
+K10CR1 = Scale(409600 / 3, 7329109.0, 1502.0)
+
+
+class Config(AxisConfig):
+    """An APT axis in a rig file. Every unit has its own USB port; `serial_number` makes sure it is the right one."""
+
+    kind: Literal["apt"] = "apt"
+    serial_number: int | None = None
+    stage: Literal["K10CR1", "PRM1-Z8"] | None = Field(
+        default=None, description="scale to use for a controller or a stage that is not known here"
+    )
+    home_speed_deg_s: float | None = Field(
+        default=None, gt=0, description="sets the homing speed, which a unit forgets at power-off"
+    )
+
+
+class APTLine:
+    """The port of one APT unit."""
+
+    def __init__(self, port: str, reply_s: float, transcript: Transcript | None) -> None:
+        self.link = SerialLink(port, 115_200, apt_framer, transcript=transcript)
+        self.reply_s = reply_s
+        # The vendor's order of opening: a unit that is not reset so can stay silent.
+        self.link.set_rts(True)
+        time.sleep(0.05)
+        self.link.purge(0.0)
+        time.sleep(0.05)
+        self.link.set_rts(False)
+
+    def close(self) -> None:
+        """Close the port."""
+        self.link.close()
+
+    def ask(self, request: bytes, reply_id: int) -> bytes:
+        """Send a request and return the data of the reply with this id (short replies: both parameters).
+
+        Raises
+        ------
+        ReplyTimeout, ReplyError
+        """
+        seen: list[bytes] = []
+        for _ in range(2):
+            with self.link.lock:
+                # Replies carry no id of their request: drop what waits, it was not asked for now.
+                self.link.purge(0.0)
+                self.link.write(request)
+                deadline_s = time.monotonic() + self.reply_s
+                while (frame := self.link.read_frame(deadline_s)) is not None:
+                    if int.from_bytes(frame[:2], "little") == reply_id:
+                        return frame[6:] if len(frame) > 6 else frame[2:4]
+                    seen.append(frame)
+                self.link.purge()
+        asked = f"APT {self.link.port}, {REPLY_NAMES.get(reply_id, hex(reply_id))}"
+        advice = "Is it an APT unit, and the only program on it? A frozen unit needs its power switched off and on"
+        if seen:
+            raise ReplyError(asked, f"no valid reply, but {[frame.hex(' ') for frame in seen[:3]]}", advice)
+        raise ReplyTimeout(asked, f"nothing within {self.reply_s} s", advice)
+
+
+class APTAxis(MotionAxis):
+    """The motor of one APT unit, channel 1."""
+
+    def __init__(self, name: str, config: Config, line: APTLine, lines: LineRegistry) -> None:
+        super().__init__(name, config)
+        self.config: Config = config
+        self._line, self._lines = line, lines
+        # Periodic messages of an earlier program would only disturb; this moves nothing.
+        line.link.write(short_message(0x0012))
+        info = line.ask(short_message(0x0005), 0x0006)
+        serial_number = int.from_bytes(info[0:4], "little")
+        model = info[4:12].split(b"\0")[0].decode("ascii", "replace").strip()
+        if config.serial_number not in (None, serial_number):
+            raise WrongDevice(
+                f"axis {name}, find APT unit {config.serial_number} on {config.port}",
+                f"there is {model} with serial number {serial_number}",
+                "Correct port or serial_number; /dev/serial/by-id names the port by its serial number",
+            )
+        self._unknown = ""
+        self._scale = self._find_scale(model, int.from_bytes(info[76:78], "little"))
+        self.counts_per_deg = self._scale.position
+        minimum, acceleration, velocity = struct.unpack_from("<3i", line.ask(short_message(0x0414, 1), 0x0415), 2)
+        if velocity <= 0 or acceleration <= 0:
+            raise ReplyError(
+                f"axis {name}, velocity parameters",
+                f"velocity {velocity}, acceleration {acceleration}, minimum {minimum}",
+                "Load the stage's settings with the vendor's software",
+            )
+        self.speed_deg_s = velocity / self._scale.velocity
+        self.acceleration_deg_s2 = acceleration / self._scale.acceleration
+        self._home_speed_deg_s = self._read_home_parameters()[2] / self._scale.velocity or self.speed_deg_s
+        self._identity = AxisIdentity(
+            kind="apt",
+            model=model,
+            serial_number=str(serial_number),
+            firmware=".".join(str(part) for part in reversed(info[14:17])),
+            port=config.port,
+            address="0x50",
+        )
+
+    def _find_scale(self, model: str, stage: int) -> Scale:
+        if self.config.stage is not None:
+            return PRM1_Z8 if self.config.stage == "PRM1-Z8" else K10CR1
+        if model.startswith("K10CR"):
+            if model != "K10CR1":
+                self._unknown = f"model {model} is not known here, treated as K10CR1"
+            return K10CR1
+        if model.startswith(("KDC101", "TDC001")) and stage == PRM1_Z8_STAGE:
+            return PRM1_Z8
+        raise WrongDevice(
+            f"axis {self.name}, find the counts per degree",
+            f"controller {model} with stage id {stage} is not known",
+            "If it is compatible, set `stage: K10CR1` or `stage: PRM1-Z8` in the rig file",
+        )
+
+    def describe(self) -> AxisIdentity:
+        return self._identity
+
+    def _read_home_parameters(self) -> tuple[int, int, int, int]:
+        """Return direction, limit switch, velocity and offset of homing."""
+        data = self._line.ask(short_message(0x0441, 1), 0x0442)
+        direction, switch, velocity, offset = struct.unpack_from("<HHii", data, 2)
+        return direction, switch, velocity, offset
+
+    def _status_bits(self) -> int:
+        return int.from_bytes(self._line.ask(short_message(0x0429, 1), 0x042A)[2:6], "little")
+
+    def _do_read_counts(self) -> int:
+        return int.from_bytes(self._line.ask(short_message(0x0411, 1), 0x0412)[2:6], "little", signed=True)
+
+    def _do_is_homed(self) -> bool:
+        # One flipped bit must not make a reference.
+        return bool(self._status_bits() & self._status_bits() & HOMED)
+
+    def _do_is_moving(self) -> bool:
+        return bool((self._status_bits() | self._status_bits()) & MOVING_BITS)
+
+    def _enable(self) -> None:
+        if not self._status_bits() & ENABLED:
+            self._line.link.write(short_message(0x0210, 1, 1))
+
+    def _do_start_move(self, counts: float) -> None:
+        self._enable()
+        self._line.link.write(long_message(0x0453, struct.pack("<Hi", 1, round(counts))))
+
+    def _do_start_home(self) -> None:
+        """Start homing and wait until the unit says that it homes; the old `homed` bit may still stand till then."""
+        direction, switch, velocity, offset = self._read_home_parameters()
+        if self.config.home_speed_deg_s is not None:
+            velocity = round(self.config.home_speed_deg_s * self._scale.velocity)
+            parameters = struct.pack("<HHHii", 1, direction, switch, velocity, offset)
+            self._line.link.write(long_message(0x0440, parameters))
+        if velocity <= 0:
+            raise CommandRejected(
+                f"axis {self.name}, home",
+                f"the unit's homing speed is {velocity}: it would stand still",
+                "Set home_speed_deg_s in the rig file; the unit forgets its homing parameters at power-off",
+            )
+        log.info(
+            "axis %s homes: direction %d, switch %d, speed %.3f deg/s, offset %.3f deg",
+            self.name, direction, switch, velocity / self._scale.velocity, offset / self._scale.position,
+        )  # fmt: skip
+        self._enable()
+        self._line.link.write(short_message(0x0443, 1))
+        give_up_s = time.monotonic() + 0.3
+        while time.monotonic() < give_up_s:
+            bits = self._status_bits()
+            if bits & HOMING or not bits & HOMED:
+                return
+            time.sleep(0.01)
+
+    def _do_stop(self) -> None:
+        self._line.link.write(short_message(0x0465, 1, 2))
+
+    def _do_check_fault(self) -> None:
+        bits = self._status_bits() & self._status_bits()
+        names = {MOTION_ERROR: "motion error (position error too large)", ERROR: "error"}
+        faults = [word for bit, word in names.items() if bits & bit]
+        if faults:
+            raise CommandRejected(f"axis {self.name}, state", f"fault {', '.join(faults)}", "Is the stage blocked?")
+
+    def _do_warnings(self) -> list[str]:
+        words = [self._unknown] if self._unknown else []
+        if self._status_bits() & CURRENT_LIMIT:
+            words.append("motor current limit reached")
+        return words
+
+    def _do_close(self) -> None:
+        self._lines.release(self.config.port)
+
+
+def open(name: str, config: Config, lines: LineRegistry) -> APTAxis:
+    """Open one unit; reads its identity, homing parameters and speed and moves nothing."""
+    line = lines.take(config.port, APTLine, lambda transcript: APTLine(config.port, config.reply_s or 0.5, transcript))
+    try:
+        return APTAxis(name, config, line, lines)
+    except BaseException:
+        lines.release(config.port)
+        raise

@@ -1,0 +1,251 @@
+"""Thorlabs Elliptec rotation mounts ELL14 and ELL18 on a multi-drop line.
+
+Facts: shared/instruments.md 2.2. A module says at the end of a move where it is, once; it cannot be stopped in
+between, and it cannot say whether it was ever homed. Assumed, not read: 430 deg/s at full velocity (vendor's
+specification) and 2000 deg/s^2, used for deadlines only.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import time
+from typing import Literal
+
+from pydantic import Field
+
+from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
+from drivers.motion import AxisIdentity
+from drivers.serial_link import LineRegistry, SerialLink, Transcript, line_framer
+from drivers.session_reference import SessionReferenceAxis, SessionReferenceConfig
+
+log = logging.getLogger(__name__)
+
+STATUS = {
+    0: "ok",
+    1: "communication timeout",
+    2: "mechanical timeout",
+    3: "command error or not supported",
+    4: "value out of range",
+    5: "module isolated",
+    6: "module out of isolation",
+    7: "initialising",
+    8: "thermal error",
+    9: "busy",
+    10: "sensor error",
+    11: "motor error",
+    12: "out of range",
+    13: "over-current",
+}
+BUSY = 9
+FULL_SPEED_DEG_S = 430.0
+ACCELERATION_DEG_S2 = 2000.0
+# pylablib notes that a move sent too soon after another command can end at zero.
+PAUSE_BEFORE_MOVE_S = 0.1
+_ROTARY = {14: "ELL14", 18: "ELL18"}
+_FRAME = re.compile(r"([0-9A-F])([A-Z][A-Z0-9])([0-9A-F]*)")
+
+
+class Config(SessionReferenceConfig):
+    """An Elliptec module in a rig file. Without `address` the line is searched for `serial_number`."""
+
+    kind: Literal["elliptec"] = "elliptec"
+    address: str | None = Field(default=None, pattern="^[0-9A-F]$")
+    serial_number: str | None = None
+    home_clockwise: bool = True
+
+
+class ElliptecLine:
+    """Up to 16 modules on one line; replies are sorted by address and letters."""
+
+    def __init__(self, port: str, reply_s: float, transcript: Transcript | None) -> None:
+        self.link = SerialLink(port, 9600, line_framer, transcript=transcript)
+        self.reply_s = reply_s
+        # Last message of each module that nobody had asked for: the end of its move.
+        self.ended: dict[str, tuple[str, str]] = {}
+        self._last_sent_s = 0.0
+
+    def close(self) -> None:
+        """Close the port."""
+        self.link.close()
+
+    def send(self, address: str, command: str) -> None:
+        """Write a command; takes no lock."""
+        self.link.write(f"{address}{command}".encode("ascii"))
+        self._last_sent_s = time.monotonic()
+
+    def start(self, address: str, command: str) -> None:
+        """Start a move, whose reply comes when it ends."""
+        with self.link.lock:
+            time.sleep(max(0.0, self._last_sent_s + PAUSE_BEFORE_MOVE_S - time.monotonic()))
+            self.drain()
+            self.ended.pop(address, None)
+            self.send(address, command)
+
+    def drain(self) -> None:
+        """Sort what has arrived without waiting."""
+        with self.link.lock:
+            while (frame := self.link.read_frame(0.0)) is not None:
+                self._sort(frame)
+
+    def _sort(self, frame: bytes) -> tuple[str, str, str] | None:
+        match = _FRAME.fullmatch(frame.decode("ascii", "replace"))
+        if match is None:
+            return None
+        address, letters, data = match[1], match[2], match[3]
+        whole = (letters == "PO" and len(data) == 8) or (letters == "GS" and len(data) == 2)
+        if whole and (letters, data) != ("GS", f"{BUSY:02X}"):
+            self.ended[address] = (letters, data)
+        return address, letters, data
+
+    def ask(self, address: str, command: str, letters: str, digits: int, *, tries: int = 2) -> str:
+        """Ask a question and return the hex digits of the reply with these letters.
+
+        Raises
+        ------
+        CommandRejected
+            The module answered with a status that is an error, or it is busy.
+        ReplyTimeout, ReplyError
+        """
+        asked = f"Elliptec {self.link.port} address {address}, {command}"
+        seen: list[bytes] = []
+        for _ in range(tries):
+            with self.link.lock:
+                self.drain()
+                self.send(address, command)
+                deadline_s = time.monotonic() + self.reply_s
+                while (frame := self.link.read_frame(deadline_s)) is not None:
+                    match = self._sort(frame)
+                    if match is not None and match[0] == address:
+                        if match[1] == letters and len(match[2]) >= digits:
+                            return match[2]
+                        if match[1] == "GS" and len(match[2]) == 2 and letters != "GS":
+                            code = int(match[2], 16)
+                            if code != 0:
+                                word = STATUS.get(code, "unknown")
+                                raise CommandRejected(asked, f"status {code}: {word}", "Look at the module")
+                    seen.append(frame)
+                self.link.purge()
+        if seen:
+            raise ReplyError(asked, f"no valid reply, but {seen[:3]}", "Check cable, and that addresses differ")
+        raise ReplyTimeout(asked, f"nothing within {self.reply_s} s", "Check power, cable and address")
+
+
+class ElliptecAxis(SessionReferenceAxis):
+    """One rotation mount. A started move runs to its end: `stop` cannot end it."""
+
+    can_stop_a_move = False
+    _reads_while_moving = False
+
+    def __init__(self, name: str, config: Config, line: ElliptecLine, lines: LineRegistry) -> None:
+        super().__init__(name, config)
+        self.config: Config = config
+        self._line, self._lines = line, lines
+        self._in_motion = False
+        self._status = 0
+        self._address, info = self._find()
+        module = int(info[0:2], 16)
+        travel, pulses = int(info[18:22], 16), int(info[22:30], 16)
+        if travel == 0 or pulses == 0:
+            raise ReplyError(f"axis {name}, identify", f"travel {travel}, pulses {pulses}", "Is it a rotation mount?")
+        if module in (7, 10, 17, 20):
+            raise WrongDevice(f"axis {name}, identify", f"ELL{module} is a linear stage", "Correct the rig file")
+        self._known = module in _ROTARY
+        # The field is pulses for the whole travel of a turn, whatever the manual calls it.
+        self.counts_per_deg = pulses / travel
+        velocity = int(line.ask(self._address, "gv", "GV", 2), 16)
+        self.speed_deg_s = FULL_SPEED_DEG_S * max(velocity, 1) / 100
+        self.acceleration_deg_s2 = ACCELERATION_DEG_S2
+        self._identity = AxisIdentity(
+            kind="elliptec",
+            model=_ROTARY.get(module, f"ELL{module}"),
+            serial_number=info[2:10],
+            firmware=info[14:16],
+            port=config.port,
+            address=self._address,
+        )
+
+    def _find(self) -> tuple[str, str]:
+        config, line = self.config, self._line
+        found = {}
+        for address in config.address or "0123456789ABCDEF":
+            try:
+                found[address] = line.ask(address, "in", "IN", 30, tries=2 if config.address else 1)
+            except ReplyTimeout:
+                if config.address is not None:
+                    raise
+        asked = f"axis {self.name}, find Elliptec module on {config.port}"
+        listed = ", ".join(f"address {address}: serial {info[2:10]}" for address, info in found.items()) or "none"
+        wanted = [item for item in found.items() if config.serial_number in (None, item[1][2:10])]
+        if len(wanted) != 1:
+            rule = f"address {config.address}, serial_number {config.serial_number}"
+            raise WrongDevice(asked, f"{len(wanted)} modules match {rule}; found {listed}", "Correct the rig file")
+        return wanted[0]
+
+    def describe(self) -> AxisIdentity:
+        return self._identity
+
+    def _do_read_counts(self) -> int:
+        value = int(self._line.ask(self._address, "gp", "PO", 8), 16)
+        return value - (1 << 32) if value >= 1 << 31 else value
+
+    def _do_is_moving(self) -> bool:
+        line = self._line
+        line.drain()
+        if self._in_motion and self._address in line.ended:
+            self._in_motion = False
+            letters, data = line.ended.pop(self._address)
+            self._status = int(data, 16) if letters == "GS" else 0
+            return False
+        # The message at the end may be lost: the status decides.
+        status = int(line.ask(self._address, "gs", "GS", 2), 16)
+        if status not in (0, BUSY):
+            self._status = status
+        return status == BUSY
+
+    def _do_start_move(self, counts: float) -> None:
+        self._begin_moving()
+        self._start(f"ma{round(counts) & 0xFFFFFFFF:08X}")
+
+    def _do_start_home(self) -> None:
+        self._begin_homing()
+        self._start("ho0" if self.config.home_clockwise else "ho1")
+
+    def _start(self, command: str) -> None:
+        self._status = 0
+        self._in_motion = True
+        self._line.start(self._address, command)
+
+    def _do_stop(self) -> None:
+        log.warning("axis %s: an Elliptec module runs a started move to its end, it cannot be stopped", self.name)
+        self._line.send(self._address, "st")
+
+    def _do_check_fault(self) -> None:
+        if self._status:
+            status, self._status = self._status, 0
+            raise CommandRejected(
+                f"axis {self.name}, state", f"status {status}: {STATUS.get(status, 'unknown')}", "Is the mount free?"
+            )
+
+    def _do_warnings(self) -> list[str]:
+        words = self._reference_warnings()
+        if not self._known:
+            words.append(f"model {self._identity.model} is not known here, treated as ELL14")
+        return words
+
+    def _do_close(self) -> None:
+        self._lines.release(self.config.port)
+
+
+def open(name: str, config: Config, lines: LineRegistry) -> ElliptecAxis:
+    """Open one module; reads its identity and velocity and moves nothing."""
+    line = lines.take(
+        config.port,
+        ElliptecLine,
+        lambda transcript: ElliptecLine(config.port, config.reply_s or 0.6, transcript),
+    )
+    try:
+        return ElliptecAxis(name, config, line, lines)
+    except BaseException:
+        lines.release(config.port)
+        raise

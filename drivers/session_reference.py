@@ -1,0 +1,61 @@
+"""Axes whose controller cannot tell whether it is homed: the session remembers, and watches the resting position."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from drivers.motion import AxisConfig, MotionAxis
+
+
+class SessionReferenceConfig(AxisConfig):
+    """Rig entries of an axis that cannot say whether it is homed."""
+
+    assume_homed: bool = Field(
+        default=False,
+        description="the operator states that the axis was homed since it was switched on; the device cannot tell",
+    )
+
+
+class SessionReferenceAxis(MotionAxis):
+    """Homed after `home()` in this session, or because the rig file says so.
+
+    The reference is given up when the resting axis shows another position than the one it was left at: the
+    controller was reset, or somebody turned it.
+    """
+
+    def __init__(self, name: str, config: SessionReferenceConfig) -> None:
+        super().__init__(name, config)
+        self._referenced = config.assume_homed
+        self._homing = False
+        self._rest_counts: float | None = None
+        self._lost = ""
+
+    def _begin_homing(self) -> None:
+        self._homing, self._referenced, self._lost = True, False, ""
+        self._rest_counts = None
+
+    def _begin_moving(self) -> None:
+        self._homing = False
+        self._rest_counts = None
+
+    def _do_is_homed(self) -> bool:
+        if self._do_is_moving():
+            return self._referenced
+        counts = self._confirm(self._do_read_counts())
+        if self._homing:
+            # Raises if homing ended in a fault; then there is no reference.
+            self._do_check_fault()
+            self._homing, self._referenced = False, True
+        tolerance = self.config.tolerance_deg * abs(self.counts_per_deg)
+        if self._rest_counts is not None and abs(counts - self._rest_counts) > tolerance and self._referenced:
+            self._referenced = False
+            self._lost = f"the resting position jumped from {self._rest_counts:g} to {counts:g} counts: home again"
+        self._rest_counts = counts
+        return self._referenced
+
+    def _reference_warnings(self) -> list[str]:
+        if self._lost:
+            return [self._lost]
+        if self._referenced:
+            return []
+        return ["not homed in this session, and the device cannot tell whether it ever was"]
