@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import typer
 
 from processing.command_line import run
-from processing.commands import importing, reduce
+from processing.commands import calibrate, importing, reduce
 
 app = typer.Typer(
     name="process",
@@ -19,6 +19,7 @@ app = typer.Typer(
 )
 
 # One line a module that brings commands. It must not import anything heavy at its top: `--help` is fast.
+calibrate.register(app)
 importing.register(app)
 reduce.register(app)
 

@@ -1,0 +1,66 @@
+"""`process calibrate`: parameters of an instrument from a capture of a known sample."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+#: A fit that leaves more than this of the mean signal has probably ended in the wrong valley.
+POOR_FIT = 0.05
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    app.command("calibrate")(calibrate_command)
+
+
+def calibrate_command(
+    capture: Annotated[Path, typer.Argument(help="Capture of air, a mirror or another known sample.")],
+    instrument: Annotated[Path, typer.Option(help="Instrument file that the fit starts from.")],
+    free: Annotated[str, typer.Option(help="Parameters to fit: element.field,element.field,...")],
+    region: Annotated[
+        str | None, typer.Option(help="Pixels to average: r0:r1,c0:c1; default: the middle half of the frame.")
+    ] = None,
+    write: Annotated[Path | None, typer.Option(help="New instrument file with the fitted values.")] = None,
+) -> None:
+    """Fit element parameters (azimuth_deg, retardance_deg, ...) to region means; the throughput is eliminated."""
+    from processing.calibrate import calibrate, write_fitted
+    from processing.capture import Capture
+    from processing.instrument import InstrumentModel
+
+    with Capture(capture) as source:
+        wavelength = source.header.wavelength_nm
+        rows, columns = _region(region, source.frame_shape)
+        model = InstrumentModel.load(instrument).at(wavelength)
+        result = calibrate(source, model, free.split(","), rows, columns)
+        if source.simulated:
+            typer.echo("SIMULATED data")
+    typer.echo(
+        f"{capture.name}: rows {rows.start}:{rows.stop}, columns {columns.start}:{columns.stop}, {wavelength:g} nm"
+    )
+    for name, value, stderr in zip(result.names, result.values, result.stderr, strict=True):
+        typer.echo(f"  {name:32s} {value:12.5f} +- {stderr:.5f}")
+    typer.echo(f"  residual {100 * result.residual_over_mean:.3f} % of the mean signal (rms)")
+    if result.residual_over_mean > POOR_FIT:
+        typer.echo("warning: a poor fit; start from values closer to the truth, or free more parameters", err=True)
+    if write is not None:
+        note = f"process calibrate of {capture.name}, residual {100 * result.residual_over_mean:.2f} % of the mean"
+        write_fitted(instrument, write, result, wavelength, note)
+        typer.echo(str(write))
+
+
+def _region(text: str | None, shape: tuple[int, int]) -> tuple[slice, slice]:
+    from processing.calibrate import CalibrationError
+
+    height, width = shape
+    if text is None:
+        return slice(height // 4, max(height - height // 4, 1)), slice(width // 4, max(width - width // 4, 1))
+    try:
+        (r0, r1), (c0, c1) = ((int(v) for v in part.split(":")) for part in text.split(","))
+    except ValueError:
+        raise CalibrationError(f"--region {text}: write it as r0:r1,c0:c1, whole numbers") from None
+    if not (0 <= r0 < r1 <= height and 0 <= c0 < c1 <= width):
+        raise CalibrationError(f"--region {text}: outside the frame of {height} rows and {width} columns")
+    return slice(r0, r1), slice(c0, c1)
