@@ -1,0 +1,207 @@
+"""Newport ESP301 and ESP300 with rotation stages.
+
+Facts: shared/instruments.md 2.5. Replies carry neither address nor command, so only their order and their form tell
+whose they are. The controller cannot say whether an axis is homed. Use RS-232: USB is reported unusable on Linux.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from typing import Literal
+
+from pydantic import Field
+
+from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
+from drivers.motion import AxisIdentity
+from drivers.serial_link import LineRegistry, SerialLink, Transcript, line_framer
+from drivers.session_reference import SessionReferenceAxis, SessionReferenceConfig
+
+ERRORS = {6: "no such command", 7: "parameter out of range", 9: "axis out of range", 37: "axis number missing"}
+AXIS_ERRORS = {
+    4: "hardware limit",
+    5: "hardware limit",
+    6: "software limit",
+    7: "software limit",
+    13: "motor not enabled",
+    20: "homing aborted",
+    30: "not allowed during homing",
+}
+DEGREE = 7
+# Limits as large as this are those of a stage that has none.
+NO_LIMIT_DEG = 1e6
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_FLAG = re.compile(r"[01]")
+_INTEGER = re.compile(r"\d{1,4}")
+_VERSION = re.compile(r"ESP30\d.*", re.IGNORECASE)
+_TEXT = re.compile(r"[^,]+,\s*[^,]+|UNKNOWN.*", re.IGNORECASE)
+
+
+class Config(SessionReferenceConfig):
+    """An ESP301 axis in a rig file; its unit must be degrees.
+
+    `stage_id` is compared with the start of what ``ID?`` answers (stage model and serial number).
+    """
+
+    kind: Literal["esp301"] = "esp301"
+    axis: int = Field(default=1, ge=1, le=3)
+    stage_id: str | None = None
+    home_mode: int = Field(default=1, ge=0, le=6, description="mode of OR")
+    baudrate: int = 19_200
+    rtscts: bool = True
+
+
+class ESP301Line:
+    """The port of one controller, shared by its axes."""
+
+    def __init__(self, port: str, baudrate: int, rtscts: bool, reply_s: float, transcript: Transcript | None) -> None:
+        self.link = SerialLink(port, baudrate, line_framer, rtscts=rtscts, transcript=transcript)
+        self.reply_s = reply_s
+
+    def close(self) -> None:
+        """Close the port."""
+        self.link.close()
+
+    def send(self, command: str) -> None:
+        """Write a command that answers nothing; takes no lock."""
+        self.link.write(f"{command}\r".encode("ascii"))
+
+    def ask(self, command: str, form: re.Pattern[str]) -> str:
+        """Ask a question and return the reply of the given form; once more if none came.
+
+        Raises
+        ------
+        ReplyTimeout, ReplyError
+        """
+        seen: list[bytes] = []
+        for _ in range(2):
+            with self.link.lock:
+                self.link.purge(0.0)
+                self.send(command)
+                deadline_s = time.monotonic() + self.reply_s
+                while (frame := self.link.read_frame(deadline_s)) is not None:
+                    text = frame.decode("ascii", "replace").strip()
+                    if form.fullmatch(text):
+                        return text
+                    seen.append(frame)
+                self.link.purge()
+        asked = f"ESP301 {self.link.port}, {command}"
+        if seen:
+            raise ReplyError(asked, f"no valid reply, but {seen[:3]}", "Check cable and baud rate")
+        raise ReplyTimeout(asked, f"nothing within {self.reply_s} s", "Check power, cable, baud rate and RTS/CTS")
+
+
+class ESP301Axis(SessionReferenceAxis):
+    """One axis of a controller."""
+
+    def __init__(self, name: str, config: Config, line: ESP301Line, lines: LineRegistry) -> None:
+        super().__init__(name, config)
+        self.config: Config = config
+        self._line, self._lines = line, lines
+        version = line.ask("VE?", _VERSION)
+        stage = line.ask(f"{config.axis}ID?", _TEXT)
+        asked = f"axis {name} on {config.port} axis {config.axis}"
+        if config.stage_id is not None and not stage.startswith(config.stage_id):
+            raise WrongDevice(f"{asked}, stage {config.stage_id}", f"found {stage!r}", "Correct stage_id, port or axis")
+        unit = int(line.ask(f"{config.axis}SN?", _INTEGER))
+        if unit != DEGREE:
+            raise WrongDevice(f"{asked}, unit", f"unit {unit}, not {DEGREE} (degree)", "Set it with the front panel")
+        self.speed_deg_s = self._number("VA?")
+        self.acceleration_deg_s2 = self._number("AC?")
+        if self.speed_deg_s <= 0 or self.acceleration_deg_s2 <= 0:
+            raise ReplyError(f"{asked}, speed", f"{self.speed_deg_s}, {self.acceleration_deg_s2}", "Set VA and AC")
+        self._device_min_deg = self._limit("SL?")
+        self._device_max_deg = self._limit("SR?")
+        model, _, serial_number = stage.partition(",")
+        self._identity = AxisIdentity(
+            kind="esp301",
+            model=f"{version.split()[0]} stage {model.strip()}",
+            serial_number=serial_number.strip(),
+            firmware=" ".join(version.split()[1:]),
+            port=config.port,
+            address=str(config.axis),
+        )
+
+    def describe(self) -> AxisIdentity:
+        return self._identity
+
+    def _number(self, command: str) -> float:
+        return float(self._line.ask(f"{self.config.axis}{command}", _NUMBER))
+
+    def _limit(self, command: str) -> float | None:
+        value = self._number(command)
+        return None if abs(value) >= NO_LIMIT_DEG else value
+
+    def _take_errors(self) -> list[int]:
+        """Empty the error memory; it holds each error once, oldest first."""
+        codes: list[int] = []
+        for _ in range(20):
+            code = int(self._line.ask("TE?", _INTEGER))
+            if code == 0:
+                break
+            codes.append(code)
+        return codes
+
+    def _raise_errors(self, asked: str) -> None:
+        own = [code for code in self._take_errors() if code < 100 or code // 100 == self.config.axis]
+        if own:
+            words = [
+                f"error {code}: {(AXIS_ERRORS.get(code % 100) if code >= 100 else ERRORS.get(code)) or 'see manual'}"
+                for code in own
+            ]
+            raise CommandRejected(f"axis {self.name}, {asked}", ", ".join(words), "Look at the controller's display")
+
+    def _command(self, command: str) -> None:
+        axis = self.config.axis
+        with self._line.link.lock:
+            self._take_errors()
+            # The motor is off at power-up; a move would only leave an error behind.
+            if self._line.ask(f"{axis}MO?", _FLAG) == "0":
+                self._line.send(f"{axis}MO")
+            self._line.send(f"{axis}{command}")
+            self._raise_errors(command)
+
+    def _do_read_counts(self) -> float:
+        return self._number("TP?")
+
+    def _do_is_moving(self) -> bool:
+        # One garbled digit must not end a motion.
+        answers = [self._line.ask(f"{self.config.axis}MD?", _FLAG) for _ in range(2)]
+        return "0" in answers
+
+    def _do_start_move(self, counts: float) -> None:
+        self._begin_moving()
+        self._command(f"PA{counts:.5f}")
+
+    def _do_start_home(self) -> None:
+        self._begin_homing()
+        self._command(f"OR{self.config.home_mode}")
+
+    def _do_stop(self) -> None:
+        self._line.send(f"{self.config.axis}ST")
+
+    def _do_check_fault(self) -> None:
+        self._raise_errors("state")
+
+    def _do_warnings(self) -> list[str]:
+        words = self._reference_warnings()
+        if self._line.ask(f"{self.config.axis}MO?", _FLAG) == "0":
+            words.append("motor off")
+        return words
+
+    def _do_close(self) -> None:
+        self._lines.release(self.config.port)
+
+
+def open(name: str, config: Config, lines: LineRegistry) -> ESP301Axis:
+    """Open one axis; reads its identity, limits and speed and moves nothing."""
+    line = lines.take(
+        config.port,
+        ESP301Line,
+        lambda transcript: ESP301Line(config.port, config.baudrate, config.rtscts, config.reply_s or 2.0, transcript),
+    )
+    try:
+        return ESP301Axis(name, config, line, lines)
+    except BaseException:
+        lines.release(config.port)
+        raise
