@@ -84,12 +84,12 @@ class FaultSchedule:
         self._waiting = list(faults)
         self._left: dict[int, int] = {}
         self._random = random.Random(seed)
-        self._commands = 0
+        self.commands = 0
         self.active: dict[FaultKind, Fault] = {}
 
     def add(self, *faults: Fault) -> None:
         """Add faults while the emulator runs; their `from_command` counts from now."""
-        now = self._commands
+        now = self.commands
         self._waiting += [
             Fault(fault.kind, now + fault.from_command, fault.from_s, fault.commands, fault.amount) for fault in faults
         ]
@@ -101,10 +101,10 @@ class FaultSchedule:
 
     def count_command(self, now_s: float) -> dict[FaultKind, Fault]:
         """Count a command and return the faults that act on it, by kind."""
-        self._commands += 1
+        self.commands += 1
         self.active = {}
         for fault in list(self._waiting):
-            if self._commands < fault.from_command or now_s < fault.from_s:
+            if self.commands < fault.from_command or now_s < fault.from_s:
                 continue
             self.active[fault.kind] = fault
             if fault.kind == "not_homed":

@@ -48,6 +48,10 @@ class PtyPort:
         self._thread = threading.Thread(target=self._serve, name=f"emulator {self.path}", daemon=True)
         self._thread.start()
 
+    def is_serving(self) -> bool:
+        """True until it is closed or the emulator fails."""
+        return self._thread.is_alive()
+
     def close(self) -> None:
         """Stop serving and remove the port.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 
+from drivers.axes.apt import Config
 from simulators.clock import Clock
 from simulators.emulator import EmulatedAxis, Emulator
 from simulators.faults import FaultSchedule
@@ -245,6 +246,8 @@ class APTEmulator(Emulator):
 
 def _make(options: ServeOptions, model: APTModel, start_deg: float) -> APTEmulator:
     low, high = options.limits_deg or (None, None)
+    if options.axes not in (None, 1):
+        raise ValueError("an APT unit has one axis, and a port of its own")
     if options.model is not None:
         model.name = options.model
     axis = options.axis(low, high, start_deg)
@@ -261,6 +264,11 @@ def make_k10cr1(options: ServeOptions) -> APTEmulator:
 def make_kdc101(options: ServeOptions) -> APTEmulator:
     """A KDC101 with a PRM1-Z8, serial number starting with 27."""
     return _make(options, kdc101(), 12.0)
+
+
+def axis_configs(emulator: APTEmulator, port: str) -> list[Config]:
+    """Rig entry for the unit."""
+    return [Config(port=port, serial_number=emulator.model.serial_number)]
 
 
 SERVES = {"apt-k10cr1": make_k10cr1, "apt-kdc101": make_kdc101}

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from drivers.axes.elliptec import Config
 from simulators.clock import Clock
 from simulators.emulator import EmulatedAxis, Emulator
 from simulators.faults import FaultSchedule
@@ -217,12 +219,23 @@ class ElliptecEmulator(Emulator):
 def make(options: ServeOptions) -> ElliptecEmulator:
     """Two rotation modules at addresses 0 and 1."""
     low, high = options.limits_deg or (None, None)
-    model = int((options.model or "ELL14").upper().removeprefix("ELL"))
+    model = (options.model or "ELL14").upper()
+    if not re.fullmatch(r"ELL\d{1,2}", model):
+        raise ValueError(f"model {options.model!r} is not ELL14, ELL18 or the like")
     modules = [
-        ElliptecModule(f"{index:X}", options.axis(low, high, 17.0 * (index + 1)), f"{11400502 + index:08d}", model)
+        ElliptecModule(
+            f"{index:X}", options.axis(low, high, 17.0 * (index + 1)), f"{11400502 + index:08d}", int(model[3:])
+        )
         for index in range(options.axes or 2)
     ]
     return ElliptecEmulator(modules, options.clock, options.faults)
+
+
+def axis_configs(emulator: ElliptecEmulator, port: str) -> list[Config]:
+    """Rig entries for every module on the line."""
+    return [
+        Config(port=port, address=module.address, serial_number=module.serial_number) for module in emulator.modules
+    ]
 
 
 SERVES = {"elliptec": make}

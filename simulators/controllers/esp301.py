@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from drivers.axes.esp301 import Config
 from simulators.clock import Clock
 from simulators.emulator import EmulatedAxis, Emulator
 from simulators.faults import FaultSchedule
@@ -297,6 +298,11 @@ def make(options: ServeOptions) -> ESP301Emulator:
         for index in range(options.axes or 2)
     ]
     return ESP301Emulator(stages, options.clock, options.faults)
+
+
+def axis_configs(emulator: ESP301Emulator, port: str) -> list[Config]:
+    """Rig entries for every axis of the controller."""
+    return [Config(port=port, axis=index + 1) for index in range(len(emulator.stages))]
 
 
 SERVES = {"esp301": make}

@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from drivers.axes.smc100 import Config
 from simulators.clock import Clock
 from simulators.emulator import EmulatedAxis, Emulator
 from simulators.faults import FaultSchedule
@@ -272,6 +273,11 @@ def make(options: ServeOptions) -> SMC100Emulator:
             controller.version = f"{options.model} 2.0.1"
         controllers.append(controller)
     return SMC100Emulator(controllers, options.clock, options.faults)
+
+
+def axis_configs(emulator: SMC100Emulator, port: str) -> list[Config]:
+    """Rig entries for every controller on the line."""
+    return [Config(port=port, address=address) for address in emulator.controllers]
 
 
 SERVES = {"smc100": make}

@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from drivers.axes.zaber import Config
 from simulators.clock import Clock
 from simulators.emulator import EmulatedAxis, Emulator
 from simulators.faults import FaultSchedule
@@ -297,6 +298,11 @@ def make(options: ServeOptions) -> ZaberEmulator:
         start_deg = (37.0, 101.0, 20.0)[index % 3]
         devices.append(ZaberDevice(index + 1, options.axis(low, high, start_deg), serial_number=110_001 + index))
     return ZaberEmulator(devices, options.clock, options.faults)
+
+
+def axis_configs(emulator: ZaberEmulator, port: str) -> list[Config]:
+    """Rig entries for every device of a chain."""
+    return [Config(port=port, serial_number=device.serial_number) for device in emulator.devices]
 
 
 SERVES = {"zaber": make}

@@ -1,0 +1,90 @@
+"""The `simulate` command: emulated controllers behind a pseudo-terminal, for any serial client."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, help="Emulated hardware that speaks the real bytes.")
+
+
+@app.callback()
+def _simulate() -> None:
+    """Keep `serve` a subcommand, although it is the only one."""
+
+
+@app.command()
+def serve(
+    kind: Annotated[str, typer.Argument(help="elliptec, zaber, apt-k10cr1, apt-kdc101, smc100 or esp301")],
+    model: Annotated[str | None, typer.Option(help="model that it says it is")] = None,
+    axes: Annotated[int | None, typer.Option(min=1, max=16, help="number of devices, modules or axes")] = None,
+    limits: Annotated[str | None, typer.Option(help="travel of every axis as MIN:MAX in degrees")] = None,
+    speed: Annotated[float, typer.Option(min=1e-3, help="deg/s")] = 300.0,
+    acceleration: Annotated[float, typer.Option(min=1e-3, help="deg/s^2")] = 1500.0,
+    homed: Annotated[bool, typer.Option("--homed", help="start with a reference, at angle zero")] = False,
+    clock_speed: Annotated[float, typer.Option(min=1e-3, help="simulated seconds in a real second")] = 1.0,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="KIND[@COMMAND|@TIMEs][xCOUNT][:AMOUNT], repeatable; KIND silent, stuck, slow, garbled, late, "
+            "foreign or not_homed; garbled@12x1 spoils the reply to the 12th command"
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="of the garbled bytes")] = 0,
+) -> None:
+    """Serve an emulated controller until SIGTERM; the first line of output is the path of its port."""
+    from simulators.clock import Clock
+    from simulators.faults import FaultSchedule, parse_fault
+    from simulators.pty_port import PtyPort
+    from simulators.serve import ServeOptions, served_kinds
+
+    kinds = served_kinds()
+    if kind not in kinds:
+        raise typer.BadParameter(f"no controller {kind!r}; there are {', '.join(kinds)}", param_hint="KIND")
+    try:
+        faults = [parse_fault(text) for text in fault or []]
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--fault") from error
+    options = ServeOptions(
+        model=model,
+        axes=axes,
+        limits_deg=_parse_limits(limits),
+        speed_deg_s=speed,
+        acceleration_deg_s2=acceleration,
+        homed=homed,
+        clock=Clock(clock_speed),
+        faults=FaultSchedule(faults, seed),
+    )
+    ended = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: ended.set())
+    try:
+        emulator = kinds[kind](options)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
+    with PtyPort(emulator) as port:
+        typer.echo(port.path)
+        sys.stdout.flush()
+        while not ended.wait(0.2) and port.is_serving():
+            pass
+
+
+def _parse_limits(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    try:
+        low, high = (float(part) for part in text.split(":"))
+    except ValueError as error:
+        raise typer.BadParameter(f"{text!r} is not MIN:MAX in degrees", param_hint="--limits") from error
+    if low >= high:
+        raise typer.BadParameter(f"{text!r}: the lower limit comes first", param_hint="--limits")
+    return low, high
+
+
+def main() -> None:
+    """Run the command line."""
+    app()
