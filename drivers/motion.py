@@ -8,11 +8,10 @@ import math
 import threading
 import time
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Callable
+from typing import TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field
-
+from drivers.axis_types import AxisConfig, AxisIdentity, Limits, Position
 from drivers.errors import (
     CommandRejected,
     DeviceError,
@@ -24,7 +23,10 @@ from drivers.errors import (
     ReplyTimeout,
 )
 
+__all__ = ["AxisConfig", "AxisIdentity", "Limits", "Motion", "MotionAxis", "Position", "agreed"]
+
 log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 # A motion may take this many times its computed duration, plus the margin of the axis.
 SLACK = 1.5
@@ -35,55 +37,20 @@ SETTLE_S = 0.3
 PROGRESS_EVERY_S = 0.2
 
 
-@dataclass(frozen=True, slots=True)
-class Position:
-    """A position read from an axis: user degrees, and the controller's own number beside it."""
+def agreed(read: Callable[[], T]) -> T:
+    """Read a constant until two readings in a row are equal; for protocols without a checksum.
 
-    deg: float
-    counts: int | float
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """Lowest and highest allowed user angle in degrees; None where there is no limit."""
-
-    min_deg: float | None
-    max_deg: float | None
-
-
-@dataclass(frozen=True, slots=True)
-class AxisIdentity:
-    """Who answered on the line: kind of driver, model, serial number, firmware, port and address."""
-
-    kind: str
-    model: str
-    serial_number: str
-    firmware: str
-    port: str
-    address: str
-
-
-class AxisConfig(BaseModel):
-    """What every kind of axis has in a rig file.
-
-    The user angle is ``direction * (device angle - zero_deg)``: `zero_deg` is the angle that the controller
-    shows where the user's angle is zero, and the only offset there is. Angles are never wrapped.
+    Raises
+    ------
+    ReplyError
+        Four readings and no two in a row alike.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    port: str = Field(description="device path, /dev/serial/by-id path or socket://host:port")
-    zero_deg: float = Field(default=0.0, allow_inf_nan=False, description="controller angle at user angle zero")
-    direction: Literal[1, -1] = Field(default=1, description="-1 if the user angle grows the other way")
-    limits_deg: tuple[float | None, float | None] | None = Field(
-        default=None, description="host limits in user degrees, checked besides those of the controller"
-    )
-    tolerance_deg: float = Field(default=0.05, gt=0, description="largest allowed distance from the target at rest")
-    poll_s: float = Field(default=0.03, gt=0, description="time between two looks at a moving axis")
-    margin_s: float = Field(default=2.0, gt=0, description="added to the time that distance and speed allow")
-    stall_s: float = Field(default=1.5, gt=0, description="moving without progress for so long is a stall")
-    home_allowed_s: float | None = Field(default=None, gt=0, description="longest homing; default from speed")
-    reply_s: float | None = Field(default=None, gt=0, description="longest wait for a reply; default by kind")
+    seen = [read()]
+    while len(seen) < 4:
+        seen.append(read())
+        if seen[-1] == seen[-2]:
+            return seen[-1]
+    raise ReplyError("read a constant twice", f"readings differ: {seen}", "The line is disturbed: check the cable")
 
 
 class Motion:
@@ -232,8 +199,6 @@ class MotionAxis(ABC):
         self._device_min_deg: float | None = None
         self._device_max_deg: float | None = None
 
-    # --- angles ------------------------------------------------------------------------------------------
-
     def _to_user_deg(self, device_deg: float) -> float:
         return self.config.direction * (device_deg - self.config.zero_deg)
 
@@ -278,15 +243,13 @@ class MotionAxis(ABC):
             return 2 * math.sqrt(distance / a)
         return distance / v + v / a
 
-    # --- state -------------------------------------------------------------------------------------------
-
     def read_position(self) -> Position:
-        """Read the position; where the protocol has no checksum, two readings must agree.
+        """Read the position; at rest, where the protocol has no checksum, two readings in a row must agree.
 
         Raises
         ------
         ReplyError
-            No two readings in a row agree within what speed and time between them allow.
+            Readings at rest contradict each other.
         """
         counts = self._do_read_counts()
         if not self._reply_is_checked:
@@ -294,25 +257,17 @@ class MotionAxis(ABC):
         return Position(self._to_user_deg(counts / self.counts_per_deg), counts)
 
     def _confirm(self, first: int | float) -> int | float:
+        tolerance = self.config.tolerance_deg * abs(self.counts_per_deg)
         seen = [first]
-        then_s = time.monotonic()
-        for _ in range(3):
-            counts = self._do_read_counts()
-            now_s = time.monotonic()
-            difference_deg = abs(counts - seen[-1]) / abs(self.counts_per_deg)
-            if difference_deg <= self.config.tolerance_deg + self._plausible_deg(now_s - then_s):
-                return counts
-            seen.append(counts)
-            then_s = now_s
+        while len(seen) < 4:
+            seen.append(self._do_read_counts())
+            if abs(seen[-1] - seen[-2]) <= tolerance or self._do_is_moving():
+                return seen[-1]
         raise ReplyError(
             f"axis {self.name}, read position",
-            f"readings that contradict each other: {seen}",
+            f"readings at rest that contradict each other: {seen}",
             "The line is disturbed: check cable, grounding and baud rate",
         )
-
-    def _plausible_deg(self, interval_s: float) -> float:
-        """How far the axis can have turned between two readings; nothing if it is at rest."""
-        return 1.2 * self.speed_deg_s * interval_s if self._do_is_moving() else 0.0
 
     def is_homed(self) -> bool:
         """True if the controller has a reference position."""
@@ -329,8 +284,6 @@ class MotionAxis(ABC):
     @abstractmethod
     def describe(self) -> AxisIdentity:
         """Model, serial number and firmware as read when the axis was opened."""
-
-    # --- motion ------------------------------------------------------------------------------------------
 
     def start_move(self, target_deg: float) -> Motion:
         """Start a move to an absolute user angle in degrees and return at once.
@@ -406,8 +359,6 @@ class MotionAxis(ABC):
         """Release the axis; the last axis on a line closes the line. Moves and stops nothing."""
         with contextlib.suppress(DeviceError):
             self._do_close()
-
-    # --- hooks of the driver -----------------------------------------------------------------------------
 
     @abstractmethod
     def _do_read_counts(self) -> int | float:

@@ -27,10 +27,13 @@ class SessionReferenceAxis(MotionAxis):
         super().__init__(name, config)
         self._referenced = config.assume_homed
         self._homing = False
+        # Set by the driver when the device was seen in motion or told of its end.
+        self._saw_motion = False
         self._rest_counts: float | None = None
         self._lost = ""
 
     def _begin_homing(self) -> None:
+        self._saw_motion = False
         self._homing, self._referenced, self._lost = True, False, ""
         self._rest_counts = None
 
@@ -42,16 +45,23 @@ class SessionReferenceAxis(MotionAxis):
         if self._do_is_moving():
             return self._referenced
         counts = self._confirm(self._do_read_counts())
-        if self._homing:
-            # Raises if homing ended in a fault; then there is no reference.
-            self._do_check_fault()
-            self._homing, self._referenced = False, True
         tolerance = self.config.tolerance_deg * abs(self.counts_per_deg)
+        if self._homing:
+            self._do_check_fault()
+            # A command that never arrived leaves an idle axis too: something must have been seen to happen.
+            self._homing, self._referenced = False, self._homing_is_proved(counts, tolerance)
         if self._rest_counts is not None and abs(counts - self._rest_counts) > tolerance and self._referenced:
             self._referenced = False
             self._lost = f"the resting position jumped from {self._rest_counts:g} to {counts:g} counts: home again"
         self._rest_counts = counts
         return self._referenced
+
+    def _homing_is_proved(self, counts: float, tolerance: float) -> bool:
+        return self._saw_motion
+
+    def _give_up_homing(self) -> None:
+        """Homing was stopped or failed: it makes no reference."""
+        self._homing = False
 
     def _reference_warnings(self) -> list[str]:
         if self._lost:

@@ -17,7 +17,7 @@ from pydantic import Field
 
 from drivers.apt_frames import REPLY_NAMES, apt_framer, long_message, short_message
 from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
-from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
+from drivers.motion import AxisConfig, AxisIdentity, MotionAxis, agreed
 from drivers.serial_link import LineRegistry, SerialLink, Transcript
 
 log = logging.getLogger(__name__)
@@ -107,7 +107,7 @@ class APTAxis(MotionAxis):
         self._line, self._lines = line, lines
         # Periodic messages of an earlier program would only disturb; this moves nothing.
         line.link.write(short_message(0x0012))
-        info = line.ask(short_message(0x0005), 0x0006)
+        info = agreed(lambda: line.ask(short_message(0x0005), 0x0006))
         serial_number = int.from_bytes(info[0:4], "little")
         model = info[4:12].split(b"\0")[0].decode("ascii", "replace").strip()
         if config.serial_number not in (None, serial_number):
@@ -119,7 +119,8 @@ class APTAxis(MotionAxis):
         self._unknown = ""
         self._scale = self._find_scale(model, int.from_bytes(info[76:78], "little"))
         self.counts_per_deg = self._scale.position
-        minimum, acceleration, velocity = struct.unpack_from("<3i", line.ask(short_message(0x0414, 1), 0x0415), 2)
+        parameters = agreed(lambda: line.ask(short_message(0x0414, 1), 0x0415))
+        minimum, acceleration, velocity = struct.unpack_from("<3i", parameters, 2)
         if velocity <= 0 or acceleration <= 0:
             raise ReplyError(
                 f"axis {name}, velocity parameters",
@@ -158,7 +159,7 @@ class APTAxis(MotionAxis):
 
     def _read_home_parameters(self) -> tuple[int, int, int, int]:
         """Return direction, limit switch, velocity and offset of homing."""
-        data = self._line.ask(short_message(0x0441, 1), 0x0442)
+        data = agreed(lambda: self._line.ask(short_message(0x0441, 1), 0x0442))
         direction, switch, velocity, offset = struct.unpack_from("<HHii", data, 2)
         return direction, switch, velocity, offset
 

@@ -10,12 +10,13 @@ from __future__ import annotations
 import logging
 import re
 import time
+from functools import partial
 from typing import Literal
 
 from pydantic import Field
 
 from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
-from drivers.motion import AxisIdentity
+from drivers.motion import AxisIdentity, agreed
 from drivers.serial_link import LineRegistry, SerialLink, Transcript, line_framer
 from drivers.session_reference import SessionReferenceAxis, SessionReferenceConfig
 
@@ -153,7 +154,7 @@ class ElliptecAxis(SessionReferenceAxis):
         self._known = module in _ROTARY
         # The field is pulses for the whole travel of a turn, whatever the manual calls it.
         self.counts_per_deg = pulses / travel
-        velocity = int(line.ask(self._address, "gv", "GV", 2), 16)
+        velocity = int(agreed(lambda: line.ask(self._address, "gv", "GV", 2)), 16)
         self.speed_deg_s = FULL_SPEED_DEG_S * max(velocity, 1) / 100
         self.acceleration_deg_s2 = ACCELERATION_DEG_S2
         self._identity = AxisIdentity(
@@ -170,7 +171,7 @@ class ElliptecAxis(SessionReferenceAxis):
         found = {}
         for address in config.address or "0123456789ABCDEF":
             try:
-                found[address] = line.ask(address, "in", "IN", 30, tries=2 if config.address else 1)
+                found[address] = agreed(partial(line.ask, address, "in", "IN", 30, tries=2 if config.address else 1))
             except ReplyTimeout:
                 if config.address is not None:
                     raise
@@ -192,16 +193,20 @@ class ElliptecAxis(SessionReferenceAxis):
     def _do_is_moving(self) -> bool:
         line = self._line
         line.drain()
-        if self._in_motion and self._address in line.ended:
-            self._in_motion = False
-            letters, data = line.ended.pop(self._address)
-            self._status = int(data, 16) if letters == "GS" else 0
-            return False
-        # The message at the end may be lost: the status decides.
-        status = int(line.ask(self._address, "gs", "GS", 2), 16)
-        if status not in (0, BUSY):
-            self._status = status
-        return status == BUSY
+        ended = line.ended.pop(self._address, None) if self._in_motion else None
+        if ended is not None:
+            self._saw_motion = self._saw_motion or ended[0] == "PO"
+            self._status = int(ended[1], 16) if ended[0] == "GS" else self._status
+        # The message at the end can be lost or late: the status decides, and a single "idle" is not believed
+        # without it.
+        for _ in range(1 if ended is not None or not self._in_motion else 2):
+            status = int(line.ask(self._address, "gs", "GS", 2), 16)
+            if status == BUSY:
+                self._saw_motion = True
+                return True
+            self._status = status or self._status
+        self._in_motion = False
+        return False
 
     def _do_start_move(self, counts: float) -> None:
         self._begin_moving()
@@ -223,6 +228,7 @@ class ElliptecAxis(SessionReferenceAxis):
     def _do_check_fault(self) -> None:
         if self._status:
             status, self._status = self._status, 0
+            self._give_up_homing()
             raise CommandRejected(
                 f"axis {self.name}, state", f"status {status}: {STATUS.get(status, 'unknown')}", "Is the mount free?"
             )

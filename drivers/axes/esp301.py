@@ -13,7 +13,7 @@ from typing import Literal
 from pydantic import Field
 
 from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
-from drivers.motion import AxisIdentity
+from drivers.motion import AxisIdentity, agreed
 from drivers.serial_link import LineRegistry, SerialLink, Transcript, line_framer
 from drivers.session_reference import SessionReferenceAxis, SessionReferenceConfig
 
@@ -106,8 +106,8 @@ class ESP301Axis(SessionReferenceAxis):
         unit = int(line.ask(f"{config.axis}SN?", _INTEGER))
         if unit != DEGREE:
             raise WrongDevice(f"{asked}, unit", f"unit {unit}, not {DEGREE} (degree)", "Set it with the front panel")
-        self.speed_deg_s = self._number("VA?")
-        self.acceleration_deg_s2 = self._number("AC?")
+        self.speed_deg_s = self._constant("VA?")
+        self.acceleration_deg_s2 = self._constant("AC?")
         if self.speed_deg_s <= 0 or self.acceleration_deg_s2 <= 0:
             raise ReplyError(f"{asked}, speed", f"{self.speed_deg_s}, {self.acceleration_deg_s2}", "Set VA and AC")
         self._device_min_deg = self._limit("SL?")
@@ -128,8 +128,11 @@ class ESP301Axis(SessionReferenceAxis):
     def _number(self, command: str) -> float:
         return float(self._line.ask(f"{self.config.axis}{command}", _NUMBER))
 
+    def _constant(self, command: str) -> float:
+        return agreed(lambda: self._number(command))
+
     def _limit(self, command: str) -> float | None:
-        value = self._number(command)
+        value = self._constant(command)
         return None if abs(value) >= NO_LIMIT_DEG else value
 
     def _take_errors(self) -> list[int]:
@@ -149,6 +152,7 @@ class ESP301Axis(SessionReferenceAxis):
                 f"error {code}: {(AXIS_ERRORS.get(code % 100) if code >= 100 else ERRORS.get(code)) or 'see manual'}"
                 for code in own
             ]
+            self._give_up_homing()
             raise CommandRejected(f"axis {self.name}, {asked}", ", ".join(words), "Look at the controller's display")
 
     def _command(self, command: str) -> None:
@@ -161,12 +165,17 @@ class ESP301Axis(SessionReferenceAxis):
             self._line.send(f"{axis}{command}")
             self._raise_errors(command)
 
+    def _homing_is_proved(self, counts: float, tolerance: float) -> bool:
+        # The controller took OR without an error; a short way home may be over before the first look.
+        return self._saw_motion or abs(counts) <= tolerance
+
     def _do_read_counts(self) -> float:
         return self._number("TP?")
 
     def _do_is_moving(self) -> bool:
         # One garbled digit must not end a motion.
         answers = [self._line.ask(f"{self.config.axis}MD?", _FLAG) for _ in range(2)]
+        self._saw_motion = self._saw_motion or answers == ["0", "0"]
         return "0" in answers
 
     def _do_start_move(self, counts: float) -> None:
@@ -178,6 +187,7 @@ class ESP301Axis(SessionReferenceAxis):
         self._command(f"OR{self.config.home_mode}")
 
     def _do_stop(self) -> None:
+        self._give_up_homing()
         self._line.send(f"{self.config.axis}ST")
 
     def _do_check_fault(self) -> None:

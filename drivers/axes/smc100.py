@@ -13,7 +13,7 @@ from typing import Literal
 from pydantic import Field
 
 from drivers.errors import CommandRejected, DeviceError, NotHomedError, ReplyError, ReplyTimeout, WrongDevice
-from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
+from drivers.motion import AxisConfig, AxisIdentity, MotionAxis, agreed
 from drivers.serial_link import LineRegistry, SerialLink, Transcript, line_framer
 
 ERRORS = {
@@ -152,10 +152,10 @@ class SMC100Axis(MotionAxis):
                 f"its stage identifier is {stage!r}",
                 "Correct stage_id, port or address in the rig file",
             )
-        self.speed_deg_s = self._number("VA?")
-        self.acceleration_deg_s2 = self._number("AC?")
-        self._device_min_deg = self._number("SL?")
-        self._device_max_deg = self._number("SR?")
+        self.speed_deg_s = self._constant("VA?")
+        self.acceleration_deg_s2 = self._constant("AC?")
+        self._device_min_deg = self._constant("SL?")
+        self._device_max_deg = self._constant("SR?")
         model, _, firmware = version.rpartition(" ")
         self._model_is_known = any(known in version.upper() for known in _KNOWN)
         self._identity = AxisIdentity(
@@ -183,6 +183,9 @@ class SMC100Axis(MotionAxis):
 
     def _number(self, command: str) -> float:
         return float(self._ask(command, _NUMBER))
+
+    def _constant(self, command: str) -> float:
+        return agreed(lambda: self._number(command))
 
     def _take_error(self) -> str:
         return self._ask("TE", _LETTER)

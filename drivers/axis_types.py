@@ -1,0 +1,59 @@
+"""What an axis tells about itself and what a rig file tells about an axis."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+@dataclass(frozen=True, slots=True)
+class Position:
+    """A position read from an axis: user degrees, and the controller's own number beside it."""
+
+    deg: float
+    counts: int | float
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Lowest and highest allowed user angle in degrees; None where there is no limit."""
+
+    min_deg: float | None
+    max_deg: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class AxisIdentity:
+    """Who answered on the line: kind of driver, model, serial number, firmware, port and address."""
+
+    kind: str
+    model: str
+    serial_number: str
+    firmware: str
+    port: str
+    address: str
+
+
+class AxisConfig(BaseModel):
+    """What every kind of axis has in a rig file.
+
+    The user angle is ``direction * (device angle - zero_deg)``: `zero_deg` is the angle that the controller
+    shows where the user's angle is zero, and the only offset there is. Angles are never wrapped.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    port: str = Field(description="device path, /dev/serial/by-id path or socket://host:port")
+    zero_deg: float = Field(default=0.0, allow_inf_nan=False, description="controller angle at user angle zero")
+    direction: Literal[1, -1] = Field(default=1, description="-1 if the user angle grows the other way")
+    limits_deg: tuple[float | None, float | None] | None = Field(
+        default=None, description="host limits in user degrees, checked besides those of the controller"
+    )
+    tolerance_deg: float = Field(default=0.05, gt=0, description="largest allowed distance from the target at rest")
+    poll_s: float = Field(default=0.03, gt=0, description="time between two looks at a moving axis")
+    margin_s: float = Field(default=2.0, gt=0, description="added to the time that distance and speed allow")
+    stall_s: float = Field(default=1.5, gt=0, description="moving without progress for so long is a stall")
+    home_allowed_s: float | None = Field(default=None, gt=0, description="longest homing; default from speed")
+    reply_s: float | None = Field(default=None, gt=0, description="longest wait for a reply; default by kind")
