@@ -78,6 +78,10 @@ class Capture:
         """A column of the state table (exposure_s, host_time_s, ...) for the states done."""
         return np.asarray(self._h5[f"entry/states/{name}"][...][self.done])
 
+    def planned_column(self, name: str) -> NDArray[Any]:
+        """A column of the state table for all planned states, done or not."""
+        return np.asarray(self._h5[f"entry/states/{name}"][...])
+
     @property
     def frame_shape(self) -> tuple[int, int]:
         """(rows, columns) of one frame."""

@@ -1,0 +1,23 @@
+"""What can stop a measurement, besides a device: the plan, the disc, the person at the bench."""
+
+from __future__ import annotations
+
+
+class AcquisitionError(Exception):
+    """A run cannot start or go on; the message says what was asked, what came back and what to do."""
+
+
+class PlanRefused(AcquisitionError):
+    """The check of the plan failed; nothing was moved. Holds every failure."""
+
+    def __init__(self, failures: list[str]) -> None:
+        super().__init__("the plan is refused, nothing was moved:\n" + "\n".join(f"  - {f}" for f in failures))
+        self.failures = failures
+
+
+class RunFailed(AcquisitionError):
+    """A run ended early; the partial file holds every state that was done."""
+
+
+class Stopped(AcquisitionError):
+    """The person at the bench asked for the end (Ctrl-C or the stop button)."""

@@ -1,0 +1,68 @@
+"""Conditions under which a state counts; when one opens, the state is thrown away and the axes are held."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from acquisition.errors import RunFailed
+from acquisition.observer import StateReport
+from acquisition.rig import Rig
+from acquisition.stop_request import StopRequest
+
+#: How often an open interlock is looked at.
+LOOK_S = 0.05
+
+
+class Interlocks:
+    """The interlocks of a rig file, looked at before, during and after each state.
+
+    Parameters
+    ----------
+    warn : told when one opens and closes.
+    go_on : True if the plan lets the run go on by itself when it closes again.
+    """
+
+    def __init__(self, rig: Rig, warn: Callable[[str], None], go_on: bool) -> None:
+        self.rig = rig
+        self.warn = warn
+        self.go_on = go_on
+        self.events: list[dict[str, str | float]] = []
+        self._entries = {entry.kind: entry for entry in rig.config.interlocks}
+
+    def open_now(self) -> str | None:
+        """Why no state may be taken now, or None."""
+        if "door" in self._entries and self.rig.source is not None and self.rig.source.interlock_open():
+            return "the door is open"
+        return None
+
+    def judge(self, report: StateReport) -> str | None:
+        """Why this state cannot count, or None."""
+        entry = self._entries.get("saturation")
+        if entry is not None and report.saturated_fraction > entry.limit:
+            return f"{100 * report.saturated_fraction:.2f} % of the pixels are saturated"
+        return None
+
+    def hold(self, state: int, why: str, stop: StopRequest) -> None:
+        """Hold the axes until the interlock is closed again; reason and duration are kept.
+
+        Raises
+        ------
+        RunFailed
+            The plan does not go on by itself, or waiting cannot help.
+        """
+        start_s = time.monotonic()
+        self.rig.stop()
+        event: dict[str, str | float] = {"state": float(state), "why": why}
+        self.events.append(event)
+        self.warn(f"interlock: {why}; the state is discarded, the axes are held")
+        waiting_helps = self.open_now() is not None or "door" in why
+        if not (self.go_on and waiting_helps):
+            raise RunFailed(
+                f"interlock: {why}. State {state} was discarded and the axes stopped. "
+                "Remove the cause, then go on with --resume."
+            )
+        while self.open_now() is not None and not stop.requested:
+            time.sleep(LOOK_S)
+        event["duration_s"] = round(time.monotonic() - start_s, 3)
+        self.warn(f"interlock: closed after {event['duration_s']} s, going on")

@@ -1,0 +1,49 @@
+"""Where the time of a capture went: moving, settling, exposing, waiting for what is unavoidable, or overhead."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Literal
+
+Entry = Literal["moving", "settling", "exposure", "transfer", "interlock", "operator", "shutter", "writing"]
+
+
+class TimeLedger:
+    """Adds up, in seconds of the measuring thread, what each kind of step took.
+
+    `moving` is the time the thread waited for axes (parallel moves count once), so what overlaps a move costs
+    nothing here. `overhead` is what no entry explains.
+    """
+
+    def __init__(self) -> None:
+        self._start_s = time.monotonic()
+        self.spent_s: dict[str, float] = {}
+        self.states = 0
+        # What physics asks for: per state the longest parallel move, settling, exposure.
+        self.unavoidable_s = 0.0
+
+    @contextmanager
+    def time(self, entry: Entry) -> Iterator[None]:
+        """Count the time inside the block."""
+        start_s = time.monotonic()
+        try:
+            yield
+        finally:
+            self.spent_s[entry] = self.spent_s.get(entry, 0.0) + time.monotonic() - start_s
+
+    def total_s(self) -> float:
+        """Seconds since the ledger was opened."""
+        return time.monotonic() - self._start_s
+
+    def summary(self) -> dict[str, float]:
+        """Seconds of each entry, `overhead`, `total`, `unavoidable`, and `excess` = total / unavoidable - 1."""
+        total = self.total_s()
+        known = sum(self.spent_s.values())
+        summary = {f"{name}_s": round(value, 4) for name, value in sorted(self.spent_s.items())}
+        summary |= {"overhead_s": round(total - known, 4), "total_s": round(total, 4), "states": float(self.states)}
+        if self.unavoidable_s > 0:
+            summary["unavoidable_s"] = round(self.unavoidable_s, 4)
+            summary["excess"] = round(total / self.unavoidable_s - 1, 4)
+        return summary

@@ -1,0 +1,48 @@
+"""Who watches a run: progress bar, live page, campaign log, and the simulated bench."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.motion import Position
+from processing.states import StateTable
+
+
+@dataclass(frozen=True)
+class StateReport:
+    """What was seen in one state that is on its way to the file."""
+
+    state: int
+    role: str
+    positions: dict[str, Position]
+    exposure_s: float
+    saturated_fraction: float
+    near_black_fraction: float
+    monitor: float
+    pixels: NDArray[np.uint16]
+
+
+class Observer:
+    """Hears what happens; every method may be left as it is. It must return at once and never raise."""
+
+    def run_started(self, title: str, table: StateTable, pending: int) -> None:
+        """A capture begins with so many states to take."""
+
+    def activity(self, text: str) -> None:
+        """What the rig does now, in a few words."""
+
+    def exposing(self, state: int, retake: int) -> None:
+        """The next exposure belongs to this state; `retake` counts its tries from 0."""
+
+    def state_done(self, report: StateReport) -> None:
+        """A state was handed to the writer."""
+
+    def warning(self, text: str) -> None:
+        """Something that a person should know; also kept in the capture."""
+
+    def run_ended(self, status: str, details: dict[str, Any]) -> None:
+        """The capture is sealed or given up."""

@@ -1,0 +1,218 @@
+"""The open rig: the only holder of live hardware. Opening it moves nothing and changes no light."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from acquisition.cleanup import Step, run_all
+from acquisition.errors import AcquisitionError
+from acquisition.rig_config import RigConfig
+from drivers.camera import Camera, CameraSettings
+from drivers.errors import MotionFailed
+from drivers.motion import Motion, MotionAxis, Position
+from drivers.registry import open_axis
+from drivers.serial_link import LineRegistry
+from drivers.source import LightSource
+from simulators.rig import SimulatedRig
+from simulators.rig_model import SCHEME
+
+log = logging.getLogger(__name__)
+
+
+class Rig:
+    """Named axes, a camera and a light source, opened from a rig file; a context manager.
+
+    Attributes
+    ----------
+    axes : dict of name to MotionAxis
+    camera : Camera or None where it was not asked for
+    source : LightSource or None where the rig has none
+    simulation : SimulatedRig or None
+    """
+
+    def __init__(self, config: RigConfig, *, with_camera: bool = True, transcripts: Path | None = None) -> None:
+        self.config = config
+        self.axes: dict[str, MotionAxis] = {}
+        self.camera: Camera | None = None
+        self.source: LightSource | None = None
+        self.simulation: SimulatedRig | None = None
+        self._with_camera = with_camera
+        self._lines = LineRegistry(transcripts)
+
+    def __enter__(self) -> Self:
+        try:
+            self._open()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        failure = self.close()
+        if failure is not None:
+            if error is None:
+                raise failure
+            error.add_note(f"closing the rig failed too: {failure}")
+
+    def _open(self) -> None:
+        config = self.config
+        if config.simulator is not None:
+            self.simulation = SimulatedRig(config.simulator, with_camera=self._with_camera)
+            self.simulation.start()
+        for name, entry in config.axes.items():
+            entry = self._at_port(entry)
+            self.axes[name] = open_axis(name, entry, self._lines)
+            if self.simulation is not None:
+                self.simulation.connect(name, entry.direction, entry.zero_deg)
+        if config.source is not None:
+            entry = self._at_port(config.source)
+            module = _driver("drivers.sources", entry.kind)
+            self.source = module.open(entry, self._lines)
+        if self._with_camera:
+            entry = config.camera
+            if self.simulation is not None:
+                entry = entry.model_copy(update={"device": self.simulation.camera_device()})
+            self.camera = _driver("drivers.cameras", entry.kind).open("camera", entry)
+
+    def _at_port(self, entry: Any) -> Any:
+        if not entry.port.startswith(SCHEME):
+            return entry
+        if self.simulation is None:
+            raise AcquisitionError(
+                f"port {entry.port!r} is an emulator, but the rig file has no `simulator` section. "
+                "Give the device path."
+            )
+        return entry.model_copy(update={"port": self.simulation.port(entry.port.removeprefix(SCHEME))})
+
+    # --- motion ------------------------------------------------------------------------------------------
+
+    def unhomed(self) -> list[str]:
+        """Names of the axes without a reference, in homing order."""
+        order = [*self.config.home_order, *(name for name in self.axes if name not in self.config.home_order)]
+        return [name for name in order if not self.axes[name].is_homed()]
+
+    def home(self, names: list[str], wait: Callable[[Mapping[str, Motion]], None] | None = None) -> None:
+        """Home the axes one after another. Raises MotionFailed; every axis has been sent a stop by then."""
+        for name in names:
+            self._wait({name: self.axes[name].home()}, wait)
+
+    def move(
+        self, targets_deg: Mapping[str, float], wait: Callable[[Mapping[str, Motion]], None] | None = None
+    ) -> dict[str, Position]:
+        """Move axes at the same time and wait; returns the positions read back at rest."""
+        return self._wait(self.start_moves(targets_deg), wait)
+
+    def start_moves(self, targets_deg: Mapping[str, float]) -> dict[str, Motion]:
+        """Start axes at the same time; those that stand within a count of their target are started too."""
+        for name, target in targets_deg.items():
+            self.axes[name].check(target)
+        motions: dict[str, Motion] = {}
+        try:
+            for name, target in targets_deg.items():
+                motions[name] = self.axes[name].start_move(target)
+        except BaseException:
+            self.stop()
+            raise
+        return motions
+
+    def wait(self, motions: Mapping[str, Motion]) -> dict[str, Position]:
+        """Wait for all motions and return the positions read back at rest.
+
+        Raises
+        ------
+        MotionFailed
+            As the first axis that failed has it; every axis has been sent a stop.
+        """
+        return self._wait(motions, None)
+
+    def _wait(
+        self, motions: Mapping[str, Motion], tick: Callable[[Mapping[str, Motion]], None] | None
+    ) -> dict[str, Position]:
+        left = dict(motions)
+        positions: dict[str, Position] = {}
+        try:
+            while left:
+                for name, motion in list(left.items()):
+                    if motion.done():
+                        positions[name] = motion.wait()
+                        del left[name]
+                if tick is not None:
+                    tick(motions)
+                if left:
+                    time.sleep(min(self.axes[name].config.poll_s for name in left))
+        except MotionFailed as failure:
+            others = self.stop()
+            if others is not None:
+                failure.add_note(f"stopping the other axes failed too: {others}")
+            raise
+        except BaseException:
+            self.stop()
+            raise
+        return {name: positions[name] for name in motions}
+
+    def positions(self) -> dict[str, Position]:
+        """Positions of all axes, read now."""
+        return {name: axis.read_position() for name, axis in self.axes.items()}
+
+    def stop(self) -> Exception | None:
+        """Send a stop to every axis, whatever the others answer; returns the first failure."""
+        return run_all([(f"stop axis {name}", axis.stop) for name, axis in self.axes.items()])
+
+    @property
+    def time_scale(self) -> float:
+        """Seconds of the devices for one second here: the emulators' clock may run fast."""
+        return 1.0 if self.simulation is None else self.simulation.clock.speed
+
+    # --- the rest ----------------------------------------------------------------------------------------
+
+    def set_exposure(self, exposure_s: float, repeats: int) -> CameraSettings:
+        """Set exposure and averaging; returns the camera's settings as read back."""
+        settings = CameraSettings(exposure_s=exposure_s, frame_average=repeats, trigger="software")
+        return self.require_camera().configure(settings)
+
+    def require_camera(self) -> Camera:
+        """The camera; AcquisitionError if the rig was opened without."""
+        if self.camera is None:
+            raise AcquisitionError("this rig was opened without its camera")
+        return self.camera
+
+    def describe(self) -> dict[str, Any]:
+        """Identities of all devices, for the capture file."""
+        from dataclasses import asdict
+
+        devices: dict[str, Any] = {name: asdict(axis.describe()) for name, axis in self.axes.items()}
+        if self.camera is not None:
+            devices["camera"] = asdict(self.camera.describe())
+        if self.source is not None:
+            devices["source"] = self.source.describe()
+        # The port as the rig file has it: a pseudo-terminal's number means nothing tomorrow.
+        for name, entry in (*self.config.axes.items(), ("source", self.config.source)):
+            if name in devices and entry is not None:
+                devices[name]["port"] = entry.port
+        return devices
+
+    def close(self) -> Exception | None:
+        """Release every device; moves and stops nothing. Returns the first failure."""
+        steps: list[Step] = []
+        if self.camera is not None:
+            steps.append(("close the camera", self.camera.close))
+        if self.source is not None:
+            steps.append(("close the source", self.source.close))
+        steps += [(f"close axis {name}", axis.close) for name, axis in self.axes.items()]
+        steps.append(("close the ports", self._lines.close))
+        if self.simulation is not None:
+            steps.append(("end the emulators", self.simulation.stop))
+        return run_all(steps)
+
+
+def _driver(package: str, kind: str) -> Any:
+    import importlib
+
+    return importlib.import_module(f"{package}.{kind}")

@@ -1,0 +1,138 @@
+"""`acquire --omega 35` and `acquire --resume FILE`: one capture, from the options to the summary."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from acquisition import session
+from acquisition.checks import Check, refuse_failed
+from acquisition.cli import CONFIGS, DEFAULT_RIG, INTERRUPTED
+from acquisition.estimate import capture_seconds
+from acquisition.plan import MeasurementPlan
+from acquisition.progress import ConsoleProgress
+from acquisition.rig import Rig
+from acquisition.rig_config import RigConfig, load_rig
+from acquisition.stop_request import StopRequest
+from processing.capture_schema import Sample
+from processing.yaml_file import ConfigError
+
+
+@dataclass(frozen=True)
+class Options:
+    """The options of `acquire` without a subcommand."""
+
+    omega: float | None
+    mode: str | None
+    wavelength: float | None
+    sample: str | None
+    exposure: float | None
+    rig: Path | None
+    plan: Path | None
+    out: Path
+    seed: int | None
+    dry_run: bool
+    home: bool
+    resume: Path | None
+    yes: bool
+
+
+def run(options: Options, stop: StopRequest) -> int:
+    """Take or go on with one capture; returns the exit code. Raises the errors that `main` prints."""
+    console = Console(stderr=True)
+    if options.resume is not None:
+        job = session.job_of(options.resume, load_rig(options.rig) if options.rig else None)
+        path = options.resume
+    else:
+        job = session.prepare(plan_of(options), rig_of(options))
+        path = options.out / session.default_name(job)
+    if job.rig.simulated:
+        console.print(f"SIMULATED: rig {job.rig.name!r}, emulated devices, no hardware", style="bold red")
+    with Rig(job.rig) as rig:
+        checks = session.check_with_devices(job, rig, path.parent)
+        if options.dry_run:
+            show_checks(Console(), (*job.checks, *checks))
+            refuse_failed(checks)
+            Console().print(f"about {capture_seconds(job, rig):.0f} s; nothing was moved", markup=False)
+            return 0
+        refuse_failed(checks)
+        take = session.take if options.resume is None else session.resume
+        result = take(job, rig, path, stop, [ConsoleProgress(console)], home=options.home)
+    summarize(job, result)
+    return INTERRUPTED if result.status == "aborted" else 0
+
+
+def plan_of(options: Options) -> MeasurementPlan:
+    """The plan file, or the default plan of the mode, with the options on top."""
+    path = options.plan or CONFIGS / "plans" / f"{options.mode or 'drr'}.yaml"
+    if options.plan is None and not path.exists():
+        known = ", ".join(sorted(p.stem for p in (CONFIGS / "plans").glob("*.yaml")))
+        raise ConfigError(f"--mode {options.mode}: there is no default plan of that name, only {known}. Give --plan.")
+    plan = MeasurementPlan.load(path)
+    sample = None if options.sample is None else sample_of(options.sample)
+    return plan.with_changes(
+        omega_deg=options.omega, wavelength_nm=options.wavelength, sample=sample, exposure_s=options.exposure
+    )
+
+
+def sample_of(name: str) -> Sample:
+    """A sample by its name; air and mirror are known ones."""
+    if name == "air":
+        return Sample(kind="air", name=name)
+    if name == "mirror":
+        return Sample(kind="mirror", name=name)
+    return Sample(name=name)
+
+
+def rig_of(options: Options) -> RigConfig:
+    """The rig file, or the simulated rig; `--seed` sets the seed of its noise."""
+    rig = load_rig(options.rig or DEFAULT_RIG)
+    if options.seed is not None:
+        if rig.simulator is None:
+            raise ConfigError(f"--seed {options.seed}: rig {rig.name!r} is not simulated, its noise has no seed")
+        rig = rig.model_copy(update={"simulator": rig.simulator.model_copy(update={"seed": options.seed})})
+    return rig
+
+
+def show_checks(console: Console, checks: tuple[Check, ...]) -> None:
+    """One line for each check."""
+    table = Table(box=None, show_header=False)
+    for check in checks:
+        table.add_row("ok" if check.passed else "REFUSED", check.what, check.found)
+    console.print(table)
+
+
+def summarize(job: session.Job, result: session.Result) -> None:
+    """Draw the quick look and print one screen."""
+    from acquisition.quicklook import draw
+
+    figure = draw(result.path)
+    table = Table(box=None, show_header=False, title=None)
+    plan = job.plan
+    kind = "SIMULATED " if job.rig.simulated else ""
+    table.add_row(
+        "what", f"{kind}{plan.mode}, {plan.wavelength_nm:g} nm, Omega {plan.omega_deg:g} deg, {plan.sample.name}"
+    )
+    darks = sum(role == "dark" for role in job.table.role)
+    table.add_row("states", f"{result.states_done} of {result.states} ({darks} dark), {result.status}")
+    table.add_row("angles", f"largest distance from target {result.worst_angle_deg:.4f} deg, read back at every state")
+    table.add_row("saturation", f"worst state {100 * result.saturated_fraction:.3f} % of pixels")
+    ledger = result.ledger
+    parts = ", ".join(f"{name.removesuffix('_s')} {ledger[name]:.1f}" for name in ledger if name.endswith("_s"))
+    table.add_row("time", f"{parts} s")
+    for message in result.messages[-5:]:
+        table.add_row("warning", message)
+    table.add_row("figure", str(figure))
+    table.add_row("capture", str(result.path))
+    table.add_row("next", next_command(job, result))
+    Console(soft_wrap=True).print(table, markup=False, highlight=False)
+
+
+def next_command(job: session.Job, result: session.Result) -> str:
+    """What to do with the file now."""
+    if result.status != "complete":
+        return f"acquire --resume {result.path}"
+    return f"process reduce {result.path}"
