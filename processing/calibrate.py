@@ -121,7 +121,7 @@ def fit_train(
         raise CalibrationError(f"{data.size} intensities cannot fix {len(names)} parameters and the throughput")
     start = np.array([_value(model, name) for name in names])
     step = np.array([FITTABLE[name.rpartition(".")[2]][0] for name in names])
-    bounds = np.array([FITTABLE[name.rpartition(".")[2]][1:] for name in names]).T
+    lower, upper = np.array([FITTABLE[name.rpartition(".")[2]][1:] for name in names]).T
     weight = np.ones(signal.shape[0]) if exposure is None else exposure
     scale = float(np.mean(data))
 
@@ -131,8 +131,8 @@ def fit_train(
         throughput = shape @ data / (shape @ shape)
         return np.asarray((data - shape[:, None] * throughput).reshape(-1) / scale)
 
-    inside = np.clip(start, bounds[0] + 1e-9 * step, bounds[1] - 1e-9 * step)
-    found = least_squares(residual, inside, x_scale=step, bounds=bounds, method="trf", xtol=1e-12, ftol=1e-12)
+    inside = np.clip(start, lower + 1e-9 * step, upper - 1e-9 * step)
+    found = least_squares(residual, inside, x_scale=step, bounds=(lower, upper), method="trf", xtol=1e-12, ftol=1e-12)
     if not found.success:
         raise NotDetermined(
             f"the fit did not converge ({found.message}); start from an instrument file closer to the truth"

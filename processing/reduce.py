@@ -152,11 +152,9 @@ def _facts(
     good = (mask & ~np.uint8(Mask.SATURATED)) == 0
     counts = {flag.name.lower(): int(np.sum((mask & np.uint8(flag)) != 0)) for flag in Mask if flag.name}
     if not good.any():
-        raise CaptureError(
-            f"no pixel could be reduced: {_in_words(counts)} of {mask.size} pixels. Nothing was written."
-        )
+        raise CaptureError(f"no pixel could be reduced: {in_words(counts)} of {mask.size} pixels. Nothing was written.")
     if any(counts.values()):
-        warnings.append(f"of {mask.size} pixels: {_in_words(counts)} (pixel_mask says where)")
+        warnings.append(f"of {mask.size} pixels: {in_words(counts)} (pixel_mask says where)")
     # Medians from about 128 rows are plenty, and read little.
     some = slice(None, None, max(1, mask.shape[0] // 128))
     residual, elements = product.get("residual_rms", some), product.get("mueller", some)
@@ -194,7 +192,8 @@ def _median(values: NDArray[Any]) -> float:
     return float(np.median(finite)) if finite.size else float("nan")
 
 
-def _in_words(counts: dict[str, int]) -> str:
+def in_words(counts: dict[str, int]) -> str:
+    """Numbers of masked pixels by reason, for a message."""
     return ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in counts.items() if n) or "none masked"
 
 

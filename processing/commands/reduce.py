@@ -20,6 +20,7 @@ def reduce_command(
         Path | None, typer.Option(help="Instrument file to use instead of the one in the capture.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Product file; default: beside the capture.")] = None,
+    demosaic: Annotated[str | None, typer.Option(help="Mosaic method; default: the best of docs/mosaic.md.")] = None,
     figure: Annotated[Path | None, typer.Option(help="Also draw the image (PNG).")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
 ) -> None:
@@ -30,15 +31,24 @@ def reduce_command(
     from processing.console import progress_bar
     from processing.product import Step, file_identity
     from processing.reduce import choose_model, reduce_mueller
+    from processing.reduce_stokes import DEFAULT_METHOD, reduce_stokes
 
     with Capture(capture) as source:
         kind = "stokes" if source.header.mosaic else "mueller"
         product = out or capture.with_suffix(f".{kind}.h5")
         inputs = [file_identity(p) for p in (capture, instrument) if p is not None]
-        step = Step("reduce", {"capture": capture.name, "instrument": instrument and str(instrument)}, tuple(inputs))
+        step = Step(
+            "reduce",
+            {"capture": capture.name, "instrument": instrument and str(instrument), "demosaic": demosaic},
+            tuple(inputs),
+        )
         model = choose_model(source, instrument)
         with progress_bar("reducing", "rows") as tick:
-            facts = reduce_mueller(source, model, product, (step,), overwrite=overwrite, progress=tick)
+            if kind == "stokes":
+                method = demosaic or DEFAULT_METHOD
+                facts = reduce_stokes(source, model, product, (step,), method, overwrite=overwrite, progress=tick)
+            else:
+                facts = reduce_mueller(source, model, product, (step,), overwrite=overwrite, progress=tick)
         _summary(product, facts, source.simulated)
     if figure is not None:
         from processing.figures import draw_product

@@ -1,0 +1,1 @@
+"""Polarization mosaics (division of focal plane): layout, demosaicing, propagated noise."""

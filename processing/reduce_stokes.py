@@ -1,0 +1,237 @@
+"""Reduce the frames of a polarization mosaic to a linear Stokes image: S0, S1, S2, DoLP, AoLP with standard errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.capture import Capture, CaptureError
+from processing.correction import Correction, Mask
+from processing.errors import NotDetermined
+from processing.instrument import InstrumentModel
+from processing.mosaic.layout import MosaicLayout
+from processing.mosaic.methods import demosaic
+from processing.mosaic.noise import stokes_covariance
+from processing.noise import NoiseModel
+from processing.product import Plane, ProductWriter, Step
+from processing.reduce import Progress, in_words, relative_exposure, sample_states
+
+#: The method that docs/mosaic.md found best.
+DEFAULT_METHOD = "difference"
+LINEAR = 3
+
+_COVARIANCE = "covariance of (s0, s1, s2): 00, 11, 22, 01, 02, 12"
+PLANES = {
+    "s0": Plane((), "count", "S0, total intensity"),
+    "s1": Plane((), "count", "S1 = I(0) - I(90)"),
+    "s2": Plane((), "count", "S2 = I(45) - I(135)"),
+    "s0_errors": Plane((), "count", "standard errors of s0"),
+    "s1_errors": Plane((), "count", "standard errors of s1"),
+    "s2_errors": Plane((), "count", "standard errors of s2"),
+    "stokes_covariance": Plane((6,), "count2", _COVARIANCE),
+    "dolp": Plane((), "", "degree of linear polarization, sqrt(S1^2 + S2^2)/S0; noise biases it upwards near 0"),
+    "dolp_errors": Plane((), "", "standard errors of dolp, first order"),
+    "aolp_deg": Plane((), "degree", "angle of linear polarization, 0 to 180, from +x of the analyzer frame"),
+    "aolp_deg_errors": Plane((), "degree", "standard errors of aolp_deg, first order; meaningless where dolp is noise"),
+    "closure": Plane((), "count", "what the model cannot explain of the four channels: I0 + I90 - I45 - I135 if ideal"),
+    "pixel_mask": Plane((), "", f"0 = good; bits: {Mask.meaning()}", np.uint8),
+}
+
+
+def analyzer_matrix(capture: Capture, model: InstrumentModel, states: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Analyzer rows (4, 3) for (S0, S1, S2), the same in all states.
+
+    Raises
+    ------
+    CaptureError : the states differ in their generator or analyzer, so their frames cannot be averaged.
+    NotDetermined : the channels do not determine a linear Stokes vector.
+    """
+    angles = {name: values[states] for name, values in capture.angles_deg.items()} if model.axes else {}
+    rows = model.rows(angles)
+    if np.ptp(rows, axis=0).max(initial=0.0) > 1e-6:
+        raise CaptureError(
+            f"{capture.path}: the {len(states)} states of this mosaic capture have different angles, and one Stokes "
+            "image comes from frames that are alike. Capture one generator state, or split the capture."
+        )
+    analyzers = model.analyzer_states(angles)[0][:, :LINEAR]
+    rank = int(np.linalg.matrix_rank(analyzers))
+    if rank < LINEAR:
+        raise NotDetermined(f"{capture.path}: the mosaic's analyzers have rank {rank}; a linear Stokes vector needs 3.")
+    return np.asarray(analyzers)
+
+
+def mean_frame(
+    capture: Capture, states: NDArray[np.int64], correction: Correction, progress: Progress | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Mean signal (rows, columns) of alike states, black subtracted and flat divided, and the mask of raw pixels."""
+    total = np.zeros(capture.frame_shape)
+    mask = np.zeros(capture.frame_shape, np.uint8)
+    weight = relative_exposure(capture, states)
+    for count, state in enumerate(states, 1):
+        frame = capture.frames(int(state))[0]
+        if correction.saturation is not None:
+            mask[frame >= correction.saturation] |= np.uint8(Mask.SATURATED)
+        if frame.dtype.kind == "f":
+            mask[~np.isfinite(frame)] |= np.uint8(Mask.NOT_FINITE)
+        total += frame
+        if progress:
+            progress(count, len(states))
+    black = correction.black[0] if isinstance(correction.black, np.ndarray) else correction.black
+    total = (total / len(states) - black) / float(np.mean(weight))
+    if correction.flat is not None:
+        total /= correction.flat[0]
+    if correction.bad is not None:
+        mask[correction.bad] |= np.uint8(Mask.BAD)
+    return total.astype(np.float32), mask
+
+
+def reduce_stokes(
+    capture: Capture,
+    model: InstrumentModel,
+    out: Path,
+    steps: tuple[Step, ...],
+    method: str = DEFAULT_METHOD,
+    correction: Correction | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Write the Stokes image of a mosaic capture; returns the facts that the product holds.
+
+    Several states with the same angles are averaged first.
+
+    Raises
+    ------
+    CaptureError, NotDetermined : see `analyzer_matrix`.
+    MosaicError : the frame does not hold whole super-pixels.
+    """
+    mosaic = capture.header.mosaic or model.mosaic
+    if mosaic is None:
+        raise CaptureError(f"{capture.path} is not a mosaic capture; it reduces to a Mueller image.")
+    layout = MosaicLayout.of(mosaic, [c.name for c in model.channels])
+    states = sample_states(capture)
+    analyzers = analyzer_matrix(capture, model, states)
+    correction = correction or Correction.of(capture)
+    noise = NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
+    frame, mask = mean_frame(capture, states, correction, progress)
+    channels = demosaic(frame, layout, method)
+    found = stokes(channels, analyzers, layout, method, noise, len(states), correction.dark_frames)
+    found["pixel_mask"] = _spread(mask, channels.shape[1:])
+    lost = (found["pixel_mask"] != 0) | ~(found["s0"] > 0)
+    found["pixel_mask"][~(found["s0"] > 0) & (found["pixel_mask"] == 0)] = np.uint8(Mask.NOT_DETERMINED)
+    for name, values in found.items():
+        if name != "pixel_mask":
+            values[..., lost] = np.nan
+    rows, columns = channels.shape[1:]
+    facts = _facts(found, analyzers, noise, correction, method, len(states))
+    with ProductWriter(out, "stokes", capture.header, (rows, columns), PLANES, steps, overwrite) as product:
+        product.array("analyzers", analyzers, "", "rows (channel, 3): intensity = row . (S0, S1, S2)")
+        product.write(slice(0, rows), **found)
+        product.seal(facts)
+    return facts
+
+
+def stokes(
+    channels: NDArray[np.float32],
+    analyzers: NDArray[np.float64],
+    layout: MosaicLayout,
+    method: str,
+    noise: NoiseModel | None,
+    frames: int = 1,
+    dark_frames: int = 0,
+) -> dict[str, NDArray[Any]]:
+    """Stokes planes and their errors from demosaiced channels (4, rows, columns); names as in PLANES.
+
+    Without a noise model the variance of a raw pixel is estimated from the closure, one number for the whole image.
+    """
+    solve = np.linalg.pinv(analyzers)
+    null = np.linalg.svd(analyzers)[0][:, LINEAR]
+    # Scaled so that ideal analyzers give I0 + I90 - I45 - I135.
+    null = null / np.abs(null).max() * np.sign(null[0])
+    s0, s1, s2 = np.tensordot(solve.astype(np.float32), channels, axes=1)
+    closure = np.tensordot(null.astype(np.float32), channels, axes=1)
+    if noise is None:
+        spread = 1.4826 * np.nanmedian(np.abs(closure - np.nanmedian(closure))) / np.linalg.norm(null)
+        variance = np.full_like(channels, spread**2)
+    else:
+        floor = noise.floor / frames + (noise.floor / dark_frames if dark_frames else 0.0)
+        variance = (noise.slope / frames * np.maximum(channels, 0.0) + floor).astype(np.float32)
+    covariance = stokes_covariance(variance, layout, method, solve)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        linear = np.hypot(s1, s2)
+        dolp = linear / s0
+        aolp = np.mod(0.5 * np.arctan2(s2, s1), np.pi)
+        c00, c11, c22, c01, c02, c12 = covariance
+        u, v = s1 / linear, s2 / linear
+        along = u * u * c11 + v * v * c22 + 2 * u * v * c12
+        across = v * v * c11 + u * u * c22 - 2 * u * v * c12
+        cross = u * c01 + v * c02
+        dolp_variance = (along - 2 * dolp * cross + dolp**2 * c00) / s0**2
+        dolp_errors, aolp_errors = np.sqrt(np.maximum(dolp_variance, 0.0)), 0.5 * np.sqrt(across) / linear
+    found = {
+        "s0": s0,
+        "s1": s1,
+        "s2": s2,
+        "s0_errors": np.sqrt(c00),
+        "s1_errors": np.sqrt(c11),
+        "s2_errors": np.sqrt(c22),
+    }
+    found |= {"stokes_covariance": covariance, "dolp": dolp, "dolp_errors": dolp_errors, "closure": closure}
+    found |= {"aolp_deg": np.rad2deg(aolp), "aolp_deg_errors": np.rad2deg(aolp_errors)}
+    return {name: np.asarray(values, dtype=np.float32) for name, values in found.items()}
+
+
+def _spread(mask: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """Flags of raw pixels, carried to every pixel whose value a bilinear method takes from them."""
+    if shape[0] < mask.shape[0]:
+        return np.asarray(mask[0::2, 0::2] | mask[0::2, 1::2] | mask[1::2, 0::2] | mask[1::2, 1::2])
+    if not mask.any():
+        return mask
+    import cv2
+
+    out = np.zeros_like(mask)
+    for flag in Mask:
+        bit = np.uint8(flag)
+        out |= cv2.dilate((mask & bit), np.ones((3, 3), np.uint8)) & bit
+    return out
+
+
+def _facts(
+    found: dict[str, NDArray[Any]],
+    analyzers: NDArray[np.float64],
+    noise: NoiseModel | None,
+    correction: Correction,
+    method: str,
+    states: int,
+) -> dict[str, Any]:
+    mask, warnings = found["pixel_mask"], list(correction.warnings)
+    counts = {flag.name.lower(): int(np.sum((mask & np.uint8(flag)) != 0)) for flag in Mask if flag.name}
+    good = mask == 0
+    if not good.any():
+        raise CaptureError(f"no pixel could be reduced: {in_words(counts)} of {mask.size} pixels. Nothing was written.")
+    if any(counts.values()):
+        warnings.append(f"of {mask.size} pixels: {in_words(counts)} (pixel_mask says where)")
+    if noise is None:
+        warnings.append("the gain is not known: one noise for the whole image, estimated from the channels' closure")
+    some = good & (np.indices(mask.shape).sum(axis=0) % 7 == 0) if good.sum() > 1000 else good
+    return {
+        "states": states,
+        "method": method,
+        "condition_number": condition_number_linear(analyzers),
+        "black": correction.source,
+        "noise": noise.source if noise else "estimated from the closure",
+        "median_closure_over_s0": float(np.median(found["closure"][some] / found["s0"][some])),
+        "rms_closure_over_s0": float(np.sqrt(np.mean((found["closure"][some] / found["s0"][some]) ** 2))),
+        "median_dolp": float(np.median(found["dolp"][some])),
+        "pixels": mask.size,
+        "masked": counts,
+        "warnings": warnings,
+    }
+
+
+def condition_number_linear(analyzers: NDArray[np.float64]) -> float:
+    """Condition number of the analyzer matrix (channels, 3)."""
+    singular = np.linalg.svd(analyzers, compute_uv=False)
+    return float(singular[0] / singular[-1])
