@@ -6,6 +6,7 @@ import fcntl
 import ipaddress
 import socket
 import struct
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ _SIOCGIFADDR = 0x8915
 _PRIMARY_APPLICATION_IP = 0x0A14
 
 
-def load_aravis() -> tuple[Any, type[Exception]]:
+def load_aravis() -> tuple[Any, Any]:
     """Import Aravis and return its module and GLib's exception class.
 
     Raises
@@ -28,7 +29,10 @@ def load_aravis() -> tuple[Any, type[Exception]]:
         import gi
 
         gi.require_version("Aravis", "0.8")
-        from gi.repository import Aravis, GLib
+        with warnings.catch_warnings():
+            # Debian 12's PyGObject imports in a way that Python 3.11 calls outdated.
+            warnings.simplefilter("ignore", ImportWarning)
+            from gi.repository import Aravis, GLib
     except (ImportError, ValueError) as error:
         raise CameraError(
             "import Aravis",
@@ -59,7 +63,7 @@ def list_cameras(aravis: Any) -> list[dict[str, str]]:
     ]
 
 
-def open_camera(name: str, device: str | None, aravis: Any, glib_error: type[Exception]) -> Any:
+def open_camera(name: str, device: str | None, aravis: Any, glib_error: Any) -> Any:
     """Open a camera by id, serial number or IP address and take control of it.
 
     Parameters
@@ -84,7 +88,7 @@ def open_camera(name: str, device: str | None, aravis: Any, glib_error: type[Exc
     try:
         camera = aravis.Camera.new(key)
     except glib_error as error:
-        raise _not_found(name, device, list_cameras(aravis), str(error.message)) from error  # type: ignore[attr-defined]
+        raise _not_found(name, device, list_cameras(aravis), str(error.message)) from error
     link = camera.get_device()
     if isinstance(link, aravis.GvDevice) and not link.is_controller():
         raise CameraBusy(
@@ -114,7 +118,7 @@ def _not_found(name: str, device: str | None, found: list[dict[str, str]], detai
     )
 
 
-def _holder(link: Any, glib_error: type[Exception]) -> str:
+def _holder(link: Any, glib_error: Any) -> str:
     try:
         number = int(link.read_register(_PRIMARY_APPLICATION_IP))
     except glib_error:

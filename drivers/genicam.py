@@ -37,7 +37,7 @@ class Features:
         The open `Aravis.Camera`.
     """
 
-    def __init__(self, name: str, aravis: Any, glib_error: type[Exception], camera: Any) -> None:
+    def __init__(self, name: str, aravis: Any, glib_error: Any, camera: Any) -> None:
         self._name = name
         self._aravis = aravis
         self._glib_error = glib_error
@@ -53,11 +53,11 @@ class Features:
             codes = self._aravis.DeviceError
             gone = (codes.TIMEOUT, codes.NOT_CONNECTED, codes.NOT_CONTROLLER, codes.TRANSFER_ERROR)
             quark = self._aravis.device_error_quark()
-            if self.control_is_lost() or any(error.matches(quark, code) for code in gone):  # type: ignore[attr-defined]
-                raise self.lost(what, str(error.message)) from error  # type: ignore[attr-defined]
+            if self.control_is_lost() or any(error.matches(quark, code) for code in gone):
+                raise self.lost(what, str(error.message)) from error
             raise CameraError(
                 f"camera {self._name}, {what}",
-                str(error.message),  # type: ignore[attr-defined]
+                str(error.message),
                 "Look the feature up in the camera's manual, or with `arv-tool-0.8 features`",
             ) from error
 

@@ -27,6 +27,7 @@ from drivers.aravis_library import load_aravis
 from drivers.errors import CameraError
 from drivers.pixel_formats import PixelFormat, pixel_format
 from simulators import gige_features as features
+from simulators.loopback_address import LoopbackAddress
 
 # Frames start on this grid. A finer one shortens the wait, but Aravis spins through the last millisecond of each.
 _GRID_HZ = 100.0
@@ -114,6 +115,7 @@ class GigeCamera:
         self._gone = threading.Event()
         self._camera: Any = None
         self._memory: Any = None
+        self._loopback = LoopbackAddress(address)
         self._library = ctypes.CDLL("libaravis-0.8.so.0")
         self._library.arv_buffer_get_data.restype = ctypes.c_void_p
         self._library.arv_buffer_get_data.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
@@ -145,24 +147,21 @@ class GigeCamera:
             The address is taken or does not exist.
         """
         aravis, _ = load_aravis()
-        deadline_s = time.monotonic() + self._wait_s
+        self._loopback.take(self._wait_s)
         with tempfile.TemporaryDirectory() as folder:
             path = None
             if self._description == "sfnc":
                 path = Path(folder) / "camera.xml"
                 path.write_text(features.sfnc_description(*self._size))
-            while True:
-                camera = aravis.GvFakeCamera.new_full(self.address, self.serial, None if path is None else str(path))
-                if camera.is_running():
-                    break
-                del camera
-                if time.monotonic() > deadline_s:
-                    raise CameraError(
-                        f"start a simulated camera at {self.address}",
-                        f"the address did not become free within {self._wait_s:g} s, or no interface has it",
-                        "End the other simulated camera, or add the address: ip addr add 127.0.0.2/8 dev lo",
-                    )
-                time.sleep(0.2)
+            camera = aravis.GvFakeCamera.new_full(self.address, self.serial, None if path is None else str(path))
+        # It also says that it runs where it could not bind its port, which is why the address was taken first.
+        if not camera.is_running():
+            self._loopback.release()
+            raise CameraError(
+                f"start a simulated camera at {self.address}",
+                "no network interface has that address",
+                f"Add it: ip addr add {self.address}/8 dev lo",
+            )
         self._gone.clear()
         self._camera, self._memory = camera, camera.get_fake_camera()
         self._power_up()
@@ -179,6 +178,7 @@ class GigeCamera:
         self._camera.set_property("gvsp-lost-ratio", 1.0)
         self._library.arv_fake_camera_set_fill_pattern(hash(self._memory), _FillPattern(), None)
         self._camera = self._memory = None
+        self._loopback.release()
 
     def check(self) -> None:
         """Raise the error of the pixel source, if it had one."""
@@ -200,6 +200,10 @@ class GigeCamera:
     def fire(self) -> None:
         """Start an exposure that no driver asked for, as a stray pulse on the trigger line would."""
         self._write(features.SOFTWARE_TRIGGER, 1)
+
+    def register(self, address: int) -> int:
+        """Read a 32-bit register, as a look into the camera from behind."""
+        return self._read(address)
 
     # --- registers ---------------------------------------------------------------------------------------
 

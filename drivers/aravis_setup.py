@@ -1,0 +1,242 @@
+"""Setting a camera up through Aravis, each part in the order that cameras need, and reading all of it back."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from drivers import genicam
+from drivers.aravis_library import interface_of
+from drivers.camera import CameraSettings
+from drivers.errors import CameraError, SettingRefused
+from drivers.genicam import Features
+from drivers.pixel_formats import PixelFormat, pixel_format
+
+# Fits every Ethernet; jumbo frames have to be asked for, because a switch in between may drop them.
+_DEFAULT_PACKET_BYTES = 1500
+# Differences on read-back that are rounding on cameras that state no step: a sensor row, a tenth of a decibel, a count.
+_EXPOSURE_FLOOR_US = 20.0
+_GAIN_FLOOR_DB = 0.1
+_BLACK_LEVEL_FLOOR = 1.0
+# What makes counts non-linear in light or changes between frames.
+# A frame rate limits the exposure, and triggered frames have none.
+_SWITCHED_OFF = (
+    "ExposureAuto",
+    "GainAuto",
+    "BlackLevelAuto",
+    "GammaEnable",
+    "LUTEnable",
+    "ChunkModeActive",
+    "AcquisitionFrameRateEnable",
+)
+
+
+class Config(BaseModel):
+    """A camera in the rig file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["aravis"] = "aravis"
+    device: str | None = Field(default=None, description="id, serial number or IP address; none: the only camera")
+    interface: str | None = Field(default=None, description="network interface that must lead to it, e.g. enp3s0")
+    packet_size: int | None = Field(default=None, ge=576, le=65535, description="bytes with headers; default 1500")
+    settings: CameraSettings = Field(default=CameraSettings(), description="used where a plan leaves a setting open")
+    resend: bool = Field(default=True, description="ask for lost packets again, where the camera can")
+    retakes: int = Field(default=3, ge=0, description="how often a lost frame is taken again")
+    buffers: int = Field(default=4, ge=2, le=64)
+    bits: int | None = Field(default=None, ge=8, le=16, description="real bits, where the format has room for more")
+    shift: int = Field(default=0, ge=0, le=8, description="empty low bits, where the camera left-aligns")
+    gain_raw_per_db: float | None = Field(default=None, gt=0, description="for cameras that only have GainRaw")
+    trigger_line: str = Field(default="Line0", description="input of the hardware trigger")
+    trigger_edge: Literal["RisingEdge", "FallingEdge"] = "RisingEdge"
+    trigger_timeout_s: float = Field(default=10.0, gt=0, description="longest wait for a hardware trigger")
+    trigger_latency_s: float = Field(default=0.002, ge=0, description="added to the exposure before the bench moves")
+
+
+class Setup:
+    """What is set on one camera.
+
+    Attributes
+    ----------
+    interface : tuple of str and int, or None
+        Name and MTU of the network interface that leads to the camera.
+    exposure_s : float
+        Exposure as read back.
+    size : tuple of int
+        Width and height of a frame as read back.
+    hardware : bool
+        True if an input line triggers.
+    has_exposure_status : bool
+        True if the camera tells when an exposure has ended.
+    """
+
+    def __init__(self, name: str, config: Config, aravis: Any, camera: Any, features: Features) -> None:
+        self._name = name
+        self._config = config
+        self._aravis = aravis
+        self._camera = camera
+        self._features = features
+        self.is_gige = bool(camera.is_gv_device())
+        self.interface = self._find_interface() if self.is_gige else None
+        self.exposure_s = 0.0
+        self.size = (0, 0)
+        self.hardware = False
+        self.has_exposure_status = False
+
+    def pixel_format(self) -> PixelFormat:
+        """The pixel format that the camera is set to now; raises UnknownPixelFormat if it is not known here."""
+        with self._features.asking("read PixelFormat"):
+            return pixel_format(int(self._camera.get_pixel_format()))
+
+    def packet_size(self) -> int | None:
+        """Bytes of a GigE Vision packet with its headers; None for another kind of link."""
+        with self._features.asking("read the packet size"):
+            return int(self._camera.gv_get_packet_size()) if self.is_gige else None
+
+    def _find_interface(self) -> tuple[str, int] | None:
+        address = self._camera.get_device().get_interface_address().get_address().to_string()
+        found = interface_of(address)
+        wanted = self._config.interface
+        if wanted is not None and (found is None or found[0] != wanted):
+            raise CameraError(
+                f"open camera {self._name} over {wanted}",
+                f"it is reached over {found[0] if found else address}",
+                "Plug it into the interface that the rig file names, or change `interface` there",
+            )
+        return found
+
+    def set_structure(self, settings: CameraSettings) -> None:
+        """Pixel format, region, binning, packets and trigger: the acquisition must be stopped."""
+        features = self._features
+        for name in _SWITCHED_OFF:
+            features.switch_off(name)
+        if features.find(("GammaEnable",)) is None and features.find(("Gamma",)) is not None:
+            features.set_number(("Gamma",), 1.0, floor=1e-3)
+        if settings.pixel_format is not None:
+            pixel_format(settings.pixel_format)
+            features.set_choice("PixelFormat", settings.pixel_format)
+        if settings.binning is not None and (settings.binning != 1 or features.find(("BinningHorizontal",))):
+            features.set_number(("BinningHorizontal",), settings.binning)
+            features.set_number(("BinningVertical",), settings.binning)
+        self._set_region(settings)
+        if self.is_gige:
+            self._set_packet_size(settings.packet_size or self._config.packet_size)
+        elif settings.packet_size is not None:
+            raise self._refused(f"packet_size {settings.packet_size}", "this camera is not on Ethernet")
+        self._set_trigger(settings.trigger)
+        fmt = self.pixel_format()
+        if self._config.bits is not None and self._config.bits > fmt.bits - self._config.shift:
+            raise self._refused(
+                f"bits {self._config.bits} and shift {self._config.shift} in the rig file",
+                f"{fmt.name} holds {fmt.bits} bits",
+            )
+
+    def _set_region(self, settings: CameraSettings) -> None:
+        # Offsets first to zero: they limit the size. Then the size, which limits the offsets.
+        for offset, size, start, length in (
+            ("OffsetX", "Width", settings.offset_x, settings.width),
+            ("OffsetY", "Height", settings.offset_y, settings.height),
+        ):
+            if self._features.find((offset,)) is not None:
+                self._features.set_number((offset,), 0)
+            if length is None:
+                with self._features.asking(f"read the limits of {size}"):
+                    length = self._camera.get_integer_bounds(size)[1] - (start or 0)
+            self._features.set_number((size,), length)
+            if start:
+                self._features.set_number((offset,), start)
+
+    def _set_packet_size(self, packet_size: int | None) -> None:
+        interface, mtu = self.interface or ("", None)
+        if packet_size is None:
+            packet_size = min(_DEFAULT_PACKET_BYTES, mtu or _DEFAULT_PACKET_BYTES)
+        if mtu is not None and packet_size > mtu:
+            raise self._refused(
+                f"packet_size {packet_size}",
+                f"interface {interface} has an MTU of {mtu}",
+            )
+        with self._features.asking(f"set packet size to {packet_size}"):
+            self._camera.gv_set_packet_size_adjustment(self._aravis.GvPacketSizeAdjustment.NEVER)
+            self._camera.gv_set_packet_size(packet_size)
+            back = int(self._camera.gv_get_packet_size())
+        if back != packet_size:
+            raise self._refused(f"packet_size {packet_size}", f"it reads back {back}")
+
+    def _set_trigger(self, trigger: Literal["software", "hardware"] | None) -> None:
+        features = self._features
+        if trigger is not None:
+            self.hardware = trigger == "hardware"
+        with features.asking("set AcquisitionMode to Continuous"):
+            self._camera.set_acquisition_mode(self._aravis.AcquisitionMode.CONTINUOUS)
+            # Every trigger off first: one left on by another program would hold frames back.
+            self._camera.clear_triggers()
+        if features.find(("ExposureMode",)) is not None:
+            features.set_choice("ExposureMode", "Timed")
+        if features.find(("TriggerSelector",)) is not None:
+            features.set_choice("TriggerSelector", "FrameStart")
+        features.set_choice("TriggerSource", self._config.trigger_line if self.hardware else "Software")
+        if self.hardware and features.find(("TriggerActivation",)) is not None:
+            features.set_choice("TriggerActivation", self._config.trigger_edge)
+        features.set_choice("TriggerMode", "On")
+        self.has_exposure_status = (
+            features.find(("AcquisitionStatusSelector",)) is not None
+            and features.find(("AcquisitionStatus",)) is not None
+        )
+        if self.has_exposure_status:
+            try:
+                features.set_choice("AcquisitionStatusSelector", "ExposureActive")
+            except SettingRefused:
+                self.has_exposure_status = False
+
+    def set_light(self, settings: CameraSettings) -> None:
+        """Exposure, gain and black level: no exposure is under way when this is called."""
+        features = self._features
+        if settings.exposure_s is not None:
+            features.set_number(genicam.EXPOSURE_US, settings.exposure_s * 1e6, floor=_EXPOSURE_FLOOR_US)
+        if settings.gain_db is not None:
+            per_db = self._config.gain_raw_per_db
+            if features.find(genicam.GAIN_DB) is not None:
+                features.set_number(genicam.GAIN_DB, settings.gain_db, floor=_GAIN_FLOOR_DB)
+            elif per_db is not None:
+                features.set_number(genicam.GAIN_RAW, settings.gain_db * per_db)
+            else:
+                raise self._refused(
+                    f"gain_db {settings.gain_db:g}",
+                    "this camera has no Gain in decibels; with GainRaw, `gain_raw_per_db` is needed in the rig file",
+                )
+        if settings.black_level is not None:
+            features.set_number(genicam.BLACK_LEVEL, settings.black_level, floor=_BLACK_LEVEL_FLOOR)
+
+    def read_back(self, frame_average: int | None) -> CameraSettings:
+        """Every setting as the camera has it now."""
+        features = self._features
+        exposure_us = features.number(genicam.EXPOSURE_US)
+        gain_db = features.number(genicam.GAIN_DB)
+        raw = features.number(genicam.GAIN_RAW)
+        if gain_db is None and raw is not None and self._config.gain_raw_per_db is not None:
+            gain_db = raw / self._config.gain_raw_per_db
+        self.exposure_s = (exposure_us or 0.0) * 1e-6
+        binning = features.number(("BinningHorizontal",))
+        with features.asking("read the region"):
+            left, top, width, height = self._camera.get_region()
+        self.size = (int(width), int(height))
+        return CameraSettings(
+            exposure_s=self.exposure_s or None,
+            gain_db=gain_db,
+            black_level=features.number(genicam.BLACK_LEVEL),
+            pixel_format=self.pixel_format().name,
+            width=int(width),
+            height=int(height),
+            offset_x=int(left),
+            offset_y=int(top),
+            binning=None if binning is None else int(binning),
+            packet_size=self.packet_size(),
+            frame_average=frame_average or 1,
+            trigger="hardware" if self.hardware else "software",
+        )
+
+    def _refused(self, what: str, came_back: str) -> SettingRefused:
+        return SettingRefused(
+            f"camera {self._name}, {what}", came_back, "Change the setting in the plan or the rig file"
+        )

@@ -1,0 +1,290 @@
+"""The camera suite over the loopback GigE Vision camera: settings, frames, averages, formats, identity."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.camera import Camera, CameraSettings
+from drivers.cameras import aravis
+from drivers.errors import CameraError, CameraNotFound, FrameLost, SettingRefused, UnknownPixelFormat
+from simulators import gige_features
+from simulators.gige_camera import ExposureInfo, GigeCamera
+
+Bench = Callable[..., tuple[GigeCamera, aravis.AravisCamera]]
+DARK = CameraSettings(exposure_s=1e-4)
+
+
+def counting(info: ExposureInfo) -> NDArray[np.uint16]:
+    """A picture in which neighbours differ and each frame differs from the one before."""
+    size = info.width * info.height
+    return ((np.arange(size) * 7 + info.frame_id) % 4096).astype(np.uint16).reshape(info.height, info.width)
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    """Start a simulated camera and open it; both end with the test."""
+    with ExitStack() as stack:
+
+        def make(
+            source: Callable[[ExposureInfo], NDArray[np.uint16]] = counting,
+            size: tuple[int, int] = (64, 48),
+            config: aravis.Config | None = None,
+            **options: object,
+        ) -> tuple[GigeCamera, aravis.AravisCamera]:
+            simulated = stack.enter_context(GigeCamera("LOOP1", *size, source, **options))  # type: ignore[arg-type]
+            config = config or aravis.Config(device="127.0.0.1", packet_size=9000, bits=12)
+            return simulated, stack.enter_context(aravis.open("camera", config))
+
+        yield make
+
+
+@pytest.mark.parametrize("description", ["sfnc", "aravis"])
+def test_settings_are_read_back(bench: Bench, description: str) -> None:
+    _, camera = bench(description=description)
+    region = {"width": 32, "height": 20, "offset_x": 8, "offset_y": 4}
+    back = camera.configure(CameraSettings(exposure_s=0.0123, pixel_format="Mono16", trigger="software", **region))
+    assert back.exposure_s == pytest.approx(0.0123, abs=1e-6)
+    assert (back.width, back.height, back.offset_x, back.offset_y) == (32, 20, 8, 4)
+    assert (back.pixel_format, back.trigger, back.packet_size, back.frame_average) == ("Mono16", "software", 9000, 1)
+    assert camera.settings == back
+    assert camera.capture(1)[0].pixels.shape == (20, 32)
+    # No region asked for is the full sensor again, and a setting left open stays.
+    back = camera.configure(CameraSettings(gain_db=6.5) if description == "sfnc" else CameraSettings())
+    assert (back.width, back.height, back.offset_x) == (64, 48, 0)
+    assert back.exposure_s == pytest.approx(0.0123, abs=1e-6)
+    assert back.gain_db == (6.5 if description == "sfnc" else None)
+    assert camera.temperature_c() == (38.5 if description == "sfnc" else None)
+
+
+def test_what_makes_counts_non_linear_is_switched_off(bench: Bench) -> None:
+    simulated, camera = bench()
+    assert simulated.register(gige_features.GAMMA_ENABLE) == 1
+    assert simulated.register(gige_features.GAIN_AUTO) != 0
+    camera.configure(DARK)
+    assert simulated.register(gige_features.GAMMA_ENABLE) == 0
+    assert simulated.register(gige_features.GAIN_AUTO) == 0
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"exposure_s": 1e6},
+        {"width": 99999},
+        {"width": 60, "offset_x": 20},
+        {"binning": 9},
+        {"gain_db": 99.0},
+        {"black_level": -1.0},
+        {"pixel_format": "Mono14p"},
+    ],
+)
+def test_a_setting_out_of_limits_is_refused(bench: Bench, wrong: dict[str, float]) -> None:
+    _, camera = bench()
+    with pytest.raises((SettingRefused, UnknownPixelFormat)) as refused:
+        camera.configure(CameraSettings(**wrong))
+    assert refused.value.came_back
+    with pytest.raises(CameraError):
+        camera.capture()
+    camera.configure(DARK)
+    camera.capture()
+
+
+def test_a_setting_that_reads_back_different_is_refused(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    # The description promises more than the 32-bit register holds, as Aravis' own camera did with 1e12 us.
+    monkeypatch.setattr(gige_features, "MAX_EXPOSURE_S", 1e7)
+    _, camera = bench()
+    with pytest.raises(SettingRefused, match="reads back"):
+        camera.configure(CameraSettings(exposure_s=1e6))
+
+
+def test_gain_without_decibels_needs_its_scale(bench: Bench) -> None:
+    simulated, camera = bench(description="aravis")
+    with pytest.raises(SettingRefused, match="gain_raw_per_db"):
+        camera.configure(CameraSettings(gain_db=3.0))
+    camera.close()
+    config = aravis.Config(device="127.0.0.1", bits=12, gain_raw_per_db=2.0)
+    with aravis.open("camera", config) as scaled:
+        assert scaled.configure(CameraSettings(gain_db=3.0)).gain_db == 3.0
+        assert simulated.register(0x110) == 6
+
+
+def test_settings_of_the_rig_file_fill_what_a_plan_leaves_open(bench: Bench) -> None:
+    config = aravis.Config(device="127.0.0.1", settings=CameraSettings(pixel_format="Mono12p", gain_db=2.0, height=16))
+    _, camera = bench(config=config)
+    back = camera.configure(CameraSettings(exposure_s=1e-3, height=24))
+    assert (back.pixel_format, back.gain_db, back.height) == ("Mono12p", 2.0, 24)
+
+
+def test_a_full_sensor_comes_through_exactly(bench: Bench) -> None:
+    _, camera = bench(size=(2448, 2048))
+    camera.configure(CameraSettings(exposure_s=1e-3, pixel_format="Mono16"))
+    frames = camera.capture(3)
+    for frame in frames:
+        expected = ((np.arange(2448 * 2048) * 7 + frame.frame_id) % 4096).reshape(2048, 2448)
+        assert np.array_equal(frame.pixels, expected)
+        assert frame.pixels.dtype == np.uint16
+        assert not frame.pixels.flags.writeable
+        assert frame.complete
+    assert [b.frame_id - a.frame_id for a, b in pairwise(frames)] == [1, 1]
+    assert frames[0].camera_time_ns < frames[1].camera_time_ns < frames[2].camera_time_ns
+    assert frames[0].host_time_s < frames[1].host_time_s
+    assert camera.statistics().completed == 3
+    assert camera.full_scale == 4095
+
+
+@pytest.mark.parametrize(
+    ("name", "bits", "polarized"),
+    [
+        ("Mono8", 8, False),
+        ("Mono10p", 10, False),
+        ("Mono12", 12, False),
+        ("Mono12Packed", 12, False),
+        ("PolarizeMono8", 8, True),
+        ("PolarizedMono12p", 12, True),
+        ("PolarizedMono12Packed", 12, True),
+    ],
+)
+def test_every_format_gives_right_aligned_counts(bench: Bench, name: str, bits: int, polarized: bool) -> None:
+    _, camera = bench(config=aravis.Config(device="127.0.0.1"))
+    camera.configure(CameraSettings(exposure_s=1e-4, pixel_format=name))
+    frame = camera.capture()[0]
+    expected = ((np.arange(64 * 48) * 7 + frame.frame_id) % 4096).reshape(48, 64) >> (12 - bits)
+    assert np.array_equal(frame.pixels, expected)
+    identity = camera.describe()
+    assert (camera.bits, identity.bits, identity.pixel_format, identity.polarized) == (bits, bits, name, polarized)
+    assert identity.pixel_format_code >> 16 & 0xFF in (8, 10, 12, 16)
+
+
+def test_left_aligned_counts_are_shifted_and_a_wrong_shift_is_noticed(bench: Bench) -> None:
+    def left_aligned(info: ExposureInfo) -> NDArray[np.uint16]:
+        return counting(info) << np.uint16(4)
+
+    _, camera = bench(left_aligned, bits=16, config=aravis.Config(device="127.0.0.1", bits=12, shift=4))
+    camera.configure(DARK)
+    frame = camera.capture()[0]
+    assert np.array_equal(frame.pixels.ravel(), (np.arange(64 * 48) * 7 + frame.frame_id) % 4096)
+    assert camera.describe().shift == 4
+    for bits, shift in ((12, 0), (8, 8), (10, 6)):
+        camera.close()
+        with aravis.open("camera", aravis.Config(device="127.0.0.1", bits=bits, shift=shift)) as wrong:
+            wrong.configure(DARK)
+            with pytest.raises(UnknownPixelFormat, match="`bits` and `shift`"):
+                wrong.capture()
+
+
+def test_an_average_keeps_saturated_pixels_saturated(bench: Bench) -> None:
+    shown: list[int] = []
+
+    def flicker(info: ExposureInfo) -> NDArray[np.uint16]:
+        shown.append(info.frame_id)
+        pixels = np.full((info.height, info.width), 100 + 3 * len(shown), np.uint16)
+        pixels[0, 0] = 4095 if len(shown) == 2 else 0
+        return pixels
+
+    _, camera = bench(flicker)
+    camera.configure(CameraSettings(exposure_s=1e-4, frame_average=4))
+    exposure = camera.trigger()
+    exposure.wait_exposed()
+    assert len(shown) == 4
+    frame = exposure.frame()
+    assert frame.pixels[1, 1] == 108  # the mean of 103, 106, 109, 112 is 107.5
+    assert frame.pixels[0, 0] == 4095
+    assert frame.frame_id == shown[-1]
+    assert len(camera.capture(2)) == 2
+    assert len(shown) == 12
+
+
+def test_frames_stay_as_they_were_when_more_come(bench: Bench) -> None:
+    _, camera = bench()
+    camera.configure(DARK)
+    frames = camera.capture(12)
+    for frame in frames:
+        assert frame.pixels[0, 0] == frame.frame_id % 4096
+
+
+def test_frame_numbers_go_round(bench: Bench) -> None:
+    _, camera = bench(size=(8, 4))
+    camera.configure(DARK)
+    # Aravis' camera starts near 65400, and 16-bit numbers go from 65535 to 1.
+    ids = [frame.frame_id for frame in camera.capture(150)]
+    assert 65535 in ids
+    assert ids[ids.index(65535) + 1] == 1
+    assert camera.statistics().retakes == 0
+
+
+def test_no_hardware_trigger_is_said_and_waited_for_no_longer_than_allowed(bench: Bench) -> None:
+    config = aravis.Config(device="127.0.0.1", trigger_timeout_s=0.2, retakes=0)
+    _, camera = bench(config=config)
+    camera.configure(CameraSettings(exposure_s=1e-4, trigger="hardware"))
+    with pytest.raises(FrameLost, match="no signal at Line0"):
+        camera.capture()
+    camera.configure(CameraSettings(trigger="software"))
+    camera.capture()
+
+
+def test_describe_names_camera_and_link(bench: Bench) -> None:
+    _, camera = bench()
+    camera.configure(DARK)
+    identity = camera.describe()
+    assert identity.serial_number == "LOOP1"
+    assert (identity.address, identity.interface) == ("127.0.0.1", "lo")
+    assert identity.interface_mtu is not None
+    assert identity.packet_size == 9000
+    assert (identity.sensor_width, identity.sensor_height) == (64, 48)
+
+
+@pytest.mark.parametrize("device", ["LOOP1", "Aravis-Fake-LOOP1", None])
+def test_a_camera_is_found_by_serial_number_by_id_or_alone(bench: Bench, device: str | None) -> None:
+    _, camera = bench(config=aravis.Config(device=device))
+    assert camera.describe().serial_number == "LOOP1"
+
+
+def test_a_camera_that_is_not_there_is_named_with_those_that_are() -> None:
+    with (
+        GigeCamera("LOOP1", 8, 4, counting),
+        pytest.raises(CameraNotFound, match=r"WRONG7.*LOOP1.*127\.0\.0\.1"),
+    ):
+        aravis.open("camera", aravis.Config(device="WRONG7"))
+
+
+def test_packets_larger_than_the_interface_takes_are_refused(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivers.aravis_setup.interface_of", lambda _: ("eth7", 1500))
+    _, camera = bench()
+    with pytest.raises(SettingRefused, match="eth7 has an MTU of 1500"):
+        camera.configure(DARK)
+
+
+def test_another_interface_than_the_rig_file_names_is_refused(bench: Bench) -> None:
+    with pytest.raises(CameraError, match="reached over lo"):
+        bench(config=aravis.Config(device="127.0.0.1", interface="eth7"))
+
+
+def test_a_closed_camera_says_so(bench: Bench) -> None:
+    _, camera = bench()
+    camera.close()
+    camera.close()
+    with pytest.raises(CameraError, match="closed"):
+        camera.configure(DARK)
+
+
+def test_without_gi_the_driver_can_be_imported_and_opening_says_what_is_missing() -> None:
+    code = (
+        "import sys; sys.modules['gi'] = None\n"
+        "from drivers.cameras import aravis\n"
+        "from drivers.errors import CameraError\n"
+        "try: aravis.open('camera', aravis.Config())\n"
+        "except CameraError as error: print(error)\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "gir1.2-aravis-0.8" in run.stdout
+
+
+def test_the_base_class_is_what_others_see(bench: Bench) -> None:
+    assert isinstance(bench()[1], Camera)
