@@ -58,8 +58,11 @@ class Correction:
         dark = capture.dark
         black: float | NDArray[np.float32]
         if dark is not None:
-            black, dark_frames = dark.astype(np.float32), int(capture.states_with("dark").size)
-            source = f"mean of {dark_frames} dark state(s)"
+            black, dark_frames = (
+                dark.astype(np.float32),
+                int(capture.column("repeats")[capture.states_with("dark")].sum()),
+            )
+            source = f"mean of {dark_frames} dark frame(s)"
         else:
             black, dark_frames = detector.black_level_counts, 0
             source = f"black level {black:g} counts from the header"
@@ -97,6 +100,7 @@ class BlockReader:
 
     def __init__(self, capture: Capture, states: NDArray[np.int64], correction: Correction) -> None:
         self.capture, self.states, self.correction = capture, states, correction
+        self.repeats = capture.column("repeats")[states].astype(float)
         self._buffer: NDArray[np.generic] | None = None
         self._rows = slice(0, 0)
         self._black: NDArray[np.float32] | np.float32 = np.float32(0)

@@ -29,11 +29,13 @@ class MuellerSolver:
         self.inversion, self.reader, self.noise = inversion, reader, noise
         channels = reader.capture.channels
         squares = np.concatenate([inversion.pinv**2, np.sum(inversion.null**2, axis=0, keepdims=True)])
-        stack = [inversion.pinv, inversion.null, *([squares] if noise else [])]
+        self.repeats = np.repeat(reader.repeats, channels)
+        stack = [inversion.pinv, inversion.null, *([squares / self.repeats] if noise else [])]
         self.stack = np.concatenate(stack).astype(np.float32)
         self.first_square = inversion.w.shape[0]
-        # Read noise is alike in all states; the black is one number for all states of a channel.
-        self.floor_unit = squares.reshape(17, -1, channels).sum(axis=1).astype(np.float32)
+        # The black is one number for all states of a channel, so its error is common to them.
+        floor = noise.averaged_floor(self.repeats) if noise else np.zeros(inversion.w.shape[0])
+        self.floor = (squares * floor).reshape(17, -1, channels).sum(axis=1).astype(np.float32)
         by_channel = inversion.pinv.reshape(16, -1, channels).sum(axis=1) ** 2
         null_channel = np.sum(inversion.null.reshape(len(inversion.null), -1, channels).sum(axis=1) ** 2, axis=0)
         self.black_unit = np.concatenate([by_channel, null_channel[None]]).astype(np.float32)
@@ -81,7 +83,7 @@ class MuellerSolver:
         noise: NoiseModel,
     ) -> NDArray[np.float32]:
         """Variances (17, pixels), counts^2: of the 16 elements, and of the whole residual."""
-        constant = noise.floor * self.floor_unit + self.reader.black_variance(noise) * self.black_unit
+        constant = self.floor + self.reader.black_variance(noise) * self.black_unit
         if gain is None:
             shot *= np.float32(noise.slope)
             np.maximum(shot, 0.0, out=shot)
@@ -123,7 +125,8 @@ def solve_without_saturated(
             if solver.noise is None:
                 variance = np.broadcast_to((rss / free)[:, None], y.shape)
             else:
-                variance = (solver.noise.slope * np.maximum(y, 0) + solver.noise.floor * per_state) * per_state
+                shot = solver.noise.slope / solver.repeats * np.maximum(y, 0)
+                variance = (shot + solver.noise.averaged_floor(solver.repeats) * per_state) * per_state
             found["mueller_errors"][:, part] = np.sqrt(np.einsum("pin,pn->ip", solve**2, variance))
             found["reduced_chi_square"][part] = np.sum(residual**2 / variance, axis=1) / free
         found["mueller"][:, part] = m.T

@@ -15,17 +15,21 @@ QUANTIZATION = 1.0 / 12.0
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """variance = slope * signal + floor, signal in counts above black.
+    """variance of a frame = slope * signal + floor, signal in counts above black.
+
+    A mean of n frames that is rounded again has (slope * signal + read) / n + rounding.
 
     Attributes
     ----------
     slope : counts; 1 / (electrons a count), from shot noise.
-    floor : counts^2; read noise and rounding.
+    read : counts^2; read noise.
+    rounding : counts^2; 1/12 for whole counts, 0 for floating numbers.
     source : where the numbers come from, for the provenance.
     """
 
     slope: float
-    floor: float
+    read: float
+    rounding: float
     source: str
 
     @classmethod
@@ -40,7 +44,16 @@ class NoiseModel:
         source = f"gain {gain:g} e/count, read noise "
         source += "unknown, taken as 0" if detector.read_noise_e is None else f"{detector.read_noise_e:g} e"
         read = (detector.read_noise_e or 0.0) / gain
-        return cls(1.0 / gain, read**2 + (QUANTIZATION if integer else 0.0), source)
+        return cls(1.0 / gain, read**2, QUANTIZATION if integer else 0.0, source)
+
+    @property
+    def floor(self) -> float:
+        """Variance without light, counts^2."""
+        return self.read + self.rounding
+
+    def averaged_floor(self, repeats: ArrayLike) -> NDArray[np.float64]:
+        """Variance without light of means of `repeats` frames, counts^2."""
+        return np.asarray(self.read / np.asarray(repeats, dtype=float) + self.rounding)
 
     def variance(self, signal: ArrayLike) -> NDArray[np.float64]:
         """Variance, counts^2, at a signal in counts above black; a negative signal has the floor's."""

@@ -116,6 +116,7 @@ def reduce_mueller(
     solver = MuellerSolver(inversion, BlockReader(capture, states, correction), noise)
     with ProductWriter(out, "mueller", capture.header, capture.frame_shape, planes, steps, overwrite) as product:
         product.array("measurement_matrix", w, "", "W (state, channel, 16): intensity = W . vec(M), row-major")
+        _store_noise(product, noise, solver)
         for rows in capture.row_blocks(BLOCK_PIXELS):
             if rows.stop > product.rows_done:
                 product.write(rows, **_block(solver, rows, tuple(planes)))
@@ -124,6 +125,15 @@ def reduce_mueller(
         facts = _facts(inversion, noise, correction, product, len(states))
         product.seal(facts)
     return facts
+
+
+def _store_noise(product: ProductWriter, noise: NoiseModel | None, solver: MuellerSolver) -> None:
+    # variance of intensity n = slope[n] * signal + floor[n]; NaN: estimated from the residual.
+    nothing = np.full(len(solver.repeats), np.nan)
+    slope = noise.slope / solver.repeats if noise else nothing
+    product.array("noise_slope", slope, "count", "shot noise: variance a signal count, for each row of W")
+    floor = noise.averaged_floor(solver.repeats) if noise else nothing
+    product.array("noise_floor", floor, "count2", "variance without light, for each row of W")
 
 
 def _block(solver: MuellerSolver, rows: slice, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
@@ -169,6 +179,7 @@ def _facts(
         "degrees_of_freedom": inversion.degrees_of_freedom,
         "black": correction.source,
         "noise": noise.source if noise else "estimated from each pixel's residual, because the gain is not known",
+        "weighted": False,
         "median_residual_rms_count": _median(residual),
         "median_residual_over_signal": _median(relative),
         "pixels": mask.size,

@@ -117,7 +117,8 @@ def reduce_stokes(
     noise = NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
     frame, mask = mean_frame(capture, states, correction, progress)
     channels = demosaic(frame, layout, method)
-    found = stokes(channels, analyzers, layout, method, noise, len(states), correction.dark_frames)
+    frames = float(capture.column("repeats")[states].sum())
+    found = stokes(channels, analyzers, layout, method, noise, frames, correction.dark_frames)
     found["pixel_mask"] = _spread(mask, channels.shape[1:])
     lost = (found["pixel_mask"] != 0) | ~(found["s0"] > 0)
     found["pixel_mask"][~(found["s0"] > 0) & (found["pixel_mask"] == 0)] = np.uint8(Mask.NOT_DETERMINED)
@@ -139,14 +140,14 @@ def stokes(
     layout: MosaicLayout,
     method: str,
     noise: NoiseModel | None,
-    frames: int = 1,
+    frames: float = 1,
     dark_frames: int = 0,
 ) -> dict[str, NDArray[Any]]:
     """Stokes planes and their errors from demosaiced channels (4, rows, columns); names as in PLANES.
 
     Without a noise model the variance of a raw pixel is estimated from the closure, one number for the whole image.
     """
-    solve = np.linalg.pinv(analyzers)
+    solve = np.asarray(np.linalg.pinv(analyzers), dtype=float)
     null = np.linalg.svd(analyzers)[0][:, LINEAR]
     # Scaled so that ideal analyzers give I0 + I90 - I45 - I135.
     null = null / np.abs(null).max() * np.sign(null[0])
