@@ -1,8 +1,11 @@
 """Fixtures that every test room shares."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -24,3 +27,86 @@ def shared_data() -> Path:
 def configs() -> Path:
     """The repository's configuration files."""
     return ROOT / "configs"
+
+
+@pytest.fixture
+def small_rig(configs: Path, tmp_path: Path) -> Callable[..., Path]:
+    """Makes a simulated rig file with small frames and a fast clock; keywords change its `simulator` section."""
+    from ruamel.yaml import YAML
+
+    def make(name: str = "rig.yaml", top: dict | None = None, **simulator: object) -> Path:
+        yaml = YAML()
+        rig = yaml.load(configs / "rigs" / "simulated.yaml")
+        quick = {"rows": 64, "columns": 80, "clock_speed": 50, "camera_wait_s": 60}
+        rig["simulator"].update(quick | simulator)
+        rig.update(top or {})
+        for mode in rig["modes"].values():
+            mode["instrument"] = str((configs / "rigs" / mode["instrument"]).resolve())
+        samples = rig["simulator"]["samples"]
+        samples.update({key: str((configs / "rigs" / path).resolve()) for key, path in samples.items()})
+        path = tmp_path / name
+        with path.open("w") as file:
+            yaml.dump(rig, file)
+        return path
+
+    return make
+
+
+@pytest.fixture
+def acquire(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., tuple[int, str, str]]:
+    """Runs `acquire` in this process; returns exit code, standard output and standard error."""
+    from acquisition.cli import main
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as end:
+            main([str(argument) for argument in arguments])
+        out, err = capfd.readouterr()
+        code = end.value.code
+        return (code if isinstance(code, int) else 0), out, err
+
+    return run
+
+
+class SyntheticCapture:
+    """Writes small captures with known content, straight into the file format (no bench, no drivers)."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __call__(
+        self,
+        frames: np.ndarray,
+        angles_deg: dict[str, np.ndarray],
+        *,
+        name: str = "capture.h5",
+        role: tuple[str, ...] | None = None,
+        exposure_s: np.ndarray | float = 0.01,
+        repeats: np.ndarray | int = 1,
+        done: np.ndarray | int = 1,
+        **header: Any,
+    ) -> Path:
+        """Write frames (states, channels, rows, columns) and angles; `header` are fields of CaptureHeader."""
+        import h5py
+
+        from processing.capture_schema import CaptureHeader, create_layout, write_closing
+
+        defaults = {"title": "synthetic", "simulated": True, "mode": "test", "wavelength_nm": 662.0}
+        path = self.folder / name
+        with h5py.File(path, "w") as h5:
+            record = CaptureHeader.model_validate(defaults | header)
+            roles = role or ("sample",) * len(frames)
+            create_layout(h5, record, angles_deg, roles, frames.shape[2:], frames.dtype, "2026-01-01T00:00:00")
+            h5["entry/instrument/detector/data"][...] = frames
+            for axis, values in angles_deg.items():
+                h5[f"entry/instrument/{axis}/value"][...] = values
+            states = h5["entry/states"]
+            states["exposure_s"][...], states["repeats"][...], states["done"][...] = exposure_s, repeats, done
+            write_closing(h5, "complete", "{}")
+        return path
+
+
+@pytest.fixture
+def synthetic_capture(tmp_path: Path) -> SyntheticCapture:
+    """A function that writes a capture with known frames into the test's own folder."""
+    return SyntheticCapture(tmp_path)
