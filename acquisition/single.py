@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import typer
 from rich.console import Console
 from rich.table import Table
 
@@ -110,25 +111,23 @@ def summarize(job: session.Job, result: session.Result) -> None:
     from acquisition.quicklook import draw
 
     figure = draw(result.path)
-    table = Table(box=None, show_header=False, title=None)
-    plan = job.plan
-    kind = "SIMULATED " if job.rig.simulated else ""
-    table.add_row(
-        "what", f"{kind}{plan.mode}, {plan.wavelength_nm:g} nm, Omega {plan.omega_deg:g} deg, {plan.sample.name}"
-    )
+    plan, ledger = job.plan, result.ledger
     darks = sum(role == "dark" for role in job.table.role)
-    table.add_row("states", f"{result.states_done} of {result.states} ({darks} dark), {result.status}")
-    table.add_row("angles", f"largest distance from target {result.worst_angle_deg:.4f} deg, read back at every state")
-    table.add_row("saturation", f"worst state {100 * result.saturated_fraction:.3f} % of pixels")
-    ledger = result.ledger
-    parts = ", ".join(f"{name.removesuffix('_s')} {ledger[name]:.1f}" for name in ledger if name.endswith("_s"))
-    table.add_row("time", f"{parts} s")
-    for message in result.messages[-5:]:
-        table.add_row("warning", message)
-    table.add_row("figure", str(figure))
-    table.add_row("capture", str(result.path))
-    table.add_row("next", next_command(job, result))
-    Console(soft_wrap=True).print(table, markup=False, highlight=False)
+    parts = [f"{name.removesuffix('_s')} {ledger[name]:.1f}" for name in ledger if name.endswith("_s")]
+    what = f"{plan.mode}, {plan.wavelength_nm:g} nm, Omega {plan.omega_deg:g} deg, {plan.sample.name}"
+    lines = [
+        ("what", ("SIMULATED " if job.rig.simulated else "") + what),
+        ("states", f"{result.states_done} of {result.states} ({darks} dark), {result.status}"),
+        ("angles", f"read back at every state, at most {result.worst_angle_deg:.4f} deg from the target"),
+        ("saturation", f"worst state {100 * result.saturated_fraction:.3f} % of pixels"),
+        ("seconds", ", ".join(parts)),
+        *(("warning", message) for message in result.messages[-5:]),
+        ("figure", str(figure)),
+        ("capture", str(result.path)),
+        ("next", next_command(job, result)),
+    ]
+    for label, text in lines:
+        typer.echo(f"{label:<11} {text}")
 
 
 def next_command(job: session.Job, result: session.Result) -> str:

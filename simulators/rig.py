@@ -102,6 +102,7 @@ class SimulatedRig:
             bits=config.detector.bits or 12,
             lost_ratio=config.packet_loss,
             address=config.camera_address,
+            wait_s=config.camera_wait_s,
         )
         self.camera.start()
 

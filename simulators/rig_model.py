@@ -57,6 +57,7 @@ class SimulatorConfig(_Part):
     dark_current_e_per_s: float = Field(default=DARK_CURRENT_E_PER_S, ge=0)
     effects: tuple[AnyBenchEffect, ...] = ()
     camera_address: str = Field(default="127.0.0.1", description="loopback address that the camera occupies")
+    camera_wait_s: float = Field(default=10.0, ge=0, description="wait for that address while another run has it")
     packet_loss: float = Field(default=0.0, ge=0, lt=1)
     stamp: bool = False
 

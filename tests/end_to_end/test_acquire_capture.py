@@ -1,0 +1,102 @@
+"""`acquire` takes whole captures on emulated devices through the real drivers."""
+
+import h5py
+import numpy as np
+import pytest
+
+from processing.capture import Capture
+from simulators.pixel_stamp import read_stamp
+
+
+def _path(out: str):
+    from pathlib import Path
+
+    lines = [line.split() for line in out.splitlines()]
+    return next(Path(words[1]) for words in lines if words and words[0] == "capture")
+
+
+def test_every_frame_shows_the_angles_that_its_metadata_claims(acquire, small_rig, tmp_path):
+    rig = small_rig(stamp=True)
+    code, out, err = acquire("--omega", 35, "--rig", rig, "--out", tmp_path)
+    assert code == 0, err
+    with Capture(_path(out)) as capture:
+        assert capture.role == ("dark",) * 4 + ("sample",) * 40
+        axes = sorted(capture.angles_deg)
+        assert axes == ["arm", "psa", "psg"]
+        for state in range(44):
+            true = dict(zip(axes, read_stamp(capture.frames(state)[0]), strict=True))
+            for axis in axes:
+                # Half a microstep of the Zaber stages, the resolution of the SMC100's reply.
+                assert true[axis] == pytest.approx(capture.angles_deg[axis][state], abs=3e-4)
+        n = np.arange(40)
+        np.testing.assert_allclose(capture.angles_deg["psg"][4:], 9 * n, atol=3e-4)
+        np.testing.assert_allclose(capture.angles_deg["psa"][4:], 4.91 * 9 * n, atol=3e-4)
+        np.testing.assert_allclose(capture.angles_deg["arm"], 35, atol=3e-4)
+
+
+def test_the_capture_says_what_it_is(acquire, small_rig, tmp_path):
+    code, out, err = acquire("--omega", 35, "--rig", small_rig(), "--out", tmp_path)
+    assert code == 0, err
+    assert "SIMULATED" in out and "SIMULATED" in err
+    path = _path(out)
+    assert path.with_suffix(".png").stat().st_size > 10_000
+    assert not path.with_name(path.name + ".partial").exists()
+    with Capture(path) as capture:
+        assert capture.simulated and capture.header.simulated
+        assert capture.status == "complete"
+        assert capture.instrument is not None and capture.instrument.name == "RGB950"
+        assert capture.header.seed == 1
+        ledger = capture.closing["ledger"]
+        parts = [v for k, v in ledger.items() if k.endswith("_s") and k not in ("total_s", "unavoidable_s")]
+        assert sum(parts) == pytest.approx(ledger["total_s"], abs=0.01)
+        assert capture.closing["stream"]["completed"] >= 44
+        dark = capture.frames(0)
+        light = capture.frames(20)
+        assert abs(dark.mean() - 64) < 0.2
+        assert light.mean() > 100
+        assert np.all(np.diff(capture.column("host_time_s")) > 0)
+
+
+def test_same_plan_and_seed_give_the_same_bytes(acquire, small_rig, tmp_path):
+    def frames(folder, seed):
+        code, out, err = acquire("--omega", 35, "--rig", small_rig(), "--seed", seed, "--out", tmp_path / folder)
+        assert code == 0, err
+        with h5py.File(_path(out)) as file:
+            return file["entry/instrument/detector/data"][...]
+
+    first = frames("a", 7)
+    assert np.array_equal(first, frames("b", 7))
+    assert not np.array_equal(first, frames("c", 8))
+
+
+def test_stokes_capture_is_a_mosaic_under_horizontal_light(acquire, small_rig, tmp_path):
+    code, out, err = acquire(
+        "--mode", "stokes", "--omega", 180, "--sample", "air", "--rig", small_rig(), "--out", tmp_path
+    )
+    assert code == 0, err
+    with Capture(_path(out)) as capture:
+        assert capture.header.mosaic == (("90", "45"), ("135", "0"))
+        assert capture.header.illumination == "horizontal"
+        assert capture.role == ("dark",) * 4 + ("air",) * 8
+        np.testing.assert_allclose(capture.angles_deg["psg"], 17.02, atol=3e-4)
+        frame = capture.frames(5)[0].astype(float) - 64
+        horizontal, vertical = frame[1::2, 1::2].mean(), frame[0::2, 0::2].mean()
+        assert abs(vertical) < 1
+        assert frame[0::2, 1::2].mean() == pytest.approx(horizontal / 2, rel=0.01)
+
+
+def test_dry_run_moves_nothing_and_writes_nothing(acquire, small_rig, tmp_path):
+    out_folder = tmp_path / "captures"
+    code, out, err = acquire("--omega", 35, "--rig", small_rig(), "--out", out_folder, "--dry-run")
+    assert code == 0, err
+    assert "nothing was moved" in out and "limits of psa" in out
+    assert not out_folder.exists()
+
+
+def test_averaged_frames_say_so(acquire, small_rig, tmp_path):
+    plan = tmp_path / "plan.yaml"
+    plan.write_text("kind: plan\nmode: stokes\nstates: {kind: fixed, states: 2}\nrepeats: 5\ndarks: 1\n")
+    code, out, err = acquire("--plan", plan, "--rig", small_rig(), "--out", tmp_path)
+    assert code == 0, err
+    with Capture(_path(out)) as capture:
+        assert capture.column("repeats").tolist() == [5, 5, 5]
