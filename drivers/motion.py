@@ -33,6 +33,8 @@ SLACK = 1.5
 # Status words can lag behind the start and the end of a motion, and a servo settles: idle off the target
 # counts only when it lasts this long.
 SETTLE_S = 0.3
+# Sums of zero and angle in floating point: a target at the limit itself is inside.
+ROUNDING_DEG = 1e-6
 # A look at the position while moving, for the detection of a stall.
 PROGRESS_EVERY_S = 0.2
 
@@ -136,6 +138,7 @@ class Motion:
                 short = None
         if short is None:
             self._result = self._last
+            axis._do_note_rest(self._last.counts)
         elif axis._stops != self._stops_before:
             raise MotionStopped(*self._figures(), "stopped on request", "Start a new move when it is safe")
         elif self._idle_since_s is None:
@@ -224,9 +227,8 @@ class MotionAxis(ABC):
             Outside the limits, or not a finite number.
         """
         limits = self.limits
-        half_count_deg = 0.5 / abs(self.counts_per_deg)
-        low = -math.inf if limits.min_deg is None else limits.min_deg - half_count_deg
-        high = math.inf if limits.max_deg is None else limits.max_deg + half_count_deg
+        low = -math.inf if limits.min_deg is None else limits.min_deg - ROUNDING_DEG
+        high = math.inf if limits.max_deg is None else limits.max_deg + ROUNDING_DEG
         if math.isfinite(target_deg) and low <= target_deg <= high:
             return
         ends = " to ".join("no limit" if end is None else f"{end:g}" for end in (limits.min_deg, limits.max_deg))
@@ -259,10 +261,15 @@ class MotionAxis(ABC):
     def _confirm(self, first: int | float) -> int | float:
         tolerance = self.config.tolerance_deg * abs(self.counts_per_deg)
         seen = [first]
-        while len(seen) < 4:
+        while len(seen) < 5:
             seen.append(self._do_read_counts())
-            if abs(seen[-1] - seen[-2]) <= tolerance or self._do_is_moving():
+            if seen[-1] == seen[-2]:
                 return seen[-1]
+            if self._do_is_moving():
+                return seen[-1]
+            # A servo trembles within the tolerance, and so can a changed last digit: the middle of three is right.
+            if len(seen) >= 3 and max(seen[-3:]) - min(seen[-3:]) <= tolerance:
+                return sorted(seen[-3:])[1]
         raise ReplyError(
             f"axis {self.name}, read position",
             f"readings at rest that contradict each other: {seen}",
@@ -380,6 +387,9 @@ class MotionAxis(ABC):
     @abstractmethod
     def _do_stop(self) -> None:
         """Write the stop without waiting for the line's lock or for a reply."""
+
+    def _do_note_rest(self, counts: int | float) -> None:  # noqa: B027 - for drivers that watch the resting position
+        """Take the position at which a motion has ended."""
 
     @abstractmethod
     def _do_check_fault(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import termios
 import threading
 import time
 from collections.abc import Callable
@@ -154,8 +155,8 @@ class SerialLink:
     def _lost_port_named(self) -> Any:
         try:
             yield
-        except (OSError, serial.SerialException, TypeError) as error:
-            # pyserial raises TypeError when another thread has closed the port during a read.
+        except (OSError, serial.SerialException, termios.error, TypeError) as error:
+            # termios.error is no OSError; pyserial raises TypeError when another thread closes the port in a read.
             raise PortLost(
                 f"use port {self.port}", f"it is gone ({error})", "Check cable and power, then start again"
             ) from error

@@ -41,6 +41,9 @@ class SessionReferenceAxis(MotionAxis):
         self._homing = False
         self._rest_counts = None
 
+    def _do_note_rest(self, counts: float) -> None:
+        self._rest_counts = counts
+
     def _do_is_homed(self) -> bool:
         if self._do_is_moving():
             return self._referenced

@@ -114,7 +114,7 @@ class APTAxis(MotionAxis):
             raise WrongDevice(
                 f"axis {name}, find APT unit {config.serial_number} on {config.port}",
                 f"there is {model} with serial number {serial_number}",
-                "Correct port or serial_number; /dev/serial/by-id names the port by its serial number",
+                "Correct port or serial_number in the rig file; /dev/serial/by-id names ports by serial number",
             )
         self._unknown = ""
         self._scale = self._find_scale(model, int.from_bytes(info[76:78], "little"))

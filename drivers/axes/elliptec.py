@@ -41,8 +41,6 @@ STATUS = {
 BUSY = 9
 FULL_SPEED_DEG_S = 430.0
 ACCELERATION_DEG_S2 = 2000.0
-# pylablib notes that a move sent too soon after another command can end at zero.
-PAUSE_BEFORE_MOVE_S = 0.1
 _ROTARY = {14: "ELL14", 18: "ELL18"}
 _FRAME = re.compile(r"([0-9A-F])([A-Z][A-Z0-9])([0-9A-F]*)")
 
@@ -54,6 +52,9 @@ class Config(SessionReferenceConfig):
     address: str | None = Field(default=None, pattern="^[0-9A-F]$")
     serial_number: str | None = None
     home_clockwise: bool = True
+    pause_before_move_s: float = Field(
+        default=0.1, ge=0, description="pylablib notes that a move sent too soon after another command can end at zero"
+    )
 
 
 class ElliptecLine:
@@ -75,10 +76,10 @@ class ElliptecLine:
         self.link.write(f"{address}{command}".encode("ascii"))
         self._last_sent_s = time.monotonic()
 
-    def start(self, address: str, command: str) -> None:
+    def start(self, address: str, command: str, pause_s: float) -> None:
         """Start a move, whose reply comes when it ends."""
         with self.link.lock:
-            time.sleep(max(0.0, self._last_sent_s + PAUSE_BEFORE_MOVE_S - time.monotonic()))
+            time.sleep(max(0.0, self._last_sent_s + pause_s - time.monotonic()))
             self.drain()
             self.ended.pop(address, None)
             self.send(address, command)
@@ -219,7 +220,7 @@ class ElliptecAxis(SessionReferenceAxis):
     def _start(self, command: str) -> None:
         self._status = 0
         self._in_motion = True
-        self._line.start(self._address, command)
+        self._line.start(self._address, command, self.config.pause_before_move_s)
 
     def _do_stop(self) -> None:
         log.warning("axis %s: an Elliptec module runs a started move to its end, it cannot be stopped", self.name)

@@ -102,7 +102,7 @@ class ESP301Axis(SessionReferenceAxis):
         stage = line.ask(f"{config.axis}ID?", _TEXT)
         asked = f"axis {name} on {config.port} axis {config.axis}"
         if config.stage_id is not None and not stage.startswith(config.stage_id):
-            raise WrongDevice(f"{asked}, stage {config.stage_id}", f"found {stage!r}", "Correct stage_id, port or axis")
+            raise WrongDevice(f"{asked}, stage {config.stage_id}", f"found {stage!r}", "Correct it in the rig file")
         unit = int(line.ask(f"{config.axis}SN?", _INTEGER))
         if unit != DEGREE:
             raise WrongDevice(f"{asked}, unit", f"unit {unit}, not {DEGREE} (degree)", "Set it with the front panel")

@@ -158,7 +158,7 @@ class ZaberLine:
         self.link.purge()
         return None, seen
 
-    def ask_all(self, words: str, quiet_s: float = 0.25) -> list[Reply]:
+    def ask_all(self, words: str, quiet_s: float = 0.1) -> list[Reply]:
         """Ask every device on the chain and collect the replies until the line is quiet."""
         replies: list[Reply] = []
         with self.link.lock:
