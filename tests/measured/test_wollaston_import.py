@@ -1,0 +1,67 @@
+"""A public near-infrared polarimeter with two channel fluxes a state, no frames at all."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from processing.calibrate import calibrate
+from processing.capture import Capture
+from processing.images import MuellerImage
+from processing.importing import ImportRequest, import_capture, read_sample
+from processing.instrument import InstrumentModel
+from processing.product import Step
+from processing.reduce import reduce_mueller
+
+pytestmark = pytest.mark.measured
+
+
+def states_csv(data: Path, prefix: str, wavelength: int, target: Path) -> Path:
+    """states.csv from the JSON keys: the generator angle in degrees, sorted, and one column a channel."""
+    raw = json.loads(data.read_text(encoding="utf-8"))
+    theta = np.degrees(raw[f"{prefix}theta{wavelength}"])
+    lines = ["state,psg_deg,channel_left,channel_right"]
+    for state, k in enumerate(np.argsort(theta)):
+        left, right = (raw[f"{prefix}I{side}_{wavelength}"][k] for side in "lr")
+        lines.append(f"{state},{float(theta[k])!r},{left!r},{right!r}")
+    target.write_text("\n".join(lines), encoding="utf-8")
+    return target
+
+
+@pytest.mark.parametrize("wavelength", [1300, 1600])
+def test_two_channels_a_state(wavelength: int, shared_data: Path, configs: Path, tmp_path: Path) -> None:
+    folder = shared_data / "drr-wollaston-nir"
+    instrument = configs / "instruments/drr_wollaston.yaml"
+    for name, prefix, sample in (("cal", "Cal_", "air"), ("sample", "", "unknown")):
+        request = ImportRequest(
+            states=states_csv(folder / f"{name}_results.json", prefix, wavelength, tmp_path / f"{name}.csv"),
+            out=tmp_path / f"{name}.h5",
+            wavelength_nm=wavelength,
+            instrument=instrument,
+            sample=read_sample(sample),
+        )
+        header = import_capture(request)
+        assert header.channels == ("left", "right")
+        assert header.sample.kind == sample
+    raw = json.loads((folder / "cal_results.json").read_text(encoding="utf-8"))
+    with Capture(tmp_path / "cal.h5") as capture:
+        stored = np.stack([capture.frames(k)[:, 0, 0] for k in range(46)])
+        assert sorted(stored[:, 0]) == sorted(raw[f"Cal_Il_{wavelength}"])
+        # Air at 0 degrees: nearly all light in one channel, so the polarizer stands across the left one's axis.
+        assert stored[0, 1] > 5 * stored[0, 0]
+        # From the nominal train, with the polarizer at 90 degrees, the fit explains the capture of air.
+        model = InstrumentModel.load(instrument).at(wavelength)
+        crossed = model.generator[0].model_copy(update={"azimuth_deg": 90.0})
+        model = model.model_copy(update={"generator": (crossed, model.generator[1])})
+        free = [f"{e}.{f}" for e in ("psg_retarder", "psa_retarder") for f in ("retardance_deg", "azimuth_deg")]
+        fitted = calibrate(capture, model, [*free, "psg_polarizer.azimuth_deg"], slice(0, 1), slice(0, 1))
+    assert fitted.residual_over_mean < 0.03
+    with Capture(tmp_path / "sample.h5") as capture:
+        reduce_mueller(capture, fitted.model, tmp_path / "m.h5", (Step("reduce", {}),))
+    image = MuellerImage.load(tmp_path / "m.h5")
+    normalized = image.values[..., 0, 0] / image.values[0, 0, 0, 0]
+    # A half-wave plate near its design wavelength: no diattenuation, m33 close to -1, det > 0.
+    assert np.linalg.norm(normalized[0, 1:]) < 0.05
+    assert normalized[3, 3] < -0.9
+    assert np.linalg.det(normalized) > 0.8
