@@ -1,0 +1,227 @@
+"""The `process` command as a user runs it: import, reduce, calibrate, and every way to feed it badly."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from processing.cli import main
+from processing.images import MuellerImage
+from processing.instrument import InstrumentModel
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def process(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run `process ARGS`; returns exit code, stdout, stderr. No traceback may ever be printed."""
+
+    def run(*args: object) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as ended:
+            main([str(a) for a in args])
+        out, err = capsys.readouterr()
+        assert "Traceback" not in err
+        return int(ended.value.code or 0), out, err
+
+    return run
+
+
+@pytest.fixture
+def instrument(configs: Path) -> Path:
+    return configs / "instruments/rgb950.yaml"
+
+
+class Measured:
+    """A folder as another lab would hand it over: states.csv and one image a state."""
+
+    def __init__(self, folder: Path, instrument: Path, sample: np.ndarray, suffix: str = ".png") -> None:
+        self.folder, self.states = folder, folder / "states.csv"
+        psg = 9.0 * np.arange(40)
+        self.angles = {"psg": psg, "psa": 4.91 * psg}
+        w = InstrumentModel.load(instrument).at(662).rows(self.angles)[:, 0]
+        ramp = np.linspace(4000, 16000, 8 * 12).reshape(8, 12)
+        self.m = sample.reshape(16, 1, 1) * ramp
+        frames = np.rint(np.einsum("nk,kxy->nxy", w, self.m) + 200).astype(np.uint16)
+        lines = ["state,psg_deg,psa_deg,exposure_s,file"]
+        for k, frame in enumerate(frames):
+            cv2.imwrite(str(folder / f"f{k}{suffix}"), frame)
+            lines.append(f"{k},{psg[k]},{4.91 * psg[k]},0.01,f{k}{suffix}")
+        self.lines, self.frames = lines, frames
+        self.write(lines)
+
+    def write(self, lines: list[str]) -> None:
+        self.states.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+@pytest.fixture
+def measured(tmp_path: Path, instrument: Path) -> Measured:
+    return Measured(tmp_path, instrument, np.diag([1.0, 1.0, -1.0, -1.0]))
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_import_reduce_figure(suffix: str, tmp_path: Path, instrument: Path, process: Run) -> None:
+    data = Measured(tmp_path, instrument, np.diag([1.0, 1.0, -1.0, -1.0]), suffix)
+    options = ["--wavelength-nm", 662, "--instrument", instrument, "--sample", "mirror", "--omega-deg", 3]
+    noise = ["--black-level", 200, "--gain-e-per-count", 0.5, "--read-noise-e", 2]
+    code, out, err = process("import", "--states", data.states, *options, *noise)
+    assert (code, err) == (0, "")
+    figure = tmp_path / "m.png"
+    code, out, err = process("reduce", tmp_path / "states.h5", "--figure", figure)
+    assert (code, err) == (0, "")
+    assert "condition number: 7.14" in out
+    assert "SIMULATED" not in out
+    drawn = cv2.imread(str(figure))
+    assert drawn.shape[0] > 500
+    assert drawn.std() > 10
+    image = MuellerImage.load(tmp_path / "states.mueller.h5")
+    assert np.max(np.abs(image.values.reshape(16, 8, 12) - data.m)) < 5  # counts, from rounding of the frames
+    assert np.isfinite(image.errors).all()
+    code, out, err = process("reduce", tmp_path / "states.h5")
+    assert code == 2
+    assert "exists" in err
+    assert process("reduce", tmp_path / "states.h5", "--overwrite")[0] == 0
+
+
+@pytest.mark.parametrize("kind", ["npy", "h5", "h5 named"])
+def test_import_of_a_stack(kind: str, measured: Measured, tmp_path: Path, instrument: Path, process: Run) -> None:
+    measured.write([line.rsplit(",", 1)[0] for line in measured.lines])
+    if kind == "npy":
+        stack = str(tmp_path / "stack.npy")
+        np.save(stack, measured.frames)
+    else:
+        with h5py.File(tmp_path / "stack.hdf", "w") as h5:
+            h5["raw/frames"] = measured.frames
+        stack = str(tmp_path / "stack.hdf") + ("::/raw/frames" if "named" in kind else "")
+    options = ["--wavelength-nm", 662, "--instrument", instrument, "--black-level", 200]
+    code, _, err = process("import", "--states", measured.states, "--stack", stack, *options)
+    assert (code, err) == (0, "")
+    assert process("reduce", tmp_path / "states.h5")[0] == 0
+    image = MuellerImage.load(tmp_path / "states.mueller.h5")
+    assert np.max(np.abs(image.values.reshape(16, 8, 12) - measured.m)) < 5
+
+
+def test_calibrate_finds_a_wrong_train_and_never_overwrites(
+    measured: Measured, tmp_path: Path, instrument: Path, process: Run
+) -> None:
+    options = ["--wavelength-nm", 662, "--instrument", instrument, "--black-level", 200, "--sample", "mirror"]
+    assert process("import", "--states", measured.states, *options)[0] == 0
+    wrong = tmp_path / "wrong.yaml"
+    wrong.write_text(instrument.read_text().replace("662: 94.78", "662: 91.0").replace("662: 13.41", "662: 12.0"))
+    free = "psa_retarder.retardance_deg,psa_retarder.azimuth_deg"
+    new = tmp_path / "new.yaml"
+    command = ["calibrate", tmp_path / "states.h5", "--instrument", wrong, "--free", free, "--write", new]
+    code, _, err = process(*command)
+    assert (code, err) == (0, "")
+    before, model = InstrumentModel.load(wrong), InstrumentModel.load(new)
+    fitted = model.at(662).analyzer[0]
+    assert fitted.retardance_deg == pytest.approx(94.78, abs=0.01)  # type: ignore[union-attr]
+    assert fitted.azimuth_deg == pytest.approx(13.41, abs=0.01)
+    assert model.at(451).generator == before.at(451).generator
+    code, _, err = process(*command)
+    assert code == 2
+    assert "never replaces" in err
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: s.replace("f7.png", "gone.png"), r"states.csv:9: column file: no such frame: .*gone.png"),
+        (lambda s: s.replace("\n5,45.0,", "\n5,fortyfive,"), r"states.csv:7: column psg: 'fortyfive' is not a finite"),
+        (lambda s: s.replace("\n5,45.0,", "\n5,nan,"), r"states.csv:7: column psg: 'nan' is not a finite"),
+        (lambda s: s.replace("psa_deg", "psa_angle"), r"states.csv:1: no column psa"),
+        (lambda s: s.replace("\n6,", "\n5,"), r"states.csv:8: state 5 is given already in line 7"),
+        (lambda s: s.replace("\n6,54.0,", "\n6,"), r"states.csv:8: 4 columns, the header has 5"),
+        (lambda s: s.replace("file", "psg"), r"column given twice: psg"),
+        (lambda s: s.split("\n")[0], r"needs a header line and one row per state"),
+    ],
+    ids=["missing frame", "no number", "nan", "no column", "state twice", "short row", "column twice", "empty"],
+)
+def test_bad_states_file(
+    change: Callable[[str], str], message: str, measured: Measured, instrument: Path, process: Run
+) -> None:
+    measured.states.write_text(change(measured.states.read_text()), encoding="utf-8")
+    code, _, err = process("import", "--states", measured.states, "--wavelength-nm", 662, "--instrument", instrument)
+    assert code == 2
+    assert re.search(message, err), err
+    assert not list(measured.folder.glob("*.h5*"))
+
+
+def test_frames_that_do_not_fit(measured: Measured, instrument: Path, process: Run, tmp_path: Path) -> None:
+    options = ["--states", measured.states, "--wavelength-nm", 662, "--instrument", instrument]
+    cv2.imwrite(str(tmp_path / "f3.png"), np.zeros((9, 12), np.uint16))
+    code, _, err = process("import", *options)
+    assert code == 2
+    assert "states.csv:5: f3.png is 12 x 9 uint16, but the first frame is 12 x 8 uint16" in err
+    (tmp_path / "f3.png").write_bytes(b"not an image")
+    code, _, err = process("import", *options)
+    assert code == 2
+    assert "f3.png: is not an image" in err
+    assert not list(tmp_path.glob("*.h5*"))
+    np.save(tmp_path / "s.npy", measured.frames[:39])
+    code, _, err = process("import", *options, "--stack", tmp_path / "s.npy")
+    assert code == 2
+    assert "exactly one of" in err
+    measured.write([line.rsplit(",", 1)[0] for line in measured.lines])
+    code, _, err = process("import", *options, "--stack", tmp_path / "s.npy")
+    assert code == 2
+    assert "shape (39, 8, 12)" in err
+    assert "(40, rows, columns)" in err
+
+
+def test_bad_options(measured: Measured, instrument: Path, process: Run, tmp_path: Path) -> None:
+    options = ["--states", measured.states, "--instrument", instrument]
+    code, _, err = process("import", *options, "--wavelength-nm", 700)
+    assert code == 2
+    assert "is given at 451, 524, 662, 947 nm; asked for 700 nm" in err
+    code, _, err = process("import", *options, "--wavelength-nm", 662, "--sample", "glass")
+    assert code == 2
+    assert "--sample glass: neither air, mirror, unknown" in err
+    code, _, err = process("import", *options, "--wavelength-nm", 662, "--gain-e-per-count", -1)
+    assert code == 2
+    broken = tmp_path / "broken.yaml"
+    broken.write_text(instrument.read_text().replace("analyzer:", "anlyzer:"), encoding="utf-8")
+    code, _, err = process("import", "--states", measured.states, "--wavelength-nm", 662, "--instrument", broken)
+    assert code == 2
+    assert "broken.yaml:" in err
+    assert "unknown key" in err
+
+
+def test_bad_captures(measured: Measured, instrument: Path, process: Run, tmp_path: Path) -> None:
+    code, _, err = process("reduce", tmp_path / "none.h5")
+    assert code == 2
+    assert "no such file" in err
+    assert process("import", "--states", measured.states, "--wavelength-nm", 662)[0] == 0
+    capture = tmp_path / "states.h5"
+    code, _, err = process("reduce", capture)
+    assert code == 2
+    assert "holds no instrument model. Give one with --instrument" in err
+    truncated = tmp_path / "truncated.h5"
+    truncated.write_bytes(capture.read_bytes()[:3000])
+    code, _, err = process("reduce", truncated)
+    assert code == 2
+    assert "truncated" in err
+    other = tmp_path / "other.h5"
+    with h5py.File(other, "w") as h5:
+        h5["x"] = 1
+    code, _, err = process("reduce", other)
+    assert code == 2
+    assert "no umov capture" in err
+    before = sorted(tmp_path.iterdir())
+    line = measured.lines
+    measured.write(line[:11])
+    assert process("import", "--states", measured.states, "--wavelength-nm", 662, "--overwrite")[0] == 0
+    code, _, err = process("reduce", capture, "--instrument", instrument)
+    assert code == 1
+    assert "rank 10, and 16 are needed" in err
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_help_names_every_command(process: Run) -> None:
+    code, out, _ = process("--help")
+    assert code == 0
+    for name in ("reduce", "import", "calibrate"):
+        assert name in out
