@@ -8,11 +8,11 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from processing.capture_schema import Sample
 from processing.states import RGB950_RATIO, RGB950_STATES, RGB950_STEP_DEG, Role, StateTable, rotating_retarders
-from processing.yaml_file import load_yaml
+from processing.yaml_file import ConfigError, load_yaml
 
 Mode = Literal["drr", "stokes"]
 
@@ -121,9 +121,13 @@ class MeasurementPlan(_Part):
         return load_yaml(path, cls)
 
     def with_changes(self, **changes: Any) -> MeasurementPlan:
-        """A copy with the values that are not None; validated again."""
+        """A copy with the values that are not None, validated again. Raises ConfigError."""
         chosen = {name: value for name, value in changes.items() if value is not None}
-        return MeasurementPlan.model_validate(self.model_dump() | chosen)
+        try:
+            return MeasurementPlan.model_validate(self.model_dump() | chosen)
+        except ValidationError as error:
+            lines = [f"{'.'.join(str(part) for part in e['loc'])}: {e['msg']}" for e in error.errors()]
+            raise ConfigError("\n".join(lines)) from error
 
     def state_table(self, pose_deg: Mapping[str, float], exposure_s: float) -> StateTable:
         """Rows of the capture: darks in the first pose, then the sample states.

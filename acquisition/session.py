@@ -120,16 +120,18 @@ def take(
     AcquisitionError, DeviceError
         The run failed; the message names the partial file, which `resume` goes on with.
     """
+    _require_reference(rig, home)
     place_sample(job, rig)
     header = _header(job, rig)
     writer = CaptureWriter.create(path, header, job.table, _frame_shape(rig), _now())
-    return _run(job, rig, writer, range(len(job.table)), stop, observers, home)
+    return _run(job, rig, writer, range(len(job.table)), stop, observers)
 
 
 def resume(
     job: Job, rig: Rig, partial: Path, stop: StopRequest, observers: Sequence[Observer] = (), home: bool = False
 ) -> Result:
     """Go on with a capture: the first state not done, then the others. Raises as `take`."""
+    _require_reference(rig, home)
     place_sample(job, rig)
     with Capture(partial) as capture:
         done = set(capture.done.tolist())
@@ -142,7 +144,7 @@ def resume(
         partial = partial.rename(partial.with_name(partial.name + PARTIAL))
     writer = CaptureWriter.reopen(partial)
     pending = [k for k in range(len(job.table)) if k not in done]
-    return _run(job, rig, writer, pending, stop, observers, home)
+    return _run(job, rig, writer, pending, stop, observers)
 
 
 def job_of(path: Path, rig: RigConfig | None = None) -> Job:
@@ -193,7 +195,6 @@ def _run(
     pending: Sequence[int],
     stop: StopRequest,
     observers: Sequence[Observer],
-    home: bool,
 ) -> Result:
     watchers = list(observers)
     if rig.simulation is not None:
@@ -204,7 +205,7 @@ def _run(
     for observer in watchers:
         observer.run_started(_title(job), job.table, len(pending))
     try:
-        _go_to_start(job, rig, watchers, home)
+        _go_to_start(job, rig, watchers)
         if runner.run(pending):
             status = "complete"
         else:
@@ -232,13 +233,18 @@ def _run(
     return _result(path, status, job, runner)
 
 
-def _go_to_start(job: Job, rig: Rig, observers: Sequence[Observer], home: bool) -> None:
+def _require_reference(rig: Rig, home: bool) -> None:
+    """Refuse axes without a reference, unless homing was asked for, by option or rig file."""
     unhomed = rig.unhomed()
-    if unhomed and not (home or job.rig.home_at_start):
+    if unhomed and not (home or rig.config.home_at_start):
         raise AcquisitionError(
             f"no reference position: {', '.join(unhomed)}. Nothing was moved. Look whether the way is free, then "
             "home the axes with `acquire home` (or --home)."
         )
+
+
+def _go_to_start(job: Job, rig: Rig, observers: Sequence[Observer]) -> None:
+    unhomed = rig.unhomed()
     if unhomed:
         for observer in observers:
             observer.activity(f"homing {', '.join(unhomed)}")

@@ -37,14 +37,17 @@ def test_every_frame_shows_the_angles_that_its_metadata_claims(acquire, small_ri
 def test_the_capture_says_what_it_is(acquire, small_rig, tmp_path):
     code, out, err = acquire("--omega", 35, "--rig", small_rig(), "--out", tmp_path)
     assert code == 0, err
-    assert "SIMULATED" in out and "SIMULATED" in err
+    assert "SIMULATED" in out
+    assert "SIMULATED" in err
     path = _path(out)
     assert path.with_suffix(".png").stat().st_size > 10_000
     assert not path.with_name(path.name + ".partial").exists()
     with Capture(path) as capture:
-        assert capture.simulated and capture.header.simulated
+        assert capture.simulated
+        assert capture.header.simulated
         assert capture.status == "complete"
-        assert capture.instrument is not None and capture.instrument.name == "RGB950"
+        assert capture.instrument is not None
+        assert capture.instrument.name == "RGB950"
         assert capture.header.seed == 1
         ledger = capture.closing["ledger"]
         parts = [v for k, v in ledger.items() if k.endswith("_s") and k not in ("total_s", "unavoidable_s")]
@@ -89,7 +92,8 @@ def test_dry_run_moves_nothing_and_writes_nothing(acquire, small_rig, tmp_path):
     out_folder = tmp_path / "captures"
     code, out, err = acquire("--omega", 35, "--rig", small_rig(), "--out", out_folder, "--dry-run")
     assert code == 0, err
-    assert "nothing was moved" in out and "limits of psa" in out
+    assert "nothing was moved" in out
+    assert "limits of psa" in out
     assert not out_folder.exists()
 
 

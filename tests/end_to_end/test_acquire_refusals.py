@@ -1,0 +1,143 @@
+"""Bad input of `acquire`: a clear message, an exit code, no traceback, nothing moved, nothing written."""
+
+import os
+import pty
+import subprocess
+import sys
+
+import pytest
+from ruamel.yaml import YAML
+
+
+def _changed(path, change):
+    yaml = YAML()
+    rig = yaml.load(path)
+    change(rig)
+    with path.open("w") as file:
+        yaml.dump(rig, file)
+    return path
+
+
+@pytest.fixture
+def refused(acquire, tmp_path):
+    """Runs `acquire`, which must refuse without traceback or capture; returns exit code and message."""
+
+    def run(*arguments):
+        code, out, err = acquire(*arguments, "--out", tmp_path / "captures")
+        assert code != 0
+        assert "Traceback" not in out + err
+        assert not list(tmp_path.glob("captures/*"))
+        return code, err
+
+    return run
+
+
+def test_unknown_key_is_named_with_its_line(refused, small_rig):
+    rig = small_rig()
+    rig.write_text(rig.read_text().replace("home_at_start:", "home_at_strat:"))
+    line = next(n for n, text in enumerate(rig.read_text().splitlines(), 1) if "home_at_strat" in text)
+    code, err = refused("--omega", 35, "--rig", rig)
+    assert code == 2
+    assert f"rig.yaml:{line}: home_at_strat: unknown key" in err
+
+
+def test_unknown_key_of_an_axis_is_named_with_its_line(refused, small_rig):
+    rig = _changed(small_rig(), lambda r: r["axes"]["psa"].update(adress=2))
+    code, err = refused("--omega", 35, "--rig", rig)
+    assert code == 2
+    assert "adress: unknown key" in err
+    assert "rig.yaml:" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--omega", 181), ("181", "0 to 180")),
+        (("--omega", 3), ("forbidden pose", "arm")),
+        (("--omega", 35, "--wavelength", 500), ("500", "662")),
+        (("--omega", 35, "--mode", "mueller"), ("mueller", "drr")),
+        (("--omega", 35, "--sample", "gold"), ("gold", "red_sphere")),
+        (("--omega", 35, "--sample", "air"), ("air", "180")),
+        (("--omega", 35, "--exposure", 100), ("100", "exposure")),
+        (("--omega", 35, "--exposure", -1), ("exposure_s", "positive")),
+        (("--omega", "nan"), ("omega_deg",)),
+    ],
+)
+def test_plan_outside_what_the_rig_can_do(refused, small_rig, arguments, words):
+    code, err = refused(*arguments, "--rig", small_rig())
+    assert code == 2
+    assert all(word in err for word in words), err
+
+
+def test_states_that_do_not_determine_a_mueller_matrix(refused, small_rig, tmp_path):
+    plan = tmp_path / "plan.yaml"
+    plan.write_text("kind: plan\nstates: {kind: rotating_retarders, states: 40, step_deg: 9, ratio: 5}\n")
+    code, err = refused("--plan", plan, "--rig", small_rig())
+    assert code == 2
+    assert "rank 12 of 16" in err
+
+
+def test_no_such_port(refused, small_rig):
+    rig = _changed(small_rig(), lambda r: r["axes"]["arm"].update(port="/dev/ttyNOTHERE"))
+    code, err = refused("--omega", 35, "--rig", rig)
+    assert code == 1
+    assert "/dev/ttyNOTHERE" in err
+    assert "no such port" in err
+
+
+def test_camera_not_there(refused, small_rig):
+    def far(rig):
+        rig["camera"]["device"] = "127.9.9.9"
+        del rig["simulator"]
+        for axis in rig["axes"].values():
+            axis["port"] = "/dev/null"
+
+    # Without emulators the ports come first: a rig that only has a camera shows the camera's message.
+    def camera_only(rig):
+        far(rig)
+        rig["axes"].clear()
+        del rig["source"]
+        rig["modes"] = {"stokes": {"instrument": rig["modes"]["stokes"]["instrument"]}}
+        rig["interlocks"] = []
+        rig["home_order"] = []
+        rig["forbidden"] = []
+
+    code, err = refused("--omega", 35, "--mode", "stokes", "--rig", _changed(small_rig(), camera_only))
+    assert code == 1
+    assert "127.9.9.9" in err
+
+
+def test_port_held_by_another_program_names_it(refused, small_rig):
+    master, slave = pty.openpty()
+    path = os.ttyname(slave)
+    holder = subprocess.Popen(
+        [sys.executable, "-c", f"import time; f=open({path!r}); print('x', flush=True); time.sleep(60)"],
+        stdout=subprocess.PIPE,
+    )
+    try:
+        assert holder.stdout is not None
+        holder.stdout.readline()
+        rig = _changed(small_rig(), lambda r: r["axes"]["arm"].update(port=path))
+        code, err = refused("--omega", 35, "--rig", rig)
+    finally:
+        holder.kill()
+        holder.wait()
+        holder.stdout.close()
+        os.close(master)
+        os.close(slave)
+    assert code == 1
+    assert f"pid {holder.pid}" in err
+
+
+def test_axes_without_reference_are_not_homed_unasked(refused, small_rig):
+    rig = _changed(small_rig(), lambda r: r.update(home_at_start=False))
+    code, err = refused("--omega", 35, "--rig", rig)
+    assert code == 1
+    assert "acquire home" in err
+    assert "arm, psg, psa" in err
+
+
+def test_nothing_asked_shows_help(acquire):
+    code, out, _ = acquire()
+    assert code == 2
+    assert "--omega" in out
