@@ -16,6 +16,9 @@ from processing.threads import for_ranges
 
 Floats = NDArray[np.floating]
 
+#: Pixels that a compiled loop gets at a time: small enough for the second-level cache.
+CHUNK = 2048
+
 
 class Cloude(NamedTuple):
     """Cloude decomposition: M = m00 sum_k xi_k m_k."""
@@ -41,8 +44,7 @@ def coherency_eigenvalues(m: Floats) -> Floats:
     """
     planar, shape = _planar(m)
     xi = np.empty((4, planar.shape[1]), planar.dtype)
-    none = np.empty((4, 16, 0), planar.dtype)
-    for_ranges(planar.shape[1], lambda start, stop: kernels.eigen_range(planar, xi, none, start, stop))
+    for_ranges(planar.shape[1], lambda start, stop: _eigen_range(planar, xi, None, start, stop))
     return np.moveaxis(xi.reshape(4, *shape), 0, -1)
 
 
@@ -55,7 +57,7 @@ def cloude(m: Floats) -> Cloude:
     planar, shape = _planar(m)
     xi = np.empty((4, planar.shape[1]), planar.dtype)
     parts = np.empty((4, 16, planar.shape[1]), planar.dtype)
-    for_ranges(planar.shape[1], lambda start, stop: kernels.eigen_range(planar, xi, parts, start, stop))
+    for_ranges(planar.shape[1], lambda start, stop: _eigen_range(planar, xi, parts, start, stop))
     matrices = np.moveaxis(parts.reshape(4, 4, 4, *shape), (0, 1, 2), (-3, -2, -1))
     return Cloude(np.moveaxis(xi.reshape(4, *shape), 0, -1), matrices)
 
@@ -79,7 +81,7 @@ def xi0_and_dominant(m: Floats) -> tuple[Floats, Floats]:
     planar, shape = _planar(m)
     xi0 = np.empty(planar.shape[1], planar.dtype)
     m0 = np.empty((16, planar.shape[1]), planar.dtype)
-    for_ranges(planar.shape[1], lambda start, stop: kernels.dominant_range(planar, xi0, m0, start, stop))
+    for_ranges(planar.shape[1], lambda start, stop: _dominant_range(planar, xi0, m0, start, stop))
     return xi0.reshape(shape), np.moveaxis(m0.reshape(4, 4, *shape), (0, 1), (-2, -1))
 
 
@@ -91,6 +93,28 @@ def xi0_of_dominant(m: Floats, m0: Floats) -> Floats:
     """
     m = np.asarray(m)
     return np.asarray(np.einsum("...ij,...ij->...", m, m0) / (4 * m[..., 0, 0]))
+
+
+def _dominant_range(m: Floats, xi0: Floats, m0: Floats, start: int, stop: int) -> None:
+    # The kernels know one type and layout, because each further one costs seconds of compilation.
+    planar, values, matrices = np.empty((16, CHUNK)), np.empty(CHUNK), np.empty((16, CHUNK))
+    for a in range(start, stop, CHUNK):
+        b = min(a + CHUNK, stop)
+        planar[:, : b - a] = m[:, a:b]
+        kernels.dominant(planar, b - a, values, matrices)
+        xi0[a:b], m0[:, a:b] = values[: b - a], matrices[:, : b - a]
+
+
+def _eigen_range(m: Floats, xi: Floats, parts: Floats | None, start: int, stop: int) -> None:
+    planar, values = np.empty((16, CHUNK)), np.empty((4, CHUNK))
+    matrices = np.empty((4, 16, 0 if parts is None else CHUNK))
+    for a in range(start, stop, CHUNK):
+        b = min(a + CHUNK, stop)
+        planar[:, : b - a] = m[:, a:b]
+        kernels.eigen(planar, b - a, values, matrices)
+        xi[:, a:b] = values[:, : b - a]
+        if parts is not None:
+            parts[:, :, a:b] = matrices[:, :, : b - a]
 
 
 def _planar(m: Floats) -> tuple[Floats, tuple[int, ...]]:

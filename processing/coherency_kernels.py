@@ -26,9 +26,8 @@ SMALLEST_NORM = 1e-24
 
 
 @jit
-def load_tile(m, start, count, a, norm):  # type: ignore[no-untyped-def]
-    """Fill a (16, T) from planar m (16, pixels); norm (T,) is the scale, sqrt(tr A^2), NaN where m00 <= 0."""
-    b = np.empty(16 * T)
+def load_tile(m, start, count, a, b, norm):  # type: ignore[no-untyped-def]
+    """Fill a from planar m (16, pixels); norm (T,) is the scale, sqrt(tr A^2), NaN where m00 <= 0. b is scratch."""
     for k in range(16):
         row = m[k, start : start + count]
         for j in range(count):
@@ -152,12 +151,11 @@ def largest_root_tile(a, b, count, x, slope):  # type: ignore[no-untyped-def]
 
 
 @jit
-def dominant_tile(a, b, x, count, out, start):  # type: ignore[no-untyped-def]
-    """Write the dominant Mueller-Jones matrix, m00 = 1, into planar out (16, pixels).
+def dominant_tile(a, b, x, count, c, out, start):  # type: ignore[no-untyped-def]
+    """Write the dominant Mueller-Jones matrix, m00 = 1, into planar out (16, pixels); c is scratch.
 
     The adjugate of x - A is A^3 + x A^2 + (x^2 + e2) A + const: the dominant projector times the slope.
     """
-    c = np.empty(16 * T)
     for j in range(count):
         v = x[j]
         w = v * v - 0.5
@@ -221,16 +219,16 @@ def dominant_tile(a, b, x, count, out, start):  # type: ignore[no-untyped-def]
 
 
 @jit
-def dominant_range(m, xi0, out, start, stop):  # type: ignore[no-untyped-def]
-    """Largest eigenvalue and dominant Mueller-Jones matrix of pixels start..stop of planar m (16, pixels)."""
-    a, b, v = np.empty(16 * T), np.empty(16 * T), np.empty(32 * T)
+def dominant(m, pixels, xi0, out):  # type: ignore[no-untyped-def]
+    """Largest eigenvalue (pixels,) and dominant Mueller-Jones matrix (16, pixels) of planar m (16, at least pixels)."""
+    a, b, c, v = np.empty(16 * T), np.empty(16 * T), np.empty(16 * T), np.empty(32 * T)
     x, slope, norm = np.empty(T), np.empty(T), np.empty(T)
-    for first in range(start, stop, T):
-        count = min(T, stop - first)
-        load_tile(m, first, count, a, norm)
+    for first in range(0, pixels, T):
+        count = min(T, pixels - first)
+        load_tile(m, first, count, a, b, norm)
         square_tile(a, count, b)
         largest_root_tile(a, b, count, x, slope)
-        dominant_tile(a, b, x, count, out, first)
+        dominant_tile(a, b, x, count, c, out, first)
         doubtful = 0
         for j in range(count):
             xi0[first + j] = 0.25 + norm[j] * x[j]
@@ -248,13 +246,14 @@ def dominant_range(m, xi0, out, start, stop):  # type: ignore[no-untyped-def]
 
 
 @jit
-def eigen_range(m, xi, out, start, stop):  # type: ignore[no-untyped-def]
+def eigen(m, pixels, xi, out):  # type: ignore[no-untyped-def]
     """All eigenvalues, descending, into xi (4, pixels); out (4, 16, pixels), if not empty, gets the four matrices."""
-    a, v, norm, order = np.empty(16 * T), np.empty(32 * T), np.empty(T), np.empty(4, np.int64)
+    a, b, v = np.empty(16 * T), np.empty(16 * T), np.empty(32 * T)
+    norm, order = np.empty(T), np.empty(4, np.int64)
     vectors = out.shape[2] > 0
-    for first in range(start, stop, T):
-        count = min(T, stop - first)
-        load_tile(m, first, count, a, norm)
+    for first in range(0, pixels, T):
+        count = min(T, pixels - first)
+        load_tile(m, first, count, a, b, norm)
         jacobi_tile(a, count, v, vectors)
         for j in range(count):
             for k in range(4):
