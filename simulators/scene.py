@@ -112,7 +112,9 @@ class Scene:
         spec = load_yaml(path, _SceneFile).root
         material = None
         if isinstance(spec, ObjectScene):
-            material = load_reflectance(Path(path).parent / spec.material)
+            folder = Path(path).parent
+            material = load_reflectance(folder / spec.material)
+            spec = spec.model_copy(update={"geometry": spec.geometry.relative_to(folder)})
         return cls(spec, material)
 
     @property

@@ -44,3 +44,8 @@ class Flat(BaseModel):
         )
         found = points[hit]
         return hit, found, np.broadcast_to(normal, found.shape).copy()
+
+    def occluded(self, points_mm: FloatArray, towards: FloatArray) -> NDArray[np.bool_]:
+        """No point on the lit side is shaded by the shape itself: (N,) of False."""
+        del towards
+        return np.zeros(len(points_mm), dtype=bool)

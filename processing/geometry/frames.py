@@ -3,7 +3,7 @@
 World frame: origin at the centre of rotation, y up, camera on +z (conventions.md, "Frames"). Each beam has
 x = unit(up cross k) and y = k cross x, k being its propagation. With up = y these are the instrument frames
 that a measured Mueller image is in; with up = n they are the paper's normal-based ones, which turn with the
-surface (trap 1); with up = s, normal to the plane of wi and wo, they are the frames of a renderer's table.
+surface (trap 1); with up = h, x is the axis s of the facet for both beams, as in a renderer's table (trap 15).
 """
 
 from __future__ import annotations

@@ -33,3 +33,8 @@ class Sphere(BaseModel):
         t = along[hit] - np.sqrt(gap[hit])
         points = np.asarray(origin_mm) + rays[hit] * t[:, None]
         return hit, points, (points - centre) / self.radius_mm
+
+    def occluded(self, points_mm: FloatArray, towards: FloatArray) -> NDArray[np.bool_]:
+        """No point on the lit side is shaded by the shape itself: (N,) of False."""
+        del towards
+        return np.zeros(len(points_mm), dtype=bool)

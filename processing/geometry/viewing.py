@@ -11,13 +11,14 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from processing.geometry.flat import Flat
 from processing.geometry.frames import GeometryImage, ScatteringGeometry, dot, unit
+from processing.geometry.mesh import Mesh
 from processing.geometry.pinhole import PinholeCamera
 from processing.geometry.sphere import Sphere
 from processing.yaml_file import load_yaml
 
 FloatArray = NDArray[np.float64]
 
-Shape = Annotated[Sphere | Flat, Field(discriminator="kind")]
+Shape = Annotated[Sphere | Flat | Mesh, Field(discriminator="kind")]
 
 
 class ViewingGeometry(BaseModel):
@@ -32,7 +33,13 @@ class ViewingGeometry(BaseModel):
     @classmethod
     def load(cls, path: Path | str) -> ViewingGeometry:
         """Read a geometry file. Raises ConfigError with file, line and key."""
-        return load_yaml(path, cls)
+        return load_yaml(path, cls).relative_to(Path(path).parent)
+
+    def relative_to(self, folder: Path) -> ViewingGeometry:
+        """The same geometry with the file of a mesh looked up from `folder`."""
+        if not isinstance(self.shape, Mesh):
+            return self
+        return self.model_copy(update={"shape": self.shape.relative_to(folder)})
 
     def source_position_mm(self, omega_deg: float) -> FloatArray:
         """(sin W, 0, cos W) times the source's distance."""
@@ -62,6 +69,8 @@ class ViewingGeometry(BaseModel):
         to_source = unit(self.source_position_mm(omega_deg) - points)
         to_camera = unit(eye - points)
         lit = (dot(normal, to_source) > 0) & (dot(normal, to_camera) > 0)
+        if lit.any():
+            lit[lit] = ~self.shape.occluded(points[lit], to_source[lit])
         mask = hit.copy()
         mask[hit] = lit
         return GeometryImage(mask, ScatteringGeometry(normal[lit], to_source[lit], to_camera[lit]))

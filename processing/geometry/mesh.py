@@ -1,0 +1,134 @@
+"""A triangle mesh in front of the camera, by ray casting (trimesh with embree)."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.spatial.transform import Rotation
+
+from processing.geometry.errors import GeometryError
+
+FloatArray = NDArray[np.float64]
+
+
+class Mesh(BaseModel):
+    """An STL, OBJ or PLY file, scaled to mm, turned, then moved.
+
+    `rotation_deg` is a rotation vector in the world frame; `translation_mm` moves the file's origin off the
+    centre of rotation. A mesh with holes is refused unless `allow_holes`: rays would pass to its inside.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["mesh"] = "mesh"
+    file: str
+    scale_mm: float = Field(default=1.0, gt=0)
+    rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    translation_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    smooth_normals: bool = True
+    allow_holes: bool = False
+
+    def relative_to(self, folder: Path) -> Mesh:
+        """The same mesh with its file looked up from `folder`."""
+        return self.model_copy(update={"file": str(folder / self.file)})
+
+    def to_world(self, points: FloatArray) -> FloatArray:
+        """World coordinates in mm of points (..., 3) in the file's own."""
+        turn = Rotation.from_rotvec(np.deg2rad(self.rotation_deg)).as_matrix()
+        return np.asarray((points * self.scale_mm) @ turn.T + np.asarray(self.translation_mm))
+
+    def intersect(
+        self, origin_mm: FloatArray, rays: FloatArray, omega_deg: float
+    ) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
+        """Nearest hits of rays (..., 3): mask (...), points (N, 3) in mm and unit normals (N, 3).
+
+        Raises GeometryError when the file cannot be read or the mesh has holes.
+        """
+        del omega_deg
+        mesh, caster = self._world()
+        flat = rays.reshape(-1, 3)
+        face = _first_hits(caster, np.asarray(origin_mm, dtype=float), flat)
+        hit = face >= 0
+        corner = mesh.triangles[face[hit]]
+        normal = mesh.face_normals[face[hit]]
+        # Meet the triangle's plane in double precision: embree's own distance is single.
+        d = flat[hit]
+        t = np.einsum("ij,ij->i", corner[:, 0] - origin_mm, normal) / np.einsum("ij,ij->i", d, normal)
+        points = origin_mm + d * t[:, None]
+        if self.smooth_normals:
+            normal = _smooth(mesh, face[hit], corner, points, normal)
+        return hit.reshape(rays.shape[:-1]), points, normal
+
+    def occluded(self, points_mm: FloatArray, towards: FloatArray) -> NDArray[np.bool_]:
+        """Whether the mesh itself stands between points (N, 3) and the directions (N, 3) towards the source."""
+        mesh, caster = self._world()
+        start = points_mm + towards * (1e-4 * float(mesh.scale))
+        return np.asarray(_first_hits(caster, start, towards) >= 0)
+
+    def _world(self) -> tuple[Any, Any]:
+        path = Path(self.file)
+        try:
+            stamp = path.stat().st_mtime_ns
+        except OSError as error:
+            raise GeometryError(f"{path}: no such mesh file ({error.strerror}). Check the path.") from error
+        return _load(path, stamp, self.scale_mm, self.rotation_deg, self.translation_mm, self.allow_holes)
+
+
+@lru_cache(maxsize=4)
+def _load(
+    path: Path,
+    stamp: int,
+    scale_mm: float,
+    rotation_deg: tuple[float, float, float],
+    translation_mm: tuple[float, float, float],
+    allow_holes: bool,
+) -> tuple[Any, Any]:
+    del stamp  # a part of the cache's key: the file may change
+    import trimesh
+    from embreex import rtcore_scene
+    from embreex.mesh_construction import TriangleMesh
+
+    try:
+        mesh = trimesh.load_mesh(path)
+    except (ValueError, TypeError, IndexError, KeyError, NotImplementedError) as error:
+        raise GeometryError(f"{path} cannot be read as a mesh ({error}). STL, OBJ and PLY are.") from error
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise GeometryError(f"{path} holds no triangles. Export it as a triangle mesh.")
+    if not mesh.is_watertight and not allow_holes:
+        raise GeometryError(
+            f"{path} has holes ({len(mesh.faces)} triangles, not closed): rays would reach its inside. "
+            "Close it in a mesh editor, or set allow_holes: true to take it as it is."
+        )
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_rotvec(np.deg2rad(rotation_deg)).as_matrix() * scale_mm
+    matrix[:3, 3] = translation_mm
+    mesh = mesh.copy()
+    mesh.apply_transform(matrix)
+    # Embree itself: trimesh's wrapper around it makes several copies of all rays.
+    scene = rtcore_scene.EmbreeScene()
+    TriangleMesh(scene, np.ascontiguousarray(mesh.triangles, dtype=np.float32))
+    return mesh, scene
+
+
+def _first_hits(scene: Any, origin: FloatArray, rays: FloatArray) -> NDArray[np.int64]:
+    # Index of the first triangle that each ray meets, -1 for none.
+    origins = np.empty(rays.shape, dtype=np.float32)
+    origins[:] = origin
+    return np.asarray(scene.run(origins, rays.astype(np.float32)), dtype=np.int64)
+
+
+def _smooth(mesh: Any, face: NDArray[np.int64], corner: FloatArray, points: FloatArray, flat: FloatArray) -> FloatArray:
+    # Normals of the corners, weighted with barycentric coordinates from the three small areas.
+    a, b, c = corner[:, 0], corner[:, 1], corner[:, 2]
+
+    def area(p: FloatArray, q: FloatArray, r: FloatArray) -> FloatArray:
+        return np.asarray(np.einsum("ij,ij->i", np.cross(q - p, r - p), flat))
+
+    weights = np.stack([area(b, c, points), area(c, a, points), area(a, b, points)], axis=-1)
+    normals = np.einsum("ij,ijk->ik", weights, mesh.vertex_normals[mesh.faces[face]])
+    return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
