@@ -84,13 +84,15 @@ class CaptureWriter:
             The file exists, the folder cannot be written, or the disc has not enough room.
         """
         partial = path.with_name(path.name + PARTIAL)
+        # A partial file is whole from the moment it has that name.
+        new = path.with_name(path.name + ".new")
         needed = bytes_needed(len(table), len(header.channels), frame_shape)
         if path.exists() or partial.exists():
             raise AcquisitionError(f"{path if path.exists() else partial} exists already; nothing was changed")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             check_space(path.parent, needed)
-            h5 = h5py.File(partial, "w")
+            h5 = h5py.File(new, "w")
         except OSError as error:
             raise AcquisitionError(
                 f"{partial} cannot be created ({error}). Choose another folder with --out."
@@ -100,10 +102,11 @@ class CaptureWriter:
             h5["entry/states/exposure_s"][...] = table.exposure_s
             h5["entry/states/repeats"][...] = table.repeats
             h5.flush()
-            _reserve(partial)
+            _reserve(new)
+            os.rename(new, partial)
         except (OSError, RuntimeError) as error:
             _close_quietly(h5)
-            partial.unlink(missing_ok=True)
+            new.unlink(missing_ok=True)
             free = shutil.disk_usage(path.parent).free
             raise AcquisitionError(
                 f"the capture needs {needed:,} bytes in {path.parent} and cannot get them ({error}; {free:,} free). "

@@ -1,0 +1,119 @@
+"""Runs of `acquire` in a process of their own, to be killed, stopped and starved; and how captures compare."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+#: What may differ between two runs of one plan: times, and the camera's own count of its frames.
+TIMES = {"host_time_s", "camera_time_ns", "frame_id", "start_time", "closing/json"}
+
+
+@pytest.fixture
+def runs() -> int:
+    """Repetitions of a random fault: few in CI; UMOV_FAULT_RUNS=50 for the full promise."""
+    return int(os.environ.get("UMOV_FAULT_RUNS", "3"))
+
+
+@pytest.fixture
+def spawn() -> Iterator[Callable[..., subprocess.Popen]]:
+    """Starts `acquire` in a child process; what is left of it is killed at the end."""
+    children = []
+
+    def start(*arguments: object, **keywords: object) -> subprocess.Popen:
+        child = subprocess.Popen(
+            [sys.executable, "-m", "acquisition.cli", *map(str, arguments)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            **keywords,
+        )
+        children.append(child)
+        return child
+
+    yield start
+    for child in children:
+        child.kill()
+        child.communicate()
+
+
+@pytest.fixture
+def partial_of() -> Callable[..., Path]:
+    """Waits until the child's partial file holds at least so many states done."""
+
+    def wait(folder: Path, child: subprocess.Popen, states: int = 0, timeout_s: float = 60.0) -> Path:
+        end_s = time.monotonic() + timeout_s
+        while time.monotonic() < end_s:
+            found = list(folder.glob("*.partial"))
+            if found and (states == 0 or _states_done(found[0]) >= states):
+                return found[0]
+            if child.poll() is not None:
+                raise AssertionError(f"the run ended early: {child.communicate()}")
+            time.sleep(0.01)
+        raise AssertionError(f"no partial file with {states} states in {timeout_s} s")
+
+    return wait
+
+
+def _states_done(path: Path) -> int:
+    # HDF5 locks the file while it is written; reading without the lock is good enough to see how far it is.
+    try:
+        with h5py.File(path, "r", locking=False) as file:
+            return int(np.count_nonzero(file["entry/states/done"][...]))
+    except (OSError, KeyError, RuntimeError):
+        return 0
+
+
+@pytest.fixture
+def content() -> Callable[[Path], dict[str, object]]:
+    """Everything in a capture but times."""
+
+    def read(path: Path) -> dict[str, object]:
+        found: dict[str, object] = {}
+
+        def visit(name: str, node: h5py.Group | h5py.Dataset) -> None:
+            for key, value in node.attrs.items():
+                found[f"{name}@{key}"] = value if np.isscalar(value) else np.asarray(value).tolist()
+            if isinstance(node, h5py.Dataset) and not any(name.endswith(time) for time in TIMES):
+                found[name] = node[...].tobytes() if node.dtype.kind != "O" else np.asarray(node[()]).tolist()
+
+        with h5py.File(path) as file:
+            visit("entry", file["entry"])
+            file["entry"].visititems(visit)
+        return found
+
+    return read
+
+
+@pytest.fixture
+def quick_rig(small_rig: Callable[..., Path]) -> Callable[..., Path]:
+    """A rig for fault runs: small frames, no settling; stamped with the true angles."""
+
+    def make(name: str = "rig.yaml", top: dict | None = None, **simulator: object) -> Path:
+        return small_rig(name, top={"settle_s": 0.0} | (top or {}), **({"stamp": True} | simulator))
+
+    return make
+
+
+@pytest.fixture
+def intact(configs: Path) -> Callable[[Path], int]:
+    """Checks every state done of a capture: whole frame, true angles in its pixels; returns their number."""
+    from processing.capture import Capture
+    from simulators.pixel_stamp import read_stamp
+
+    def check(path: Path) -> int:
+        with Capture(path) as capture:
+            axes = sorted(capture.angles_deg)
+            for state in range(len(capture.done)):
+                true = dict(zip(axes, read_stamp(capture.frames(state)[0]), strict=True))
+                for axis in axes:
+                    assert true[axis] == pytest.approx(capture.angles_deg[axis][state], abs=5e-4), (state, axis)
+            return len(capture.done)
+
+    return check
