@@ -12,12 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing import coherency_kernels as kernels
-from processing.threads import for_ranges
+from processing.threads import for_chunks
 
 Floats = NDArray[np.floating]
-
-#: Pixels that a compiled loop gets at a time: small enough for the second-level cache.
-CHUNK = 2048
 
 
 class Cloude(NamedTuple):
@@ -42,9 +39,9 @@ def coherency_eigenvalues(m: Floats) -> Floats:
     (..., 4) of the same type, sum 1. A negative eigenvalue means an unphysical matrix (noise) and stays.
     NaN where m00 <= 0 or an element is not finite.
     """
-    planar, shape = _planar(m)
+    planar, shape = as_planar(m)
     xi = np.empty((4, planar.shape[1]), planar.dtype)
-    for_ranges(planar.shape[1], lambda start, stop: _eigen_range(planar, xi, None, start, stop))
+    for_chunks(kernels.eigenvalues, planar, xi)
     return np.moveaxis(xi.reshape(4, *shape), 0, -1)
 
 
@@ -54,10 +51,10 @@ def cloude(m: Floats) -> Cloude:
     Values and NaN as in `coherency_eigenvalues`. Where eigenvalues are equal their matrices are one choice of
     many (any basis of their common space); an exact ideal depolarizer has none and gets NaN.
     """
-    planar, shape = _planar(m)
+    planar, shape = as_planar(m)
     xi = np.empty((4, planar.shape[1]), planar.dtype)
     parts = np.empty((4, 16, planar.shape[1]), planar.dtype)
-    for_ranges(planar.shape[1], lambda start, stop: _eigen_range(planar, xi, parts, start, stop))
+    for_chunks(kernels.eigensystem, planar, xi, parts)
     matrices = np.moveaxis(parts.reshape(4, 4, 4, *shape), (0, 1, 2), (-3, -2, -1))
     return Cloude(np.moveaxis(xi.reshape(4, *shape), 0, -1), matrices)
 
@@ -78,10 +75,10 @@ def xi0_and_dominant(m: Floats) -> tuple[Floats, Floats]:
     mueller_jones : (..., 4, 4), m00 = 1. NaN where m00 <= 0 or an element is not finite, and for an exact ideal
         depolarizer, which has no dominant process.
     """
-    planar, shape = _planar(m)
+    planar, shape = as_planar(m)
     xi0 = np.empty(planar.shape[1], planar.dtype)
     m0 = np.empty((16, planar.shape[1]), planar.dtype)
-    for_ranges(planar.shape[1], lambda start, stop: _dominant_range(planar, xi0, m0, start, stop))
+    for_chunks(kernels.dominant, planar, xi0, m0)
     return xi0.reshape(shape), np.moveaxis(m0.reshape(4, 4, *shape), (0, 1), (-2, -1))
 
 
@@ -95,29 +92,7 @@ def xi0_of_dominant(m: Floats, m0: Floats) -> Floats:
     return np.asarray(np.einsum("...ij,...ij->...", m, m0) / (4 * m[..., 0, 0]))
 
 
-def _dominant_range(m: Floats, xi0: Floats, m0: Floats, start: int, stop: int) -> None:
-    # The kernels know one type and layout, because each further one costs seconds of compilation.
-    planar, values, matrices = np.empty((16, CHUNK)), np.empty(CHUNK), np.empty((16, CHUNK))
-    for a in range(start, stop, CHUNK):
-        b = min(a + CHUNK, stop)
-        planar[:, : b - a] = m[:, a:b]
-        kernels.dominant(planar, b - a, values, matrices)
-        xi0[a:b], m0[:, a:b] = values[: b - a], matrices[:, : b - a]
-
-
-def _eigen_range(m: Floats, xi: Floats, parts: Floats | None, start: int, stop: int) -> None:
-    planar, values = np.empty((16, CHUNK)), np.empty((4, CHUNK))
-    matrices = np.empty((4, 16, 0 if parts is None else CHUNK))
-    for a in range(start, stop, CHUNK):
-        b = min(a + CHUNK, stop)
-        planar[:, : b - a] = m[:, a:b]
-        kernels.eigen(planar, b - a, values, matrices)
-        xi[:, a:b] = values[:, : b - a]
-        if parts is not None:
-            parts[:, :, a:b] = matrices[:, :, : b - a]
-
-
-def _planar(m: Floats) -> tuple[Floats, tuple[int, ...]]:
+def as_planar(m: Floats) -> tuple[Floats, tuple[int, ...]]:
     """View m as (16, pixels), C- or Fortran-ordered, copying only where its memory is neither."""
     m = np.asarray(m)
     if m.shape[-2:] != (4, 4):

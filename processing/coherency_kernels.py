@@ -246,15 +246,32 @@ def dominant(m, pixels, xi0, out):  # type: ignore[no-untyped-def]
 
 
 @jit
-def eigen(m, pixels, xi, out):  # type: ignore[no-untyped-def]
-    """All eigenvalues, descending, into xi (4, pixels); out (4, 16, pixels), if not empty, gets the four matrices."""
-    a, b, v = np.empty(16 * T), np.empty(16 * T), np.empty(32 * T)
-    norm, order = np.empty(T), np.empty(4, np.int64)
-    vectors = out.shape[2] > 0
+def eigenvalues(m, pixels, xi):  # type: ignore[no-untyped-def]
+    """All eigenvalues, descending, into xi (4, pixels)."""
+    a, b, norm = np.empty(16 * T), np.empty(16 * T), np.empty(T)
     for first in range(0, pixels, T):
         count = min(T, pixels - first)
         load_tile(m, first, count, a, b, norm)
-        jacobi_tile(a, count, v, vectors)
+        jacobi_tile(a, count, b, False)
+        for j in range(count):
+            for k in range(4):
+                value = 0.25 + norm[j] * a[k * T + j]
+                at = k
+                while at > 0 and xi[at - 1, first + j] < value:
+                    xi[at, first + j] = xi[at - 1, first + j]
+                    at -= 1
+                xi[at, first + j] = value
+
+
+@jit
+def eigensystem(m, pixels, xi, out):  # type: ignore[no-untyped-def]
+    """All eigenvalues, descending, into xi (4, pixels), and their Mueller-Jones matrices into out (4, 16, pixels)."""
+    a, b, v = np.empty(16 * T), np.empty(16 * T), np.empty(32 * T)
+    norm, order = np.empty(T), np.empty(4, np.int64)
+    for first in range(0, pixels, T):
+        count = min(T, pixels - first)
+        load_tile(m, first, count, a, b, norm)
+        jacobi_tile(a, count, v, True)
         for j in range(count):
             for k in range(4):
                 at = k
@@ -264,5 +281,4 @@ def eigen(m, pixels, xi, out):  # type: ignore[no-untyped-def]
                 order[at] = k
             for k in range(4):
                 xi[k, first + j] = 0.25 + norm[j] * a[order[k] * T + j]
-                if vectors:
-                    project(v, order[k], j, norm[j], out[k], first + j)
+                project(v, order[k], j, norm[j], out[k], first + j)
