@@ -138,6 +138,10 @@ class EmulatedAxis:
         if stuck and self.is_moving():
             self._start(0.0)
 
+    def call_position(self, position_deg: float) -> None:
+        """Give the resting position another name."""
+        self._origin_deg = self._motion.target - position_deg
+
     def lose_reference(self) -> None:
         """Forget the home position, as after a power cut; the optic stays where it is."""
         self.stop()

@@ -49,7 +49,7 @@ class APTEmulator(Emulator):
         super().__init__([axis], clock, faults)
         self.model = model
         self.axis = axis
-        self.enabled = model.is_dc
+        self.enabled = True
         self.home_parameters = [2, 1, round(axis.speed_deg_s * model.per_deg_s), 0]
         # Settings that a host writes and reads back: id of the answer -> data behind the channel.
         self.stored = {
@@ -59,6 +59,9 @@ class APTEmulator(Emulator):
             0x0428: struct.pack("<HH", 30, 30),
             0x0447: struct.pack("<i", self._counts(1.0)),
             0x0452: struct.pack("<i", 0),
+            0x04A2: struct.pack("<iiiiH", 435, 195, 993, 195, 15),
+            0x0525: struct.pack("<HHHH", 0, 1, 0, 1),
+            0x0528: struct.pack("<8i", 0, 0, 1, 0, 0, 1, 50_000, 1),
         }
         self._moves_ends = 0
         self._home_ends = False
@@ -111,6 +114,7 @@ class APTEmulator(Emulator):
             0x0012: lambda *_: self._set_updates(False),
             0x0210: self._set_enabled,
             0x0211: lambda *_: self._send_short(0x0212, 1, 1 if self.enabled else 2),
+            0x0410: self._set_position,
             0x0411: lambda *_: self._send_long(0x0412, struct.pack("<Hi", 1, self.position())),
             0x0429: lambda *_: self._send_long(0x042A, struct.pack("<HI", 1, self.status_bits())),
             0x0480: lambda *_: self._send_long(0x0481, self._stepper_status()),
@@ -169,6 +173,10 @@ class APTEmulator(Emulator):
             if acceleration > 0 and velocity > 0:
                 self.axis.acceleration_deg_s2 = acceleration / self.model.per_deg_s2
                 self.axis.speed_deg_s = velocity / self.model.per_deg_s
+
+    def _set_position(self, _: bytes, data: bytes) -> None:
+        if len(data) == 6 and not self.axis.is_moving():
+            self.axis.call_position(struct.unpack("<Hi", data)[1] / self.model.per_deg)
 
     def _set_home_parameters(self, _: bytes, data: bytes) -> None:
         if len(data) == 14:

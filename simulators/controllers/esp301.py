@@ -125,7 +125,7 @@ class ESP301Emulator(Emulator):
             "AB": self._abort,
             "RS": self._reset,
         }
-        if letters in general and (letters != "ST" or not number):
+        if letters in general:
             return general[letters]()
         by_axis: dict[str, Callable[[ESPAxis, int, str], str | None]] = {
             "ID": lambda stage, *_: stage.stage,

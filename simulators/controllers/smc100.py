@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from drivers.axes.smc100 import Config
 from simulators.clock import Clock
@@ -19,6 +19,7 @@ ERROR_TEXTS = {
     "D": "Command not allowed",
     "G": "Displacement out of limits",
     "H": "Command not allowed in NOT REFERENCED state",
+    "I": "Command not allowed in CONFIGURATION state",
     "J": "Command not allowed in DISABLE state",
     "K": "Command not allowed in READY state",
     "L": "Command not allowed in HOMING state",
@@ -50,10 +51,14 @@ class SMC100Controller:
     axis: EmulatedAxis
     version: str = "SMC100CC 2.0.1"
     stage: str = "URS150CC"
-    restart_s: float = 1.0
+    restart_s: float = 0.3
     error: str = "@"
     disabled: bool = False
-    busy_before: bool = False
+    configuring: bool = False
+    # Settings that are only kept: jerk time, homing type, speed and time-out, backlash, hysteresis, encoder, error.
+    settings: dict[str, str] = field(
+        default_factory=lambda: dict(JR="0.04", HT="2", OH="20", OT="30", BA="0", BH="0", SU="0.001", FE="1")
+    )
     came_by: int = 0x0A
     target_deg: float = 0.0
     silent_until_s: float = 0.0
@@ -65,6 +70,8 @@ class SMC100Controller:
         if moving and axis.homing:
             self.came_by = 0x32
             return 0x1E
+        if self.configuring:
+            return 0x14
         if not axis.homed:
             return 0x0A if self.came_by >= 0x32 else self.came_by
         if moving:
@@ -101,7 +108,10 @@ class SMC100Controller:
             "ST": self._stop,
             "MM": self._enable,
             "RS": self._reset,
+            "PW": self._configure,
         }
+        if letters in self.settings:
+            return self._keep(letters, value)
         if letters not in handlers:
             raise Refused("A")
         return handlers[letters](value)
@@ -125,6 +135,24 @@ class SMC100Controller:
         if self.state() in (0x1E, 0x28):
             raise Refused("L" if self.state() == 0x1E else "M")
         return None, new
+
+    def _keep(self, letters: str, value: str) -> str | None:
+        if value == "?":
+            return self.settings[letters]
+        _number(value)
+        self.settings[letters] = value
+        return None
+
+    def _configure(self, value: str) -> str | None:
+        """Enter (1) or leave (0) CONFIGURATION, from NOT REFERENCED only."""
+        if value == "?":
+            return str(int(self.configuring))
+        if value not in ("0", "1"):
+            raise Refused("C")
+        if self.state() not in (0x0A, 0x14):
+            raise Refused("D")
+        self.configuring = value == "1"
+        return None
 
     def _left_limit(self, value: str) -> str | None:
         answer, new = self._setting(value, self.axis.min_deg, -1e6, 0.0)
@@ -154,7 +182,7 @@ class SMC100Controller:
         state = self.state()
         refusals = {0x1E: "L", 0x28: "M", 0x3C: "J"}
         if state < 0x1E:
-            raise Refused("H")
+            raise Refused("I" if state == 0x14 else "H")
         if state in refusals:
             raise Refused(refusals[state])
 
@@ -178,6 +206,8 @@ class SMC100Controller:
 
     def _home(self, _: str) -> None:
         state = self.state()
+        if state == 0x14:
+            raise Refused("I")
         if state >= 0x1E:
             raise Refused({0x1E: "L", 0x28: "M", 0x3C: "J"}.get(state, "K"))
         self.target_deg = 0.0
@@ -189,7 +219,7 @@ class SMC100Controller:
 
     def _enable(self, value: str) -> str | None:
         if value == "?":
-            return f"{self.state():02X}"
+            return str(int(not self.disabled))
         if value not in ("0", "1"):
             raise Refused("C")
         state = self.state()
@@ -203,7 +233,7 @@ class SMC100Controller:
 
     def _reset(self, _: str) -> None:
         self.axis.lose_reference()
-        self.disabled, self.error, self.came_by = False, "@", 0x0A
+        self.disabled, self.configuring, self.error, self.came_by = False, False, "@", 0x0A
         self.silent_until_s = self.axis.clock.now_s() + self.restart_s
 
 
