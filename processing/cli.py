@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import typer
 
 from processing.command_line import run
-from processing.commands import calibrate, importing, reduce
+from processing.commands import calibrate, importing, reduce, xi0
 
 app = typer.Typer(
     name="process",
@@ -22,6 +22,7 @@ app = typer.Typer(
 calibrate.register(app)
 importing.register(app)
 reduce.register(app)
+xi0.register(app)
 
 
 @app.callback()

@@ -43,6 +43,16 @@ def product_figure(product: Product) -> Figure:
     if product.kind == "stokes":
         maps = {name: thin(product.get(name)) for name in ("s0", "dolp", "aolp_deg")}
         return stokes_figure(maps, _title(product), product.simulated)
+    if product.kind == "xi0":
+        xi0, errors, valid = (thin(product.get(name)) for name in ("xi0", "xi0_errors", "valid"))
+        shown = np.where(valid > 0, xi0, np.nan)
+        limit = max(_percentile(errors[valid > 0], 95), 1e-6)
+        panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = [
+            ("$\\xi_0$ where valid", shown, {"cmap": "viridis", "vmin": 0.25, "vmax": 1}),
+            ("standard error of $\\xi_0$", errors, {"cmap": "magma", "vmin": 0, "vmax": limit}),
+            ("valid", valid, {"cmap": "gray", "vmin": 0, "vmax": 1}),
+        ]
+        return map_figure(panels, _title(product), product.simulated)
     raise ProcessError(f"{product.path}: no figure is defined for a {product.kind} image.")
 
 
@@ -124,8 +134,8 @@ def _entitle(figure: Figure, title: str, simulated: bool) -> None:
 
 def _title(product: Product) -> str:
     header = product.header
-    omega = "" if header.omega_deg is None else f", Omega {header.omega_deg:g} degrees"
-    return f"{header.title}: {header.wavelength_nm:g} nm{omega}"
+    wavelength = f"{header.wavelength_nm:g} nm"
+    return header.title if wavelength in header.title else f"{header.title}, {wavelength}"
 
 
 def _percentile(values: NDArray[Any], percent: float) -> float:

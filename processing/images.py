@@ -98,6 +98,21 @@ class MuellerImage:
         full *= scale[:, :, None] * scale[:, None, :]
         return np.asarray(full.reshape(*self.mask.shape, 16, 16))
 
+    def variance_of(self, gradient: NDArray[np.floating]) -> NDArray[np.float64]:
+        """First-order variance (rows, columns) of a quantity with gradient (rows, columns, 16) by the elements.
+
+        The same as gradient . covariance . gradient, without forming the covariance.
+        """
+        g = np.asarray(gradient).reshape(-1, 16)
+        if self.facts["weighted"]:
+            full = self.covariance().reshape(-1, 16, 16)
+            return np.asarray(np.einsum("pi,pij,pj->p", g, full, g, optimize=True).reshape(self.mask.shape))
+        inverse, variance = self._inverse(), self.intensity_variance()
+        found = np.einsum("pn,np->p", np.square(g @ inverse), variance)
+        # Flats, dark frames and left-out states change all errors of a pixel much alike.
+        told = np.square(self.errors.reshape(16, -1)).sum(axis=0) / (np.square(inverse) @ variance).sum(axis=0)
+        return np.asarray((found * told).reshape(self.mask.shape))
+
     def _inverse(self) -> NDArray[np.float64]:
         return np.asarray(np.linalg.pinv(self.w))
 
@@ -110,12 +125,15 @@ class StokesImage:
     ----------
     values : (3, rows, columns) float32, S0, S1, S2 in counts; NaN where masked.
     covariance : (rows, columns, 3, 3), counts^2.
+    w, analyzers : (channels, 16) and (channels, 3), from the Mueller matrix and from S to intensities.
     mask : (rows, columns) uint8, bits of `processing.correction.Mask`.
     """
 
     values: NDArray[np.float32]
     covariance: NDArray[np.float32]
     mask: NDArray[np.uint8]
+    w: NDArray[np.float64]
+    analyzers: NDArray[np.float64]
     header: CaptureHeader
     steps: tuple[Step, ...]
     simulated: bool
@@ -131,6 +149,8 @@ class StokesImage:
                 values=np.stack([product.get(name, rows) for name in ("s0", "s1", "s2")]),
                 covariance=np.moveaxis(packed[[0, 3, 4, 3, 1, 5, 4, 5, 2]], 0, -1).reshape(*packed.shape[1:], 3, 3),
                 mask=product.get("pixel_mask", rows),
+                w=product.array("measurement_matrix"),
+                analyzers=product.array("analyzers"),
                 header=product.header,
                 steps=product.steps,
                 simulated=product.simulated,

@@ -261,6 +261,15 @@ class Product:
         self.close()
 
 
+def is_product(path: Path) -> bool:
+    """Whether a file is a product of `process` (and not a capture, or anything else)."""
+    try:
+        with h5py.File(path, "r") as h5:
+            return "umov_product" in h5.attrs
+    except OSError:
+        return False
+
+
 def write_steps(entry: h5py.Group, steps: Sequence[Step]) -> None:
     """Append steps to an entry as NXprocess groups, numbered after those that are there."""
     first = 1 + sum(1 for name in entry if name.startswith("process_"))

@@ -41,8 +41,10 @@ PLANES = {
 }
 
 
-def analyzer_matrix(capture: Capture, model: InstrumentModel, states: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Analyzer rows (4, 3) for (S0, S1, S2), the same in all states.
+def channel_rows(
+    capture: Capture, model: InstrumentModel, states: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rows of W (4, 16), and analyzer rows (4, 3) for (S0, S1, S2), the same in all states.
 
     Raises
     ------
@@ -60,7 +62,7 @@ def analyzer_matrix(capture: Capture, model: InstrumentModel, states: NDArray[np
     rank = int(np.linalg.matrix_rank(analyzers))
     if rank < LINEAR:
         raise NotDetermined(f"{capture.path}: the mosaic's analyzers have rank {rank}; a linear Stokes vector needs 3.")
-    return np.asarray(analyzers)
+    return np.asarray(rows[0]), np.asarray(analyzers)
 
 
 def mean_frame(
@@ -104,7 +106,7 @@ def reduce_stokes(
 
     Raises
     ------
-    CaptureError, NotDetermined : see `analyzer_matrix`.
+    CaptureError, NotDetermined : see `channel_rows`.
     MosaicError : the frame does not hold whole super-pixels.
     """
     mosaic = capture.header.mosaic or model.mosaic
@@ -112,7 +114,7 @@ def reduce_stokes(
         raise CaptureError(f"{capture.path} is not a mosaic capture; it reduces to a Mueller image.")
     layout = MosaicLayout.of(mosaic, [c.name for c in model.channels])
     states = sample_states(capture)
-    analyzers = analyzer_matrix(capture, model, states)
+    model_rows, analyzers = channel_rows(capture, model, states)
     correction = correction or Correction.of(capture)
     noise = NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
     frame, mask = mean_frame(capture, states, correction, progress)
@@ -128,6 +130,7 @@ def reduce_stokes(
     rows, columns = channels.shape[1:]
     facts = _facts(found, analyzers, noise, correction, method, len(states))
     with ProductWriter(out, "stokes", capture.header, (rows, columns), PLANES, steps, overwrite) as product:
+        product.array("measurement_matrix", model_rows, "", "W (channel, 16): intensity = W . vec(M), row-major")
         product.array("analyzers", analyzers, "", "rows (channel, 3): intensity = row . (S0, S1, S2)")
         product.write(slice(0, rows), **found)
         product.seal(facts)

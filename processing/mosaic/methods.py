@@ -73,6 +73,9 @@ def guided_residual(frame: Frame, layout: MosaicLayout) -> NDArray[np.float32]:
     return out
 
 
+#: Pixels from which a value is taken lie within this distance; next to an edge of the scene they mix both sides.
+REACH = {"superpixel": 1, "bilinear": 1, "bicubic": 3, "difference": 2, "guided-residual": 2 * GUIDE_RADIUS + 2}
+
 METHODS: dict[str, Method] = {
     "superpixel": superpixel,
     "bilinear": bilinear,
