@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.cloude import Floats, as_planar
-from processing.decompositions.polar_kernel import lu_chipman_chunk
-from processing.threads import for_chunks
+from processing.decompositions.polar_kernel import lu_chipman_range
+from processing.threads import for_ranges
 
 
 class LuChipman(NamedTuple):
@@ -37,9 +37,10 @@ def lu_chipman(m: Floats) -> LuChipman:
     Linear retarder, half wave plate and rotation come back as themselves, the ideal depolarizer as not defined.
     """
     planar, shape = as_planar(m)
+    planar = np.ascontiguousarray(planar)
     factors = [np.empty((16, planar.shape[1]), planar.dtype) for _ in range(3)]
     sign = np.empty(planar.shape[1])
-    for_chunks(lu_chipman_chunk, planar, *factors, sign)
+    for_ranges(planar.shape[1], lambda start, stop: lu_chipman_range(planar, start, stop, *factors, sign))
     depolarizer, retarder, diattenuator = (np.moveaxis(f.reshape(4, 4, *shape), (0, 1), (-2, -1)) for f in factors)
     sign = sign.reshape(shape)
     return LuChipman(depolarizer, retarder, diattenuator, ~np.isnan(sign), sign < 0)

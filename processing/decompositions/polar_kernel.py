@@ -19,26 +19,40 @@ SMALLEST_DETERMINANT = 1e-12
 
 
 @jit
-def lu_chipman_chunk(m, pixels, depolarizer, retarder, diattenuator, sign):  # type: ignore[no-untyped-def]
+def lu_chipman_range(m, start, stop, depolarizer, retarder, diattenuator, sign):  # type: ignore[no-untyped-def]
     """Planar factors (16, pixels) of planar m (16, pixels); sign (pixels,) is that of det m', NaN where undefined."""
-    x, r = np.empty(9 * T), np.empty(9 * T)
-    for first in range(0, pixels, T):
-        count = min(T, pixels - first)
-        rows = m[:, first : first + count]
-        state = sign[first : first + count]
-        _strip_diattenuation(rows, count, x, diattenuator[:, first : first + count], state)
+    one, x, r, state = np.empty(16 * T), np.empty(9 * T), np.empty(9 * T), np.empty(T)
+    for first in range(start, stop, T):
+        count = min(T, stop - first)
+        for k in range(16):
+            row = m[k, first : first + count]
+            for j in range(count):
+                one[k * T + j] = row[j]
+        top = one[: 4 * T].copy()
+        _strip_diattenuation(one, count, x, state)
         _rotation(x, r, count, state)
-        _factors(rows, x, r, count, depolarizer[:, first : first + count], retarder[:, first : first + count], state)
+        _depolarizer(one, x, r, count, state)
+        _store(one, count, depolarizer, first)
+        _retarder(one, r, count, state)
+        _store(one, count, retarder, first)
+        _diattenuator(top, one, count)
+        _store(one, count, diattenuator, first)
+        row = sign[first : first + count]
+        for j in range(count):
+            row[j] = state[j]
 
 
 @jit
-def _strip_diattenuation(m, count, x, out, state):  # type: ignore[no-untyped-def]
-    """x = m', the 3 x 3 remainder of M MD^-1 / m00; out = MD; state = det m' / |m'|^3, NaN where |D| >= 1."""
-    one = np.empty(16 * T)
+def _store(one, count, out, first):  # type: ignore[no-untyped-def]
     for k in range(16):
-        row = m[k]
+        row = out[k, first : first + count]
         for j in range(count):
-            one[k * T + j] = row[j]
+            row[j] = one[k * T + j]
+
+
+@jit
+def _strip_diattenuation(one, count, x, state):  # type: ignore[no-untyped-def]
+    """x = m', the 3 x 3 remainder of M MD^-1 / m00; state = det m' / |m'|^3, NaN where |D| >= 1."""
     for j in range(count):
         m00 = one[j] if one[j] > 0 else np.nan
         u = 1 / m00
@@ -47,7 +61,7 @@ def _strip_diattenuation(m, count, x, out, state):  # type: ignore[no-untyped-de
         rest = 1 - square if square < 1 else np.nan
         q = math.sqrt(rest)
         w, g = 1 / (1 + q), 1 / rest
-        e, f = u * g * q, u * g
+        e = u * g * q
         p0, p1, p2 = u * one[4 * T + j], u * one[8 * T + j], u * one[12 * T + j]
         d0 = g * (w * u * (one[5 * T + j] * a + one[6 * T + j] * b + one[7 * T + j] * c) - p0)
         d1 = g * (w * u * (one[9 * T + j] * a + one[10 * T + j] * b + one[11 * T + j] * c) - p1)
@@ -62,16 +76,6 @@ def _strip_diattenuation(m, count, x, out, state):  # type: ignore[no-untyped-de
         det = x0 * (x4 * x8 - x5 * x7) + x1 * (x5 * x6 - x3 * x8) + x2 * (x3 * x7 - x4 * x6)
         relative = det / (norm * math.sqrt(norm))
         state[j] = relative if abs(relative) > SMALLEST_DETERMINANT else np.nan
-        n = 0.0 * f + m00
-        one[j], one[T + j], one[2 * T + j], one[3 * T + j] = n, n * a, n * b, n * c
-        one[4 * T + j], one[8 * T + j], one[12 * T + j] = n * a, n * b, n * c
-        one[5 * T + j], one[6 * T + j], one[7 * T + j] = n * (q + w * a * a), n * w * a * b, n * w * a * c
-        one[9 * T + j], one[10 * T + j], one[11 * T + j] = n * w * a * b, n * (q + w * b * b), n * w * b * c
-        one[13 * T + j], one[14 * T + j], one[15 * T + j] = n * w * a * c, n * w * b * c, n * (q + w * c * c)
-    for k in range(16):
-        row = out[k]
-        for j in range(count):
-            row[j] = one[k * T + j]
 
 
 @jit
@@ -109,52 +113,58 @@ def _rotation(x, r, count, state):  # type: ignore[no-untyped-def]
 
 
 @jit
-def _factors(m, x, r, count, depolarizer, retarder, state):  # type: ignore[no-untyped-def]
-    """MR from the rotation r; Mdelta = [[1, 0], [(P - m D) / (1 - D^2), x r^T]]."""
-    out = np.empty(16 * T)
-    d, p = np.empty(3 * T), np.empty(3 * T)
-    for k in range(3):
-        top, left = m[1 + k], m[4 * (1 + k)]
-        total = m[0]
-        for j in range(count):
-            d[k * T + j], p[k * T + j] = top[j] / total[j], left[j] / total[j]
+def _depolarizer(one, x, r, count, state):  # type: ignore[no-untyped-def]
+    """Replace M in `one` by Mdelta = [[1, 0], [(P - m D) / (1 - D^2), x r^T]]."""
     for j in range(count):
-        g = 1 / (1 - d[j] * d[j] - d[T + j] * d[T + j] - d[2 * T + j] * d[2 * T + j])
-        one = 1.0 + 0.0 * state[j]
-        out[j], out[T + j], out[2 * T + j], out[3 * T + j] = one, 0.0 * one, 0.0 * one, 0.0 * one
-        out[4 * T + j], out[8 * T + j], out[12 * T + j] = g * p[j], g * p[T + j], g * p[2 * T + j]
+        u = 1 / one[j]
+        a, b, c = u * one[T + j], u * one[2 * T + j], u * one[3 * T + j]
+        g = u / (1 - a * a - b * b - c * c)
+        p0 = g * (one[4 * T + j] - one[5 * T + j] * a - one[6 * T + j] * b - one[7 * T + j] * c)
+        p1 = g * (one[8 * T + j] - one[9 * T + j] * a - one[10 * T + j] * b - one[11 * T + j] * c)
+        p2 = g * (one[12 * T + j] - one[13 * T + j] * a - one[14 * T + j] * b - one[15 * T + j] * c)
         x0, x1, x2, x3, x4, x5 = x[j], x[T + j], x[2 * T + j], x[3 * T + j], x[4 * T + j], x[5 * T + j]
         x6, x7, x8 = x[6 * T + j], x[7 * T + j], x[8 * T + j]
         r0, r1, r2, r3, r4, r5 = r[j], r[T + j], r[2 * T + j], r[3 * T + j], r[4 * T + j], r[5 * T + j]
         r6, r7, r8 = r[6 * T + j], r[7 * T + j], r[8 * T + j]
-        out[5 * T + j] = x0 * r0 + x1 * r1 + x2 * r2
-        out[10 * T + j] = x3 * r3 + x4 * r4 + x5 * r5
-        out[15 * T + j] = x6 * r6 + x7 * r7 + x8 * r8
+        zero = 0.0 * state[j]
+        one[j], one[T + j], one[2 * T + j], one[3 * T + j] = 1.0 + zero, zero, zero, zero
+        one[4 * T + j], one[8 * T + j], one[12 * T + j] = p0 + zero, p1 + zero, p2 + zero
+        one[5 * T + j] = x0 * r0 + x1 * r1 + x2 * r2
+        one[10 * T + j] = x3 * r3 + x4 * r4 + x5 * r5
+        one[15 * T + j] = x6 * r6 + x7 * r7 + x8 * r8
         # Symmetric up to rounding: the mean of both triangles.
         s = 0.5 * (x0 * r3 + x1 * r4 + x2 * r5 + x3 * r0 + x4 * r1 + x5 * r2)
-        out[6 * T + j], out[9 * T + j] = s, s
+        one[6 * T + j], one[9 * T + j] = s, s
         s = 0.5 * (x0 * r6 + x1 * r7 + x2 * r8 + x6 * r0 + x7 * r1 + x8 * r2)
-        out[7 * T + j], out[13 * T + j] = s, s
+        one[7 * T + j], one[13 * T + j] = s, s
         s = 0.5 * (x3 * r6 + x4 * r7 + x5 * r8 + x6 * r3 + x7 * r4 + x8 * r5)
-        out[11 * T + j], out[14 * T + j] = s, s
-    # P_delta = (P - m D) / (1 - D^2), with m D taken from the rows of M.
-    for k in range(3):
-        u, v, w, total = m[4 * k + 5], m[4 * k + 6], m[4 * k + 7], m[0]
-        for j in range(count):
-            g = 1 / (1 - d[j] * d[j] - d[T + j] * d[T + j] - d[2 * T + j] * d[2 * T + j])
-            out[4 * (k + 1) * T + j] -= g * (u[j] * d[j] + v[j] * d[T + j] + w[j] * d[2 * T + j]) / total[j]
-    for k in range(16):
-        row = depolarizer[k]
-        for j in range(count):
-            row[j] = out[k * T + j] + 0.0 * state[j]
-    for k in range(4):
-        top, left = retarder[k], retarder[4 * k]
-        for j in range(count):
-            top[j], left[j] = 0.0 * state[j], 0.0 * state[j]
-    corner = retarder[0]
+        one[11 * T + j], one[14 * T + j] = s, s
+
+
+@jit
+def _retarder(one, r, count, state):  # type: ignore[no-untyped-def]
     for j in range(count):
-        corner[j] = 1.0 + 0.0 * state[j]
-    for k in range(9):
-        row = retarder[4 * (k // 3) + 5 + k % 3]
-        for j in range(count):
-            row[j] = r[k * T + j]
+        zero = 0.0 * state[j]
+        one[j], one[T + j], one[2 * T + j], one[3 * T + j] = 1.0 + zero, zero, zero, zero
+        one[4 * T + j], one[8 * T + j], one[12 * T + j] = zero, zero, zero
+        one[5 * T + j], one[6 * T + j], one[7 * T + j] = r[j], r[T + j], r[2 * T + j]
+        one[9 * T + j], one[10 * T + j], one[11 * T + j] = r[3 * T + j], r[4 * T + j], r[5 * T + j]
+        one[13 * T + j], one[14 * T + j], one[15 * T + j] = r[6 * T + j], r[7 * T + j], r[8 * T + j]
+
+
+@jit
+def _diattenuator(top, one, count):  # type: ignore[no-untyped-def]
+    """MD in `one` from the first row of M."""
+    for j in range(count):
+        n = top[j] if top[j] > 0 else np.nan
+        u = 1 / n
+        a, b, c = u * top[T + j], u * top[2 * T + j], u * top[3 * T + j]
+        square = a * a + b * b + c * c
+        q = math.sqrt(1 - square if square < 1 else np.nan)
+        n += 0.0 * q
+        w = n / (1 + q)
+        one[j], one[T + j], one[2 * T + j], one[3 * T + j] = n, n * a, n * b, n * c
+        one[4 * T + j], one[8 * T + j], one[12 * T + j] = n * a, n * b, n * c
+        one[5 * T + j], one[6 * T + j], one[7 * T + j] = n * q + w * a * a, w * a * b, w * a * c
+        one[9 * T + j], one[10 * T + j], one[11 * T + j] = w * a * b, n * q + w * b * b, w * b * c
+        one[13 * T + j], one[14 * T + j], one[15 * T + j] = w * a * c, w * b * c, n * q + w * c * c
