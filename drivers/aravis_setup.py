@@ -84,6 +84,10 @@ class Setup:
         self.hardware = False
         self.has_exposure_status = False
 
+    def release(self) -> None:
+        """Drop the reference to the camera."""
+        self._camera = None
+
     def pixel_format(self) -> PixelFormat:
         """The pixel format that the camera is set to now; raises UnknownPixelFormat if it is not known here."""
         with self._features.asking("read PixelFormat"):

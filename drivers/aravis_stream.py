@@ -18,7 +18,8 @@ _COUNTERS = ("n_completed_buffers", "n_failures", "n_underruns", "n_missing_pack
 class Arrival:
     """A buffer that came out of the stream, whole or not.
 
-    `memory` is only good until the arrival is given back.
+    `memory` is only good until the arrival is given back. `frame_id` and `first_packet_s` (unix time) are 0 where
+    the first packet of the frame was lost.
     """
 
     buffer: Any
@@ -28,6 +29,17 @@ class Arrival:
     frame_id: int
     camera_time_ns: int
     first_packet_s: float
+
+    def is_stale(self, sent_unix_s: float, last_id: int | None) -> bool:
+        """True if this frame began before a trigger was sent, or does not follow the last frame seen.
+
+        16-bit frame ids go from 65535 to 1; they are compared on that circle.
+        """
+        if 0 < self.first_packet_s < sent_unix_s:
+            return True
+        if last_id is None or self.frame_id == 0:
+            return False
+        return not 0 < (self.frame_id - last_id) % 65535 < 65535 // 2
 
     def image_layout(self) -> tuple[int, int, int]:
         """Pixel format code, width and height as the camera announced them with this frame."""

@@ -44,6 +44,10 @@ class Features:
         self._camera = camera
         self._device = camera.get_device()
 
+    def release(self) -> None:
+        """Drop the references to the camera."""
+        self._camera = self._device = None
+
     @contextmanager
     def asking(self, what: str) -> Iterator[None]:
         """Turn an error of Aravis inside the block into one of ours; `what` says what was asked."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import time
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,6 +76,7 @@ class AravisCamera(Camera):
 
     def describe(self) -> CameraIdentity:
         """Which camera this is and how it is connected."""
+        self._require_open()
         features, fmt = self._features, self._pixel_format()
         with features.asking("describe itself"):
             name, mtu = self._setup.interface or ("", None)
@@ -104,6 +105,7 @@ class AravisCamera(Camera):
 
     def temperature_c(self) -> float | None:
         """Temperature of the camera in degrees Celsius; None where it has no sensor."""
+        self._require_open()
         return self._features.number(genicam.TEMPERATURE_C)
 
     def _pixel_format(self) -> PixelFormat:
@@ -181,7 +183,7 @@ class AravisCamera(Camera):
 
     def _throw_away(self, stream: FrameStream, arrival: Arrival) -> None:
         stream.give_back(arrival)
-        self._last_id = arrival.frame_id
+        self._last_id = arrival.frame_id or self._last_id
         if arrival.whole:
             self._stale += 1
             log.warning("camera %s: frame %d is stale and was discarded", self.name, arrival.frame_id)
@@ -246,9 +248,11 @@ class AravisCamera(Camera):
                     self._restart()
                     raise self._frame_lost(f"no frame within {time.monotonic() - self._sent_s:.2f} s of the trigger")
                 continue
-            if self._is_stale(arrival):
+            if arrival.is_stale(self._sent_unix_s, self._last_id):
                 self._throw_away(stream, arrival)
                 continue
+            if not arrival.whole:
+                self._give_up(stream, arrival)
             self._outstanding = False
             self._last_id = arrival.frame_id
             try:
@@ -256,15 +260,17 @@ class AravisCamera(Camera):
             finally:
                 stream.give_back(arrival)
 
-    def _is_stale(self, arrival: Arrival) -> bool:
-        if arrival.first_packet_s < self._sent_unix_s:
-            return True
-        # 16-bit frame ids go from 65535 to 1; ids are compared on that circle.
-        return self._last_id is not None and (arrival.frame_id - self._last_id) % 65535 > 65535 // 2
+    def _give_up(self, stream: FrameStream, arrival: Arrival) -> NoReturn:
+        stream.give_back(arrival)
+        if arrival.frame_id:
+            self._outstanding = False
+            self._last_id = arrival.frame_id
+        else:
+            # Without its first packet nobody can tell whose frame it was, so ours might still come.
+            self._restart()
+        raise self._frame_lost(f"frame {arrival.frame_id or 'without a number'} is not whole ({arrival.status})")
 
     def _make_frame(self, arrival: Arrival) -> Frame:
-        if not arrival.whole:
-            raise self._frame_lost(f"frame {arrival.frame_id} is not whole ({arrival.status})")
         fmt = self._pixel_format()
         announced = arrival.image_layout()
         if announced != (fmt.code, *self._setup.size):
@@ -307,7 +313,7 @@ class AravisCamera(Camera):
             if arrival is None:
                 self._check_control("wait for an abandoned exposure")
                 continue
-            ours = not self._is_stale(arrival)
+            ours = not arrival.is_stale(self._sent_unix_s, self._last_id)
             self._throw_away(stream, arrival)
             if ours:
                 self._outstanding = False
@@ -352,7 +358,8 @@ class AravisCamera(Camera):
         if not self._features.control_is_lost():
             with contextlib.suppress(CameraError), self._features.asking("stop"):
                 self._camera.stop_acquisition()
-                if self._setup.is_gige:
-                    # At once and not when the last reference goes, so that the next program finds it free.
-                    self._camera.get_device().leave_control()
         self._close_stream()
+        # Control is given up when the last reference goes, and an error's traceback may keep this object.
+        self._features.release()
+        self._setup.release()
+        self._camera = None

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.camera import Camera, CameraSettings
+from drivers.camera import CameraSettings
 from drivers.cameras import aravis
 from drivers.errors import CameraError, CameraNotFound, FrameLost, SettingRefused, UnknownPixelFormat
 from simulators import gige_features
@@ -240,8 +240,8 @@ def test_describe_names_camera_and_link(bench: Bench) -> None:
     assert (identity.sensor_width, identity.sensor_height) == (64, 48)
 
 
-@pytest.mark.parametrize("device", ["LOOP1", "Aravis-Fake-LOOP1", None])
-def test_a_camera_is_found_by_serial_number_by_id_or_alone(bench: Bench, device: str | None) -> None:
+@pytest.mark.parametrize("device", ["LOOP1", None])
+def test_a_camera_is_found_by_serial_number_or_alone(bench: Bench, device: str | None) -> None:
     _, camera = bench(config=aravis.Config(device=device))
     assert camera.describe().serial_number == "LOOP1"
 
@@ -284,7 +284,3 @@ def test_without_gi_the_driver_can_be_imported_and_opening_says_what_is_missing(
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "gir1.2-aravis-0.8" in run.stdout
-
-
-def test_the_base_class_is_what_others_see(bench: Bench) -> None:
-    assert isinstance(bench()[1], Camera)

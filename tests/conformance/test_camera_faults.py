@@ -1,0 +1,224 @@
+"""The camera when things go wrong: lost packets, stale frames, a stolen or vanished camera, Ctrl-C."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.camera import CameraSettings
+from drivers.cameras import aravis
+from drivers.errors import CameraBusy, CameraLost, FrameLost
+from simulators.gige_camera import ExposureInfo, GigeCamera
+from simulators.pixel_stamp import read_stamp, stamp
+
+SIZE = (128, 64)
+
+
+class Scene:
+    """What the camera sees: its own exposure number, exposure time and an angle that the test turns."""
+
+    def __init__(self) -> None:
+        self.angle_deg = 0.0
+        self.exposures = 0
+        self.before: Callable[[int], None] = lambda _: None
+
+    def __call__(self, info: ExposureInfo) -> NDArray[np.uint16]:
+        self.exposures += 1
+        self.before(self.exposures)
+        # The rest of the picture changes too: memory that was not filled again would show the frame before.
+        pixels = np.full((info.height, info.width), 100 + self.exposures, np.uint16)
+        stamp(pixels, [self.angle_deg, info.exposure_s, self.exposures])
+        return pixels
+
+
+@pytest.fixture
+def scene() -> Scene:
+    return Scene()
+
+
+@pytest.fixture
+def simulated(scene: Scene) -> Iterator[GigeCamera]:
+    with GigeCamera("FAULT1", *SIZE, scene) as camera:
+        yield camera
+
+
+@pytest.fixture
+def camera(simulated: GigeCamera) -> Iterator[aravis.AravisCamera]:
+    with aravis.open("camera", aravis.Config(device="127.0.0.1", packet_size=1500, bits=12)) as opened:
+        opened.configure(CameraSettings(exposure_s=1e-3))
+        yield opened
+
+
+def test_an_incomplete_frame_is_retaken_logged_and_counted(
+    scene: Scene, simulated: GigeCamera, camera: aravis.AravisCamera, caplog: pytest.LogCaptureFixture
+) -> None:
+    scene.before = lambda number: setattr(simulated, "lost_ratio", 0.5 if number == 2 else 0.0)
+    with caplog.at_level(logging.WARNING, "drivers.camera"):
+        numbers = [read_stamp(frame.pixels)[2] for frame in camera.capture(3)]
+    assert numbers == [1, 3, 4]
+    assert camera.statistics().retakes == 1
+    assert camera.statistics().failures == 1
+    assert [record.getMessage() for record in caplog.records if "retake 1 of 3" in record.getMessage()]
+
+
+def test_a_frame_of_which_nothing_came_is_retaken(
+    scene: Scene, simulated: GigeCamera, camera: aravis.AravisCamera
+) -> None:
+    scene.before = lambda number: setattr(simulated, "lost_ratio", 1.0 if number == 2 else 0.0)
+    assert [read_stamp(frame.pixels)[2] for frame in camera.capture(3)] == [1, 3, 4]
+    assert camera.statistics().retakes == 1
+
+
+def test_after_the_last_retake_the_frame_is_lost(simulated: GigeCamera, camera: aravis.AravisCamera) -> None:
+    simulated.lost_ratio = 0.5
+    with pytest.raises(FrameLost, match="4 tries in a row failed"):
+        camera.capture()
+    simulated.lost_ratio = 0.0
+    camera.capture()
+
+
+def test_a_split_exposure_is_never_retaken_by_itself(
+    scene: Scene, simulated: GigeCamera, camera: aravis.AravisCamera
+) -> None:
+    # After wait_exposed the bench may have moved, so only the caller can take it again.
+    simulated.lost_ratio = 0.5
+    exposure = camera.trigger()
+    exposure.wait_exposed()
+    with pytest.raises(FrameLost):
+        exposure.frame()
+    assert scene.exposures == 1
+
+
+def test_two_percent_of_packets_lost_costs_time_and_nothing_else(scene: Scene, simulated: GigeCamera) -> None:
+    # 14 packets a frame: one frame in four is hit, and that none of 40 is happens once in 80 000 runs.
+    config = aravis.Config(device="127.0.0.1", packet_size=1500, bits=12, retakes=12)
+    with aravis.open("camera", config) as camera:
+        camera.configure(CameraSettings(exposure_s=1e-3))
+        simulated.lost_ratio = 0.02
+        for state in range(40):
+            scene.angle_deg = 9.0 * state
+            pixels = camera.capture()[0].pixels
+            assert read_stamp(pixels)[0] == 9.0 * state
+            assert np.all(pixels[1:] == 100 + scene.exposures)
+        statistics = camera.statistics()
+    assert statistics.retakes > 0
+    assert scene.exposures == 40 + statistics.retakes
+    assert statistics.completed == 40
+
+
+def test_every_frame_of_a_40_state_run_belongs_to_its_angle(scene: Scene, camera: aravis.AravisCamera) -> None:
+    # The bench starts to move as soon as the exposure has ended, while the frame is still on its way.
+    seen = []
+    for state in range(40):
+        scene.angle_deg = 9.0 * state
+        exposure = camera.trigger()
+        exposure.wait_exposed()
+        scene.angle_deg = -1.0
+        seen.append(read_stamp(exposure.frame().pixels)[0])
+    assert seen == [9.0 * state for state in range(40)]
+    assert camera.statistics().stale_discarded == 0
+
+
+def test_a_frame_in_flight_when_a_setting_changes_is_thrown_away(scene: Scene, camera: aravis.AravisCamera) -> None:
+    camera.configure(CameraSettings(exposure_s=0.1))
+    camera.trigger()
+    camera.configure(CameraSettings(exposure_s=0.02))
+    for frame in camera.capture(2):
+        assert read_stamp(frame.pixels)[1] == pytest.approx(0.02)
+    assert camera.statistics().stale_discarded == 1
+    assert scene.exposures == 3
+
+
+def test_an_exposure_that_nobody_collects_does_not_become_the_next_frame(
+    scene: Scene, camera: aravis.AravisCamera
+) -> None:
+    scene.angle_deg = 1.0
+    camera.trigger().wait_exposed()
+    scene.angle_deg = 2.0
+    assert read_stamp(camera.trigger().frame().pixels)[0] == 2.0
+    assert camera.statistics().stale_discarded == 1
+
+
+@pytest.mark.parametrize("pause_s", [0.3, 0.05])
+def test_a_stray_exposure_before_the_trigger_is_not_taken_for_its_own(
+    scene: Scene, simulated: GigeCamera, camera: aravis.AravisCamera, pause_s: float
+) -> None:
+    # 0.3 s: its frame waits when the trigger comes. 0.05 s: it still exposes then.
+    camera.configure(CameraSettings(exposure_s=0.2))
+    camera.capture()
+    scene.angle_deg = 1.0
+    simulated.fire()
+    time.sleep(pause_s)
+    scene.angle_deg = 2.0
+    frame = camera.capture()[0]
+    assert read_stamp(frame.pixels)[0] == 2.0
+    assert camera.statistics().stale_discarded == 1
+
+
+def test_a_camera_that_vanishes_is_noticed_and_can_be_opened_again(
+    scene: Scene, simulated: GigeCamera, camera: aravis.AravisCamera
+) -> None:
+    camera.capture(2)
+    exposure = camera.trigger()
+    simulated.vanish()
+    gone_s = time.monotonic()
+    with pytest.raises(CameraLost, match=r"does not answer|obeys another"):
+        exposure.frame()
+    assert time.monotonic() - gone_s < 10
+    with pytest.raises(CameraLost):
+        camera.capture()
+    camera.close()
+    simulated.start()
+    with aravis.open("camera", aravis.Config(device="127.0.0.1", bits=12)) as again:
+        again.configure(CameraSettings(exposure_s=1e-3))
+        assert read_stamp(again.capture()[0].pixels)[2] == scene.exposures
+
+
+def test_a_second_program_is_refused_and_the_first_goes_on(camera: aravis.AravisCamera) -> None:
+    with pytest.raises(CameraBusy, match="another program controls it"):
+        aravis.open("second", aravis.Config(device="127.0.0.1"))
+    camera.capture()
+
+
+def test_ctrl_c_gets_through_a_long_wait(simulated: GigeCamera) -> None:
+    config = aravis.Config(device="127.0.0.1", trigger_timeout_s=30.0)
+    with aravis.open("camera", config) as camera:
+        camera.configure(CameraSettings(exposure_s=1e-3, trigger="hardware"))
+        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+        start_s = time.monotonic()
+        with pytest.raises(KeyboardInterrupt):
+            camera.capture()
+        assert time.monotonic() - start_s < 3
+
+
+def test_an_error_of_the_pixel_source_is_raised_and_its_frame_not_sent() -> None:
+    def broken(info: ExposureInfo) -> NDArray[np.uint16]:
+        raise ZeroDivisionError("the bench is broken")
+
+    simulated = GigeCamera("FAULT2", *SIZE, broken)
+    with simulated, aravis.open("camera", aravis.Config(device="127.0.0.1", retakes=0)) as camera:
+        camera.configure(CameraSettings(exposure_s=1e-3))
+        with pytest.raises(FrameLost):
+            camera.capture()
+        with pytest.raises(ZeroDivisionError, match="bench is broken"):
+            simulated.check()
+
+
+@pytest.mark.parametrize(
+    "wrong", [np.zeros((64, 128)), np.zeros((2, 2), np.uint16), np.full((64, 128), 5000, np.uint16)]
+)
+def test_counts_that_the_camera_cannot_send_are_an_error_of_the_source(wrong: NDArray[np.uint16]) -> None:
+    simulated = GigeCamera("FAULT3", *SIZE, lambda _: wrong)
+    with simulated, aravis.open("camera", aravis.Config(device="127.0.0.1")) as camera:
+        camera.configure(CameraSettings(exposure_s=1e-3))
+        camera.trigger().wait_exposed()
+        with pytest.raises(ValueError, match="the pixel source gave"):
+            simulated.check()

@@ -1,0 +1,108 @@
+"""Pixel formats byte by byte, from the GenICam naming convention and GigE Vision."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.errors import UnknownPixelFormat
+from drivers.pixel_formats import PIXEL_FORMATS, PixelFormat, pixel_format
+from simulators.pixel_stamp import read_stamp, stamp
+
+
+@pytest.mark.parametrize(
+    ("name", "memory", "counts"),
+    [
+        ("Mono8", "00 7f ff", [0, 0x7F, 0xFF]),
+        ("Mono12", "bc 0a 23 01", [0xABC, 0x123]),
+        ("Mono16", "34 12 ff ff", [0x1234, 0xFFFF]),
+        # p: lowest bits first, end to end.
+        ("Mono12p", "bc 3a 12", [0xABC, 0x123]),
+        ("PolarizedMono12p", "bc 3a 12", [0xABC, 0x123]),
+        ("Mono12p", "bc 3a 12 ef 0d", [0xABC, 0x123, 0xDEF]),
+        ("Mono10p", "ff 03 00 00 80", [0x3FF, 0x000, 0x000, 0x200]),
+        # packed: high bits in the outer bytes, low bits of both in the middle.
+        ("Mono12Packed", "ab 3c 12", [0xABC, 0x123]),
+        ("PolarizedMono12Packed", "ab 3c 12", [0xABC, 0x123]),
+        ("Mono10Packed", "ff 13 00", [0x3FF, 0x001]),
+    ],
+)
+def test_bytes_become_counts(name: str, memory: str, counts: list[int]) -> None:
+    data = np.frombuffer(bytes.fromhex(memory), np.uint8)
+    assert pixel_format(name).decode(data, len(counts), 1).tolist() == [counts]
+
+
+@given(
+    fmt=st.sampled_from(PIXEL_FORMATS),
+    width=st.integers(1, 9),
+    height=st.integers(1, 5),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_an_image_survives_the_wire(fmt: PixelFormat, width: int, height: int, seed: int) -> None:
+    pixels = np.random.default_rng(seed).integers(0, 1 << fmt.bits, (height, width)).astype(np.uint16)
+    memory = fmt.encode(pixels)
+    assert memory.size == fmt.payload_bytes(width, height)
+    assert np.array_equal(fmt.decode(memory, width, height), pixels)
+
+
+def test_bits_in_memory_are_in_the_code() -> None:
+    for fmt in PIXEL_FORMATS:
+        packed = {"plain": 8 if fmt.bits == 8 else 16, "p": fmt.bits, "packed": 12}
+        assert fmt.bits_in_memory == packed[fmt.layout], fmt
+    assert len({fmt.code for fmt in PIXEL_FORMATS}) == len({fmt.name for fmt in PIXEL_FORMATS}) == len(PIXEL_FORMATS)
+
+
+def test_a_shift_takes_empty_low_bits_away() -> None:
+    left_aligned = (np.arange(12, dtype=np.uint16).reshape(3, 4) * 300) << 4
+    fmt = pixel_format("Mono16")
+    assert np.array_equal(fmt.decode(fmt.encode(left_aligned), 4, 3, shift=4), left_aligned >> 4)
+
+
+def test_decoded_counts_share_nothing_with_the_buffer() -> None:
+    memory = np.full(8, 1, np.uint8)
+    pixels = pixel_format("Mono8").decode(memory, 4, 2)
+    memory[:] = 9
+    assert pixels.tolist() == [[1] * 4] * 2
+
+
+# The last one is a degree of polarization that a camera computed itself, not an intensity.
+@pytest.mark.parametrize("unknown", ["Bayer", 0x02180014, 0x8220000F, "PolarizedDolp_Mono8"])
+def test_an_unknown_format_is_refused_and_named(unknown: str | int) -> None:
+    with pytest.raises(UnknownPixelFormat) as refused:
+        pixel_format(unknown)
+    assert (unknown if isinstance(unknown, str) else f"0x{unknown:08x}") in str(refused.value)
+
+
+def test_a_code_that_a_library_sign_extended_is_the_same_code() -> None:
+    assert pixel_format(0x810C0010 - (1 << 32)).name == "PolarizedMono12Packed"
+
+
+def test_short_memory_and_counts_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(ValueError, match="needs 12 bytes"):
+        pixel_format("Mono12p").decode(np.zeros(11, np.uint8), 4, 2)
+    with pytest.raises(ValueError, match="holds 12 bits"):
+        pixel_format("Mono12p").encode(np.full((2, 2), 4096, np.uint16))
+
+
+@given(values=st.lists(st.floats(allow_nan=False), max_size=4), bits=st.integers(8, 16), seed=st.integers(0, 1000))
+def test_a_stamp_survives_noise(values: list[float], bits: int, seed: int) -> None:
+    pixels = np.zeros((8, 16), np.uint16)
+    stamp(pixels, values, bits=bits)
+    noise = (1 << bits) // 32 - 1
+    noisy = pixels + np.random.default_rng(seed).integers(-noise, noise + 1, pixels.shape)
+    assert read_stamp(np.clip(noisy, 0, (1 << bits) - 1).astype(np.uint16), bits=bits) == tuple(values)
+
+
+def test_a_picture_without_a_stamp_is_told() -> None:
+    for pixels in (np.zeros((8, 16), np.uint16), np.full((1, 2), 9, np.uint16)):
+        with pytest.raises(ValueError, match="no stamp"):
+            read_stamp(pixels)
+    disturbed = np.zeros((8, 16), np.uint16)
+    stamp(disturbed, [1.5])
+    disturbed[0, 7] ^= 0xF00
+    with pytest.raises(ValueError, match="disturbed"):
+        read_stamp(disturbed)
+    with pytest.raises(ValueError, match="needs"):
+        stamp(np.zeros((2, 2), np.uint16), [1.0])
