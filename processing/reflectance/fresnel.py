@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from processing.geometry.frames import ScatteringGeometry, cross, dot
 
+FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 
@@ -24,16 +25,20 @@ def amplitudes(index: complex, angle: ArrayLike) -> tuple[ComplexArray, ComplexA
     return rs, rp
 
 
+def basis(geometry: ScatteringGeometry) -> tuple[FloatArray, FloatArray]:
+    """Real matrices (..., 2, 2) of s- and p-polarized reflection at the facet: F = r_s S + r_p P."""
+    s = geometry.s_axis
+    p_in, p_out = cross(-geometry.to_source, s), cross(geometry.to_camera, s)
+    via_s, via_p = (np.empty((*s.shape[:-1], 2, 2)) for _ in range(2))
+    for i, axis_out in enumerate(geometry.axes_out):
+        for j, axis_in in enumerate(geometry.axes_in):
+            via_s[..., i, j] = dot(axis_out, s) * dot(s, axis_in)
+            via_p[..., i, j] = dot(axis_out, p_out) * dot(p_in, axis_in)
+    return via_s, via_p
+
+
 def jones(geometry: ScatteringGeometry, index: complex) -> ComplexArray:
     """Jones matrices (..., 2, 2) of reflection at the facet whose normal is h (paper Eq. for F)."""
-    s = geometry.s_axis
     rs, rp = amplitudes(index, geometry.angles.theta_d)
-    p_in, p_out = cross(-geometry.to_source, s), cross(geometry.to_camera, s)
-    x_in, y_in = geometry.axes_in
-    x_out, y_out = geometry.axes_out
-    out = np.empty((*rs.shape, 2, 2), dtype=complex)
-    for i, axis_out in enumerate((x_out, y_out)):
-        via_s, via_p = dot(axis_out, s) * rs, dot(axis_out, p_out) * rp
-        for j, axis_in in enumerate((x_in, y_in)):
-            out[..., i, j] = via_s * dot(s, axis_in) + via_p * dot(p_in, axis_in)
-    return out
+    via_s, via_p = basis(geometry)
+    return np.asarray(rs[..., None, None] * via_s + rp[..., None, None] * via_p)

@@ -1,0 +1,198 @@
+"""Material constants n + i k, a, b of the polarized diffuse model, from Mueller images or from intensities.
+
+Mueller images: least squares on the dominant process m0, each pixel weighed with alpha_0 = M00 (4 xi0 - 1)/3, which
+makes the noise of all pixels alike. Intensities: at each pixel P = alpha_0 W m0 + alpha_ID W mID, so the right
+constants make the measured and the modelled intensities most linearly related (paper, conclusion); the two
+coefficients of each pixel are projected out, with alpha_0 >= 0: a negative correlation is no agreement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
+
+from processing.errors import NotDetermined
+from processing.geometry.frames import ScatteringGeometry
+from processing.reflectance import fresnel, polarized_diffuse
+from processing.reflectance.base import ComplexArray, normalized_mueller
+
+FloatArray = NDArray[np.float64]
+
+NAMES = ("n", "k", "a", "b")
+LOWER, UPPER = np.array([1.01, 0.0, 0.0, 0.3]), np.array([4.0, 4.0, 3.0, 8.0])
+#: Start values; the sum of squares has more than one minimum.
+STARTS = ((1.3, 0.1, 0.1, 2.0), (1.6, 0.02, 0.3, 1.5), (1.2, 0.4, 0.05, 3.0), (2.0, 1.0, 0.5, 2.0))
+#: A constant counts as identified when its standard error is below this part of it (k: or below 0.02).
+RELATIVE_LIMIT, K_LIMIT = 0.3, 0.02
+
+
+@dataclass(frozen=True)
+class MaterialFit:
+    """Fitted constants.
+
+    Attributes
+    ----------
+    constants : n, k, a, b.
+    covariance : (4, 4); NaN for a constant at its bound. From the scatter of whole pixels, whose elements are
+        correlated; it holds noise and misfit, not errors of the geometry.
+    identified : which constants the data fix at all; an unidentified one may be anything.
+    correlation : mean linear correlation between data and model; NaN for Mueller images.
+    residual : root mean square of the residual over that of the data's polarized part.
+    """
+
+    constants: FloatArray
+    covariance: FloatArray
+    identified: dict[str, bool]
+    condition: float
+    residual: float
+    correlation: float
+    pixels: int
+
+    @property
+    def stderr(self) -> FloatArray:
+        """(4,), standard errors."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def model(self, name: str, wavelength_nm: float) -> polarized_diffuse.Model:
+        """The fitted reflectance model."""
+        n, k, a, b = (float(v) for v in self.constants)
+        constants = {wavelength_nm: polarized_diffuse.Constants(n=n, k=k, a=a, b=b)}
+        return polarized_diffuse.Model(name=name, source="process fit-material", constants=constants)
+
+
+def fit_mueller(
+    geometry: ScatteringGeometry, dominant: ArrayLike, xi0: ArrayLike, m00: ArrayLike, max_pixels: int = 5000
+) -> MaterialFit:
+    """Constants from dominant processes (N, 4, 4) with xi0 and M00 (N,), by least squares.
+
+    Parameters
+    ----------
+    max_pixels : use at most so many, evenly spread.
+
+    Raises
+    ------
+    NotDetermined : fewer than 10 pixels are finite.
+    """
+    m0, xi, t = np.asarray(dominant, dtype=float), np.asarray(xi0, dtype=float), np.asarray(m00, dtype=float)
+    keep = _some(np.isfinite(m0).all(axis=(-2, -1)) & np.isfinite(xi) & np.isfinite(t), max_pixels)
+    model = _Forward(geometry[keep])
+    weight = t[keep] * (4 * xi[keep] - 1) / 3
+    data = weight[:, None] * m0[keep].reshape(-1, 16)[:, 1:]
+
+    def residual(p: FloatArray) -> FloatArray:
+        return np.asarray(data - weight[:, None] * model.mueller(p).reshape(-1, 16)[:, 1:])
+
+    found, jacobian = _search(residual)
+    left = residual(found)
+    return _result(found, jacobian, left, float(np.sqrt(np.sum(left**2) / np.sum(data**2))), np.nan)
+
+
+def fit_intensities(
+    geometry: ScatteringGeometry,
+    intensities: ArrayLike,
+    w: ArrayLike,
+    variance: ArrayLike | None = None,
+    max_pixels: int = 5000,
+) -> MaterialFit:
+    """Constants from intensities (K, N) under W (K, 16), by maximum linear correlation.
+
+    Parameters
+    ----------
+    variance : (K, N), of the intensities; pixels are weighed by it. None: by their own modulation, which is the
+        plain correlation coefficient and suits noise in proportion to the signal.
+
+    Raises
+    ------
+    NotDetermined : fewer than 10 pixels are finite.
+    """
+    p = np.asarray(intensities, dtype=float)
+    rows = np.asarray(w, dtype=float).reshape(-1, 16)
+    keep = _some(np.isfinite(p).all(axis=0), max_pixels)
+    model, p = _Forward(geometry[keep]), p[:, keep].T
+    if variance is None:
+        off = p - p.mean(axis=1, keepdims=True)
+        scale = np.broadcast_to(1 / np.maximum(np.linalg.norm(off, axis=1, keepdims=True), 1e-12), p.shape)
+    else:
+        scale = 1 / np.sqrt(np.asarray(variance, dtype=float)[:, keep].T)
+    data, flat = p * scale, rows[:, 0] * scale
+    # What the ideal depolarizer explains is projected out of the data and of the model.
+    flat = flat / np.linalg.norm(flat, axis=1, keepdims=True)
+    data = data - flat * np.sum(flat * data, axis=1, keepdims=True)
+
+    def parts(q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        modelled = model.mueller(q).reshape(-1, 16) @ rows.T * scale
+        modelled = modelled - flat * np.sum(flat * modelled, axis=1, keepdims=True)
+        return modelled, np.sum(modelled * data, axis=1, keepdims=True)
+
+    def residual(q: FloatArray) -> FloatArray:
+        modelled, overlap = parts(q)
+        size = np.maximum(np.sum(modelled**2, axis=1, keepdims=True), 1e-300)
+        return np.asarray(data - modelled * np.maximum(overlap, 0) / size)
+
+    found, jacobian = _search(residual)
+    left = residual(found)
+    modelled, overlap = parts(found)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rho = overlap[:, 0] / (np.linalg.norm(modelled, axis=1) * np.linalg.norm(data, axis=1))
+    return _result(found, jacobian, left, float(np.sqrt(np.sum(left**2) / np.sum(data**2))), float(np.nanmean(rho)))
+
+
+class _Forward:
+    """m0 of given directions as a function of (n, k, a, b), everything else worked out once."""
+
+    def __init__(self, geometry: ScatteringGeometry) -> None:
+        self.via_s, self.via_p = fresnel.basis(geometry)
+        self.theta_d, self.sine = geometry.angles.theta_d, np.sin(geometry.angles.theta_h)
+        self.diffuse = polarized_diffuse.diffuse_jones(geometry)
+
+    def mueller(self, p: FloatArray) -> FloatArray:
+        n, k, a, b = p
+        rs, rp = fresnel.amplitudes(complex(n, k), self.theta_d)
+        jones: ComplexArray = rs[:, None, None] * self.via_s + rp[:, None, None] * self.via_p
+        return normalized_mueller(jones + (a * self.sine**b)[:, None, None] * self.diffuse)
+
+
+def _some(good: NDArray[np.bool_], limit: int) -> NDArray[np.int64]:
+    index = np.flatnonzero(good)
+    if index.size < 10:
+        raise NotDetermined(f"only {index.size} pixels are finite; a material fit needs 10 and more. Check the mask.")
+    return index[np.linspace(0, index.size - 1, min(index.size, limit)).astype(np.int64)]
+
+
+def _search(residual: Callable[[FloatArray], FloatArray]) -> tuple[FloatArray, FloatArray]:
+    def flat(p: FloatArray) -> FloatArray:
+        return residual(p).reshape(-1)
+
+    best = None
+    for start in STARTS:
+        fit = least_squares(flat, start, bounds=(LOWER, UPPER), x_scale=[0.1, 0.1, 0.1, 1.0], max_nfev=60)
+        if best is None or fit.cost < best.cost * (1 - 1e-9):
+            best = fit
+    if best is None:
+        raise NotDetermined("no start value led anywhere")
+    return np.asarray(best.x), np.asarray(best.jac)
+
+
+def _result(
+    found: FloatArray, jacobian: FloatArray, left: FloatArray, residual: float, correlation: float
+) -> MaterialFit:
+    width = UPPER - LOWER
+    free = (found > LOWER + 1e-4 * width) & (found < UPPER - 1e-4 * width)
+    per_pixel = jacobian.reshape(*left.shape, 4)[..., free]
+    scaled = jacobian[:, free]
+    singular = np.linalg.svd(scaled / np.maximum(np.linalg.norm(scaled, axis=0), 1e-300), compute_uv=False)
+    condition = float(singular[0] / max(singular[-1], 1e-300)) if free.any() else np.inf
+    covariance = np.full((4, 4), np.nan)
+    if free.any() and condition < 1e7:
+        bread = np.linalg.inv(scaled.T @ scaled)
+        score = np.einsum("nkp,nk->np", per_pixel, left)
+        covariance[np.ix_(free, free)] = bread @ (score.T @ score) @ bread
+    stderr = np.sqrt(np.diag(covariance))
+    limit = RELATIVE_LIMIT * np.abs(found)
+    limit[1] = max(limit[1], K_LIMIT)
+    identified = {name: bool(s <= m) for name, s, m in zip(NAMES, stderr, limit, strict=True)}
+    return MaterialFit(found, covariance, identified, condition, residual, correlation, len(left))

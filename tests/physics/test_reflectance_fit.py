@@ -1,0 +1,109 @@
+"""Material constants from Mueller images and from intensities: recovery, error bars, identifiability."""
+
+import numpy as np
+import pytest
+
+from processing.cloude import xi0_and_dominant
+from processing.errors import NotDetermined
+from processing.geometry.frames import ScatteringGeometry
+from processing.instrument import InstrumentModel
+from processing.material_fit import NAMES, fit_intensities, fit_mueller
+from processing.states import rotating_retarders
+from simulators.scene import Scene
+
+TRUE = np.array([1.3, 0.08, 0.17, 2.0])
+VERTICAL = np.array([1.0, -1, 0, 0]) / 2
+
+
+@pytest.fixture(scope="module")
+def sphere(configs) -> tuple[ScatteringGeometry, np.ndarray]:
+    """Geometry and true Mueller matrices of the red sphere at 662 nm, four arm angles."""
+    scene = Scene.load(configs / "scenes/red_sphere.yaml")
+    parts, matrices = [], []
+    for omega in (20, 35, 60, 90):
+        truth = scene.truth(omega, 662, 30, 30)
+        parts.append(truth.geometry.points)
+        matrices.append(scene.mueller_image(omega, 662, 30, 30)[truth.mask].astype(float))
+    vectors = (np.concatenate([getattr(p, name) for p in parts]) for name in ("normal", "to_source", "to_camera"))
+    return ScatteringGeometry(*vectors), np.concatenate(matrices)
+
+
+@pytest.fixture(scope="module")
+def w40(configs) -> np.ndarray:
+    rgb950 = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
+    return rgb950.rows(rotating_retarders(1.0).angles_deg).reshape(-1, 16)
+
+
+def stokes(generator: np.ndarray) -> np.ndarray:
+    analyzers = np.array([[1.0, 1, 0, 0], [1, 0, 1, 0], [1, -1, 0, 0], [1, 0, -1, 0]]) / 2
+    return (analyzers[:, :, None] * generator).reshape(4, 16)
+
+
+def test_exact_data_give_the_constants(sphere, w40):
+    geometry, m = sphere
+    xi0, m0 = xi0_and_dominant(m)
+    fit = fit_mueller(geometry, m0, xi0, m[:, 0, 0])
+    np.testing.assert_allclose(fit.constants, TRUE, rtol=1e-4)
+    for w in (stokes(VERTICAL), w40):
+        p = w @ m.reshape(-1, 16).T
+        for variance in (None, np.ones_like(p)):
+            fit = fit_intensities(geometry, p, w, variance)
+            np.testing.assert_allclose(fit.constants, TRUE, rtol=2e-3)
+            assert fit.correlation == pytest.approx(1, abs=1e-6)
+            assert all(fit.identified.values())
+
+
+def noisy(m: np.ndarray, w: np.ndarray, seed: int, electrons: float) -> tuple[np.ndarray, np.ndarray]:
+    p = electrons * (w @ m.reshape(-1, 16).T)
+    variance = p + 6
+    return p + np.random.default_rng(seed).normal(size=p.shape) * np.sqrt(variance), variance
+
+
+@pytest.mark.parametrize("way", ["mueller", "stokes"])
+def test_standard_errors_cover_the_truth(sphere, w40, way):
+    geometry, m = sphere
+    pulls = []
+    for seed in range(12):
+        if way == "mueller":
+            p, _ = noisy(m, w40, seed, 20_000)
+            measured = (np.linalg.pinv(w40) @ p).T.reshape(-1, 4, 4)
+            xi0, m0 = xi0_and_dominant(measured)
+            fit = fit_mueller(geometry, m0, xi0, measured[:, 0, 0])
+        else:
+            p, variance = noisy(m, stokes(VERTICAL), seed, 200_000)
+            fit = fit_intensities(geometry, p, stokes(VERTICAL), variance)
+        pulls.append((fit.constants - TRUE) / fit.stderr)
+    # 12 draws of 4 correlated values: the spread of a unit variance estimate is about 0.2.
+    assert np.nanstd(pulls) == pytest.approx(1, abs=0.5)
+    assert np.abs(np.nanmean(pulls, axis=0)).max() < 1.2
+
+
+def test_what_the_data_do_not_fix_is_said(sphere):
+    geometry, m = sphere
+    # Near specular the diffuse term has no weight: a and b cannot be had there.
+    near = geometry.angles.theta_h < np.deg2rad(12)
+    p, variance = noisy(m[near], stokes(VERTICAL), 0, 20_000)
+    fit = fit_intensities(geometry[near], p, stokes(VERTICAL), variance)
+    assert not fit.identified["b"]
+    with pytest.raises(NotDetermined, match="10"):
+        fit_mueller(geometry, np.full((len(m), 4, 4), np.nan), np.ones(len(m)), np.ones(len(m)))
+
+
+def test_a_turned_geometry_lowers_the_correlation(sphere):
+    geometry, m = sphere
+    w = stokes(VERTICAL)
+    p = w @ m.reshape(-1, 16).T
+    right = fit_intensities(geometry, p, w).correlation
+    wrong = ScatteringGeometry(np.roll(geometry.normal, 40, axis=0), geometry.to_source, geometry.to_camera)
+    fit = fit_intensities(wrong, p, w)
+    assert fit.correlation < right - 0.02
+    assert not all(fit.identified.values())
+
+
+def test_the_fitted_model_is_a_material(sphere):
+    geometry, m = sphere
+    xi0, m0 = xi0_and_dominant(m)
+    fit = fit_mueller(geometry, m0, xi0, m[:, 0, 0])
+    model = fit.model("mine", 662)
+    np.testing.assert_allclose(model.mueller_jones(geometry, 662), m0, atol=1e-4)
+    assert tuple(fit.identified) == NAMES
