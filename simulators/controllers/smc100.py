@@ -57,8 +57,10 @@ class SMC100Controller:
     configuring: bool = False
     # Settings that are only kept: jerk time, homing type, speed and time-out, backlash, hysteresis, encoder, error.
     settings: dict[str, str] = field(
-        default_factory=lambda: dict(JR="0.04", HT="2", OH="20", OT="30", BA="0", BH="0", SU="0.001", FE="1")
-    )
+        default_factory=lambda: {
+            "JR": "0.04", "HT": "2", "OH": "20", "OT": "30", "BA": "0", "BH": "0", "SU": "0.001", "FE": "1",
+        }
+    )  # fmt: skip
     came_by: int = 0x0A
     target_deg: float = 0.0
     silent_until_s: float = 0.0
@@ -68,14 +70,12 @@ class SMC100Controller:
         axis = self.axis
         moving = axis.is_moving()
         if moving and axis.homing:
-            self.came_by = 0x32
             return 0x1E
         if self.configuring:
             return 0x14
         if not axis.homed:
             return 0x0A if self.came_by >= 0x32 else self.came_by
         if moving:
-            self.came_by = 0x33
             return 0x28
         if self.disabled:
             return 0x3C
@@ -193,7 +193,7 @@ class SMC100Controller:
         self._refuse_unless_ready()
         if not self.axis.within(target_deg):
             raise Refused("G")
-        self.target_deg = target_deg
+        self.target_deg, self.came_by = target_deg, 0x33
         self.axis.move_to(target_deg)
         return None
 
@@ -210,10 +210,12 @@ class SMC100Controller:
             raise Refused("I")
         if state >= 0x1E:
             raise Refused({0x1E: "L", 0x28: "M", 0x3C: "J"}.get(state, "K"))
-        self.target_deg = 0.0
+        self.target_deg, self.came_by = 0.0, 0x32
         self.axis.home()
 
     def _stop(self, _: str) -> None:
+        if self.axis.is_moving() and self.axis.homing:
+            self.came_by = 0x0B
         self.axis.stop()
         self.target_deg = self.axis.position_deg()
 

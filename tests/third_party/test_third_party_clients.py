@@ -1,0 +1,197 @@
+"""Clients that nobody here wrote must be able to drive the emulators; what had to be mended is in docs."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from unittest.mock import MagicMock
+
+import pytest
+
+from simulators.clock import Clock
+from simulators.emulator import Emulator
+from simulators.pty_port import PtyPort
+from simulators.serve import ServeOptions, served_kinds
+
+# The warnings that these packages cause are theirs, not ours.
+pytestmark = [pytest.mark.third_party, pytest.mark.filterwarnings("ignore")]
+
+
+@contextmanager
+def served(kind: str, speed: float = 20.0) -> Iterator[tuple[Emulator, str]]:
+    emulator = served_kinds()[kind](ServeOptions(clock=Clock(speed)))
+    with PtyPort(emulator) as port:
+        yield emulator, port.path
+
+
+def wait_until(what: str, condition: Callable[[], bool], allowed_s: float = 8.0) -> None:
+    give_up_s = time.monotonic() + allowed_s
+    while not condition():
+        if time.monotonic() > give_up_s:
+            pytest.fail(f"not within {allowed_s} s: {what}")
+        time.sleep(0.01)
+
+
+def test_zaber_motion() -> None:
+    from zaber_motion.ascii import Connection
+    from zaber_motion.exceptions.bad_data_exception import BadDataException
+
+    with served("zaber") as (emulator, path), Connection.open_serial_port(path) as connection:
+        connection.enable_alerts()
+        devices = connection.detect_devices(identify_devices=False)
+        assert [device.device_address for device in devices] == [1, 2, 3]
+        axis = devices[0].get_axis(1)
+        assert axis.warnings.get_flags() == {"WR"}
+        axis.home()
+        axis.move_absolute(10_000)
+        axis.move_relative(-500)
+        assert axis.get_position() == 9500
+        assert emulator.true_deg(0) == pytest.approx(9500 / 768_000 * 360)
+        axis.move_velocity(1000)
+        axis.stop()
+        assert not axis.is_busy()
+        arm = devices[2].get_axis(1)
+        arm.home()
+        with pytest.raises(BadDataException):
+            arm.move_absolute(10**8)
+
+
+def test_pylablib_elliptec() -> None:
+    from pylablib.devices import Thorlabs
+
+    with served("elliptec") as (emulator, path):
+        motor = Thorlabs.ElliptecMotor(path, addrs=[0, 1], scale="stage")
+        try:
+            assert motor.get_device_info().model_no == 14
+            motor.home()
+            motor.home(addr=1)
+            motor.move_to(90)
+            motor.move_by(-110)
+            assert motor.get_position() == pytest.approx(-20, abs=0.01)
+            assert emulator.true_deg(0) == pytest.approx(-20, abs=0.01)
+            motor.move_to(10, addr=1)
+            assert emulator.true_deg(1) == pytest.approx(10, abs=0.01)
+            motor.set_velocity(70)
+            assert motor.get_velocity() == 70
+        finally:
+            motor.close()
+
+
+@pytest.mark.parametrize(("kind", "scale"), [("apt-k10cr1", "K10CR1"), ("apt-kdc101", "stage")])
+def test_pylablib_kinesis(kind: str, scale: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pylablib.devices import Thorlabs
+    from pylablib.devices.Thorlabs import kinesis
+
+    # It toggles RTS, which a pseudo-terminal does not have.
+    monkeypatch.setattr(kinesis.BasicKinesisDevice, "_cycle_rts", staticmethod(lambda instr: None))
+    with served(kind) as (emulator, path):
+        motor = Thorlabs.KinesisMotor(("serial", path), scale=scale)
+        try:
+            assert motor.get_scale_units() == "deg"
+            motor.home()
+            motor.wait_for_home()
+            assert motor.is_homed()
+            motor.move_to(30)
+            motor.wait_move()
+            motor.move_by(-50)
+            motor.wait_move()
+            assert motor.get_position() == pytest.approx(-20, abs=0.01)
+            assert emulator.true_deg(0) == pytest.approx(-20, abs=0.01)
+            assert motor.get_full_info()["device_info"].serial_no // 1_000_000 == (55 if scale == "K10CR1" else 27)
+        finally:
+            motor.close()
+
+
+def test_thorlabs_apt_device() -> None:
+    from thorlabs_apt_device import KDC101
+
+    with served("apt-kdc101") as (emulator, path):
+        unit = KDC101(serial_port=path, home=False)
+        try:
+            wait_until("first status", lambda: unit.status["msg"] != "")
+            unit.home()
+            wait_until("homed", lambda: unit.status["homed"] and not unit.status["homing"])
+            unit.move_absolute(19_196)
+            wait_until("target", lambda: unit.status["position"] == 19_196)
+            unit.move_relative(-30_000)
+            wait_until("target", lambda: unit.status["position"] == -10_804)
+            assert emulator.true_deg(0) == pytest.approx(-10_804 / 1919.6418578623391)
+        finally:
+            unit.close()
+            time.sleep(0.3)
+
+
+def test_qmi_k10cr1(monkeypatch: pytest.MonkeyPatch) -> None:
+    from qmi.core.context import QMI_Context
+    from qmi.instruments.thorlabs import Thorlabs_K10Cr1
+
+    # It waits this long in every query, whenever the reply comes.
+    monkeypatch.setattr(Thorlabs_K10Cr1, "RESPONSE_TIMEOUT", 0.2)
+    with served("apt-k10cr1") as (emulator, path):
+        context = MagicMock(spec=QMI_Context)
+        context.name = "test"
+        mount = Thorlabs_K10Cr1(context, "mount", f"serial:{path}")
+        mount.open()
+        try:
+            assert mount.get_idn().serial == 55_000_001
+            assert not mount.get_motor_status().homed
+            mount.move_home()
+            mount.wait_move_complete(5)
+            mount.move_absolute(33)
+            mount.wait_move_complete(5)
+            assert mount.get_absolute_position() == pytest.approx(33, abs=1e-4)
+            assert emulator.true_deg(0) == pytest.approx(33, abs=1e-4)
+        finally:
+            mount.close()
+
+
+def test_qmi_smc100(monkeypatch: pytest.MonkeyPatch) -> None:
+    from qmi.core.context import QMI_Context
+    from qmi.instruments.newport.actuators import LinearActuator
+    from qmi.instruments.newport.smc_100cc import Newport_SMC100CC
+
+    # It sleeps half a second around each command; the emulator needs less.
+    monkeypatch.setattr(Newport_SMC100CC, "COMMAND_EXEC_TIME", 0.02)
+    with served("smc100") as (emulator, path):
+        context = MagicMock(spec=QMI_Context)
+        context.name = "test"
+        stage = LinearActuator(0, 180, 300, 0.001, 0.001, 1, 0.001)
+        arm = Newport_SMC100CC(context, "arm", f"serial:{path}", "serial", {1: stage}, 57600)
+        arm.open()
+        try:
+            assert arm.get_idn().model == "SMC100CC"
+            assert arm.get_positioner_error_and_state() == ([], "NOT REFERENCED from RESET")
+            arm.home_search()
+            wait_until("homed", lambda: "READY" in arm.get_positioner_error_and_state()[1])
+            arm.move_absolute(45.5)
+            wait_until("target", lambda: "READY from MOVING" in arm.get_positioner_error_and_state()[1])
+            assert arm.get_position() == 45.5
+            assert emulator.true_deg(0) == 45.5
+            assert arm.get_error() == ("@", "No error")
+        finally:
+            arm.close()
+
+
+def test_pymeasure_esp300() -> None:
+    from pymeasure.adapters import SerialAdapter
+    from pymeasure.instruments.newport import ESP300
+
+    with served("esp301") as (emulator, path):
+        adapter = SerialAdapter(path, baudrate=19200, timeout=1, write_termination="\r", read_termination="\r\n")
+        controller = ESP300(adapter)
+        try:
+            assert controller.errors == []
+            assert controller.x.units == "degree"
+            assert controller.x.right_limit >= 90
+            controller.x.position = 10
+            assert [str(error).split(": ")[1] for error in controller.errors] == ["MOTOR NOT ENABLED"]
+            controller.x.enable()
+            controller.x.home()
+            controller.x.wait_for_stop()
+            controller.x.position = -45
+            controller.x.wait_for_stop()
+            assert controller.x.position == -45
+            assert emulator.true_deg(0) == -45
+            controller.x.position = 400
+            assert "POSITIVE SOFTWARE LIMIT" in str(controller.errors[0])
+        finally:
+            adapter.close()
