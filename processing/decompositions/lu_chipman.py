@@ -38,10 +38,12 @@ def lu_chipman(m: Floats) -> LuChipman:
     """
     planar, shape = as_planar(m)
     planar = np.ascontiguousarray(planar)
-    factors = [np.empty((16, planar.shape[1]), planar.dtype) for _ in range(3)]
+    md, mr, mdelta = (np.empty((16, planar.shape[1]), planar.dtype) for _ in range(3))
     sign = np.empty(planar.shape[1])
-    for_ranges(planar.shape[1], lambda start, stop: lu_chipman_range(planar, start, stop, *factors, sign))
-    depolarizer, retarder, diattenuator = (np.moveaxis(f.reshape(4, 4, *shape), (0, 1), (-2, -1)) for f in factors)
+    for_ranges(planar.shape[1], lambda start, stop: lu_chipman_range(planar, start, stop, mdelta, mr, md, sign))
+    depolarizer, retarder, diattenuator = (
+        np.moveaxis(f.reshape(4, 4, *shape), (0, 1), (-2, -1)) for f in (mdelta, mr, md)
+    )
     sign = sign.reshape(shape)
     return LuChipman(depolarizer, retarder, diattenuator, ~np.isnan(sign), sign < 0)
 
