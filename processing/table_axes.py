@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.geometry.rusinkiewicz import Angles
+from processing.threads import for_ranges
 
 Layout = Literal["degree", "renderer"]
 SHAPE = (91, 91, 361)
@@ -46,7 +47,8 @@ class TableAxes:
         """Bin (...) of each direction, counted in C order over (theta_h, theta_d, phi_d); -1 for NaN."""
         th, td, pd = (np.ascontiguousarray(v, dtype=np.float64).reshape(-1) for v in angles)
         out = np.empty(th.size, dtype=np.int32)
-        _bins(th, td, pd, self.layout == "renderer", out)
+        renderer = self.layout == "renderer"
+        for_ranges(th.size, lambda start, stop: _bins(th, td, pd, renderer, out, start, stop))
         return out.reshape(np.shape(angles.theta_h))
 
     def angles(self, bins: NDArray[np.integer]) -> Angles:
@@ -55,10 +57,10 @@ class TableAxes:
         return Angles(*(np.deg2rad(v) for v in (self.theta_h_deg[i], self.theta_d_deg[j], self.phi_d_deg[k])))
 
 
-@numba.njit(parallel=True, cache=True)
-def _bins(th, td, pd, renderer, out):  # type: ignore[no-untyped-def]
+@numba.njit(nogil=True, cache=True)
+def _bins(th, td, pd, renderer, out, start, stop):  # type: ignore[no-untyped-def]
     degree = 180.0 / np.pi
-    for n in numba.prange(th.size):
+    for n in range(start, stop):
         if not (np.isfinite(th[n]) and np.isfinite(td[n]) and np.isfinite(pd[n])):
             out[n] = -1
             continue

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from processing.errors import ProcessError
 from processing.geometry.rusinkiewicz import Angles
 from processing.table_axes import SHAPE, Layout, TableAxes
+from processing.threads import for_ranges
 
 FloatArray = NDArray[np.float64]
 
@@ -79,10 +80,16 @@ class ScatteringTable:
         if v.dtype not in (np.float32, np.float64):
             v = v.astype(np.float64)
         rows = np.ascontiguousarray(self.axes.bins(angles).reshape(-1))
-        if not np.all(np.isfinite(_plane_sums(v))):
+        sums = np.empty(len(v))
+        for_ranges(len(v), lambda start, stop: _plane_sums(v, sums, start, stop), align=1, smallest=1)
+        if not np.all(np.isfinite(sums)):
             _drop_unknown(rows, v)
         self._claim(rows)
-        _accumulate(rows, v, self._sum, self._square, self.count)
+        groups = (len(v) + 3) // 4
+        total, square, count = self._sum, self._square, self.count
+        for_ranges(
+            groups, lambda start, stop: _accumulate(rows, v, total, square, count, start, stop), align=1, smallest=1
+        )
 
     @property
     def mean(self) -> FloatArray:
@@ -175,21 +182,19 @@ def _kind(simulated: bool) -> str:
     return "simulated" if simulated else "measured"
 
 
-@numba.njit(parallel=True, cache=True, fastmath={"reassoc", "contract"})
-def _plane_sums(values):  # type: ignore[no-untyped-def]
+@numba.njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
+def _plane_sums(values, out, start, stop):  # type: ignore[no-untyped-def]
     # Finite when every value is: far quicker than to look at each pixel.
-    out = np.empty(values.shape[0])
-    for c in numba.prange(values.shape[0]):
+    for c in range(start, stop):
         total = values.dtype.type(0)
         for n in range(values.shape[1]):
             total += values[c, n]
         out[c] = total
-    return out
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(nogil=True, cache=True)
 def _drop_unknown(rows, values):  # type: ignore[no-untyped-def]
-    for n in numba.prange(rows.size):
+    for n in range(rows.size):
         total = 0.0
         for c in range(values.shape[0]):
             total += values[c, n]
@@ -215,12 +220,12 @@ def _claim_rows(bins, row_of_bin, used, found):  # type: ignore[no-untyped-def]
     return new
 
 
-@numba.njit(parallel=True, cache=True)
-def _accumulate(rows, values, total, square, count):  # type: ignore[no-untyped-def]
+@numba.njit(nogil=True, cache=True)
+def _accumulate(rows, values, total, square, count, start, stop):  # type: ignore[no-untyped-def]
     # Four quantities a thread: no two threads write to one place, and the eight sums do not wait for each
     # other. A run of pixels in one bin, the rule in an image, stays in registers.
     quantities = values.shape[0]
-    for group in numba.prange((quantities + 3) // 4):
+    for group in range(start, stop):
         first = 4 * group
         c1, c2, c3 = min(first + 1, quantities - 1), min(first + 2, quantities - 1), min(first + 3, quantities - 1)
         v0, v1, v2, v3 = values[first], values[c1], values[c2], values[c3]

@@ -176,7 +176,10 @@ def estimate_from_stokes(image: StokesImage, m0: NDArray[np.float64]) -> Xi0Esti
         m00_errors = np.sqrt(spread[0, 0] + 2 * spread[0, 1] + spread[1, 1])
     valid = np.isfinite(plain.xi0) & (total > 0) & (plain.condition <= MAX_CONDITION) & (xi0_errors <= MAX_STDERR)
     unphysical = valid & ((plain.xi0 < 0.25 - xi0_errors) | (plain.xi0 > 1 + xi0_errors))
-    return Xi0Estimate(plain.xi0, xi0_errors, total, m00_errors, plain.condition, valid, unphysical, plain.chi_square)
+    weight = np.sqrt(spread[0, 0])
+    return Xi0Estimate(
+        plain.xi0, xi0_errors, total, m00_errors, plain.condition, valid, unphysical, plain.chi_square, weight
+    )
 
 
 def _facts(xi0: NDArray[Any], errors: NDArray[Any], valid: NDArray[np.bool_], method: str) -> dict[str, Any]:
