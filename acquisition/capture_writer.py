@@ -6,6 +6,7 @@ thread, while the next state is under way. A finished file loses its `.partial` 
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import queue
@@ -26,8 +27,9 @@ from processing.capture_schema import CaptureHeader, Status, create_layout, writ
 from processing.states import StateTable
 
 PARTIAL = ".partial"
-#: Layout, columns and notes besides the frames, generously.
+#: Layout and notes besides the frames, and the columns of a state, generously.
 LAYOUT_BYTES = 1 << 20
+COLUMN_BYTES = 512
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class StateRecord:
 
 def bytes_needed(states: int, channels: int, frame_shape: tuple[int, int], itemsize: int = 2) -> int:
     """Bytes of a capture file of this size."""
-    return states * channels * frame_shape[0] * frame_shape[1] * itemsize + LAYOUT_BYTES
+    return states * (channels * frame_shape[0] * frame_shape[1] * itemsize + COLUMN_BYTES) + LAYOUT_BYTES
 
 
 def check_space(folder: Path, needed: int) -> None:
@@ -92,8 +94,12 @@ class CaptureWriter:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             check_space(path.parent, needed)
+            _try_room(new, needed)
             h5 = h5py.File(new, "w")
         except OSError as error:
+            new.unlink(missing_ok=True)
+            if error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT):
+                raise _no_room(path.parent, needed, error) from error
             raise AcquisitionError(
                 f"{partial} cannot be created ({error}). Choose another folder with --out."
             ) from error
@@ -107,11 +113,7 @@ class CaptureWriter:
         except (OSError, RuntimeError) as error:
             _close_quietly(h5)
             new.unlink(missing_ok=True)
-            free = shutil.disk_usage(path.parent).free
-            raise AcquisitionError(
-                f"the capture needs {needed:,} bytes in {path.parent} and cannot get them ({error}; {free:,} free). "
-                "Nothing was moved. Make room or choose another folder with --out."
-            ) from error
+            raise _no_room(path.parent, needed, error) from error
         return cls(partial, h5)
 
     @classmethod
@@ -207,6 +209,19 @@ class CaptureWriter:
         h5["entry/states/done"][k] = 1
         h5.flush()
         self.written.append(k)
+
+
+def _try_room(path: Path, needed: int) -> None:
+    """Take the space and give it back: a write that fails inside HDF5 would bring the interpreter down."""
+    with path.open("wb") as file:
+        os.posix_fallocate(file.fileno(), 0, needed)
+
+
+def _no_room(folder: Path, needed: int, error: Exception) -> AcquisitionError:
+    return AcquisitionError(
+        f"the capture needs {needed:,} bytes in {folder} and cannot get them ({error}; "
+        f"{shutil.disk_usage(folder).free:,} free). Nothing was moved. Make room or choose another folder with --out."
+    )
 
 
 def _reserve(path: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any, Self
 
 from acquisition.cleanup import Step, run_all
 from acquisition.errors import AcquisitionError
+from acquisition.forbidden import describe, find_forbidden
 from acquisition.rig_config import RigConfig
 from drivers.camera import Camera, CameraSettings
 from drivers.errors import MotionFailed
@@ -113,6 +114,7 @@ class Rig:
         """Start axes at the same time; those that stand within a count of their target are started too."""
         for name, target in targets_deg.items():
             self.axes[name].check(target)
+        self._check_way(targets_deg)
         motions: dict[str, Motion] = {}
         try:
             for name, target in targets_deg.items():
@@ -121,6 +123,16 @@ class Rig:
             self.stop()
             raise
         return motions
+
+    def _check_way(self, targets_deg: Mapping[str, float]) -> None:
+        boxes = [box for box in self.config.forbidden if box.ranges_deg.keys() & targets_deg.keys()]
+        if not boxes:
+            return
+        concerned = {axis for box in boxes for axis in box.ranges_deg if axis in self.axes}
+        here = {axis: self.axes[axis].read_position().deg for axis in concerned}
+        box = find_forbidden(boxes, here, here | dict(targets_deg))
+        if box is not None:
+            raise AcquisitionError(f"move to {dict(targets_deg)} meets a {describe(box)}. Nothing was moved.")
 
     def wait(self, motions: Mapping[str, Motion]) -> dict[str, Position]:
         """Wait for all motions and return the positions read back at rest.

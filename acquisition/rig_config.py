@@ -7,9 +7,9 @@ import pkgutil
 from functools import reduce
 from operator import or_
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from drivers.motion import AxisConfig
 from processing.capture_schema import Detector
@@ -90,12 +90,15 @@ class RigConfig(_Part):
     retakes: int = Field(default=3, ge=0, description="tries again for a state whose frame is incomplete")
     forbidden: tuple[ForbiddenPose, ...] = ()
     interlocks: tuple[InterlockConfig, ...] = ()
+    simulated: bool = Field(default=False, description="the devices at these ports are emulators (simulate rig)")
     simulator: SimulatorConfig | None = None
 
-    @property
-    def simulated(self) -> bool:
-        """True if the devices are emulators."""
-        return self.simulator is not None
+    @model_validator(mode="after")
+    def _own_emulators_are_simulated(self) -> Self:
+        # A rig with emulators of its own cannot be declared real.
+        if self.simulator is not None and not self.simulated:
+            object.__setattr__(self, "simulated", True)
+        return self
 
 
 def load_rig(path: Path | str) -> RigConfig:

@@ -60,6 +60,8 @@ def run(options: Options, stop: StopRequest) -> int:
             Console().print(f"about {capture_seconds(job, rig):.0f} s; nothing was moved", markup=False)
             return 0
         refuse_failed(checks)
+        if stop.requested:
+            return INTERRUPTED
         take = session.take if options.resume is None else session.resume
         result = take(job, rig, path, stop, [ConsoleProgress(console)], home=options.home)
     summarize(job, result)

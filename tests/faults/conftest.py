@@ -117,3 +117,53 @@ def intact(configs: Path) -> Callable[[Path], int]:
             return len(capture.done)
 
     return check
+
+
+@pytest.fixture
+def run_with(quick_rig: Callable[..., Path], tmp_path: Path) -> Callable[..., tuple[BaseException | None, Path]]:
+    """Runs a capture in this process and does something to the rig when a state is about to be exposed.
+
+    `act(rig, state, retake)` is called before each exposure. Returns the error that ended the run, or None, and the
+    file, partial or not.
+    """
+    from acquisition import session
+    from acquisition.errors import AcquisitionError
+    from acquisition.observer import Observer
+    from acquisition.plan import MeasurementPlan
+    from acquisition.rig import Rig
+    from acquisition.rig_config import load_rig
+    from acquisition.stop_request import StopRequest
+    from drivers.errors import DeviceError
+
+    numbers = iter(range(1000))
+
+    def run(
+        act: Callable[..., None] = lambda *_: None,
+        plan: dict | None = None,
+        top: dict | None = None,
+        resume: Path | None = None,
+        observers: tuple = (),
+        **simulator: object,
+    ) -> tuple[BaseException | None, Path]:
+        config = load_rig(quick_rig(top=top, **simulator))
+        job = session.prepare(MeasurementPlan().with_changes(**(plan or {})), config)
+        folder = tmp_path / f"capture{next(numbers)}" if resume is None else resume.parent
+        error: BaseException | None = None
+        with Rig(config) as rig:
+
+            class Act(Observer):
+                def exposing(self, state: int, retake: int) -> None:
+                    act(rig, state, retake)
+
+            watchers = [Act(), *observers]
+            try:
+                session.check_with_devices(job, rig, folder)
+                if resume is None:
+                    session.take(job, rig, folder / "run.h5", StopRequest(), watchers)
+                else:
+                    session.resume(job, rig, resume, StopRequest(), watchers)
+            except (AcquisitionError, DeviceError) as caught:
+                error = caught
+        return error, next(path for path in sorted(folder.glob("run.h5*")) if path.suffix != ".png")
+
+    return run

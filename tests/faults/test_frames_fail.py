@@ -1,0 +1,100 @@
+"""Promises 8, 9 and 11: lost frames, a camera that vanishes, an interlock that opens."""
+
+import threading
+import time
+
+from acquisition.observer import Observer
+from processing.capture import Capture
+
+
+def test_lost_frames_are_taken_again_and_logged(run_with, intact):
+    def act(rig, state, retake):
+        # Every packet is lost while states 7 and 20 are tried for the first time.
+        rig.simulation.camera.lost_ratio = 1.0 if state in (7, 20) and retake == 0 else 0.0
+
+    error, path = run_with(act)
+    assert error is None
+    assert intact(path) == 44
+    with Capture(path) as capture:
+        assert capture.column("retakes")[[7, 20]].tolist() == [1, 1]
+        assert capture.column("retakes").sum() == 2
+        retaken = [text for text in capture.closing["messages"] if "taken again" in text]
+        assert len(retaken) == 2
+
+
+def test_frames_lost_in_every_try_end_the_run(run_with, intact):
+    def act(rig, state, retake):
+        rig.simulation.camera.lost_ratio = 1.0 if state == 7 else 0.0
+
+    error, path = run_with(act)
+    assert "state 7: 4 frames in a row were lost" in str(error)
+    # A loss is known when the next state is under way, so each try is followed by a state that succeeds.
+    assert intact(path) == 10
+
+
+def test_vanished_camera_is_noticed_and_the_run_resumes(run_with, intact):
+    gone_s = []
+
+    def act(rig, state, retake):
+        if state == 12 and not gone_s:
+            gone_s.append(time.monotonic())
+            rig.simulation.camera.vanish()
+
+    error, path = run_with(act)
+    assert time.monotonic() - gone_s[0] < 10
+    assert error is not None
+    assert "camera" in str(error)
+    assert intact(path) == 12
+    error, final = run_with(resume=path)
+    assert error is None
+    assert intact(final) == 44
+
+
+class _Door:
+    """Opens the door at a state and closes it after a while."""
+
+    def __init__(self, state, open_s):
+        self.state, self.open_s = state, open_s
+
+    def __call__(self, rig, state, retake):
+        if state == self.state:
+            self.state = None
+            shutter = rig.simulation.emulators["shutter"]
+            shutter.trip(True)
+            threading.Timer(self.open_s, shutter.trip, (False,)).start()
+
+
+class _Count(Observer):
+    def __init__(self):
+        self.exposed = []
+
+    def exposing(self, state, retake):
+        self.exposed.append(state)
+
+
+def test_open_door_discards_the_state_and_holds(run_with, intact):
+    error, path = run_with(_Door(9, 0.1))
+    assert "the door is open" in str(error)
+    assert "--resume" in str(error)
+    assert intact(path) == 9
+
+
+def test_open_door_and_a_plan_that_goes_on_by_itself(run_with, intact):
+    count = _Count()
+    error, path = run_with(_Door(9, 0.5), plan={"continue_after_interlock": True}, observers=(count,))
+    assert error is None
+    assert intact(path) == 44
+    assert count.exposed.count(9) == 2
+    with Capture(path) as capture:
+        (event,) = capture.closing["interlocks"]
+        assert event["state"] == 9
+        assert "door" in event["why"]
+        assert 0.3 < event["duration_s"] < 5
+        # The shutter fell with the door; the state that counts has light.
+        assert capture.frames(9).mean() > 100
+
+
+def test_saturated_state_ends_the_run_where_the_rig_file_says_so(run_with):
+    top = {"interlocks": [{"kind": "door"}, {"kind": "saturation", "limit": 0.01}]}
+    error, _ = run_with(plan={"exposure_s": 0.5}, top=top)
+    assert "saturated" in str(error)

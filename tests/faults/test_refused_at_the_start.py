@@ -1,0 +1,94 @@
+"""Promises 2 and 10: no room on the disc, or the rig is in use; and 12: clean-up that fails itself."""
+
+import json
+import resource
+
+import pytest
+
+from drivers.errors import DeviceError
+from processing.capture import Capture
+from simulators.served_rig import serve
+
+
+def test_disc_too_small_is_refused_before_any_motion(spawn, quick_rig, tmp_path):
+    rig = quick_rig()
+
+    def starve():
+        # A limit on the size of files: what a full disc looks like to the program.
+        resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+
+    child = spawn("--omega", 35, "--rig", rig, "--out", tmp_path / "out", preexec_fn=starve)
+    out, err = child.communicate(timeout=60)
+    assert child.returncode == 1, out + err
+    needed = 44 * (64 * 80 * 2 + 512) + (1 << 20)
+    assert f"needs {needed:,} bytes" in err
+    assert "Nothing was moved" in err
+    assert "homing" not in err
+    assert not list((tmp_path / "out").glob("*"))
+
+
+def test_second_program_is_refused_with_the_name_of_the_first(spawn, partial_of, quick_rig, tmp_path):
+    with serve(quick_rig("behind.yaml", clock_speed=2), tmp_path / "rig.yaml", "red_sphere"):
+        first = spawn("--omega", 35, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "first")
+        partial_of(tmp_path / "first", first, states=2)
+        second = spawn("--omega", 35, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "second")
+        _, err = second.communicate(timeout=60)
+        assert second.returncode == 1
+        assert f"pid {first.pid}" in err
+        assert not list((tmp_path / "second").glob("*"))
+        # The first one has not noticed.
+        _, err = first.communicate(timeout=60)
+        assert first.returncode == 0, err
+
+
+def test_a_capture_that_is_being_written_cannot_be_resumed(spawn, partial_of, quick_rig, acquire, tmp_path):
+    child = spawn("--omega", 35, "--rig", quick_rig(), "--out", tmp_path / "out")
+    partial = partial_of(tmp_path / "out", child, states=2)
+    code, _, err = acquire("--resume", partial)
+    assert code != 0
+    assert "Traceback" not in err
+    assert str(partial) in err
+
+
+def test_no_write_extends_the_file_during_a_run(run_with, tmp_path):
+    sizes = []
+
+    def act(rig, state, retake):
+        sizes.append(next(tmp_path.glob("*/run.h5.partial")).stat().st_size)
+
+    error, path = run_with(act)
+    assert error is None
+    assert set(sizes) == {path.stat().st_size}
+
+
+@pytest.mark.parametrize("broken", ["psg", "psa", "arm", "source"])
+def test_every_clean_up_step_runs_although_one_fails(run_with, intact, broken):
+    stopped = []
+
+    def act(rig, state, retake):
+        if state != 5:
+            return
+
+        def failing():
+            raise DeviceError(f"stop {broken}", "it does not answer", "Pull the plug")
+
+        for name, axis in rig.axes.items():
+            real = axis.stop
+            axis.stop = failing if name == broken else (lambda name=name, real=real: (stopped.append(name), real()))
+        if broken == "source":
+            rig.source.set_light = lambda on: failing()
+        raise DeviceError("something", "broke", "Mend it")
+
+    error, path = run_with(act)
+    # The first error is the one reported; what failed while cleaning up is attached to it.
+    assert str(error).startswith("something: broke")
+    if broken == "source":
+        with Capture(path) as capture:
+            assert any("light could not be shut off" in text for text in capture.closing["messages"])
+    else:
+        assert any(broken in note and "does not answer" in note for note in error.__notes__)
+    assert set(stopped) >= {"psg", "psa", "arm"} - {broken}
+    with Capture(path) as capture:
+        assert capture.status == "failed"
+        assert "broke" in json.dumps(capture.closing)
+    assert intact(path) >= 4
