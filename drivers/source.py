@@ -1,15 +1,25 @@
-"""A light source as the measurement sees it: light on or off, and whether its interlock allows light."""
+"""A light source as the measurement sees it: on or off, its wavelength, and whether its interlock allows light."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+
+from drivers.errors import DeviceError
 
 
 class LightSource(ABC):
     """Light that can be shut off for dark states.
 
     Opening one changes nothing: the light stays as it is found.
+
+    Attributes
+    ----------
+    selects_wavelength, has_level : bool
+        True where `select` and `set_level` work.
     """
+
+    selects_wavelength: bool = False
+    has_level: bool = False
 
     @abstractmethod
     def set_light(self, on: bool) -> None:
@@ -36,3 +46,29 @@ class LightSource(ABC):
     @abstractmethod
     def close(self) -> None:
         """Release the device; the light stays as it is."""
+
+    def select(self, wavelength_nm: float) -> None:
+        """Choose the wavelength in nm; light that was on is on again at the new one.
+
+        Raises
+        ------
+        DeviceError
+            The source has no such wavelength, or cannot choose at all.
+        """
+        raise DeviceError(
+            f"light source, select {wavelength_nm:g} nm",
+            "it cannot choose a wavelength",
+            "Change the filter or the lamp by hand",
+        )
+
+    def set_level(self, percent: float) -> float:
+        """Set the brightness of the selected wavelength, 0 to 100 percent, and return what was read back.
+
+        Raises
+        ------
+        DeviceError
+            Outside 0 to 100, read back as something else, or the source has one brightness only.
+        """
+        raise DeviceError(
+            f"light source, set level to {percent:g} %", "it has no level", "Change the exposure or the lamp by hand"
+        )

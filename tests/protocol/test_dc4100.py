@@ -1,0 +1,117 @@
+"""Thorlabs DC4100 on the wire, line by line as Micro-Manager's adapter sends it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from drivers.errors import CommandRejected
+from drivers.serial_link import LineRegistry
+from drivers.sources import dc4100
+from simulators.pty_port import PtyPort
+
+# Status 0xA80: no LED at channels 2, 3 and 4, so one LED is driven.
+OPENING = [
+    (b"N?\r\n", b"DC4100\r\n"),
+    (b"S?\r\n", b"M00223344\r\n"),
+    (b"V?\r\n", b"1.4.0\r\n"),
+    (b"R?\r\n", b"2688\r\n"),
+    (b"WL? 0\r\n", b"660.0\r\n"),
+    *[(b"O? 0\r\n", b"0\r\n")] * 2,
+]
+# There is no checksum, so what decides about light is asked twice.
+OFF, ON = [("O? 0", "0")] * 2, [("O? 0", "1")] * 2
+
+
+class Script:
+    """Answers each expected line, and notes what came instead."""
+
+    def __init__(self, pairs: list[tuple[bytes, bytes]]) -> None:
+        self.left = list(pairs)
+        self.unexpected: list[bytes] = []
+        self._received = b""
+        self._output = b""
+        self._lock = threading.Lock()
+
+    def receive(self, data: bytes) -> None:
+        with self._lock:
+            self._received += data
+            while b"\n" in self._received:
+                line, _, self._received = self._received.partition(b"\n")
+                if self.left and self.left[0][0] == line + b"\n":
+                    self._output += self.left.pop(0)[1]
+                else:
+                    self.unexpected.append(line)
+
+    def take_output(self) -> bytes:
+        with self._lock:
+            output, self._output = self._output, b""
+            return output
+
+    def next_output_s(self) -> float | None:
+        return 0.0 if self._output else None
+
+
+@pytest.fixture
+def lines() -> Iterator[LineRegistry]:
+    with LineRegistry() as registry:
+        yield registry
+
+
+def opened(port: PtyPort, lines: LineRegistry) -> dc4100.LedDriver:
+    return dc4100.open(dc4100.Config(port=port.path, reply_s=0.3), lines)
+
+
+@pytest.mark.parametrize(
+    ("action", "pairs"),
+    [
+        (lambda source: source.set_light(True), [*OFF, ("O 0 1", ""), *ON]),
+        (lambda source: source.set_light(True), ON),
+        (lambda source: source.set_light(False), [*ON, ("O 0 0", ""), *OFF]),
+        (lambda source: source.is_on(), ON),
+        (
+            lambda source: (source.select(662.0), source.set_level(40.0)),
+            [*OFF, *[("M?", "1")] * 2, ("BP 0 40", ""), ("BP? 0", "40.0")],
+        ),
+        (
+            lambda source: (source.select(662.0), source.set_level(12.5)),
+            [*OFF, *[("M?", "0")] * 2, *OFF, ("M 1", ""), *[("M?", "1")] * 2, ("BP 0 12.5", ""), ("BP? 0", "13")],
+        ),
+    ],
+)
+def test_each_call_sends_these_lines_and_no_others(action, pairs, lines: LineRegistry) -> None:  # type: ignore[no-untyped-def]
+    wire = [(f"{sent}\r\n".encode(), f"{answer}\r\n".encode() if answer else b"") for sent, answer in pairs]
+    script = Script(OPENING + wire)
+    port = PtyPort(script)
+    try:
+        action(opened(port, lines))
+    finally:
+        lines.close()
+        port.close()
+    assert not script.unexpected
+    assert not script.left
+
+
+def test_a_refusal_is_explained_by_status_and_error(lines: LineRegistry) -> None:
+    # Status 0xA88: too hot.
+    answers = [*OFF, ("O 0 1", ""), *OFF, ("R?", "2696"), ("E?", "ERROR 4:over temperature")]
+    wire = [(f"{sent}\r\n".encode(), f"{answer}\r\n".encode() if answer else b"") for sent, answer in answers]
+    script = Script(OPENING + wire)
+    port = PtyPort(script)
+    try:
+        source = opened(port, lines)
+        with pytest.raises(CommandRejected, match=r"LED 1 on: .*too hot.*error 4 over temperature"):
+            source.set_light(True)
+    finally:
+        lines.close()
+        port.close()
+    assert not script.left
+
+
+def test_status_bits_are_those_of_the_manual() -> None:
+    # DC4100 manual rev. 2.2, page 28: bits 5, 7, 9, 11 no LED; bits 13, 15, 17, 19 LED open.
+    assert [dc4100.missing_led(channel) for channel in range(4)] == [0x20, 0x80, 0x200, 0x800]
+    assert [dc4100.open_led(channel) for channel in range(4)] == [0x2000, 0x8000, 0x20000, 0x80000]
+    assert (dc4100.SUPPLY_FAILS, dc4100.TOO_HOT) == (0x2, 0x8)
