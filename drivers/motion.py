@@ -193,6 +193,7 @@ class MotionAxis(ABC):
         self.name = name
         self.config = config
         self._stops = 0
+        self._closed = False
         self._start_lock = threading.Lock()
         # Set by the driver's open(), from what the controller reports.
         self.counts_per_deg: float = 1.0
@@ -364,8 +365,10 @@ class MotionAxis(ABC):
 
     def close(self) -> None:
         """Release the axis; the last axis on a line closes the line. Moves and stops nothing."""
-        with contextlib.suppress(DeviceError):
-            self._do_close()
+        if not self._closed:
+            self._closed = True
+            with contextlib.suppress(DeviceError):
+                self._do_close()
 
     @abstractmethod
     def _do_read_counts(self) -> int | float:

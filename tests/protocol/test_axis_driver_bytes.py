@@ -1,0 +1,213 @@
+"""Byte transcripts: what each driver writes and how it reads the replies; a pair that is not used fails."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from drivers.apt_frames import apt_framer
+from drivers.axes import apt, elliptec, esp301, smc100, zaber
+from drivers.errors import CommandRejected, NotHomedError, ReplyError
+from drivers.serial_link import LineRegistry
+from simulators.pty_port import PtyPort
+
+
+class Script:
+    """A device that expects exactly these requests in this order and gives these replies."""
+
+    def __init__(self, pairs: list[tuple[bytes, bytes]]) -> None:
+        self.pairs = list(pairs)
+        self.received = b""
+        self.output = b""
+
+    def receive(self, data: bytes) -> None:
+        self.received += data
+        while self.pairs and self.received.startswith(self.pairs[0][0]):
+            request, reply = self.pairs.pop(0)
+            self.received = self.received[len(request) :]
+            self.output += reply
+
+    def take_output(self) -> bytes:
+        output, self.output = self.output, b""
+        return output
+
+    def next_output_s(self) -> float | None:
+        return None
+
+
+@contextmanager
+def scripted(*pairs: tuple[bytes, bytes]) -> Iterator[str]:
+    script = Script(list(pairs))
+    with PtyPort(script) as port:
+        yield port.path
+        give_up_s = time.monotonic() + 1.0
+        while script.pairs and time.monotonic() < give_up_s:
+            time.sleep(0.01)
+    assert (script.pairs, script.received) == ([], b"")
+
+
+def summed(body: str) -> bytes:
+    """Zaber text with its checksum: all characters and the checksum add up to zero modulo 256."""
+    check = next(value for value in range(256) if (sum(body.encode()) + value) % 256 == 0)
+    return f"{body}:{check:02X}".encode()
+
+
+def test_zaber_checksum_and_reply() -> None:
+    assert zaber.checksum("0 0 00") == "00"
+    assert zaber.checksum("1 1 07 move abs 10000") == "B9"
+    reply = zaber.parse_reply(b"@01 1 07 OK BUSY -- 0:E0")
+    assert reply == zaber.Reply(1, 1, 7, True, True, "--", "0")
+    for spoiled in (b"@01 1 07 OK IDLE -- 0:E0", b"@01 1 07 OK BUSY -- 0", b"01 1 07 OK BUSY -- 0:E0", b"", b"\xff"):
+        assert zaber.parse_reply(spoiled) is None
+
+
+def test_zaber_exchange_sorts_out_what_is_not_its_reply() -> None:
+    old, right = summed("02 1 99 OK IDLE -- 5"), summed("02 1 01 OK IDLE -- -77")
+    with scripted(
+        (b"/" + summed("2 1 01 get pos") + b"\n", b"!02 1 IDLE --\r\n#02 1 info\r\n@%b\r\n@%b\r\n" % (old, right)),
+        (b"/" + summed("2 1 02") + b"\n", b"@" + summed("02 1 02 OK BUSY WR 0") + b"\r\n"),
+        (b"/" + summed("2 1 03 fly") + b"\n", b"@" + summed("02 1 03 RJ IDLE -- BADCOMMAND") + b"\r\n"),
+    ) as path:
+        line = zaber.ZaberLine(path, 115200, 0.5, None)
+        assert line.ask(2, 1, "get pos", repeat=True).data == "-77"
+        assert line.ask(2, 1, "", repeat=True).busy
+        with pytest.raises(CommandRejected, match="BADCOMMAND"):
+            line.ask(2, 1, "fly", repeat=False)
+        line.close()
+
+
+def test_elliptec_real_captures() -> None:
+    # The identification and the position are captures of real mounts (fact sheet, cap1 and cap2).
+    pairs = [
+        (b"0in", b"0IN0E1140050920201501016800023000\r\n"),
+        (b"0in", b"0IN0E1140050920201501016800023000\r\n"),
+        (b"0gv", b"0GV64\r\n"),
+        (b"0gv", b"0GV64\r\n"),
+        (b"0gp", b"0POFFFFDA9C\r\n"),
+        (b"0gp", b"0POFFFFDA9C\r\n"),
+        (b"0gs", b"0GS09\r\n"),
+        (b"0gs", b"0GS0D\r\n"),
+    ]
+    with scripted(*pairs) as path, LineRegistry() as lines:
+        axis = elliptec.open("psg", elliptec.Config(port=path, address="0", serial_number="11400509"), lines)
+        assert axis.counts_per_deg == pytest.approx(398.22, abs=0.01)
+        position = axis.read_position()
+        assert position.counts == -9572
+        assert position.deg == pytest.approx(-24.04, abs=0.01)
+        assert axis.is_moving()
+        assert not axis.is_moving()
+        with pytest.raises(CommandRejected, match="over-current"):
+            axis._do_check_fault()
+
+
+def test_elliptec_move_bytes() -> None:
+    with scripted((b"0ma00008C00", b""), (b"0maFFFFE0E4", b"")) as path:
+        line = elliptec.ElliptecLine(path, 0.3, None)
+        for deg in (90.0, -20.0):
+            line.start("0", f"ma{round(deg * 143360 / 360) & 0xFFFFFFFF:08X}", 0.0)
+        line.close()
+
+
+def test_smc100_open_and_refusals() -> None:
+    opening = [
+        (b"1VE\r\n", b"1VE CONEX-CC 2.0.1\r\n"),
+        (b"1ID?\r\n", b"1IDPR50CC\r\n"),
+        *[(b"1VA?\r\n", b"1VA20\r\n")] * 2,
+        *[(b"1AC?\r\n", b"1AC80\r\n")] * 2,
+        *[(b"1SL?\r\n", b"1SL0\r\n")] * 2,
+        *[(b"1SR?\r\n", b"1SR90\r\n")] * 2,
+    ]
+    moving = [
+        (b"1TS\r\n", b"1TS000032\r\n"),
+        (b"1TS\r\n", b"1TS000032\r\n"),
+        (b"1TP\r\n", b"1TP12.34500\r\n"),
+        (b"1TP\r\n", b"1TP12.34500\r\n"),
+        (b"1TE\r\n", b"1TE@\r\n"),
+        (b"1PA45.500000\r\n", b""),
+        (b"1TE\r\n", b"1TEH\r\n"),
+        (b"1ST\r\n", b""),
+        (b"1TS\r\n", b"1TS010033\r\n"),
+    ]
+    with scripted(*opening, *moving) as path, LineRegistry() as lines:
+        arm = smc100.open("arm", smc100.Config(port=path, stage_id="PR50"), lines)
+        assert arm.describe().firmware == "2.0.1"
+        assert (arm.speed_deg_s, arm.acceleration_deg_s2, arm.limits.max_deg) == (20.0, 80.0, 90.0)
+        with pytest.raises(NotHomedError, match="NOT REFERENCED"):
+            arm.start_move(45.5)
+        arm.stop()
+        # Bit 7 from the left: supply voltage too low.
+        with pytest.raises(CommandRejected, match="DC voltage low"):
+            arm._do_check_fault()
+
+
+def test_apt_bytes() -> None:
+    info = bytes.fromhex("060054008150") + (27_000_001).to_bytes(4, "little") + b"KDC101\0\0" + bytes(64)
+    info += (6).to_bytes(2, "little") + bytes(6)
+    velocity = bytes.fromhex("15040e008150 0100 00000000 0a000000 b2450500")
+    home = bytes.fromhex("42040e008150 0100 0200 0100 b2450500 00000000")
+    completed = bytes.fromhex("64040e008150") + bytes(14)
+    position = bytes.fromhex("120406008150 0100 f8ffffff")
+    pairs = [
+        (bytes.fromhex("120000005001"), b""),
+        *[(bytes.fromhex("050000005001"), info)] * 2,
+        *[(bytes.fromhex("140401005001"), velocity)] * 2,
+        *[(bytes.fromhex("410401005001"), home)] * 2,
+        # Unsolicited messages before and after the reply, and noise in front.
+        (bytes.fromhex("110401005001"), b"\x00\x53" + completed + position + completed),
+        (bytes.fromhex("110401005001"), position),
+        (bytes.fromhex("650401025001"), b""),
+    ]
+    with scripted(*pairs) as path, LineRegistry() as lines:
+        axis = apt.open("psa", apt.Config(port=path, serial_number=27_000_001), lines)
+        assert axis.speed_deg_s == pytest.approx(345_522 / 42941.66, rel=1e-4)
+        assert axis.read_position().counts == -8
+        axis.stop()
+
+
+def test_apt_frames_are_found_in_noise() -> None:
+    reply = bytes.fromhex("2a04060081500100 00040080")
+    buffer = bytearray(b"\x2a\x04\xff\xff\x81" + reply + reply[:5])
+    assert apt_framer(buffer) == reply
+    assert apt_framer(buffer) is None
+    buffer += reply[5:]
+    assert apt_framer(buffer) == reply
+
+
+def test_esp301_bytes() -> None:
+    opening = [
+        (b"VE?\r", b"ESP301 Version 3.0.1 6/1/99\r\n"),
+        (b"2ID?\r", b"URS75CC, SN1263\r\n"),
+        (b"2SN?\r", b"7\r\n"),
+        *[(b"2VA?\r", b"20\r\n")] * 2,
+        *[(b"2AC?\r", b"80\r\n")] * 2,
+        *[(b"2SL?\r", b"-170\r\n")] * 2,
+        *[(b"2SR?\r", b"170\r\n")] * 2,
+        (b"2TP?\r", b"451322, NO ERROR\r\n30.0000\r\n"),
+        (b"2TP?\r", b"30.0000\r\n"),
+        (b"TE?\r", b"213\r\n"),
+        (b"TE?\r", b"0\r\n"),
+    ]
+    with scripted(*opening) as path, LineRegistry() as lines:
+        axis = esp301.open("arm", esp301.Config(port=path, axis=2, stage_id="URS75CC, SN1263"), lines)
+        assert axis.describe().serial_number == "SN1263"
+        assert axis.read_position().counts == 30.0
+        with pytest.raises(CommandRejected, match="213: motor not enabled"):
+            axis._do_check_fault()
+
+
+def test_readings_that_disagree_are_no_position() -> None:
+    answers = iter(range(10, 100, 10))
+    pairs = [(b"1TP\r\n", f"1TP{next(answers)}.00000\r\n".encode()) for _ in range(5)]
+    steps: list[tuple[bytes, bytes]] = [pairs[0]]
+    for pair in pairs[1:]:
+        steps += [pair, (b"1TS\r\n", b"1TS000033\r\n")]
+    opening = [
+        (b"1VE\r\n", b"1VE SMC100CC 1.0\r\n"),
+        (b"1ID?\r\n", b"1IDX\r\n"),
+        *[(f"1{c}?\r\n".encode(), f"1{c}20\r\n".encode()) for c in ("VA", "VA", "AC", "AC", "SL", "SL", "SR", "SR")],
+    ]
+    with scripted(*opening, *steps) as path, LineRegistry() as lines:
+        arm = smc100.open("arm", smc100.Config(port=path), lines)
+        with pytest.raises(ReplyError, match="contradict"):
+            arm.read_position()

@@ -1,0 +1,130 @@
+"""Ports: permission, TCP, transcripts, one owner for each line, emulators that outlive their clients."""
+
+import errno
+import socket
+import threading
+from pathlib import Path
+
+import pytest
+import serial
+
+from drivers.axes import smc100, zaber
+from drivers.errors import PermissionRefused, PortBusy, PortNotFound
+from drivers.registry import axis_kinds, open_axis
+from drivers.serial_link import LineRegistry, SerialLink, line_framer
+from simulators.clock import Clock
+from simulators.pty_port import PtyPort
+from simulators.serve import ServeOptions, axis_configs, served_kinds
+
+
+def zaber_emulator(**options: object):  # type: ignore[no-untyped-def]
+    return served_kinds()["zaber"](ServeOptions(homed=True, clock=Clock(100.0), **options))  # type: ignore[arg-type]
+
+
+def test_no_permission_names_the_group(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    port = tmp_path / "ttyS9"
+    port.touch()
+
+    def refuse(*_: object, **__: object) -> None:
+        raise serial.SerialException(errno.EACCES, "denied")
+
+    monkeypatch.setattr(serial, "serial_for_url", refuse)
+    with pytest.raises(PermissionRefused, match=r"belongs to group \w+.*log in again"):
+        SerialLink(str(port), 9600, line_framer)
+
+
+def test_a_file_that_is_no_port(tmp_path: Path) -> None:
+    plain = tmp_path / "notes.txt"
+    plain.write_text("not a port")
+    with pytest.raises(PortNotFound):
+        SerialLink(str(plain), 9600, line_framer)
+    with pytest.raises(PortNotFound):
+        SerialLink("socket://127.0.0.1:1", 9600, line_framer)
+
+
+def test_an_axis_behind_tcp() -> None:
+    emulator = zaber_emulator()
+    server = socket.create_server(("127.0.0.1", 0))
+
+    def serve() -> None:
+        connection, _ = server.accept()
+        with connection:
+            connection.settimeout(0.002)
+            while True:
+                try:
+                    data = connection.recv(4096)
+                    if not data:
+                        return
+                    emulator.receive(data)
+                except TimeoutError:
+                    pass
+                connection.sendall(emulator.take_output())
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    with LineRegistry() as lines:
+        config = zaber.Config(port=f"socket://127.0.0.1:{server.getsockname()[1]}", serial_number=110_001)
+        axis = open_axis("psg", config, lines)
+        assert axis.start_move(45.0).wait().deg == pytest.approx(45.0, abs=0.01)
+        axis.close()
+    thread.join()
+    server.close()
+
+
+def test_a_link_by_another_name_is_the_same_line(tmp_path: Path) -> None:
+    with PtyPort(zaber_emulator()) as port, LineRegistry() as lines:
+        link = tmp_path / "usb-Zaber_by_id"
+        link.symlink_to(port.path)
+        first = open_axis("psg", zaber.Config(port=str(link), address=1), lines)
+        second = open_axis("psa", zaber.Config(port=port.path, address=2), lines)
+        with pytest.raises(PortBusy, match="ZaberLine"):
+            open_axis("arm", smc100.Config(port=port.path), lines)
+        first.close()
+        first.close()
+        assert not second.is_moving()
+
+
+def test_the_transcript_holds_every_byte(tmp_path: Path) -> None:
+    with PtyPort(zaber_emulator()) as port, LineRegistry(tmp_path / "wire") as lines:
+        axis = open_axis("psg", zaber.Config(port=port.path, address=1), lines)
+        axis.read_position()
+        axis.close()
+    (log,) = (tmp_path / "wire").iterdir()
+    lines_of_log = log.read_text().splitlines()
+    assert any(">> /1 1 " in line and "get pos" in line for line in lines_of_log)
+    assert any("<<" in line and "OK IDLE -- 0:" in line for line in lines_of_log)
+
+
+def test_an_emulator_outlives_its_clients() -> None:
+    with PtyPort(zaber_emulator()) as port:
+        for turn in range(3):
+            with LineRegistry() as lines:
+                axis = open_axis("psg", axis_configs(port.emulator, port.path)[0], lines)  # type: ignore[arg-type]
+                assert axis.read_position().deg == pytest.approx(10.0 * turn, abs=0.01)
+                axis.start_move(10.0 * (turn + 1)).wait()
+
+
+def test_a_failing_emulator_is_not_silent() -> None:
+    emulator = zaber_emulator()
+    emulator.devices[0].serial_number = None
+    emulator.devices[0].run = None
+    port = PtyPort(emulator)
+    with serial.Serial(port.path, timeout=0.5) as client:
+        client.write(b"/1 get pos\n")
+        client.read(1)
+    with pytest.raises(RuntimeError, match="emulator"):
+        port.close()
+
+
+def test_kinds_are_found_by_folder() -> None:
+    assert {"zaber", "elliptec", "smc100", "apt", "esp301"} <= set(axis_kinds())
+    for kind, module in axis_kinds().items():
+        assert module.Config.model_fields["kind"].default == kind
+        assert module.__doc__
+
+
+def test_unknown_entries_of_a_rig_file_are_refused() -> None:
+    with pytest.raises(ValueError, match="sped"):
+        zaber.Config.model_validate({"kind": "zaber", "port": "x", "sped": 3})
+    with pytest.raises(ValueError, match="direction"):
+        zaber.Config.model_validate({"kind": "zaber", "port": "x", "direction": 0})
