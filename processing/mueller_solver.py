@@ -43,6 +43,14 @@ class MuellerSolver:
 
     def solve(self, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
         """Mueller elements, errors, residual and mask of frames (N, channels, pixels) that the reader just read."""
+        found = self.estimate(frames)
+        repair = np.flatnonzero(found["pixel_mask"] & np.uint8(Mask.SATURATED))
+        if repair.size:
+            solve_without_saturated(self, frames, repair, found)
+        return found
+
+    def estimate(self, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        """As `solve`, with saturated intensities taken as they are (but flagged)."""
         pixels = frames.shape[2]
         out: dict[str, NDArray[Any]] = {
             "mueller": np.empty((16, pixels), np.float32),

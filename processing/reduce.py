@@ -5,7 +5,9 @@ W is built from the angles read back. Row blocks keep memory constant; the produ
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +16,21 @@ from numpy.typing import NDArray
 
 from processing.capture import Capture, CaptureError
 from processing.correction import BlockReader, Correction, Mask
+from processing.errors import ProcessError
 from processing.instrument import InstrumentModel
 from processing.inversion import Inversion
-from processing.mueller_solver import MuellerSolver, solve_without_saturated
+from processing.mueller_solver import MuellerSolver
 from processing.noise import NoiseModel
+from processing.physical import nearest
 from processing.product import Plane, ProductWriter, Step
+from processing.reduce_facts import mueller_facts
+from processing.weighted import WeightedSolver
+from processing.weighted_kernels import PACKED
 
 #: Called with (rows done, rows in all).
 Progress = Callable[[int, int], None]
 
 BLOCK_PIXELS = 1 << 18
-
-#: Above this median, the model and not the noise makes the residual (the median of a good one is within 0.1 of 1).
-SUSPICIOUS_CHI_SQUARE = 1.5
 
 PLANES = {
     "mueller": Plane((4, 4), "count", "Mueller matrix, row-major, not normalized"),
@@ -36,6 +40,54 @@ PLANES = {
 }
 
 CHI_SQUARE = Plane((), "", "squared residual over what the noise model expects; 1 if the model is complete")
+COVARIANCE = Plane((PACKED,), "count2", "covariance of mueller, lower triangle row by row: 00, 10, 11, 20, 21, 22, ...")
+PHYSICAL = {
+    "nearest": Plane((4, 4), "count", "physical Mueller matrix nearest to mueller (Frobenius norm)"),
+    "likelihood": Plane((4, 4), "count", "physical Mueller matrix of highest likelihood"),
+}
+
+
+@dataclass(frozen=True)
+class Choice:
+    """How to reduce.
+
+    Attributes
+    ----------
+    weighted : weigh each intensity by its noise, pixel by pixel; else equal weights.
+    covariance : store the full 16 x 16 covariance of each pixel (needs `weighted`).
+    physical : "nearest", "likelihood" (needs `weighted`) or None: a physical estimate beside the plain one.
+    noise : of the camera, where it is known better than by the capture's header.
+    """
+
+    weighted: bool = False
+    covariance: bool = False
+    physical: str | None = None
+    noise: NoiseModel | None = None
+
+    def __post_init__(self) -> None:
+        if self.physical not in (None, *PHYSICAL):
+            raise ProcessError(f"physical estimate {self.physical!r} is none of {', '.join(PHYSICAL)}")
+        if not self.weighted and (self.covariance or self.physical == "likelihood"):
+            raise ProcessError(
+                "a stored covariance and the most likely physical matrix need the weighted estimate"
+            )
+
+    def solver(self, plain: MuellerSolver) -> MuellerSolver | WeightedSolver:
+        """The solver that the choice asks for."""
+        if not self.weighted:
+            return plain
+        return WeightedSolver(plain, self.covariance, self.physical == "likelihood")
+
+    def planes(self, known_noise: bool) -> dict[str, Plane]:
+        """Datasets of the product."""
+        planes = dict(PLANES)
+        if known_noise:
+            planes["reduced_chi_square"] = CHI_SQUARE
+        if self.covariance:
+            planes["mueller_covariance"] = COVARIANCE
+        if self.physical:
+            planes["mueller_physical"] = PHYSICAL[self.physical]
+        return planes
 
 
 def sample_states(capture: Capture) -> NDArray[np.int64]:
@@ -92,6 +144,7 @@ def reduce_mueller(
     out: Path,
     steps: tuple[Step, ...],
     correction: Correction | None = None,
+    choice: Choice | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -101,6 +154,7 @@ def reduce_mueller(
     ----------
     model : resolved at the capture's wavelength.
     correction : black, flat and masks; default: what the capture itself offers.
+    choice : weighting, covariance, physical estimate, noise; default: plain.
 
     Raises
     ------
@@ -111,23 +165,32 @@ def reduce_mueller(
     w = measurement_matrix(capture, model, states)
     inversion = Inversion.of(w.reshape(-1, 16), what=f"{capture.path}: ")
     correction = correction or Correction.of(capture)
-    noise = NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
-    planes = PLANES if noise is None else PLANES | {"reduced_chi_square": CHI_SQUARE}
-    solver = MuellerSolver(inversion, BlockReader(capture, states, correction), noise)
+    choice = choice or Choice()
+    noise = choice.noise or NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
+    solver = choice.solver(MuellerSolver(inversion, BlockReader(capture, states, correction), noise))
+    planes = choice.planes(known_noise=noise is not None)
     with ProductWriter(out, "mueller", capture.header, capture.frame_shape, planes, steps, overwrite) as product:
         product.array("measurement_matrix", w, "", "W (state, channel, 16): intensity = W . vec(M), row-major")
         _store_noise(product, noise, solver)
-        for rows in capture.row_blocks(BLOCK_PIXELS):
-            if rows.stop > product.rows_done:
-                product.write(rows, **_block(solver, rows, tuple(planes)))
-            if progress:
-                progress(rows.stop, capture.frame_shape[0])
-        facts = _facts(inversion, noise, correction, product, len(states))
+        # HDF5 lets the interpreter go while it writes: one block is stored while the next is solved.
+        with ThreadPoolExecutor(1) as storing:
+            stored: Future[None] | None = None
+            for rows in capture.row_blocks(BLOCK_PIXELS):
+                if rows.stop > product.rows_done:
+                    block = _block(solver, rows, planes)
+                    if stored:
+                        stored.result()
+                    stored = storing.submit(product.write, rows, **block)
+                if progress:
+                    progress(rows.stop, capture.frame_shape[0])
+            if stored:
+                stored.result()
+        facts = mueller_facts(inversion, noise, correction, product, len(states), choice.weighted)
         product.seal(facts)
     return facts
 
 
-def _store_noise(product: ProductWriter, noise: NoiseModel | None, solver: MuellerSolver) -> None:
+def _store_noise(product: ProductWriter, noise: NoiseModel | None, solver: MuellerSolver | WeightedSolver) -> None:
     # variance of intensity n = slope[n] * signal + floor[n]; NaN: estimated from the residual.
     nothing = np.full(len(solver.repeats), np.nan)
     slope = noise.slope / solver.repeats if noise else nothing
@@ -136,76 +199,18 @@ def _store_noise(product: ProductWriter, noise: NoiseModel | None, solver: Muell
     product.array("noise_floor", floor, "count2", "variance without light, for each row of W")
 
 
-def _block(solver: MuellerSolver, rows: slice, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+def _block(solver: MuellerSolver | WeightedSolver, rows: slice, planes: Mapping[str, Plane]) -> dict[str, NDArray[Any]]:
     frames = solver.reader.read(rows)
     found = solver.solve(frames)
     mask = found["pixel_mask"]
-    repair = np.flatnonzero(mask & np.uint8(Mask.SATURATED))
-    if repair.size:
-        solve_without_saturated(solver, frames, repair, found)
     lost = (mask & np.uint8(Mask.NOT_FINITE | Mask.BAD | Mask.NOT_DETERMINED)) != 0
     for name, values in found.items():
         if lost.any() and name != "pixel_mask":
             values[..., lost] = np.nan
     shape = (rows.stop - rows.start, solver.reader.capture.frame_shape[1])
-    return {name: found[name].reshape(*PLANES.get(name, CHI_SQUARE).leading, *shape) for name in names}
-
-
-def _facts(
-    inversion: Inversion,
-    noise: NoiseModel | None,
-    correction: Correction,
-    product: ProductWriter,
-    states: int,
-) -> dict[str, Any]:
-    mask, warnings = product.get("pixel_mask"), list(correction.warnings)
-    good = (mask & ~np.uint8(Mask.SATURATED)) == 0
-    counts = {flag.name.lower(): int(np.sum((mask & np.uint8(flag)) != 0)) for flag in Mask if flag.name}
-    if not good.any():
-        raise CaptureError(f"no pixel could be reduced: {in_words(counts)} of {mask.size} pixels. Nothing was written.")
-    if any(counts.values()):
-        warnings.append(f"of {mask.size} pixels: {in_words(counts)} (pixel_mask says where)")
-    # Medians from about 128 rows are plenty, and read little.
-    some = slice(None, None, max(1, mask.shape[0] // 128))
-    residual, elements = product.get("residual_rms", some), product.get("mueller", some)
-    signal = np.tensordot(inversion.w.mean(axis=0), elements.reshape(16, *residual.shape), axes=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        relative = residual / signal
-    facts: dict[str, Any] = {
-        "states": states,
-        "intensities_per_pixel": inversion.w.shape[0],
-        "rank": 16,
-        "condition_number": inversion.condition_number,
-        "degrees_of_freedom": inversion.degrees_of_freedom,
-        "black": correction.source,
-        "noise": noise.source if noise else "estimated from each pixel's residual, because the gain is not known",
-        "weighted": False,
-        "median_residual_rms_count": _median(residual),
-        "median_residual_over_signal": _median(relative),
-        "pixels": mask.size,
-        "masked": counts,
-    }
-    if noise is None and inversion.degrees_of_freedom == 0:
-        warnings.append("as many unknowns as intensities and no gain: there are no standard errors")
-    if noise is not None and inversion.degrees_of_freedom:
-        ratio = _median(product.get("reduced_chi_square", some))
-        facts["median_reduced_chi_square"] = ratio
-        if ratio > SUSPICIOUS_CHI_SQUARE:
-            warnings.append(
-                f"the residual is {np.sqrt(ratio):.2g} times what the noise explains: the model lacks something. "
-                "The standard errors do not contain it. Run `diagnose`."
-            )
-    return facts | {"warnings": warnings}
-
-
-def _median(values: NDArray[Any]) -> float:
-    finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if finite.size else float("nan")
-
-
-def in_words(counts: dict[str, int]) -> str:
-    """Numbers of masked pixels by reason, for a message."""
-    return ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in counts.items() if n) or "none masked"
+    if "mueller_physical" in planes and "mueller_physical" not in found:
+        found["mueller_physical"] = nearest(found["mueller"])
+    return {name: found[name].reshape(*plane.leading, *shape) for name, plane in planes.items()}
 
 
 def _some(values: NDArray[np.int64]) -> str:

@@ -17,7 +17,8 @@ from processing.mosaic.methods import demosaic
 from processing.mosaic.noise import stokes_covariance
 from processing.noise import NoiseModel
 from processing.product import Plane, ProductWriter, Step
-from processing.reduce import Progress, in_words, relative_exposure, sample_states
+from processing.reduce import Progress, relative_exposure, sample_states
+from processing.reduce_facts import in_words
 
 #: The method that docs/mosaic.md found best.
 DEFAULT_METHOD = "difference"

@@ -1,0 +1,179 @@
+"""Noise-weighted reduction and physical estimates, against numpy one pixel at a time."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.optimize
+
+from processing import mueller
+from processing.capture import Capture
+from processing.errors import ProcessError
+from processing.images import MuellerImage
+from processing.instrument import InstrumentModel
+from processing.physical import most_likely, nearest
+from processing.product import Product, Step
+from processing.reduce import Choice, reduce_mueller
+from processing.weighted import PACKED_COLUMN, PACKED_ROW
+
+GAIN, READ, BLACK = 2.5, 3.0, 64.0
+DETECTOR = {"black_level_counts": BLACK, "gain_e_per_count": GAIN, "read_noise_e": READ, "bits": 16}
+ANGLES = {"psg": 9.0 * np.arange(40), "psa": 4.91 * 9.0 * np.arange(40)}
+
+
+@pytest.fixture
+def rgb950(configs: Path) -> InstrumentModel:
+    return InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
+
+
+def pure(rng: np.random.Generator, xi0: float = 0.97) -> np.ndarray:
+    """Mueller matrix (4, 4), m00 = 1: a random Mueller-Jones matrix with a little depolarization."""
+    jones = rng.normal(size=(2, 2)) + 1j * rng.normal(size=(2, 2))
+    m = mueller.from_jones(jones)
+    return (4 * xi0 - 1) / 3 * m / m[0, 0] + 4 * (1 - xi0) / 3 * mueller.IDEAL_DEPOLARIZER
+
+
+def capture_of(m: np.ndarray, rng: np.random.Generator, model: InstrumentModel, write, bits: int = 16, **more) -> Path:
+    """Noisy capture of a uniform or varying Mueller image (4, 4, rows, columns) in counts."""
+    signal = np.einsum("nck,kxy->ncxy", model.rows(ANGLES), m.reshape(16, *m.shape[2:]))
+    electrons = rng.poisson(np.maximum(signal, 0) * GAIN) + rng.normal(0, READ, signal.shape)
+    counts = np.clip(np.rint(electrons / GAIN + BLACK), 0, 2**bits - 1).astype(np.uint16)
+    return write(counts, ANGLES, detector=DETECTOR | {"bits": bits}, **more)
+
+
+def reduced(path: Path, model: InstrumentModel, choice: Choice) -> MuellerImage:
+    out = path.with_suffix(".m.h5")
+    with Capture(path) as capture:
+        reduce_mueller(capture, model, out, (Step("reduce", {}),), choice=choice, overwrite=True)
+    return MuellerImage.load(out)
+
+
+def test_equals_weighted_least_squares_of_numpy(rgb950: InstrumentModel, synthetic_capture) -> None:
+    rng = np.random.default_rng(1)
+    m = np.broadcast_to(800 * pure(rng)[..., None, None], (4, 4, 3, 5))
+    path = capture_of(m, rng, rgb950, synthetic_capture)
+    image = reduced(path, rgb950, Choice(weighted=True, covariance=True))
+    with Capture(path) as capture:
+        counts = np.stack([capture.frames(k)[0] for k in range(40)]).reshape(40, -1) - BLACK
+    w = rgb950.rows(ANGLES)[:, 0]
+    fitted = w @ (np.linalg.pinv(w) @ counts)
+    variance = np.maximum(fitted, 0) / GAIN + (READ / GAIN) ** 2 + 1 / 12
+    with Product(path.with_suffix(".m.h5")) as product:
+        packed = product.get("mueller_covariance").reshape(136, -1)
+    for p in range(15):
+        normal = w.T @ (w / variance[:, p, None])
+        covariance = np.linalg.inv(normal)
+        expected = covariance @ w.T @ (counts[:, p] / variance[:, p])
+        sigma = np.sqrt(np.diag(covariance))
+        assert np.max(np.abs(image.values.reshape(16, -1)[:, p] - expected) / sigma) < 1e-3
+        np.testing.assert_allclose(image.errors.reshape(16, -1)[:, p], sigma, rtol=1e-4)
+        full = np.zeros((16, 16))
+        full[PACKED_ROW, PACKED_COLUMN] = packed[:, p]
+        full[PACKED_COLUMN, PACKED_ROW] = packed[:, p]
+        np.testing.assert_allclose(full, covariance, atol=1e-4 * np.max(covariance))
+        np.testing.assert_allclose(
+            image.covariance().reshape(-1, 16, 16)[p], covariance, atol=0.02 * np.max(covariance)
+        )
+
+
+@pytest.mark.parametrize("case", ["plain", "dark", "saturated"])
+def test_unit_variance_and_smaller_errors(case: str, rgb950: InstrumentModel, synthetic_capture) -> None:
+    rng = np.random.default_rng(2)
+    m = np.broadcast_to(2500 * pure(rng)[..., None, None], (4, 4, 40, 50)).copy()
+    more, bits = {}, 16
+    if case == "saturated":
+        m, bits = 5 * m, 12
+    path = capture_of(m, rng, rgb950, synthetic_capture, bits)
+    if case == "dark":
+        with Capture(path) as capture:
+            frames = np.stack([capture.frames(k) for k in range(40)])
+        dark = np.rint(rng.normal(0, READ / GAIN, (2, 1, 40, 50)) + BLACK).astype(np.uint16)
+        angles = {axis: np.concatenate([[0, 0], v]) for axis, v in ANGLES.items()}
+        role = ("dark",) * 2 + ("sample",) * 40
+        path = synthetic_capture(np.concatenate([dark, frames]), angles, role=role, detector=DETECTOR, **more)
+    weighted, plain = (reduced(path, rgb950, Choice(weighted=flag)) for flag in (True, False))
+    if case == "saturated":
+        assert (weighted.mask & 1).all()
+    pulls = (weighted.values - m) / weighted.errors
+    assert np.mean(pulls**2) == pytest.approx(1.0, abs=0.03)
+    assert np.mean(weighted.errors**2) < 0.9 * np.mean(plain.errors**2)
+    assert np.mean((weighted.values - m) ** 2) < 0.92 * np.mean((plain.values - m) ** 2)
+    assert weighted.facts["median_reduced_chi_square"] == pytest.approx(1.0, abs=0.06)
+
+
+def test_unknown_noise_is_an_error(rgb950: InstrumentModel, synthetic_capture) -> None:
+    path = synthetic_capture(np.ones((40, 1, 4, 6)), ANGLES)
+    with pytest.raises(ProcessError, match="does not know its gain"):
+        reduced(path, rgb950, Choice(weighted=True))
+    with pytest.raises(ProcessError, match="need the weighted"):
+        Choice(covariance=True)
+    with pytest.raises(ProcessError, match="none of nearest, likelihood"):
+        Choice(physical="closest")
+
+
+def smallest_eigenvalue(planes: np.ndarray) -> np.ndarray:
+    return np.linalg.eigvalsh(mueller.coherency(planes.T.reshape(-1, 4, 4).astype(float)))[:, 0]
+
+
+def test_nearest_is_physical_and_nearest() -> None:
+    rng = np.random.default_rng(3)
+    m = np.stack([pure(rng, 1.0) + rng.normal(0, 0.05, (4, 4)) for _ in range(20)]).reshape(20, 16).T
+    found = nearest(m)
+    assert np.all(smallest_eigenvalue(found) > -1e-12)
+    # Nothing physical is closer: compare with a general minimizer over M = sum of Mueller-Jones matrices.
+    for p in range(3):
+
+        def distance(x: np.ndarray, target: np.ndarray = m[:, p]) -> float:
+            factor = (x[:16] + 1j * x[16:]).reshape(4, 4)
+            made = mueller.coherency_to_mueller(factor @ factor.conj().T).reshape(16)
+            return float(np.sum((made - target) ** 2))
+
+        best = min(scipy.optimize.minimize(distance, rng.normal(size=32), method="BFGS").fun for _ in range(2))
+        assert np.sum((found[:, p] - m[:, p]) ** 2) == pytest.approx(best, rel=1e-4)
+    physical = np.stack([pure(rng, 0.7) for _ in range(5)]).reshape(5, 16).T
+    np.testing.assert_allclose(nearest(physical), physical, atol=1e-12)
+    physical[3, 1] = np.nan
+    assert np.isnan(nearest(physical)[:, 1]).all()
+
+
+def test_most_likely_beats_every_other_physical_matrix() -> None:
+    rng = np.random.default_rng(4)
+    a = rng.normal(size=(6, 40, 16))
+    information = np.einsum("pni,pn,pnj->pij", a, rng.uniform(0.2, 5, (6, 40)), a) * 400
+    m = np.stack([pure(rng, 1.0).reshape(16) for _ in range(6)])
+    m += np.stack([rng.multivariate_normal(np.zeros(16), np.linalg.inv(f)) for f in information])
+    packed = information[:, PACKED_ROW, PACKED_COLUMN].T
+    found = most_likely(m.T, packed).T
+    assert np.all(smallest_eigenvalue(found.T) > -1e-9)
+
+    def loss(x: np.ndarray, p: int) -> float:
+        return float((x - m[p]) @ information[p] @ (x - m[p]))
+
+    for p in range(6):
+
+        def parametrized(x: np.ndarray, p: int = p) -> float:
+            factor = (x[:16] + 1j * x[16:]).reshape(4, 4)
+            return loss(mueller.coherency_to_mueller(factor @ factor.conj().T).reshape(16), p)
+
+        values, vectors = np.linalg.eigh(mueller.coherency(found[p].reshape(4, 4)))
+        root = vectors * np.sqrt(np.maximum(values, 1e-6))
+        start = np.concatenate([root.real.reshape(16), root.imag.reshape(16)])
+        best = scipy.optimize.minimize(parametrized, start, method="BFGS").fun
+        assert loss(found[p], p) <= best + 0.01
+        assert loss(found[p], p) <= loss(nearest(m[p][:, None])[:, 0], p)
+
+
+@pytest.mark.parametrize("physical", ["nearest", "likelihood"])
+def test_physical_estimate_stands_beside_the_plain_one(
+    physical: str, rgb950: InstrumentModel, synthetic_capture
+) -> None:
+    rng = np.random.default_rng(5)
+    m = np.broadcast_to(1500 * pure(rng, 0.99)[..., None, None], (4, 4, 10, 12))
+    path = capture_of(m, rng, rgb950, synthetic_capture)
+    plain = reduced(path, rgb950, Choice(weighted=True))
+    image = reduced(path, rgb950, Choice(weighted=True, physical=physical))
+    np.testing.assert_array_equal(image.values, plain.values)
+    with Product(path.with_suffix(".m.h5")) as product:
+        made = product.get("mueller_physical")
+    assert np.all(smallest_eigenvalue(made.reshape(16, -1)) > -1e-3)
+    assert np.mean((made - m) ** 2) < np.mean((plain.values - m) ** 2)
