@@ -6,6 +6,7 @@ Ossikovski, Opt. Lett. 36, 2330 (2011): L = ln M, Lm = (L - G L^T G) / 2 holds d
 
 from __future__ import annotations
 
+import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -62,11 +63,19 @@ def differential(m: Floats) -> Differential:
         logs[simple] = ((v * np.log(w)[:, None, :]) @ np.linalg.inv(v)).real
     for k in np.flatnonzero(defined & ~simple):
         # Nearly defective (for instance a retarder and an equally strong diattenuator crossed at 45 degrees).
-        from scipy.linalg import logm
-
-        logs[k] = np.real(logm(flat[k]))
+        logs[k] = _careful_logarithm(flat[k])
     logarithm = logs.reshape(m.shape)
     turned = G @ np.swapaxes(logarithm, -1, -2) @ G
     throughput = logarithm[..., 0, 0, None, None] * np.eye(4)
     mean = (logarithm - turned) / 2 + throughput
     return Differential(mean, (logarithm + turned) / 2 - throughput, defined.reshape(m.shape[:-2]))
+
+
+def _careful_logarithm(m: Floats) -> Floats:
+    """Real logarithm by scipy's inverse scaling and squaring; slower, but it needs no eigenvectors."""
+    from scipy.linalg import logm
+
+    with warnings.catch_warnings():
+        # It warns when its error estimate passes 2e-13.
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return np.asarray(np.real(logm(m)))
