@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import typer
 
 from processing.command_line import run
-from processing.commands import calibrate, importing, reduce, xi0
+from processing.commands import calibrate, camera, campaign, geometry, importing, reduce, reflectance, tables, xi0
 
 app = typer.Typer(
     name="process",
@@ -20,8 +20,13 @@ app = typer.Typer(
 
 # One line a module that brings commands. It must not import anything heavy at its top: `--help` is fast.
 calibrate.register(app)
+camera.register(app)
 importing.register(app)
 reduce.register(app)
+campaign.register(app)
+geometry.register(app)
+reflectance.register(app)
+tables.register(app)
 xi0.register(app)
 
 

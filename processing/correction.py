@@ -51,18 +51,40 @@ class Correction:
     warnings: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, capture: Capture, bad: NDArray[np.bool_] | None = None) -> Correction:
-        """What the capture itself offers: dark states, else the header's black level, else nothing (and says so)."""
+    def of(
+        cls,
+        capture: Capture,
+        bad: NDArray[np.bool_] | None = None,
+        dark_from: Capture | None = None,
+        flat_from: Capture | None = None,
+    ) -> Correction:
+        """What the capture offers: dark states, else the header's black level, else nothing (and says so).
+
+        Parameters
+        ----------
+        bad : (rows, columns), pixels to leave out.
+        dark_from, flat_from : other captures of the same camera whose dark and flat states are used instead.
+
+        Raises
+        ------
+        CaptureError : another capture does not fit, is simulated where this one is measured, or lacks such states.
+        """
+        for other, name in ((dark_from, "dark"), (flat_from, "flat")):
+            if other is not None:
+                _check_partner(capture, other, name)
+        if bad is not None and bad.shape != capture.frame_shape:
+            raise CaptureError(
+                f"the bad-pixel map is {bad.shape}, the frames of {capture.path} are {capture.frame_shape}."
+            )
+        source_of_dark = dark_from or capture
         detector = capture.header.detector
         warnings: list[str] = []
-        dark = capture.dark
+        dark = source_of_dark.dark
         black: float | NDArray[np.float32]
         if dark is not None:
-            black, dark_frames = (
-                dark.astype(np.float32),
-                int(capture.column("repeats")[capture.states_with("dark")].sum()),
-            )
-            source = f"mean of {dark_frames} dark frame(s)"
+            states = source_of_dark.states_with("dark")
+            black, dark_frames = dark.astype(np.float32), int(source_of_dark.column("repeats")[states].sum())
+            source = f"mean of {dark_frames} dark frame(s)" + (f" of {dark_from.path.name}" if dark_from else "")
         else:
             black, dark_frames = detector.black_level_counts, 0
             source = f"black level {black:g} counts from the header"
@@ -75,7 +97,24 @@ class Correction:
         saturation = None
         if detector.bits is not None and capture.integer_counts:
             saturation = float(2**detector.bits - 1)
-        return cls(black, dark_frames, source, _flat(capture, black), bad, saturation, tuple(warnings))
+        flat = _flat(flat_from, black) if flat_from else _flat(capture, black)
+        return cls(black, dark_frames, source, flat, bad, saturation, tuple(warnings))
+
+
+def _check_partner(capture: Capture, other: Capture, role: str) -> None:
+    if other.simulated != capture.simulated:
+        kinds = {True: "simulated", False: "measured"}
+        raise CaptureError(
+            f"{other.path} is {kinds[other.simulated]} and {capture.path} is {kinds[capture.simulated]}; "
+            "simulated and measured data are never mixed."
+        )
+    if (other.channels, other.frame_shape) != (capture.channels, capture.frame_shape):
+        raise CaptureError(
+            f"{other.path} has frames of {other.channels} x {other.frame_shape}, {capture.path} has "
+            f"{capture.channels} x {capture.frame_shape}; a {role} capture must be of the same camera and size."
+        )
+    if other.states_with(role).size == 0:
+        raise CaptureError(f"{other.path} has no {role} states that are done.")
 
 
 def _flat(capture: Capture, black: float | NDArray[np.float32]) -> NDArray[np.float32] | None:

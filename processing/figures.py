@@ -53,6 +53,8 @@ def product_figure(product: Product) -> Figure:
             ("valid", valid, {"cmap": "gray", "vmin": 0, "vmax": 1}),
         ]
         return map_figure(panels, _title(product), product.simulated)
+    if product.kind == "camera":
+        return photon_transfer_figure(product)
     raise ProcessError(f"{product.path}: no figure is defined for a {product.kind} image.")
 
 
@@ -109,6 +111,27 @@ def map_figure(panels: Sequence[tuple[str, NDArray[Any], dict[str, Any]]], title
     for axis, (label, values, keywords) in zip(axes, panels, strict=True):
         _map(figure, axis, values, label, **keywords)
     _entitle(figure, title, simulated)
+    return figure
+
+
+def photon_transfer_figure(product: Product) -> Figure:
+    """Variance against signal with the fitted line, and what is left over."""
+    from matplotlib.figure import Figure
+
+    signal, variance, stderr = product.array("photon_transfer")
+    fitted = product.facts["slope"] * signal + product.facts["floor"]
+    figure = Figure(figsize=(7, 6), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
+    upper.errorbar(signal, variance, stderr, fmt=".", label="pairs of repeated frames")
+    gain, read = product.facts["gain_e_per_count"], product.facts["read_noise_e"]
+    upper.plot(signal, fitted, label=f"{gain:.4g} e/count, {read:.3g} e read noise")
+    upper.set_ylabel("variance / counts$^2$")
+    upper.legend()
+    lower.errorbar(signal, (variance - fitted) / fitted * 100, stderr / fitted * 100, fmt=".")
+    lower.axhline(0, color="black", linewidth=0.8)
+    lower.set_ylabel("residual / %")
+    lower.set_xlabel("signal above black / counts")
+    _entitle(figure, f"photon transfer: {product.header.title}", product.simulated)
     return figure
 
 

@@ -79,7 +79,8 @@ class MuellerImage:
                 level = self.residual_rms.reshape(-1).astype(float) ** 2 * n / free if free else np.nan
             return np.broadcast_to(level, (n, rows * columns))
         fitted = self.w @ self.values.reshape(16, -1)
-        return np.asarray(self.noise_slope[:, None] * np.maximum(fitted, 0.0) + self.noise_floor[:, None])
+        floor = self.noise_floor[:, None]
+        return np.asarray(np.maximum(self.noise_slope[:, None] * fitted + floor, 0.5 * floor))
 
     def covariance(self) -> NDArray[np.float64]:
         """Covariance (rows, columns, 16, 16) of the elements, counts^2, row-major order m00, m01, ... m33.

@@ -16,6 +16,8 @@ from processing.threads import for_ranges
 REPAIR_BATCH = 4096
 #: A pixel's remaining states must leave W a condition number below this.
 WORST_CONDITION = 1e3
+#: In the dark the signal is noise about 0: a variance may come out below that of no light, down to this part of it.
+LEAST = 0.5
 
 
 class MuellerSolver:
@@ -94,12 +96,12 @@ class MuellerSolver:
         constant = self.floor + self.reader.black_variance(noise) * self.black_unit
         if gain is None:
             shot *= np.float32(noise.slope)
-            np.maximum(shot, 0.0, out=shot)
             shot += constant.sum(axis=1, keepdims=True)
-            return shot
+            return np.asarray(np.maximum(shot, LEAST * constant.sum(axis=1, keepdims=True), out=shot))
         # Divided by the flat, signal and noise scale together: shot variance with the gain, the rest with its square.
         np.matmul(self.stack[self.first_square :], (signal * gain).reshape(self.first_square, -1), out=shot)
-        return np.asarray(np.maximum(noise.slope * shot, 0.0) + constant.astype(np.float32) @ gain**2)
+        dark = constant.astype(np.float32) @ gain**2
+        return np.asarray(np.maximum(noise.slope * shot + dark, LEAST * dark))
 
 
 def solve_without_saturated(
@@ -133,8 +135,9 @@ def solve_without_saturated(
             if solver.noise is None:
                 variance = np.broadcast_to((rss / free)[:, None], y.shape)
             else:
-                shot = solver.noise.slope / solver.repeats * np.maximum(y, 0)
-                variance = (shot + solver.noise.averaged_floor(solver.repeats) * per_state) * per_state
+                dark = solver.noise.averaged_floor(solver.repeats) * per_state
+                shot = solver.noise.slope / solver.repeats * y
+                variance = np.maximum(shot + dark, LEAST * dark) * per_state
             found["mueller_errors"][:, part] = np.sqrt(np.einsum("pin,pn->ip", solve**2, variance))
             found["reduced_chi_square"][part] = np.sum(residual**2 / variance, axis=1) / free
         found["mueller"][:, part] = m.T

@@ -98,6 +98,7 @@ def reduce_stokes(
     steps: tuple[Step, ...],
     method: str = DEFAULT_METHOD,
     correction: Correction | None = None,
+    noise: NoiseModel | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -117,7 +118,7 @@ def reduce_stokes(
     states = sample_states(capture)
     model_rows, analyzers = channel_rows(capture, model, states)
     correction = correction or Correction.of(capture)
-    noise = NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
+    noise = noise or NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
     frame, mask = mean_frame(capture, states, correction, progress)
     channels = demosaic(frame, layout, method)
     frames = float(capture.column("repeats")[states].sum())

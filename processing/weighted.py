@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from processing.correction import Mask
 from processing.errors import ProcessError
-from processing.mueller_solver import MuellerSolver
+from processing.mueller_solver import LEAST, MuellerSolver
 from processing.noise import NoiseModel
 from processing.physical import most_likely
 from processing.threads import for_ranges
@@ -101,12 +101,13 @@ class WeightedSolver:
         self, raw: NDArray[Any], elements: NDArray[np.float32], gain: NDArray[np.float32] | None
     ) -> NDArray[np.float32]:
         """1 / variance (N, pixels); 0 for saturated intensities."""
-        fitted = np.maximum(self._w @ elements, 0.0)
+        fitted = self._w @ elements
         if gain is None:
-            variance = self._slope * fitted + self._floor
+            variance = np.maximum(self._slope * fitted + self._floor, LEAST * self._floor)
         else:
             per_state = np.broadcast_to(gain[None], raw.shape).reshape(fitted.shape)
-            variance = (self._slope * fitted + self._floor * per_state) * per_state
+            floor = self._floor * per_state
+            variance = np.maximum(self._slope * fitted + floor, LEAST * floor) * per_state
         weight = 1.0 / variance
         level = self.reader.correction.saturation
         if level is not None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,12 +22,23 @@ def reduce_command(
         Path | None, typer.Option(help="Instrument file to use instead of the one in the capture.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Product file; default: beside the capture.")] = None,
+    weighted: Annotated[bool, typer.Option("--weighted", help="Weigh each intensity by its noise.")] = False,
+    covariance: Annotated[
+        bool, typer.Option("--covariance", help="Store the 16 x 16 covariance of each pixel (with --weighted).")
+    ] = False,
+    physical: Annotated[
+        str | None, typer.Option(help="Add a physical estimate: nearest, or likelihood (with --weighted).")
+    ] = None,
+    camera: Annotated[Path | None, typer.Option(help="Noise and bad pixels, from `process camera`.")] = None,
+    dark: Annotated[Path | None, typer.Option(help="Other capture whose dark states are subtracted.")] = None,
+    flat: Annotated[Path | None, typer.Option(help="Other capture whose flat states are divided out.")] = None,
     demosaic: Annotated[str | None, typer.Option(help="Mosaic method; default: the best of docs/mosaic.md.")] = None,
     figure: Annotated[Path | None, typer.Option(help="Also draw the image (PNG).")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
 ) -> None:
     """Invert W per pixel: Mueller image, or Stokes image of a polarization mosaic, with standard errors."""
-    product, facts, simulated = reduce_file(capture, instrument, out, demosaic, overwrite)
+    options = ReduceOptions(instrument, weighted, covariance, physical, camera, dark, flat, demosaic)
+    product, facts, simulated = reduce_file(capture, out, options, overwrite)
     summary(product, facts, simulated)
     if figure is not None:
         from processing.figures import draw_product
@@ -34,31 +47,63 @@ def reduce_command(
         typer.echo(f"figure: {figure}")
 
 
-def reduce_file(
-    path: Path, instrument: Path | None, out: Path | None, demosaic: str | None, overwrite: bool
-) -> tuple[Path, dict[str, Any], bool]:
+@dataclass(frozen=True)
+class ReduceOptions:
+    """What `process reduce` was asked for; all of it goes into the provenance."""
+
+    instrument: Path | None = None
+    weighted: bool = False
+    covariance: bool = False
+    physical: str | None = None
+    camera: Path | None = None
+    dark: Path | None = None
+    flat: Path | None = None
+    demosaic: str | None = None
+
+
+def reduce_file(path: Path, out: Path | None, options: ReduceOptions, overwrite: bool) -> tuple[Path, Any, bool]:
     """Reduce one capture with a progress bar: product file, its facts, and whether the data are simulated."""
     # Tiles are spread over our own threads; a second pool inside BLAS would only fight with them.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from processing.camera_noise import read_camera
     from processing.capture import Capture
     from processing.console import progress_bar
+    from processing.correction import Correction
+    from processing.errors import ProcessError
     from processing.product import Step, file_identity
-    from processing.reduce import choose_model, reduce_mueller
-    from processing.reduce_stokes import DEFAULT_METHOD, reduce_stokes
+    from processing.reduce import Choice, choose_model, reduce_mueller
 
-    with Capture(path) as capture:
+    with ExitStack() as stack:
+        capture, dark, flat = (
+            stack.enter_context(Capture(p)) if p else None for p in (path, options.dark, options.flat)
+        )
+        if capture is None:
+            raise ProcessError("no capture was given")
+        noise, bad = read_camera(options.camera) if options.camera else (None, None)
+        correction = Correction.of(capture, bad, dark, flat)
         kind = "stokes" if capture.header.mosaic else "mueller"
         product = out or path.with_suffix(f".{kind}.h5")
-        arguments = {"capture": path.name, "instrument": instrument and str(instrument), "demosaic": demosaic}
-        inputs = [file_identity(p) for p in (path, instrument) if p is not None]
-        steps = (Step("reduce", arguments, tuple(inputs)),)
-        model = choose_model(capture, instrument)
-        with progress_bar("reducing", "rows" if kind == "mueller" else "states") as tick:
-            if kind == "stokes":
-                method = demosaic or DEFAULT_METHOD
-                facts = reduce_stokes(capture, model, product, steps, method, overwrite=overwrite, progress=tick)
-            else:
-                facts = reduce_mueller(capture, model, product, steps, overwrite=overwrite, progress=tick)
+        files = [p for p in (path, options.instrument, options.camera, options.dark, options.flat) if p is not None]
+        arguments = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(options).items()}
+        steps = (Step("reduce", {"capture": path.name} | arguments, tuple(file_identity(p) for p in files)),)
+        model = choose_model(capture, options.instrument)
+        tick = stack.enter_context(progress_bar("reducing", "rows" if kind == "mueller" else "states"))
+        if kind == "mueller":
+            if options.demosaic:
+                raise ProcessError(f"--demosaic: {path} is not a mosaic capture.")
+            choice = Choice(options.weighted, options.covariance, options.physical, noise)
+            facts = reduce_mueller(capture, model, product, steps, correction, choice, overwrite, tick)
+        else:
+            if options.weighted or options.covariance or options.physical:
+                raise ProcessError(
+                    f"{path} is a mosaic capture: its product holds the covariance of S always; "
+                    "--weighted, --covariance and --physical are for Mueller captures."
+                )
+            # Imported here: OpenCV is not needed for a Mueller capture.
+            from processing.reduce_stokes import DEFAULT_METHOD, reduce_stokes
+
+            method = options.demosaic or DEFAULT_METHOD
+            facts = reduce_stokes(capture, model, product, steps, method, correction, noise, overwrite, tick)
         return product, facts, capture.simulated
 
 
@@ -73,7 +118,7 @@ def reduced(source: Path, instrument: Path | None) -> Path:
         if instrument is None and product.exists() and source.exists() and _newer(product, source):
             typer.echo(f"using {product}")
             return product
-    product, facts, simulated = reduce_file(source, instrument, None, None, overwrite=True)
+    product, facts, simulated = reduce_file(source, None, ReduceOptions(instrument), overwrite=True)
     summary(product, facts, simulated)
     return product
 

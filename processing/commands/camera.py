@@ -1,0 +1,36 @@
+"""`process camera`: gain, read noise, black level and bad pixels of a camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    app.command("camera")(camera_command)
+
+
+def camera_command(
+    captures: Annotated[list[Path], typer.Argument(help="Captures with dark states and with repeated states.")],
+    out: Annotated[Path | None, typer.Option(help="Product file; default: beside the first capture.")] = None,
+    figure: Annotated[Path | None, typer.Option(help="Also draw the photon-transfer line (PNG).")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
+) -> None:
+    """Photon transfer: gain and read noise from states that repeat each other, bad pixels from dark states."""
+    from processing.camera_noise import write_camera
+    from processing.commands.reduce import summary
+    from processing.product import Step, file_identity
+
+    product = out or captures[0].with_suffix(".camera.h5")
+    identities = tuple(file_identity(p) for p in captures if p.exists())
+    step = Step("camera", {"captures": [p.name for p in captures]}, identities)
+    _, facts, simulated = write_camera(captures, product, step, overwrite)
+    summary(product, facts, simulated)
+    if figure is not None:
+        from processing.figures import draw_product
+
+        draw_product(product, figure)
+        typer.echo(f"figure: {figure}")
