@@ -7,7 +7,18 @@ from collections.abc import Sequence
 import typer
 
 from processing.command_line import run
-from processing.commands import calibrate, camera, campaign, geometry, importing, reduce, reflectance, tables, xi0
+from processing.commands import (
+    calibrate,
+    camera,
+    campaign,
+    design,
+    geometry,
+    importing,
+    reduce,
+    reflectance,
+    tables,
+    xi0,
+)
 
 app = typer.Typer(
     name="process",
@@ -24,6 +35,7 @@ camera.register(app)
 importing.register(app)
 reduce.register(app)
 campaign.register(app)
+design.register(app)
 geometry.register(app)
 reflectance.register(app)
 tables.register(app)

@@ -93,7 +93,7 @@ def export(
     return missing
 
 
-def load(path: Path | str, white_m00: float = 1.0) -> dict[int, ScatteringTable]:
+def load(path: Path | str, white_m00: float = 1.0, only_nm: float | None = None) -> dict[int, ScatteringTable]:
     """Tables by wavelength (nm) of a `.pbsdf`, one sample a bin; NaN bins stay empty.
 
     Raises
@@ -114,6 +114,8 @@ def load(path: Path | str, white_m00: float = 1.0) -> dict[int, ScatteringTable]
     angles, cos_i, _ = _grid()
     tables = {}
     for k, wavelength in enumerate(fields["wvls"].reshape(-1)):
+        if only_nm is not None and abs(only_nm - wavelength) > 0.5:
+            continue
         m = np.moveaxis(fields["M"][..., k, :, :].reshape(*SHAPE[::-1], 16), -1, 0).transpose(0, 3, 2, 1)
         values = m[..., :-1] * (white_m00 * np.pi * np.maximum(cos_i, 0.0))[..., :-1]
         seen = (cos_i > 0)[..., :-1] & np.isfinite(values).all(axis=0)

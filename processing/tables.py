@@ -111,6 +111,12 @@ class ScatteringTable:
         known = (rows >= 0) & (self.count[rows] >= min_count)
         return np.where(known, self.mean[:, rows], np.nan)
 
+    def counts(self, angles: Angles) -> NDArray[np.int64]:
+        """Number of samples (...) of the bin of each direction."""
+        bins = self.axes.bins(angles)
+        rows = np.where(bins >= 0, self._row[bins], -1)
+        return np.where(rows >= 0, self.count[rows], 0) if self.bins.size else np.zeros(rows.shape, dtype=np.int64)
+
     def merge(self, other: ScatteringTable) -> None:
         """Add all samples of another table of the same quantities, wavelength and layout. Raises TableError."""
         mine = (self.quantities, self.wavelength_nm, self.axes, self.simulated, self.frames)

@@ -1,0 +1,170 @@
+"""What a campaign does with one capture, as a function that can run in another process or on another machine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
+
+from processing.capture import Capture
+from processing.cloude import coherency_eigenvalues, xi0_and_dominant
+from processing.deviation import linear_diattenuation, magnitude, orientation_difference, rmsd
+from processing.geometry.frames import GeometryImage
+from processing.geometry.outline import find_sphere, registered
+from processing.geometry.viewing import ViewingGeometry
+from processing.images import MuellerImage, StokesImage
+from processing.product import Step, file_identity
+from processing.reduce import choose_model, reduce_mueller
+from processing.reduce_stokes import DEFAULT_METHOD, reduce_stokes
+from processing.reflectance.base import load_reflectance
+from processing.tables import ScatteringTable
+from processing.xi0_image import estimate_from_stokes
+
+#: Standard error of the Mueller image's xi0 above which a pixel does not count: beyond it the largest eigenvalue is
+#: noise's choice, and biased upwards.
+MAX_STDERR = 0.1
+
+
+@dataclass(frozen=True)
+class CaptureTask:
+    """One capture and what belongs to it; plain text, so that it travels."""
+
+    capture: str
+    kind: str
+    out: str
+    geometry: str
+    material: str
+    register: bool
+    border_px: int
+
+
+@dataclass(frozen=True)
+class CaptureMeasure:
+    """What one capture gives. psi, |D| and the eigenvalues only from a Mueller capture."""
+
+    kind: str
+    wavelength_nm: float
+    omega_deg: float
+    shape: tuple[int, int]
+    table: str
+    psi_deg: float
+    magnitude_percent: float
+    eigenvalue_deviation: float
+    pixels: int
+    view_json: str
+
+
+def measure(task: CaptureTask) -> CaptureMeasure:
+    """Reduce a capture (unless its product is newer) and measure it."""
+    product = reduced_product(Path(task.capture), Path(task.out), task.kind)
+    view = ViewingGeometry.load(task.geometry)
+    return (_measure_mueller if task.kind == "mueller" else _measure_stokes)(task, product, view)
+
+
+def reduced_product(path: Path, out: Path, kind: str) -> Path:
+    """The product of a capture in the folder `out`, made now unless it is there and newer."""
+    product = out / f"{path.stem}.{kind}.h5"
+    if product.exists() and product.stat().st_mtime > path.stat().st_mtime:
+        return product
+    step = Step("campaign", {"capture": path.name}, (file_identity(path),))
+    with Capture(path) as capture:
+        model = choose_model(capture, None)
+        if kind == "stokes":
+            reduce_stokes(capture, model, product, (step,), DEFAULT_METHOD, overwrite=True)
+        else:
+            reduce_mueller(capture, model, product, (step,), overwrite=True)
+    return product
+
+
+def _measure_mueller(task: CaptureTask, product: Path, view: ViewingGeometry) -> CaptureMeasure:
+    image = MuellerImage.load(product)
+    m = image.matrices
+    view, geometry = _geometry(task, view, image.values[0, 0], image.header.omega_deg)
+    model = load_reflectance(task.material).mueller_jones(geometry.points, image.header.wavelength_nm)
+    inside = m[geometry.mask].astype(float)
+    xi0, m0 = xi0_and_dominant(inside)
+    eigenvalues = coherency_eigenvalues(inside)
+    # First order: d xi0 = <dM, m0 - 4 xi0 e00> / (4 m00).
+    gradient = np.zeros((*image.mask.shape, 16))
+    direction = np.asarray(m0).reshape(-1, 16).copy()
+    direction[:, 0] -= 4 * xi0
+    gradient[geometry.mask] = direction / (4 * inside[:, :1, 0])
+    stderr = np.sqrt(image.variance_of(gradient)[geometry.mask])
+    good = np.isfinite(xi0) & ~(stderr > MAX_STDERR) & _inner(geometry, task.border_px)
+    measured, modelled = linear_diattenuation(m0), linear_diattenuation(model)
+    psi = orientation_difference(modelled, measured)[good]
+    small = eigenvalues[:, 1:]
+    deviation = np.abs(small - small.mean(axis=-1, keepdims=True)).max(axis=-1)[good]
+    return CaptureMeasure(
+        kind="mueller",
+        wavelength_nm=image.header.wavelength_nm,
+        omega_deg=float(image.header.omega_deg or 0.0),
+        shape=(image.mask.shape[0], image.mask.shape[1]),
+        table=_table(task, geometry, xi0, stderr, good, image.header.wavelength_nm, image.simulated),
+        psi_deg=float(np.rad2deg(rmsd(psi))),
+        magnitude_percent=100 * rmsd((magnitude(modelled) - magnitude(measured))[good]),
+        eigenvalue_deviation=float(np.percentile(deviation, 99)) if good.any() else float("nan"),
+        pixels=int(good.sum()),
+        view_json=view.model_dump_json() if task.register else "",
+    )
+
+
+def _measure_stokes(task: CaptureTask, product: Path, view: ViewingGeometry) -> CaptureMeasure:
+    image = StokesImage.load(product)
+    header = image.header
+    view, geometry = _geometry(task, view, image.values[0], header.omega_deg)
+    model = load_reflectance(task.material).mueller_jones(geometry.points, header.wavelength_nm)
+    found = estimate_from_stokes(image, np.asarray(geometry.fill(model), dtype=float))
+    inside = geometry.mask
+    xi0, stderr = found.xi0[inside], found.xi0_stderr[inside]
+    good = found.valid[inside] & _inner(geometry, task.border_px)
+    return CaptureMeasure(
+        kind="stokes",
+        wavelength_nm=header.wavelength_nm,
+        omega_deg=float(header.omega_deg or 0.0),
+        shape=(image.mask.shape[0], image.mask.shape[1]),
+        table=_table(task, geometry, xi0, stderr, good, header.wavelength_nm, image.simulated),
+        psi_deg=float("nan"),
+        magnitude_percent=float("nan"),
+        eigenvalue_deviation=float("nan"),
+        pixels=int(good.sum()),
+        view_json=view.model_dump_json() if task.register else "",
+    )
+
+
+def _geometry(
+    task: CaptureTask, view: ViewingGeometry, intensity: NDArray[np.floating], omega_deg: float | None
+) -> tuple[ViewingGeometry, GeometryImage]:
+    rows, columns = intensity.shape
+    if task.register:
+        view = registered(view, find_sphere(intensity), rows, columns)
+    return view, view.at(float(omega_deg or 0.0), rows, columns)
+
+
+def _inner(geometry: GeometryImage, border_px: int) -> NDArray[np.bool_]:
+    # Pixels (N,) at least so far from the outline: nearer ones mix object and background, in a mosaic most of all.
+    mask = geometry.mask
+    if border_px > 0:
+        mask = binary_erosion(mask, iterations=border_px)
+    return np.asarray(mask[geometry.mask])
+
+
+def _table(
+    task: CaptureTask,
+    geometry: GeometryImage,
+    xi0: NDArray[np.floating],
+    stderr: NDArray[np.floating],
+    good: NDArray[np.bool_],
+    wavelength_nm: float,
+    simulated: bool,
+) -> str:
+    table = ScatteringTable(("xi0", "xi0_variance"), wavelength_nm, simulated=simulated)
+    spread = np.where(np.isfinite(stderr), stderr, 0.0) ** 2
+    values = np.where(good, np.stack([xi0, spread]).astype(float), np.nan)
+    table.add(geometry.points.angles, values, simulated)
+    path = Path(task.out) / f"{Path(task.capture).stem}.xi0.table.h5"
+    table.save(path)
+    return str(path)

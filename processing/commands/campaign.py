@@ -1,0 +1,98 @@
+"""`process campaign`: everything of a folder of captures, beside the paper's averages."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from processing.campaign import CampaignResult
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    app.command("campaign")(campaign_command)
+
+
+def campaign_command(
+    folder: Annotated[Path, typer.Argument(help="Folder of captures: Mueller and Stokes, several angles.")],
+    geometry: Annotated[Path, typer.Option(help="Geometry file: camera, source, shape.")],
+    material: Annotated[Path, typer.Option(help="Material file: the dominant process.")],
+    stokes_geometry: Annotated[Path | None, typer.Option(help="Geometry of the Stokes camera, if another.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; default: FOLDER/campaign.")] = None,
+    registered: Annotated[bool, typer.Option("--register", help="Find the sphere in each image.")] = False,
+    border: Annotated[int, typer.Option(min=0, help="Pixels along the outline that do not count.")] = 3,
+    workers: Annotated[int, typer.Option(min=1, help="Processes on this machine.")] = 1,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a dask.distributed scheduler.")] = None,
+) -> None:
+    """Reduce everything, compare DRR, Stokes and model: RMSD of psi, |D| and xi0 against Omega."""
+    from processing.campaign import run_campaign
+    from processing.console import progress_bar
+    from processing.errors import ProcessError
+    from processing.executors import executor
+    from processing.reflectance_figures import campaign_figure
+
+    if not folder.is_dir():
+        raise ProcessError(f"{folder}: no such folder. Give the folder that holds the captures.")
+    target = out or folder / "campaign"
+    with executor(workers, scheduler) as pool, progress_bar("campaign", "captures") as tick:
+        result = run_campaign(
+            folder,
+            target,
+            geometry,
+            material,
+            pool,
+            stokes_geometry,
+            register=registered,
+            border_px=border,
+            progress=tick,
+        )
+    write_csv(result, target / "campaign.csv")
+    campaign_figure(result, folder.name).savefig(target / "campaign.png", dpi=150)
+    if result.simulated:
+        typer.echo("SIMULATED data")
+    typer.echo("\n".join(lines(result)))
+    for text in result.left_out:
+        typer.echo(f"left out: {text}", err=True)
+    typer.echo(str(target / "campaign.csv"))
+    typer.echo(str(target / "campaign.png"))
+
+
+COLUMNS = (
+    ("psi_deg", "psi/deg"),
+    ("magnitude_percent", "|D|/%"),
+    ("xi0_percent", "xi0/%"),
+    ("xi0_noise_percent", "noise of xi0/%"),
+    ("common", "common"),
+    ("eigenvalue_deviation", "eigenvalues"),
+)
+
+
+def lines(result: CampaignResult) -> list[str]:
+    """The table for people: a block a wavelength, its averages, and the paper's."""
+    from processing.campaign import PAPER
+
+    out = []
+    for nm in sorted({r.wavelength_nm for r in result.rows}):
+        out.append(f"{nm:g} nm   RMSD against Omega")
+        out.append("  Omega " + " ".join(f"{label:>15}" for _, label in COLUMNS))
+        for r in (r for r in result.rows if r.wavelength_nm == nm):
+            out.append(f"  {r.omega_deg:5g} " + " ".join(f"{getattr(r, name):15.3f}" for name, _ in COLUMNS))
+        out.append("   mean " + " ".join(f"{result.average(nm, name):15.3f}" for name, _ in COLUMNS))
+        if round(nm) in PAPER:
+            p = PAPER[round(nm)]
+            out.append(f"  paper {p.psi_deg:15.2f} {p.magnitude_percent:15.2f} {p.xi0_percent:15.2f}")
+    return out
+
+
+def write_csv(result: CampaignResult, path: Path) -> None:
+    """All rows as comma-separated text, one header line."""
+    import csv
+    from dataclasses import asdict
+
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, fieldnames=list(asdict(result.rows[0])))
+        writer.writeheader()
+        writer.writerows(asdict(row) for row in result.rows)

@@ -1,0 +1,99 @@
+"""`process design --stokes` (through `commands.design`), `fit-material`, `extrapolate`: from a model and back to one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    app.command("fit-material")(fit_material_command)
+    app.command("extrapolate")(extrapolate_command)
+
+
+def design_command(
+    geometry: Annotated[Path, typer.Option(help="Geometry file: camera, source, shape.")],
+    material: Annotated[Path, typer.Option(help="Material file: the dominant process.")],
+    camera: Annotated[Path, typer.Option(help="Instrument file of the Stokes camera.")],
+    stokes: Annotated[bool, typer.Option("--stokes", help="Design a linear Stokes capture.")] = False,
+    figure: Annotated[Path, typer.Option(help="Figure to draw (PNG).")] = Path("stokes_design.png"),
+    electrons: Annotated[float, typer.Option(help="Electrons in a channel for M00 = 1, unpolarized light.")] = 10_000.0,
+    xi0: Annotated[float, typer.Option(min=0.25, max=1, help="xi0 that is assumed.")] = 0.4,
+    albedo: Annotated[float, typer.Option(min=0, help="M00 at normal incidence that is assumed.")] = 0.5,
+) -> None:
+    """Recommend the illumination of a Stokes capture from the standard error of xi0 that it predicts."""
+    from processing.console import progress_bar
+    from processing.errors import ProcessError
+    from processing.geometry.viewing import ViewingGeometry
+    from processing.instrument import InstrumentModel
+    from processing.reflectance.base import load_reflectance
+    from processing.reflectance_figures import stokes_design_figure
+    from processing.stokes_design import Assumptions, linear_states, predict
+
+    if not stokes:
+        raise ProcessError("only --stokes is designed here; `acquire --dry-run` scores a table of Mueller states.")
+    view, model, instrument = ViewingGeometry.load(geometry), load_reflectance(material), InstrumentModel.load(camera)
+    given = Assumptions(xi0=xi0, albedo=albedo, electrons=electrons)
+    ranked = {}
+    for nm in model.wavelengths_nm:
+        with progress_bar(f"{nm:g} nm", "angles") as tick:
+            ranked[nm] = predict(view, model, nm, instrument, linear_states(), assumptions=given, progress=tick)
+        typer.echo(f"{nm:g} nm   standard error of xi0 over the object and Omega 20 to 90 degrees")
+        for p in ranked[nm]:
+            worst = int(p.median.argmax())
+            typer.echo(
+                f"  {p.name:>16}: rms {p.score:.4f}, median at worst {p.median[worst]:.4f} (Omega "
+                f"{p.omega_deg[worst]:g}), pixels lost there {100 * p.lost[worst]:.0f} %"
+            )
+        typer.echo(f"  recommended: {ranked[nm][0].name}")
+    stokes_design_figure(ranked).savefig(figure, dpi=150)
+    typer.echo(str(figure))
+
+
+def fit_material_command(
+    sources: Annotated[list[Path], typer.Argument(help="Products of `process reduce`, one kind, one wavelength.")],
+    geometry: Annotated[Path, typer.Option(help="Geometry file: camera, source, shape.")],
+    out: Annotated[Path, typer.Option(help="Material file (YAML) to write.")],
+    name: Annotated[str, typer.Option(help="Name of the material.")] = "fitted material",
+) -> None:
+    """Fit n + i k, a and b to Mueller images, or to linear Stokes images by maximum linear correlation."""
+    from processing.material_fit import NAMES
+    from processing.material_fit_images import fit_products
+    from processing.yaml_file import dump_yaml
+
+    fit, nm, simulated = fit_products(sources, geometry)
+    if simulated:
+        typer.echo("SIMULATED data")
+    for key, value, stderr in zip(NAMES, fit.constants, fit.stderr, strict=True):
+        known = "" if fit.identified[key] else "   NOT IDENTIFIED by these data"
+        typer.echo(f"  {key} = {value:.5g} +- {stderr:.2g}{known}")
+    typer.echo(f"  condition number of the fit: {fit.condition:.3g}, pixels: {fit.pixels}")
+    typer.echo(f"  residual over polarized signal: {100 * fit.residual:.2f} %")
+    if fit.correlation == fit.correlation:
+        typer.echo(f"  mean linear correlation: {fit.correlation:.4f}")
+    out.write_text(dump_yaml(fit.model(name, nm)), encoding="utf-8")
+    typer.echo(str(out))
+
+
+def extrapolate_command(
+    source: Annotated[Path, typer.Argument(help="Stokes capture, or its product of `process reduce`.")],
+    geometry: Annotated[Path, typer.Option(help="Geometry file: camera, source, shape.")],
+    material: Annotated[Path, typer.Option(help="Material file: the dominant process.")],
+    out: Annotated[Path | None, typer.Option(help="Product file; default: beside the source.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
+) -> None:
+    """A full Mueller image from a linear Stokes capture: TD model with the estimated xi0 and M00."""
+    from processing.commands.reduce import reduced, summary
+    from processing.extrapolation import extrapolate_mueller
+    from processing.product import Product, Step, file_identity
+
+    product = reduced(source, None)
+    target = out or product.with_name(product.name.removesuffix(".h5").rsplit(".", 1)[0] + ".extrapolated.h5")
+    with Product(product) as opened:
+        simulated = opened.simulated
+    given = {"source": product.name, "geometry": str(geometry), "material": str(material)}
+    step = Step("extrapolate", given, tuple(file_identity(p) for p in (product, geometry, material)))
+    summary(target, extrapolate_mueller(product, geometry, material, target, step, overwrite), simulated)

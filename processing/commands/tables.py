@@ -1,0 +1,75 @@
+"""`process table`: tables over scattering geometry, their comparison, and the renderer's file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    app.command("table")(table_command)
+    app.command("export-pbsdf")(export_command)
+    app.command("import-pbsdf")(import_command)
+
+
+def table_command(
+    sources: Annotated[list[Path], typer.Argument(help="Mueller or xi0 products of one wavelength.")],
+    geometry: Annotated[Path, typer.Option(help="Geometry file: camera, source, shape.")],
+    out: Annotated[Path, typer.Option(help="Table file (HDF5) to write.")],
+    layout: Annotated[str, typer.Option(help="Bins: degree (1 degree each) or renderer.")] = "degree",
+    append: Annotated[bool, typer.Option("--append", help="Add to the table if it exists.")] = False,
+) -> None:
+    """Mean, variance and count over theta_h, theta_d, phi_d from any number of images."""
+    from processing.console import progress_bar
+    from processing.errors import ProcessError
+    from processing.table_images import tabulate
+    from processing.tables import ScatteringTable
+
+    if layout not in ("degree", "renderer"):
+        raise ProcessError(f"--layout {layout!r}: there are degree and renderer")
+    table = ScatteringTable.load(out) if append and out.exists() else None
+    with progress_bar("table", "images") as tick:
+        table = tabulate(sources, geometry, "renderer" if layout == "renderer" else "degree", table, tick)
+    table.save(out)
+    if table.simulated:
+        typer.echo("SIMULATED data")
+    typer.echo(f"  {', '.join(table.quantities[:4])}{' ...' if len(table.quantities) > 4 else ''}")
+    typer.echo(f"  bins filled: {table.bins.size} of {91 * 91 * 360}, samples: {int(table.count.sum())}")
+    typer.echo(str(out))
+
+
+def export_command(
+    tables: Annotated[list[Path], typer.Argument(help="Mueller tables in the renderer layout, one a wavelength.")],
+    out: Annotated[Path, typer.Option(help="Renderer file (.pbsdf) to write; about 1 GB.")],
+    white_m00: Annotated[float, typer.Option(help="M00 of a perfect white surface at normal incidence.")] = 1.0,
+    keep_gaps: Annotated[bool, typer.Option("--keep-gaps", help="Leave empty bins black.")] = False,
+) -> None:
+    """Write tables as a Mitsuba .pbsdf."""
+    from processing.pbsdf import export
+    from processing.tables import ScatteringTable
+
+    missing = export([ScatteringTable.load(p) for p in tables], out, white_m00, "nan" if keep_gaps else "nearest")
+    filled = "left black" if keep_gaps else "filled with the nearest bin"
+    typer.echo(f"  visible bins without a sample: {100 * missing:.1f} %, {filled}")
+    typer.echo(str(out))
+
+
+def import_command(
+    source: Annotated[Path, typer.Argument(help="Renderer file (.pbsdf).")],
+    wavelength_nm: Annotated[float, typer.Option(help="Which of its wavelengths.")],
+    out: Annotated[Path, typer.Option(help="Table file (HDF5) to write.")],
+) -> None:
+    """Read one wavelength of a Mitsuba .pbsdf into a table."""
+    from processing.errors import ProcessError
+    from processing.pbsdf import load
+
+    found = load(source, only_nm=wavelength_nm)
+    if not found:
+        raise ProcessError(f"{source} has no wavelength {wavelength_nm:g} nm.")
+    table = next(iter(found.values()))
+    table.save(out)
+    typer.echo(f"  bins: {table.bins.size}")
+    typer.echo(str(out))

@@ -1,0 +1,205 @@
+"""A small campaign from simulated captures of both instruments through every command that reflectance has."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from scipy.ndimage import binary_erosion
+
+from processing.campaign import BORDER_PX, PAPER, CampaignResult, find_captures, run_campaign
+from processing.campaign_tasks import CaptureTask, measure
+from processing.errors import ProcessError
+from processing.executors import executor
+from processing.geometry.viewing import ViewingGeometry
+from processing.instrument import InstrumentModel
+from processing.product import Product
+from processing.reflectance.base import load_reflectance
+from processing.tables import ScatteringTable
+from simulators.bench import SimulatedBench
+from simulators.scene import Scene
+from simulators.virtual_capture import write_virtual_capture
+
+ANGLES = (35.0, 60.0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, configs: Path) -> Path:
+    """Both instruments at 662 nm and two arm angles; bright, so that the model and not the noise is seen."""
+    where = tmp_path_factory.mktemp("campaign")
+    scene = Scene.load(configs / "scenes/red_sphere.yaml")
+    for kind, file, size, states in (("drr", "rgb950", 90, 40), ("stokes", "linear_stokes", 180, 4)):
+        instrument = InstrumentModel.load(configs / f"instruments/{file}.yaml")
+        detector = SimulatedBench(scene, instrument, 662).detector.model_copy(
+            update={"full_well_e": 4e6, "gain_e_per_count": 100.0, "bits": 16}
+        )
+        for omega in ANGLES:
+            bench = SimulatedBench(scene, instrument, 662, size, size, detector, flux_e_per_s=1e8, seed=int(omega))
+            write_virtual_capture(where / f"{kind}_{omega:g}.h5", bench, instrument, omega, states=states, darks=2)
+    return where
+
+
+@pytest.fixture(scope="module")
+def here(folder: Path, configs: Path, tmp_path_factory: pytest.TempPathFactory) -> CampaignResult:
+    """The campaign worked out in this process."""
+    files = configs / "geometries/one_inch_sphere.yaml", configs / "materials/red_print.yaml"
+    with executor(1) as pool:
+        return run_campaign(folder, tmp_path_factory.mktemp("here"), *files, pool)
+
+
+@pytest.fixture
+def process(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Runs `process` in this process; exit code, standard output, standard error."""
+    from processing.cli import main
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            main([str(a) for a in arguments])
+        out, err = capsys.readouterr()
+        code = end.value.code
+        return (code if isinstance(code, int) else 0), out, err
+
+    return run
+
+
+def options(configs: Path) -> list[object]:
+    return [
+        "--geometry",
+        configs / "geometries/one_inch_sphere.yaml",
+        "--material",
+        configs / "materials/red_print.yaml",
+    ]
+
+
+def test_campaign_of_a_true_model_has_small_deviations(folder, configs, process):
+    code, out, err = process("campaign", folder, *options(configs))
+    assert code == 0, err
+    assert "SIMULATED" in out
+    assert f"{PAPER[662].psi_deg:.2f}" in out
+    table = (folder / "campaign/campaign.csv").read_text().splitlines()
+    rows = [dict(zip(table[0].split(","), map(float, line.split(",")), strict=True)) for line in table[1:]]
+    assert [r["omega_deg"] for r in rows] == list(ANGLES)
+    for r in rows:
+        assert r["psi_deg"] < 2
+        assert r["magnitude_percent"] < 1.5
+        assert r["xi0_percent"] < 1.0
+        # So small a Mueller image fills only part of the one-degree bins that the Stokes camera sees.
+        assert r["common"] > 0.1
+    assert (folder / "campaign/campaign.png").stat().st_size > 10_000
+
+
+def test_workers_give_the_same_numbers(folder, here, configs, tmp_path):
+    files = configs / "geometries/one_inch_sphere.yaml", configs / "materials/red_print.yaml"
+    task = CaptureTask(str(folder / "drr_35.h5"), "mueller", str(tmp_path), *map(str, files), False, BORDER_PX)
+    with executor(2) as pool:
+        there = pool.submit(measure, task).result()
+    assert there.psi_deg == here.rows[0].psi_deg
+    assert there.magnitude_percent == here.rows[0].magnitude_percent
+
+
+def test_a_cluster_gives_the_same_numbers(folder, here, configs, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    files = configs / "geometries/one_inch_sphere.yaml", configs / "materials/red_print.yaml"
+    # One address on loopback and no dashboard: both would look for a network.
+    settings = {"n_workers": 1, "threads_per_worker": 2, "processes": False, "dashboard_address": None}
+    settings |= {"protocol": "tcp", "host": "127.0.0.1"}
+    with distributed.LocalCluster(**settings) as cluster, executor(scheduler=cluster.scheduler_address) as pool:
+        there = run_campaign(folder, tmp_path, *files, pool)
+    assert here.rows == there.rows
+
+
+def test_no_scheduler_is_a_message(folder, configs, process, monkeypatch):
+    code, _, err = process("campaign", folder, *options(configs), "--scheduler", "nonsense://x")
+    assert code == 2
+    assert "scheduler" in err
+
+
+def test_registering_finds_a_sphere_that_the_geometry_file_misses(folder, configs, process, tmp_path):
+    wrong = tmp_path / "wrong.yaml"
+    text = (configs / "geometries/one_inch_sphere.yaml").read_text()
+    wrong.write_text(text.replace("focal_length_mm: 60", "focal_length_mm: 61.5, centre_px: [1040.0, 1200.0]"))
+    material = configs / "materials/red_print.yaml"
+    with executor(1) as pool:
+        off = run_campaign(folder, tmp_path / "a", wrong, material, pool)
+        found = run_campaign(folder, tmp_path / "b", wrong, material, pool, register=True)
+    for worse, better in zip(off.rows, found.rows, strict=True):
+        assert better.psi_deg < 0.6 * worse.psi_deg
+    product = next((tmp_path / "a").glob("drr_60.mueller.h5"))
+    code, out, err = process("register", product, "--geometry", wrong, "--out", tmp_path / "right.yaml")
+    assert code == 0, err
+    assert "radius" in out
+    # 60 mm is the truth; the start value was 61.5.
+    assert ViewingGeometry.load(tmp_path / "right.yaml").camera.focal_length_mm == pytest.approx(60, abs=0.8)
+
+
+def test_tables_and_material_and_extrapolation(folder, configs, process, tmp_path):
+    geometry = configs / "geometries/one_inch_sphere.yaml"
+    products = []
+    for omega in ANGLES:
+        for kind, name in (("drr", "mueller"), ("stokes", "stokes")):
+            products.append(tmp_path / f"{kind}_{omega:g}.{name}.h5")
+            assert process("reduce", folder / f"{kind}_{omega:g}.h5", "--out", products[-1])[0] == 0
+    mueller, stokes = products[0::2], products[1::2]
+
+    code, _, err = process("table", *mueller, "--geometry", geometry, "--out", tmp_path / "t.h5")
+    assert code == 0, err
+    table = ScatteringTable.load(tmp_path / "t.h5")
+    assert table.simulated
+    assert table.frames == "renderer"
+    assert table.count.sum() > 4000
+    code, _, err = process("table", *mueller, "--geometry", geometry, "--out", tmp_path / "t.h5", "--layout", "odd")
+    assert code == 2
+
+    for sources in (mueller, stokes):
+        target = tmp_path / "fit.yaml"
+        code, _, err = process("fit-material", *sources, "--geometry", geometry, "--out", target)
+        assert code == 0, err
+        fitted = load_reflectance(target).constants[662.0]
+        assert fitted.n == pytest.approx(1.3, abs=0.03)
+        assert fitted.a == pytest.approx(0.17, abs=0.02)
+        assert fitted.b == pytest.approx(2.0, abs=0.1)
+    code, _, err = process("fit-material", *products, "--geometry", geometry, "--out", target)
+    assert code == 2
+    assert "kinds" in err
+
+    code, _, err = process("extrapolate", stokes[0], *options(configs), "--out", tmp_path / "e.h5")
+    assert code == 0, err
+    truth = Scene.load(configs / "scenes/red_sphere.yaml").mueller_image(ANGLES[0], 662, 180, 180)
+    with Product(tmp_path / "e.h5") as product:
+        assert product.simulated
+        m, errors = (np.moveaxis(product.get(n), (0, 1), (-2, -1)) for n in ("mueller", "mueller_errors"))
+        inner = (product.get("valid") > 0) & binary_erosion(truth[..., 0, 0] > 0, iterations=3)
+    counts_per_unit = 1e8 * 0.02 / 100  # flux x exposure / gain
+    pulls = (m - counts_per_unit * truth)[inner] / errors[inner]
+    for i, j in ((0, 0), (0, 1), (1, 1), (2, 2), (3, 3)):
+        assert np.median(np.abs(pulls[:, i, j])) / 0.6745 == pytest.approx(1, abs=0.15)
+
+
+def test_design_recommends_vertical_light(configs, process, tmp_path):
+    camera = configs / "instruments/linear_stokes.yaml"
+    figure = tmp_path / "design.png"
+    code, out, err = process("design", "--stokes", *options(configs), "--camera", camera, "--figure", figure)
+    assert code == 0, err
+    assert out.count("recommended: vertical") == 2
+    assert figure.stat().st_size > 10_000
+    assert process("design", *options(configs), "--camera", camera)[0] == 2
+
+
+def test_what_cannot_be_a_campaign_is_refused(folder, configs, tmp_path):
+    with pytest.raises(ProcessError, match="no capture"):
+        find_captures(tmp_path)
+    for name in ("drr_35.h5", "drr_60.h5"):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    with h5py.File(tmp_path / "drr_60.h5", "r+") as h5:
+        header = json.loads(h5["entry"].attrs["header_json"])
+        h5["entry"].attrs["header_json"] = json.dumps(header | {"simulated": False})
+        h5["entry"].attrs["simulated"] = False
+    with pytest.raises(ProcessError, match="mixes simulated"):
+        find_captures(tmp_path)
+    (tmp_path / "drr_60.h5").write_bytes((folder / "drr_35.h5").read_bytes())
+    files = configs / "geometries/one_inch_sphere.yaml", configs / "materials/red_print.yaml"
+    with executor(1) as pool, pytest.raises(ProcessError, match="are both"):
+        run_campaign(tmp_path, tmp_path / "out", *files, pool)
