@@ -40,7 +40,7 @@ PROGRESS_EVERY_S = 0.2
 
 
 def agreed(read: Callable[[], T]) -> T:
-    """Read a constant until two readings in a row are equal; for protocols without a checksum.
+    """Read a constant until two readings in a row are equal.
 
     Raises
     ------
@@ -185,8 +185,6 @@ class MotionAxis(ABC):
 
     can_stop_a_move: bool = True
     may_move_on_connect: bool = False
-    # Without a checksum on the wire a changed digit looks like a position: read twice, compare.
-    _reply_is_checked: bool = False
     _reads_while_moving: bool = True
 
     def __init__(self, name: str, config: AxisConfig) -> None:
@@ -247,30 +245,33 @@ class MotionAxis(ABC):
         return distance / v + v / a
 
     def read_position(self) -> Position:
-        """Read the position; at rest, where the protocol has no checksum, two readings in a row must agree.
+        """Read the position; at rest, two readings in a row must agree.
+
+        Most protocols have no checksum, so a changed digit looks like a position; Zaber's has eight bits.
 
         Raises
         ------
         ReplyError
             Readings at rest contradict each other.
         """
-        counts = self._do_read_counts()
-        if not self._reply_is_checked:
-            counts = self._confirm(counts)
+        counts = self._confirm(self._do_read_counts())
         return Position(self._to_user_deg(counts / self.counts_per_deg), counts)
 
     def _confirm(self, first: int | float) -> int | float:
         tolerance = self.config.tolerance_deg * abs(self.counts_per_deg)
-        seen = [first]
-        while len(seen) < 5:
+        seen, moving = [first], 0
+        while len(seen) < 6:
             seen.append(self._do_read_counts())
             if seen[-1] == seen[-2]:
                 return seen[-1]
-            if self._do_is_moving():
-                return seen[-1]
             # A servo trembles within the tolerance, and so can a changed last digit: the middle of three is right.
+            middle = sorted(seen[-3:])[1]
             if len(seen) >= 3 and max(seen[-3:]) - min(seen[-3:]) <= tolerance:
-                return sorted(seen[-3:])[1]
+                return middle
+            # In motion readings differ. One reply that says "moving" may itself be the disturbed one.
+            moving = moving + 1 if self._do_is_moving() else 0
+            if moving == 3:
+                return middle
         raise ReplyError(
             f"axis {self.name}, read position",
             f"readings at rest that contradict each other: {seen}",

@@ -154,6 +154,8 @@ class SMC100Axis(MotionAxis):
             )
         self.speed_deg_s = self._constant("VA?")
         self.acceleration_deg_s2 = self._constant("AC?")
+        if min(self.speed_deg_s, self.acceleration_deg_s2) <= 0:
+            raise ReplyError(f"axis {name}, speed", "speed or acceleration is zero", "Set VA and AC of the controller")
         self._device_min_deg = self._constant("SL?")
         self._device_max_deg = self._constant("SR?")
         model, _, firmware = version.rpartition(" ")

@@ -6,6 +6,7 @@ which rejection, and that a rotary position does not wrap at a turn.
 
 from __future__ import annotations
 
+import itertools
 import re
 import time
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from typing import Literal
 from pydantic import Field
 
 from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
-from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
+from drivers.motion import AxisConfig, AxisIdentity, MotionAxis, agreed
 from drivers.serial_link import LineRegistry, SerialLink, Transcript, line_framer
 
 VELOCITY_UNIT = 1.6384  # native velocity per microstep/s (unverified)
@@ -102,7 +103,8 @@ class ZaberLine:
     def __init__(self, port: str, baudrate: int, reply_s: float, transcript: Transcript | None) -> None:
         self.link = SerialLink(port, baudrate, line_framer, transcript=transcript)
         self.reply_s = reply_s
-        self._message_id = 0
+        # A stop from another thread takes an id at the same time: never the same one.
+        self._message_ids = itertools.cycle(range(1, 100))
 
     def close(self) -> None:
         """Close the port."""
@@ -110,8 +112,7 @@ class ZaberLine:
 
     def send(self, address: int, axis: int, words: str) -> int:
         """Write a command and return its message id; takes no lock."""
-        self._message_id = self._message_id % 99 + 1
-        message_id = self._message_id
+        message_id = next(self._message_ids)
         body = f"{address} {axis} {message_id:02d} {words}".rstrip()
         self.link.write(f"/{body}:{checksum(body)}\n".encode("ascii"))
         return message_id
@@ -175,18 +176,20 @@ class ZaberLine:
 class ZaberAxis(MotionAxis):
     """One axis of a Zaber device."""
 
-    _reply_is_checked = True
-
     def __init__(self, name: str, config: Config, line: ZaberLine, lines: LineRegistry) -> None:
         super().__init__(name, config)
         self.config: Config = config
         self._line, self._lines = line, lines
         self._address, serial_number = self._find()
-        turn = config.counts_per_turn or float(self._get("limit.cycle.dist"))
+        turn = config.counts_per_turn or self._constant("limit.cycle.dist")
         self.counts_per_deg = turn / 360.0
-        self.speed_deg_s = float(self._get("maxspeed")) / VELOCITY_UNIT / self.counts_per_deg
-        self.acceleration_deg_s2 = float(self._get("accel")) / ACCELERATION_UNIT / self.counts_per_deg
-        self._home_speed_deg_s = float(self._get("limit.approach.maxspeed")) / VELOCITY_UNIT / self.counts_per_deg
+        self.speed_deg_s = self._constant("maxspeed") / VELOCITY_UNIT / self.counts_per_deg
+        self.acceleration_deg_s2 = self._constant("accel") / ACCELERATION_UNIT / self.counts_per_deg
+        self._home_speed_deg_s = self._constant("limit.approach.maxspeed") / VELOCITY_UNIT / self.counts_per_deg
+        if min(turn, self.speed_deg_s, self.acceleration_deg_s2, self._home_speed_deg_s) <= 0:
+            raise ReplyError(
+                f"axis {name}, turn, speed and acceleration", "one of them is zero", "Restore the defaults"
+            )
         self._device_min_deg = self._limit("limit.min")
         self._device_max_deg = self._limit("limit.max")
         self._identity = AxisIdentity(
@@ -200,7 +203,8 @@ class ZaberAxis(MotionAxis):
 
     def _find(self) -> tuple[int, str]:
         """Return address and serial number of the device that the rig file means."""
-        config, serials = self.config, self._line.ask_all("get system.serial")
+        config = self.config
+        serials = self._line.ask_all("get system.serial") or self._line.ask_all("get system.serial")
         found = {reply.address: reply.data for reply in serials if reply.accepted}
         listed = ", ".join(f"address {address}: serial {serial}" for address, serial in sorted(found.items()))
         asked = f"axis {self.name}, find Zaber device on {config.port}"
@@ -234,8 +238,11 @@ class ZaberAxis(MotionAxis):
             )
         return round(float(data))
 
+    def _constant(self, setting: str) -> int:
+        return agreed(lambda: self._get(setting))
+
     def _limit(self, setting: str) -> float | None:
-        counts = self._get(setting)
+        counts = self._constant(setting)
         return None if abs(counts) >= NO_LIMIT else counts / self.counts_per_deg
 
     def _do_read_counts(self) -> int:

@@ -172,6 +172,7 @@ class ESP301Emulator(Emulator):
 
     def _abort(self) -> None:
         self._waiting.clear()
+        self._wait_for = None
         for stage in self.stages:
             self._stop(stage)
 
