@@ -1,4 +1,4 @@
-"""`process design --stokes` (through `commands.design`), `fit-material`, `extrapolate`: from a model and back to one."""
+"""`process design --stokes` (through `commands.design`), `fit-material`, `extrapolate`: from and to a model."""
 
 from __future__ import annotations
 

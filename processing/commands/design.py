@@ -1,0 +1,150 @@
+"""`process design`: score a table of Mueller states, optimize one, or choose the illumination of a Stokes capture."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from processing.design import Noise, Score
+    from processing.instrument import InstrumentModel
+    from processing.states import StateTable
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    app.command("design")(design_command)
+
+
+def design_command(
+    instrument: Annotated[Path | None, typer.Argument(help="Instrument file of a Mueller polarimeter.")] = None,
+    wavelength: Annotated[float | None, typer.Option(help="Wavelength in nm.")] = None,
+    states: Annotated[str, typer.Option(help="Number of states; several for --optimize: 24,30,40.")] = "40",
+    ratio: Annotated[float, typer.Option(help="Analyzer retarder angle over generator retarder angle.")] = 4.91,
+    step: Annotated[float | None, typer.Option(help="Generator step in degrees; default: one turn.")] = None,
+    table: Annotated[
+        Path | None, typer.Option(help="CSV of your own states: a column of degrees for each axis.")
+    ] = None,
+    optimize: Annotated[
+        str | None, typer.Option(help="What may change: retardances, ratio, or both with a comma.")
+    ] = None,
+    electrons: Annotated[
+        float, typer.Option(help="Mean signal of a state, electrons, for the standard errors.")
+    ] = 20_000,
+    read_noise: Annotated[float, typer.Option(help="Read noise, electrons.")] = 3.0,
+    out: Annotated[Path | None, typer.Option(help="Write the table of the (last) design as CSV.")] = None,
+    stokes: Annotated[bool, typer.Option("--stokes", help="Illumination of a linear Stokes capture instead.")] = False,
+    geometry: Annotated[Path | None, typer.Option(help="--stokes: geometry file.")] = None,
+    material: Annotated[Path | None, typer.Option(help="--stokes: material file, the dominant process.")] = None,
+    camera: Annotated[Path | None, typer.Option(help="--stokes: instrument file of the Stokes camera.")] = None,
+    figure: Annotated[Path, typer.Option(help="--stokes: figure to draw (PNG).")] = Path("stokes_design.png"),
+    xi0: Annotated[float, typer.Option(min=0.25, max=1, help="--stokes: xi0 that is assumed.")] = 0.4,
+    albedo: Annotated[float, typer.Option(min=0, help="--stokes: M00 at normal incidence that is assumed.")] = 0.5,
+) -> None:
+    """Rank, condition number, equally weighted variance and standard errors of a table, before any motor moves."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from processing.errors import ProcessError
+
+    if stokes:
+        if geometry is None or material is None or camera is None:
+            raise ProcessError("--stokes needs --geometry FILE, --material FILE and --camera FILE")
+        from processing.commands.reflectance import design_command as design_stokes
+
+        design_stokes(geometry, material, camera, True, figure, electrons, xi0, albedo)
+        return
+    if instrument is None:
+        raise ProcessError("give an instrument file, for instance configs/instruments/rgb950.yaml (or --stokes)")
+    from processing.design import Noise, score
+    from processing.instrument import InstrumentModel
+
+    model = InstrumentModel.load(instrument)
+    if wavelength is None and model.wavelengths_nm and len(model.wavelengths_nm) > 1:
+        known = ", ".join(f"{nm:g}" for nm in model.wavelengths_nm)
+        raise ProcessError(f"{instrument} is given at {known} nm: choose one with --wavelength")
+    nm = wavelength if wavelength is not None else (model.wavelengths_nm or (0.0,))[0]
+    model = model.at(nm) if nm else model
+    noise = Noise(electrons, read_noise)
+    counts = _counts(states)
+    if optimize is not None:
+        chosen = _optimized(model, noise, counts, optimize, ratio)
+    else:
+        chosen = _given(model, counts, ratio, step, table)
+        _show(f"{model.name}, {nm:g} nm, {len(chosen)} states", score(model.rows(chosen.angles_deg), noise), noise)
+    if out is not None:
+        _write(chosen, out)
+        typer.echo(str(out))
+
+
+def _counts(text: str) -> list[int]:
+    from processing.errors import ProcessError
+
+    try:
+        found = [int(part) for part in text.split(",")]
+    except ValueError as error:
+        raise ProcessError(f"--states {text!r}: give whole numbers, for instance 40 or 24,30,40") from error
+    if min(found) < 1:
+        raise ProcessError(f"--states {text!r}: a table has at least one state")
+    return found
+
+
+def _given(
+    model: InstrumentModel, counts: list[int], ratio: float, step: float | None, table: Path | None
+) -> StateTable:
+    from processing.design import read_table, two_retarders
+    from processing.states import rotating_retarders
+
+    if table is not None:
+        return read_table(table, model.axes)
+    generator, analyzer = two_retarders(model)
+    axes = (str(generator.axis), str(analyzer.axis))
+    return rotating_retarders(1.0, counts[0], step if step is not None else 360 / counts[0], ratio, axes=axes)
+
+
+def _optimized(model: InstrumentModel, noise: Noise, counts: list[int], free: str, ratio: float) -> StateTable:
+    from processing.console import progress_bar
+    from processing.design import optimize, two_retarders
+    from processing.errors import ProcessError
+
+    names = {name.strip() for name in free.split(",")}
+    if not names <= {"retardances", "ratio"}:
+        raise ProcessError(f"--optimize {free!r}: what may change is retardances, ratio, or retardances,ratio")
+    with progress_bar("optimizing", "ratios") as tick:
+        designs = optimize(model, noise, counts, dict.fromkeys(names, True), ratio, tick)
+    for d in designs:
+        title = (
+            f"{d.states} states, ratio {d.ratio:g}, retardances {d.generator_retardance_deg:.1f} (generator) and "
+            f"{d.analyzer_retardance_deg:.1f} degrees (analyzer)"
+        )
+        _show(title, d.score, noise)
+    generator, analyzer = two_retarders(model)
+    return designs[-1].table((str(generator.axis), str(analyzer.axis)))
+
+
+def _show(title: str, found: Score, noise: Noise) -> None:
+    typer.echo(title)
+    typer.echo(f"  rank {found.rank} of 16, condition number {found.condition_number:.4g}")
+    typer.echo(
+        f"  equally weighted variance {found.equally_weighted_variance:.4g}; the bound for {found.intensities} "
+        f"intensities is {found.bound:.4g}"
+    )
+    if found.rank < 16:
+        typer.echo(
+            "  these states do not determine a Mueller matrix: take another ratio, or steps that are less regular"
+        )
+        return
+    typer.echo(
+        f"  standard errors of m_ij / m00, an ideal depolarizer at {noise.electrons:g} electrons a state, read noise "
+        f"{noise.read_noise_e:g}:"
+    )
+    for row in found.element_stderr:
+        typer.echo("    " + "  ".join(f"{value:.5f}" for value in row))
+
+
+def _write(table: StateTable, path: Path) -> None:
+    names = list(table.angles_deg)
+    lines = [",".join(names)]
+    lines += [",".join(f"{table.angles_deg[name][k]:.6f}" for name in names) for k in range(len(table))]
+    path.write_text("\n".join(lines) + "\n")
