@@ -52,6 +52,8 @@ class ZaberDevice:
     settings: dict[str, str] = field(default_factory=dict)
     interrupted: bool = False
     alerts_for: int | None = None
+    # Flags that a test raises: FS stalled, WT hot, ...
+    extra_flags: list[str] = field(default_factory=list)
 
     @property
     def per_deg(self) -> float:
@@ -64,7 +66,7 @@ class ZaberDevice:
 
     def flags(self) -> list[str]:
         """Warning flags, the gravest first."""
-        return ["WR"] * (not self.axis.homed) + ["NI"] * self.interrupted
+        return sorted(self.extra_flags) + ["WR"] * (not self.axis.homed) + ["NI"] * self.interrupted
 
     def position(self) -> int:
         """Position as `get pos` tells it."""
