@@ -70,7 +70,6 @@ class CaptureWriter:
         self._queue: queue.Queue[StateRecord | None] = queue.Queue(maxsize=2)
         self._error: BaseException | None = None
         self._closed = False
-        self.written: list[int] = []
         self._thread = threading.Thread(target=self._work, name="capture writer", daemon=True)
         self._thread.start()
 
@@ -132,6 +131,22 @@ class CaptureWriter:
         self._raise_error()
         self._queue.put(record)
 
+    def set_exposure(self, exposure_s: NDArray[np.float64]) -> None:
+        """Write the exposure of every state; NaN while it is not known. No state may be waiting."""
+        self._drain()
+        self._h5["entry/states/exposure_s"][...] = exposure_s
+        self._h5.flush()
+
+    def forget(self) -> None:
+        """Mark every state as not done."""
+        self._drain()
+        self._h5["entry/states/done"][...] = 0
+        self._h5.flush()
+
+    def _drain(self) -> None:
+        self._queue.join()
+        self._raise_error()
+
     def seal(self, status: Status, closing: Mapping[str, Any], *, keep_partial: bool = False) -> Path:
         """Write what waits, the closing record and the status; give the file its final name.
 
@@ -184,13 +199,14 @@ class CaptureWriter:
 
     def _work(self) -> None:
         while (record := self._queue.get()) is not None:
-            if self._error is not None:
-                continue
             try:
-                self._write(record)
+                if self._error is None:
+                    self._write(record)
             except (OSError, RuntimeError, ValueError, TypeError) as error:
                 # Raised again in the measuring thread by put() or seal().
                 self._error = error
+            finally:
+                self._queue.task_done()
 
     def _write(self, record: StateRecord) -> None:
         h5, k = self._h5, record.state
@@ -208,7 +224,6 @@ class CaptureWriter:
         h5.flush()
         h5["entry/states/done"][k] = 1
         h5.flush()
-        self.written.append(k)
 
 
 def _try_room(path: Path, needed: int) -> None:

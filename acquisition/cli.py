@@ -46,13 +46,14 @@ def capture(
     seed: Annotated[int | None, typer.Option(help="of the simulated noise")] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="check everything, move nothing")] = False,
     home: Annotated[bool, typer.Option("--home", help="home axes that have no reference")] = False,
+    campaign: Annotated[Path | None, typer.Option(help="campaign file: run what is missing of it")] = None,
     resume: Annotated[Path | None, typer.Option(help="go on with this partial capture")] = None,
     yes: Annotated[bool, typer.Option("--yes", help="answer every question with yes")] = False,
 ) -> None:
     """Take a capture: `acquire --omega 35`."""
     if context.invoked_subcommand is not None:
         return
-    if omega is None and plan is None and resume is None:
+    if omega is None and plan is None and resume is None and campaign is None:
         typer.echo(context.get_help())
         raise typer.Exit(2)
     from acquisition import single
@@ -60,7 +61,11 @@ def capture(
     options = single.Options(
         omega, mode, wavelength, sample, exposure, rig, plan, out, seed, dry_run, home, resume, yes
     )
-    raise typer.Exit(_stoppable(lambda stop: single.run(options, stop)))
+    if campaign is None:
+        raise typer.Exit(_stoppable(lambda stop: single.run(options, stop)))
+    from acquisition import campaign_command
+
+    raise typer.Exit(_stoppable(lambda stop: campaign_command.run(options, campaign, stop)))
 
 
 def _stoppable(action: Callable[[StopRequest], int]) -> int:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from acquisition.job import Job
 from acquisition.rig import Rig
-from acquisition.session import Job
 
 #: Seconds that a frame takes to arrive and be written, where nothing overlaps it.
 FRAME_S = 0.05

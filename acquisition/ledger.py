@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Literal
 
-Entry = Literal["moving", "settling", "exposure", "transfer", "interlock", "operator", "shutter", "writing"]
+Entry = Literal["moving", "settling", "exposure", "transfer", "interlock", "operator", "shutter", "writing", "probing"]
 
 
 class TimeLedger:

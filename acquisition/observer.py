@@ -29,6 +29,9 @@ class StateReport:
 class Observer:
     """Hears what happens; every method may be left as it is. It must return at once and never raise."""
 
+    def campaign_progress(self, number: int, total: int, name: str) -> None:
+        """A campaign comes to its capture `number`, counted from 0."""
+
     def run_started(self, title: str, table: StateTable, pending: int) -> None:
         """A capture begins with so many states to take."""
 

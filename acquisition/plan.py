@@ -107,6 +107,9 @@ class MeasurementPlan(_Part):
     repeats: int = Field(default=1, ge=1, le=1000)
     darks: int = Field(default=4, ge=0, le=1000)
     bracket: tuple[Annotated[float, Field(gt=0)], ...] = (1.0,)
+    role: Literal["flat", "air", "sample"] | None = Field(
+        default=None, description="of the light states; default air for the sample air, else sample"
+    )
     continue_after_interlock: bool = False
 
     @model_validator(mode="after")
@@ -141,7 +144,7 @@ class MeasurementPlan(_Part):
         n, darks = self.states.states, self.darks
         columns = {name: np.full(n, float(angle)) for name, angle in pose_deg.items() if name not in turning} | turning
         dark: Role = "dark"
-        role: tuple[Role, ...] = (dark,) * darks + (_sample_role(self.sample),) * n
+        role: tuple[Role, ...] = (dark,) * darks + (self.role or _sample_role(self.sample),) * n
         return StateTable(
             angles_deg={k: np.concatenate([np.full(darks, column[0]), column]) for k, column in columns.items()},
             exposure_s=np.full(darks + n, exposure_s),

@@ -28,7 +28,7 @@ class ConsoleProgress(Observer):
         self._warned: set[str] = set()
 
     def run_started(self, title: str, table: StateTable, pending: int) -> None:
-        self._total, self._pending = len(table), pending
+        self._done, self._total, self._pending = 0, len(table), pending
         self._start_s = time.monotonic()
         self._console.print(f"{title}: {pending} states" + (f" of {len(table)}" if pending < len(table) else ""))
         if self._console.is_terminal:

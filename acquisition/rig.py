@@ -3,26 +3,36 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
+
+import numpy as np
 
 from acquisition.cleanup import Step, run_all
 from acquisition.errors import AcquisitionError
 from acquisition.forbidden import describe, find_forbidden
 from acquisition.rig_config import RigConfig
 from drivers.camera import Camera, CameraSettings
-from drivers.errors import MotionFailed
+from drivers.errors import LimitError, MotionFailed
 from drivers.motion import Motion, MotionAxis, Position
 from drivers.registry import open_axis
 from drivers.serial_link import LineRegistry
 from drivers.source import LightSource
+from processing.states import StateTable
 from simulators.rig import SimulatedRig
 from simulators.rig_model import SCHEME
 
 log = logging.getLogger(__name__)
+
+#: An endless axis unwinds once it has come this far: position counters are not endless.
+ENDLESS_UP_TO_DEG = 36_000.0
+#: Longest wait for moves that were started and given up.
+REST_WITHIN_S = 60.0
 
 
 class Rig:
@@ -42,6 +52,8 @@ class Rig:
         self.camera: Camera | None = None
         self.source: LightSource | None = None
         self.simulation: SimulatedRig | None = None
+        self._asked: CameraSettings | None = None
+        self._read_back = CameraSettings()
         self._with_camera = with_camera
         self._lines = LineRegistry(transcripts)
 
@@ -107,8 +119,39 @@ class Rig:
     def move(
         self, targets_deg: Mapping[str, float], wait: Callable[[Mapping[str, Motion]], None] | None = None
     ) -> dict[str, Position]:
-        """Move axes at the same time and wait; returns the positions read back at rest."""
+        """Move axes at the same time and wait; returns the positions read back at rest.
+
+        An axis with backlash comes to its target from below, if its limits leave room for that.
+        """
+        below = {}
+        for name, slack in self.config.backlash_deg.items():
+            if name in targets_deg and targets_deg[name] < self.axes[name].read_position().deg - 1e-6:
+                below[name] = targets_deg[name] - slack
+        if below and self._allowed(below):
+            self._wait(self.start_moves(dict(targets_deg) | below), wait)
         return self._wait(self.start_moves(targets_deg), wait)
+
+    def _allowed(self, targets_deg: Mapping[str, float]) -> bool:
+        try:
+            for name, target in targets_deg.items():
+                self.axes[name].check(target)
+            self._check_way(targets_deg)
+        except (LimitError, AcquisitionError):
+            return False
+        return True
+
+    def unwound(self, table: StateTable) -> StateTable:
+        """The table with endless axes moved on by whole turns, so that they need not unwind and never turn back."""
+        angles = dict(table.angles_deg)
+        for name in self.config.endless:
+            axis = self.axes[name]
+            free = axis.limits.min_deg is None and axis.limits.max_deg is None
+            if free and name in angles and np.ptp(angles[name]) > 0 and axis.is_homed():
+                here = axis.read_position().deg
+                turns = math.ceil((here - 1e-3 - float(angles[name].min())) / 360.0)
+                if turns > 0 and here < ENDLESS_UP_TO_DEG:
+                    angles[name] = angles[name] + 360.0 * turns
+        return replace(table, angles_deg=angles)
 
     def start_moves(self, targets_deg: Mapping[str, float]) -> dict[str, Motion]:
         """Start axes at the same time; those that stand within a count of their target are started too."""
@@ -169,6 +212,16 @@ class Rig:
             raise
         return {name: positions[name] for name in motions}
 
+    def rest(self) -> None:
+        """Wait until no axis moves, for moves that nobody waits for any more."""
+        for axis in self.axes.values():
+            end_s = time.monotonic() + REST_WITHIN_S
+            while axis.is_moving():
+                if time.monotonic() > end_s:
+                    self.stop()
+                    raise AcquisitionError(f"axis {axis.name} still moves after {REST_WITHIN_S:g} s; it was stopped")
+                time.sleep(axis.config.poll_s)
+
     def positions(self) -> dict[str, Position]:
         """Positions of all axes, read now."""
         return {name: axis.read_position() for name, axis in self.axes.items()}
@@ -185,9 +238,13 @@ class Rig:
     # --- the rest ----------------------------------------------------------------------------------------
 
     def set_exposure(self, exposure_s: float, repeats: int) -> CameraSettings:
-        """Set exposure and averaging; returns the camera's settings as read back."""
-        settings = CameraSettings(exposure_s=exposure_s, frame_average=repeats, trigger="software")
-        return self.require_camera().configure(settings)
+        """Set exposure and averaging, unless they are set so already; returns the settings as read back."""
+        asked = CameraSettings(exposure_s=exposure_s, frame_average=repeats, trigger="software")
+        if self._asked != asked:
+            self._asked = None
+            self._read_back = self.require_camera().configure(asked)
+            self._asked = asked
+        return self._read_back
 
     def require_camera(self) -> Camera:
         """The camera; AcquisitionError if the rig was opened without."""

@@ -85,6 +85,12 @@ class RigConfig(_Part):
     home_at_start: bool = Field(default=False, description="home axes without a reference before the first move")
     home_order: tuple[str, ...] = ()
     park_deg: dict[str, float] = {}
+    endless: tuple[str, ...] = Field(
+        default=(), description="axes that may go on to the next turn instead of unwinding between captures"
+    )
+    backlash_deg: dict[str, Annotated[float, Field(ge=0)]] = Field(
+        default={}, description="a downward move of the axis goes this far beyond its target and comes back up"
+    )
     settle_s: float = Field(default=0.02, ge=0, description="wait after the last axis is idle")
     exposure_s: tuple[float, float] = Field(default=(1e-5, 10.0), description="shortest and longest exposure")
     retakes: int = Field(default=3, ge=0, description="tries again for a state whose frame is incomplete")

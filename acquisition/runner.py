@@ -10,27 +10,36 @@ import logging
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from acquisition.capture_writer import CaptureWriter, StateRecord
 from acquisition.errors import RunFailed
+from acquisition.exposure import find_exposure
 from acquisition.interlocks import Interlocks
 from acquisition.ledger import TimeLedger
 from acquisition.observer import Observer, StateReport
+from acquisition.plan import AutoExposure
 from acquisition.rig import Rig
 from acquisition.stop_request import StopRequest
 from drivers.camera import Exposure, Frame
 from drivers.errors import FrameLost
 from drivers.motion import Position
 from processing.capture_schema import Detector
+from processing.instrument import InstrumentModel
 from processing.states import StateTable
 
 log = logging.getLogger(__name__)
 
+#: Factor on the exposure after a saturated state.
+DARKER = 0.6
 #: A pixel below this part of full scale, above the black level, counts as near-black.
 NEAR_BLACK = 0.01
+
+
+class TooBright(RunFailed):
+    """A state saturated at an exposure that was found automatically: begin again with a shorter one."""
 
 
 @dataclass
@@ -68,6 +77,7 @@ class CaptureRunner:
     writer : open partial file.
     detector : for the black level and full scale of the statistics.
     observers : told of everything; the simulated bench is one of them.
+    saturation_limit : fraction of saturated pixels from which a state raises TooBright; None never.
     """
 
     def __init__(
@@ -79,6 +89,7 @@ class CaptureRunner:
         stop: StopRequest,
         observers: Sequence[Observer] = (),
         continue_after_interlock: bool = False,
+        saturation_limit: float | None = None,
     ) -> None:
         self.rig = rig
         self.table = table
@@ -94,6 +105,7 @@ class CaptureRunner:
         self._retakes: dict[int, int] = {}
         self._pending: deque[int] = deque()
         self._full_scale = rig.require_camera().full_scale
+        self._saturation_limit = saturation_limit
 
     def run(self, pending: Iterable[int]) -> bool:
         """Take these states; True if all are done, False if a stop was asked for.
@@ -106,6 +118,8 @@ class CaptureRunner:
             A device or the disc failed; every axis has been sent a stop.
         """
         self._pending = deque(pending)
+        self._here.clear()
+        self._retakes.clear()
         exposed: _Exposed | None = None
         try:
             while self._pending and not self.stop.requested:
@@ -117,12 +131,37 @@ class CaptureRunner:
                     exposed = None
             if exposed is not None:
                 self._collect(exposed)
+        except TooBright:
+            self.rig.rest()
+            raise
         except BaseException as error:
             failure = self.rig.stop()
             if failure is not None:
                 error.add_note(f"stopping the axes failed too: {failure}")
             raise
         return not self._pending
+
+    def find_exposure(self, instrument: InstrumentModel, sample: str, auto: AutoExposure) -> None:
+        """Probe the brightest states and take the exposure that they ask for. Moves the axes, lights the sample."""
+        for observer in self.observers:
+            observer.activity("looking for the exposure")
+        with self.ledger.time("probing"):
+            found_s = find_exposure(self.rig, self.table, instrument, sample, auto, self.observers, self.warn)
+        self._light = None
+        self._set_exposure(found_s)
+
+    def start_darker(self, why: str) -> None:
+        """Forget the states taken and go on with a shorter exposure."""
+        self.warn(f"{why}; beginning again at {DARKER:g} of the exposure")
+        self.writer.forget()
+        self.ledger.states = 0
+        self._set_exposure(float(f"{DARKER * self.table.exposure_s[0]:.3g}"))
+
+    def _set_exposure(self, exposure_s: float) -> None:
+        self.table = replace(self.table, exposure_s=np.full(len(self.table), exposure_s))
+        self.rig.set_exposure(exposure_s, int(self.table.repeats[0]))
+        self.writer.set_exposure(self.table.exposure_s)
+        self.messages.add(f"exposure {exposure_s:g} s")
 
     def warn(self, text: str) -> None:
         """Keep a warning for the closing record and tell the observers."""
@@ -181,6 +220,10 @@ class CaptureRunner:
                 self._again(exposed.state, error)
                 return
         report = self._report(exposed, frame)
+        if self._saturation_limit is not None and report.saturated_fraction > self._saturation_limit:
+            raise TooBright(
+                f"state {exposed.state}: {100 * report.saturated_fraction:.2f} % of the pixels are saturated"
+            )
         blocked = self.interlocks.judge(report)
         if blocked is not None:
             self._discard(exposed.state, blocked)

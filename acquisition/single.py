@@ -13,6 +13,8 @@ from acquisition import session
 from acquisition.checks import Check, refuse_failed
 from acquisition.cli import CONFIGS, DEFAULT_RIG, INTERRUPTED
 from acquisition.estimate import capture_seconds
+from acquisition.header import default_name
+from acquisition.job import Job, Result, check_with_devices, job_of, prepare
 from acquisition.plan import MeasurementPlan
 from acquisition.progress import ConsoleProgress
 from acquisition.rig import Rig
@@ -45,15 +47,14 @@ def run(options: Options, stop: StopRequest) -> int:
     """Take or go on with one capture; returns the exit code. Raises the errors that `main` prints."""
     console = Console(stderr=True)
     if options.resume is not None:
-        job = session.job_of(options.resume, load_rig(options.rig) if options.rig else None)
+        job = job_of(options.resume, load_rig(options.rig) if options.rig else None)
         path = options.resume
     else:
-        job = session.prepare(plan_of(options), rig_of(options))
-        path = options.out / session.default_name(job)
-    if job.rig.simulated:
-        console.print(f"SIMULATED: rig {job.rig.name!r}, emulated devices, no hardware", style="bold red")
+        job = prepare(plan_of(options), rig_of(options))
+        path = options.out / default_name(job.plan)
+    say_simulated(console, job.rig)
     with Rig(job.rig) as rig:
-        checks = session.check_with_devices(job, rig, path.parent)
+        checks = check_with_devices(job, rig, path.parent)
         if options.dry_run:
             show_checks(Console(), (*job.checks, *checks))
             refuse_failed(checks)
@@ -91,13 +92,23 @@ def sample_of(name: str) -> Sample:
 
 
 def rig_of(options: Options) -> RigConfig:
-    """The rig file, or the simulated rig; `--seed` sets the seed of its noise."""
-    rig = load_rig(options.rig or DEFAULT_RIG)
-    if options.seed is not None:
-        if rig.simulator is None:
-            raise ConfigError(f"--seed {options.seed}: rig {rig.name!r} is not simulated, its noise has no seed")
-        rig = rig.model_copy(update={"simulator": rig.simulator.model_copy(update={"seed": options.seed})})
-    return rig
+    """The rig file, or the simulated rig."""
+    return seeded(load_rig(options.rig or DEFAULT_RIG), options.seed)
+
+
+def seeded(rig: RigConfig, seed: int | None) -> RigConfig:
+    """The rig with another seed of its simulated noise. Raises ConfigError for a real rig."""
+    if seed is None:
+        return rig
+    if rig.simulator is None:
+        raise ConfigError(f"--seed {seed}: rig {rig.name!r} has no simulator, its noise has no seed")
+    return rig.model_copy(update={"simulator": rig.simulator.model_copy(update={"seed": seed})})
+
+
+def say_simulated(console: Console, rig: RigConfig) -> None:
+    """Say on the console that nothing of this is a measurement."""
+    if rig.simulated:
+        console.print(f"SIMULATED: rig {rig.name!r}, emulated devices, no hardware", style="bold red", highlight=False)
 
 
 def show_checks(console: Console, checks: tuple[Check, ...]) -> None:
@@ -108,7 +119,7 @@ def show_checks(console: Console, checks: tuple[Check, ...]) -> None:
     console.print(table)
 
 
-def summarize(job: session.Job, result: session.Result) -> None:
+def summarize(job: Job, result: Result) -> None:
     """Draw the quick look and print one screen."""
     from acquisition.quicklook import draw
 
@@ -123,7 +134,7 @@ def summarize(job: session.Job, result: session.Result) -> None:
         ("angles", f"read back at every state, at most {result.worst_angle_deg:.4f} deg from the target"),
         ("saturation", f"worst state {100 * result.saturated_fraction:.3f} % of pixels"),
         ("seconds", ", ".join(parts)),
-        *(("warning", message) for message in result.messages[-5:]),
+        *(("note", message) for message in result.messages[-5:]),
         ("figure", str(figure)),
         ("capture", str(result.path)),
         ("next", next_command(job, result)),
@@ -132,7 +143,7 @@ def summarize(job: session.Job, result: session.Result) -> None:
         typer.echo(f"{label:<11} {text}")
 
 
-def next_command(job: session.Job, result: session.Result) -> str:
+def next_command(job: Job, result: Result) -> str:
     """What to do with the file now."""
     if result.status != "complete":
         return f"acquire --resume {result.path}"

@@ -82,6 +82,10 @@ class Capture:
         """A column of the state table for all planned states, done or not."""
         return np.asarray(self._h5[f"entry/states/{name}"][...])
 
+    def planned_targets_deg(self) -> dict[str, NDArray[np.float64]]:
+        """Target angles of each axis for all planned states, done or not."""
+        return {name: self._h5[f"entry/instrument/{name}/target_value"][...] for name in self.angles_deg}
+
     @property
     def frame_shape(self) -> tuple[int, int]:
         """(rows, columns) of one frame."""

@@ -128,6 +128,7 @@ def run_with(quick_rig: Callable[..., Path], tmp_path: Path) -> Callable[..., tu
     """
     from acquisition import session
     from acquisition.errors import AcquisitionError
+    from acquisition.job import check_with_devices, prepare
     from acquisition.observer import Observer
     from acquisition.plan import MeasurementPlan
     from acquisition.rig import Rig
@@ -146,7 +147,7 @@ def run_with(quick_rig: Callable[..., Path], tmp_path: Path) -> Callable[..., tu
         **simulator: object,
     ) -> tuple[BaseException | None, Path]:
         config = load_rig(quick_rig(top=top, **simulator))
-        job = session.prepare(MeasurementPlan().with_changes(**(plan or {})), config)
+        job = prepare(MeasurementPlan().with_changes(**(plan or {})), config)
         folder = tmp_path / f"capture{next(numbers)}" if resume is None else resume.parent
         error: BaseException | None = None
         with Rig(config) as rig:
@@ -157,7 +158,7 @@ def run_with(quick_rig: Callable[..., Path], tmp_path: Path) -> Callable[..., tu
 
             watchers = [Act(), *observers]
             try:
-                session.check_with_devices(job, rig, folder)
+                check_with_devices(job, rig, folder)
                 if resume is None:
                     session.take(job, rig, folder / "run.h5", StopRequest(), watchers)
                 else:

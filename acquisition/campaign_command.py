@@ -1,0 +1,78 @@
+"""`acquire --campaign FILE`: check the whole of it, then run what is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from acquisition import campaign_run
+from acquisition.campaign import Campaign
+from acquisition.campaign_log import CampaignFolder
+from acquisition.campaign_run import CampaignRun, Planned
+from acquisition.checks import Check, refuse_failed
+from acquisition.cli import DEFAULT_RIG, INTERRUPTED
+from acquisition.observer import Observer
+from acquisition.operator import Operator
+from acquisition.progress import ConsoleProgress
+from acquisition.rig import Rig
+from acquisition.rig_config import load_rig
+from acquisition.single import Options, say_simulated, seeded, show_checks
+from acquisition.stop_request import StopRequest
+
+
+def run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Observer] = ()) -> int:
+    """Run a campaign or, with --dry-run, only check it; returns the exit code."""
+    console = Console(stderr=True)
+    campaign = Campaign.load(file)
+    rig_config = seeded(load_rig(options.rig or campaign.rig or DEFAULT_RIG), options.seed)
+    jobs = campaign_run.prepare(campaign, rig_config)
+    folder = options.out / campaign.name
+    say_simulated(console, rig_config)
+    with Rig(rig_config) as rig, console.status(f"checking {len(jobs)} captures"):
+        planned, checks = campaign_run.check_all(jobs, rig, folder)
+    if options.dry_run:
+        _show(planned, checks, folder)
+        refuse_failed(checks)
+        return 0
+    refuse_failed(checks)
+    held = CampaignFolder(folder, campaign)
+    try:
+        operator = Operator(console.print, stop, options.yes, rig_config.simulated)
+        watchers = [ConsoleProgress(console), *observers]
+        done = CampaignRun(campaign, rig_config, held, operator, stop, watchers, options.home).run(jobs)
+        complete = sum(entry.get("status") == "complete" for entry in held.index.values())
+    finally:
+        held.close()
+    typer.echo(f"{complete} of {len(jobs)} captures complete in {folder}")
+    typer.echo(f"index {folder / 'index.json'}, log {folder / 'log.jsonl'}")
+    if not done:
+        typer.echo("next: the same command goes on where it stopped")
+    return 0 if done else INTERRUPTED
+
+
+def _show(planned: Sequence[Planned], checks: Sequence[Check], folder: Path) -> None:
+    console = Console(soft_wrap=True)
+    table = Table(box=None)
+    for heading in ("", "capture", "states", "s", "MB", ""):
+        table.add_column(heading, justify="left" if heading in ("", "capture") else "right")
+    for entry in planned:
+        there = (folder / entry.capture.name).exists()
+        table.add_row(
+            str(entry.capture.number),
+            entry.capture.name,
+            str(len(entry.job.table)),
+            f"{entry.seconds:.0f}",
+            f"{entry.size / 1e6:.0f}",
+            "there already" if there else "reference" if entry.capture.reference else "",
+        )
+    console.print(table)
+    show_checks(console, tuple(checks))
+    seconds, size = sum(p.seconds for p in planned), sum(p.size for p in planned)
+    typer.echo(
+        f"{len(planned)} captures, about {seconds / 60:.0f} min without homing, arm and operator, {size / 1e9:.2f} GB; "
+        "nothing was moved"
+    )
