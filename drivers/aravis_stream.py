@@ -68,9 +68,12 @@ class FrameStream:
         if isinstance(self._stream, aravis.GvStream):
             policy = aravis.GvStreamPacketResend
             self._stream.set_property("packet-resend", policy.ALWAYS if resend else policy.NEVER)
+            # As much of a frame as net.core.rmem_max allows, for the moments in which we are not scheduled.
+            self._stream.set_property("socket-buffer", aravis.GvStreamSocketBuffer.AUTO)
             self._stream.set_property("frame-retention", _FRAME_RETENTION_US)
             self._stream.set_property("packet-timeout", _PACKET_TIMEOUT_US)
         self._memory: dict[int, NDArray[np.uint8]] = {}
+        self._unread: Arrival | None = None
         for _ in range(buffers):
             memory = np.zeros(payload_bytes, np.uint8)
             buffer = aravis.Buffer.new(payload_bytes, memory.ctypes.data)
@@ -80,6 +83,9 @@ class FrameStream:
 
     def take(self, timeout_s: float) -> Arrival | None:
         """Wait for the next buffer, at most `timeout_s` (under 0.1 s, so that Ctrl-C gets through); None if none."""
+        unread, self._unread = self._unread, None
+        if unread is not None:
+            return unread
         if timeout_s > 0:
             buffer = self._stream.timeout_pop_buffer(int(min(timeout_s, 0.1) * 1e6))
         else:
@@ -97,13 +103,17 @@ class FrameStream:
             first_packet_s=buffer.get_system_timestamp() * 1e-9,
         )
 
+    def unread(self, arrival: Arrival) -> None:
+        """Let the next `take` return this arrival once more."""
+        self._unread = arrival
+
     def give_back(self, arrival: Arrival) -> None:
         """Let the stream fill this buffer again; its memory must have been copied."""
         self._stream.push_buffer(arrival.buffer)
 
     def has_arrival(self) -> bool:
         """True if a buffer waits to be taken."""
-        return bool(self._stream.get_n_buffers()[1])
+        return self._unread is not None or bool(self._stream.get_n_buffers()[1])
 
     def counters(self) -> dict[str, int]:
         """Aravis' own counters of this stream, 0 where the transport has no such counter."""
@@ -113,5 +123,5 @@ class FrameStream:
     def close(self) -> None:
         """Stop the receiving thread; nothing writes to our memory after that."""
         # Ours is the only reference, so this ends Aravis' thread; an explicit stop would make it complain later.
-        self._stream = None
+        self._stream = self._unread = None
         self._memory.clear()

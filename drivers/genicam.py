@@ -43,6 +43,7 @@ class Features:
         self._glib_error = glib_error
         self._camera = camera
         self._device = camera.get_device()
+        self._is_lost = False
 
     def release(self) -> None:
         """Drop the references to the camera."""
@@ -66,11 +67,12 @@ class Features:
             ) from error
 
     def control_is_lost(self) -> bool:
-        """True once a GigE Vision camera no longer obeys us; Aravis' heartbeat finds that out."""
-        return isinstance(self._device, self._aravis.GvDevice) and not self._device.is_controller()
+        """True once the camera no longer answers or obeys: a command told, or Aravis' heartbeat."""
+        return self._is_lost or (isinstance(self._device, self._aravis.GvDevice) and not self._device.is_controller())
 
     def lost(self, what: str, came_back: str) -> CameraLost:
-        """Make the error for a camera that is gone."""
+        """Make the error for a camera that is gone; from then on it is asked nothing more."""
+        self._is_lost = True
         return CameraLost(
             f"camera {self._name}, {what}",
             f"the camera does not answer or obeys another program ({came_back})",

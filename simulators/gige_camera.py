@@ -134,7 +134,7 @@ class GigeCamera:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.vanish()
+        self.stop()
         if error is None:
             self.check()
 
@@ -169,8 +169,16 @@ class GigeCamera:
         self._library.arv_fake_camera_set_fill_pattern(hash(self._memory), self._callback, None)
         self.lost_ratio = self._lost_ratio
 
+    def stop(self) -> None:
+        """End the camera and let the next one have its address."""
+        self.vanish()
+        self._loopback.release()
+
     def vanish(self) -> None:
-        """End the camera at once, as if its plug was pulled."""
+        """End the camera at once, as if its plug was pulled; `start` plugs it in again.
+
+        The address stays ours until `stop`: a driver that does not know yet must not talk to another camera there.
+        """
         if self._camera is None:
             return
         self._gone.set()
@@ -178,7 +186,6 @@ class GigeCamera:
         self._camera.set_property("gvsp-lost-ratio", 1.0)
         self._library.arv_fake_camera_set_fill_pattern(hash(self._memory), _FillPattern(), None)
         self._camera = self._memory = None
-        self._loopback.release()
 
     def check(self) -> None:
         """Raise the error of the pixel source, if it had one."""

@@ -109,7 +109,7 @@ class SimulatedRig:
     def _stop_camera(self) -> None:
         camera, self.camera = self.camera, None
         if camera is not None:
-            camera.vanish()
+            camera.stop()
             camera.check()
 
     def camera_device(self) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import threading
 import time
 from typing import Any, NoReturn
 
@@ -152,14 +153,14 @@ class AravisCamera(Camera):
             return
         with self._features.asking("stop the stream"):
             self._camera.stop_acquisition()
-        self._close_stream()
+        _let_go([self._forget_stream()])
 
-    def _close_stream(self) -> None:
+    def _forget_stream(self) -> FrameStream | None:
         stream, self._stream = self._stream, None
         if stream is not None:
             for name, count in stream.counters().items():
                 self._counted[name] = self._counted.get(name, 0) + count
-            stream.close()
+        return stream
 
     def _restart(self) -> None:
         """After a frame that never came: stop, drain and start, so that it cannot come later."""
@@ -208,7 +209,11 @@ class AravisCamera(Camera):
         end_s = self._sent_s + self._setup.exposure_s
         self._sleep_until(end_s - max(0.02 * self._setup.exposure_s, 0.001))
         # A frame that is complete before the exposure can have ended is not ours.
-        self._drain()
+        while (arrival := stream.take(0)) is not None:
+            if time.monotonic() > end_s:
+                stream.unread(arrival)
+                break
+            self._throw_away(stream, arrival)
         self._sleep_until(end_s)
         if not self._setup.has_exposure_status:
             self._sleep_until(end_s + self._config.trigger_latency_s)
@@ -354,12 +359,25 @@ class AravisCamera(Camera):
         )
 
     def _do_close(self) -> None:
-        # A camera that is gone makes every command wait for its time-out, so it is asked nothing more.
-        if not self._features.control_is_lost():
+        lost = self._features.control_is_lost()
+        if not lost:
             with contextlib.suppress(CameraError), self._features.asking("stop"):
                 self._camera.stop_acquisition()
-        self._close_stream()
+            lost = self._features.control_is_lost()
         # Control is given up when the last reference goes, and an error's traceback may keep this object.
+        left = [self._forget_stream(), self._camera]
+        self._camera = None
         self._features.release()
         self._setup.release()
-        self._camera = None
+        if lost:
+            # Aravis takes leave with four commands, each of which waits 2.5 s for a camera that is gone.
+            threading.Thread(target=_let_go, args=(left,), name=f"leave camera {self.name}", daemon=True).start()
+        else:
+            _let_go(left)
+
+
+def _let_go(left: list[Any]) -> None:
+    stream = left[0]
+    if stream is not None:
+        stream.close()
+    left.clear()

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from drivers.camera import CameraSettings
 from drivers.cameras import aravis
-from drivers.errors import CameraBusy, CameraLost, FrameLost
+from drivers.errors import CameraBusy, CameraError, CameraLost, FrameLost
 from simulators.gige_camera import ExposureInfo, GigeCamera
 from simulators.pixel_stamp import read_stamp, stamp
 
@@ -175,7 +175,9 @@ def test_a_camera_that_vanishes_is_noticed_and_can_be_opened_again(
     assert time.monotonic() - gone_s < 10
     with pytest.raises(CameraLost):
         camera.capture()
+    closing_s = time.monotonic()
     camera.close()
+    assert time.monotonic() - closing_s < 1
     simulated.start()
     with aravis.open("camera", aravis.Config(device="127.0.0.1", bits=12)) as again:
         again.configure(CameraSettings(exposure_s=1e-3))
@@ -197,6 +199,16 @@ def test_ctrl_c_gets_through_a_long_wait(simulated: GigeCamera) -> None:
         with pytest.raises(KeyboardInterrupt):
             camera.capture()
         assert time.monotonic() - start_s < 3
+
+
+def test_an_address_holds_one_simulated_camera(simulated: GigeCamera) -> None:
+    with pytest.raises(CameraError, match="another camera had it"):
+        GigeCamera("FAULT4", *SIZE, Scene(), wait_s=0.1).start()
+
+
+def test_an_address_that_no_interface_has_is_named() -> None:
+    with pytest.raises(CameraError, match=r"ip addr add 127\.9\.9\.9"):
+        GigeCamera("FAULT5", *SIZE, Scene(), address="127.9.9.9").start()
 
 
 def test_an_error_of_the_pixel_source_is_raised_and_its_frame_not_sent() -> None:
