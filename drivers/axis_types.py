@@ -10,10 +10,15 @@ from pydantic import BaseModel, ConfigDict, Field
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """A position read from an axis: user degrees, and the controller's own number beside it."""
+    """A position read from an axis: user degrees, and the controller's own number beside it.
+
+    A position at rest is confirmed by a second reading; one in motion (`confirmed` False) cannot be, and is for
+    show and for the detection of a stall, not for a record.
+    """
 
     deg: float
     counts: int | float
+    confirmed: bool = True
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,6 @@ import math
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import TypeVar
 
 from drivers.axis_types import AxisConfig, AxisIdentity, Limits, Position
 from drivers.errors import (
@@ -23,10 +21,9 @@ from drivers.errors import (
     ReplyTimeout,
 )
 
-__all__ = ["AxisConfig", "AxisIdentity", "Limits", "Motion", "MotionAxis", "Position", "agreed"]
+__all__ = ["AxisConfig", "AxisIdentity", "Limits", "Motion", "MotionAxis", "Position"]
 
 log = logging.getLogger(__name__)
-T = TypeVar("T")
 
 # A motion may take this many times its computed duration, plus the margin of the axis.
 SLACK = 1.5
@@ -37,22 +34,6 @@ SETTLE_S = 0.3
 ROUNDING_DEG = 1e-6
 # A look at the position while moving, for the detection of a stall.
 PROGRESS_EVERY_S = 0.2
-
-
-def agreed(read: Callable[[], T]) -> T:
-    """Read a constant until two readings in a row are equal.
-
-    Raises
-    ------
-    ReplyError
-        Four readings and no two in a row alike.
-    """
-    seen = [read()]
-    while len(seen) < 4:
-        seen.append(read())
-        if seen[-1] == seen[-2]:
-            return seen[-1]
-    raise ReplyError("read a constant twice", f"readings differ: {seen}", "The line is disturbed: check the cable")
 
 
 class Motion:
@@ -129,6 +110,8 @@ class Motion:
             return
         axis._do_check_fault()
         self._last = axis.read_position()
+        if not self._last.confirmed:
+            return
         if self.target_deg is None:
             short = None if axis.is_homed() else "the axis is idle but has no reference"
         else:
@@ -254,24 +237,25 @@ class MotionAxis(ABC):
         ReplyError
             Readings at rest contradict each other.
         """
-        counts = self._confirm(self._do_read_counts())
-        return Position(self._to_user_deg(counts / self.counts_per_deg), counts)
+        counts, confirmed = self._read_confirmed()
+        return Position(self._to_user_deg(counts / self.counts_per_deg), counts, confirmed)
 
-    def _confirm(self, first: int | float) -> int | float:
+    def _read_confirmed(self) -> tuple[int | float, bool]:
+        """Return the counts, and False if they are those of an axis in motion."""
         tolerance = self.config.tolerance_deg * abs(self.counts_per_deg)
-        seen, moving = [first], 0
+        seen, moving = [self._do_read_counts()], 0
         while len(seen) < 6:
             seen.append(self._do_read_counts())
             if seen[-1] == seen[-2]:
-                return seen[-1]
+                return seen[-1], True
             # A servo trembles within the tolerance, and so can a changed last digit: the middle of three is right.
             middle = sorted(seen[-3:])[1]
             if len(seen) >= 3 and max(seen[-3:]) - min(seen[-3:]) <= tolerance:
-                return middle
+                return middle, True
             # In motion readings differ. One reply that says "moving" may itself be the disturbed one.
             moving = moving + 1 if self._do_is_moving() else 0
             if moving == 3:
-                return middle
+                return middle, False
         raise ReplyError(
             f"axis {self.name}, read position",
             f"readings at rest that contradict each other: {seen}",

@@ -15,7 +15,7 @@ from typing import Any, Protocol, Self, TypeVar
 
 import serial
 
-from drivers.errors import DeviceError, PermissionRefused, PortBusy, PortLost, PortNotFound
+from drivers.errors import DeviceError, PermissionRefused, PortBusy, PortLost, PortNotFound, ReplyError
 
 # A framer takes one whole frame off the front of the buffer, or returns None until there is one.
 Framer = Callable[[bytearray], bytes | None]
@@ -224,6 +224,25 @@ def _ports_hint() -> str:
     by_id = sorted(str(path) for path in Path("/dev/serial/by-id").glob("*"))
     found = ", ".join(names + by_id) or "none"
     return f"Serial ports found: {found}. Correct `port` in the rig file or plug the device in"
+
+
+T = TypeVar("T")
+
+
+def agreed(read: Callable[[], T]) -> T:
+    """Read a constant until two readings in a row are equal.
+
+    Raises
+    ------
+    ReplyError
+        Four readings and no two in a row alike.
+    """
+    seen = [read()]
+    while len(seen) < 4:
+        seen.append(read())
+        if seen[-1] == seen[-2]:
+            return seen[-1]
+    raise ReplyError("read a constant twice", f"readings differ: {seen}", "The line is disturbed: check the cable")
 
 
 class Line(Protocol):

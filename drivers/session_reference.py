@@ -47,7 +47,9 @@ class SessionReferenceAxis(MotionAxis):
     def _do_is_homed(self) -> bool:
         if self._do_is_moving():
             return self._referenced
-        counts = self._confirm(self._do_read_counts())
+        counts, confirmed = self._read_confirmed()
+        if not confirmed:
+            return self._referenced
         tolerance = self.config.tolerance_deg * abs(self.counts_per_deg)
         if self._homing:
             self._do_check_fault()

@@ -17,8 +17,8 @@ from pydantic import Field
 
 from drivers.apt_frames import REPLY_NAMES, apt_framer, long_message, short_message
 from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
-from drivers.motion import AxisConfig, AxisIdentity, MotionAxis, agreed
-from drivers.serial_link import LineRegistry, SerialLink, Transcript
+from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
+from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed
 
 log = logging.getLogger(__name__)
 
@@ -73,7 +73,7 @@ class APTLine:
         self.link.close()
 
     def ask(self, request: bytes, reply_id: int) -> bytes:
-        """Send a request and return the data of the reply with this id (short replies: both parameters).
+        """Send a request and return the data of the reply with this id.
 
         Raises
         ------
@@ -87,8 +87,10 @@ class APTLine:
                 self.link.write(request)
                 deadline_s = time.monotonic() + self.reply_s
                 while (frame := self.link.read_frame(deadline_s)) is not None:
-                    if int.from_bytes(frame[:2], "little") == reply_id:
-                        return frame[6:] if len(frame) > 6 else frame[2:4]
+                    # All but the hardware information start with the channel, which is 1.
+                    whole = reply_id == 0x0006 or frame[6:8] == b"\x01\x00"
+                    if whole and int.from_bytes(frame[:2], "little") == reply_id:
+                        return frame[6:]
                     seen.append(frame)
                 self.link.purge()
         asked = f"APT {self.link.port}, {REPLY_NAMES.get(reply_id, hex(reply_id))}"

@@ -13,8 +13,8 @@ from typing import Literal
 from pydantic import Field
 
 from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
-from drivers.motion import AxisIdentity, agreed
-from drivers.serial_link import LineRegistry, SerialLink, Transcript, line_framer
+from drivers.motion import AxisIdentity
+from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
 from drivers.session_reference import SessionReferenceAxis, SessionReferenceConfig
 
 ERRORS = {6: "no such command", 7: "parameter out of range", 9: "axis out of range", 37: "axis number missing"}

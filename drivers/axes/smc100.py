@@ -13,8 +13,8 @@ from typing import Literal
 from pydantic import Field
 
 from drivers.errors import CommandRejected, DeviceError, NotHomedError, ReplyError, ReplyTimeout, WrongDevice
-from drivers.motion import AxisConfig, AxisIdentity, MotionAxis, agreed
-from drivers.serial_link import LineRegistry, SerialLink, Transcript, line_framer
+from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
+from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
 
 ERRORS = {
     "A": "unknown message or bad address",

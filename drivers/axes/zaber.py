@@ -15,8 +15,8 @@ from typing import Literal
 from pydantic import Field
 
 from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
-from drivers.motion import AxisConfig, AxisIdentity, MotionAxis, agreed
-from drivers.serial_link import LineRegistry, SerialLink, Transcript, line_framer
+from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
+from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
 
 VELOCITY_UNIT = 1.6384  # native velocity per microstep/s (unverified)
 ACCELERATION_UNIT = 1.6384 / 10_000  # native acceleration per microstep/s^2 (unverified)
