@@ -205,7 +205,9 @@ class GigeCamera:
             self._camera.set_property("gvsp-lost-ratio", ratio)
 
     def fire(self) -> None:
-        """Start an exposure that no driver asked for, as a stray pulse on the trigger line would."""
+        """Start an exposure from outside, as a pulse on the trigger line does."""
+        # Aravis knows software triggers alone, so the source changes behind the driver's back.
+        self._write(features.TRIGGER_SOURCE, 1)
         self._write(features.SOFTWARE_TRIGGER, 1)
 
     def register(self, address: int) -> int:

@@ -15,6 +15,7 @@ EXPOSURE_US, PIXEL_FORMAT, OFFSET_X, OFFSET_Y = 0x120, 0x128, 0x130, 0x134
 GAIN_DB, BLACK_LEVEL, TEMPERATURE_C, GAMMA = 0x4000, 0x4008, 0x4010, 0x4018
 # Automatic modes and gamma are on at power-up, as they are on many cameras.
 GAIN_AUTO, GAMMA_ENABLE = 0x4020, 0x4024
+TRIGGER_SOURCE = 0x304
 # Reads 1 from the trigger until the exposure has ended.
 SOFTWARE_TRIGGER = 0x30C
 
@@ -119,7 +120,7 @@ def sfnc_description(width: int, height: int) -> str:
         "<CommandValue>0</CommandValue></Command>",
         _selector("TriggerSelector", ["FrameStart", "AcquisitionStart"]),
         _choice("TriggerMode", 0x300, {"Off": 0, "On": 1}),
-        _choice("TriggerSource", 0x304, {"Line0": 0, "Software": 1}),
+        _choice("TriggerSource", TRIGGER_SOURCE, {"Line0": 0, "Software": 1}),
         _choice("TriggerActivation", 0x308, {"RisingEdge": 0, "FallingEdge": 1}),
         _command("TriggerSoftware", SOFTWARE_TRIGGER, 1),
         _selector("AcquisitionStatusSelector", ["ExposureActive"]),

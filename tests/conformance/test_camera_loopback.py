@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from itertools import pairwise
@@ -227,6 +228,23 @@ def test_no_hardware_trigger_is_said_and_waited_for_no_longer_than_allowed(bench
         camera.capture()
     camera.configure(CameraSettings(trigger="software"))
     camera.capture()
+
+
+def test_a_hardware_trigger_starts_the_armed_camera(bench: Bench) -> None:
+    simulated, camera = bench(config=aravis.Config(device="127.0.0.1", bits=12, trigger_edge="FallingEdge"))
+    back = camera.configure(CameraSettings(exposure_s=0.05, trigger="hardware"))
+    assert back.trigger == "hardware"
+    assert simulated.register(0x308) == 1
+    for _ in range(3):
+        exposure = camera.trigger()
+        fired_s = time.time()
+        simulated.fire()
+        exposure.wait_exposed()
+        assert time.time() - fired_s >= 0.05
+        frame = exposure.frame()
+        assert frame.host_time_s > fired_s
+        assert frame.pixels[0, 0] == frame.frame_id % 4096
+    assert camera.statistics().stale_discarded == 0
 
 
 def test_describe_names_camera_and_link(bench: Bench) -> None:
