@@ -169,7 +169,7 @@ def test_limits_of_the_controller_count_as_well(kind: str) -> None:
 
 
 def test_two_moves_at_once_on_one_axis_are_refused(kind: str) -> None:
-    with served(kind, speed=1.0) as bench:
+    with served(kind, speed=3.0) as bench:
         axis = bench.open()
         motion = axis.start_move(60.0)
         assert not motion.done()
@@ -202,7 +202,7 @@ def test_stop_from_another_thread(kind: str, caplog: pytest.LogCaptureFixture) -
 
 def test_a_stuck_axis_fails_in_bounded_time_and_is_named(kind: str) -> None:
     with served(kind) as bench:
-        axis = bench.open()
+        axis = bench.open(margin_s=0.1, stall_s=0.1)
         axis.start_move(10.0).wait()
         bench.emulator.faults.add(Fault("stuck"))
         motion = axis.start_move(20.0)
@@ -219,16 +219,16 @@ def test_a_stuck_axis_fails_in_bounded_time_and_is_named(kind: str) -> None:
 
 def test_a_slow_axis_fails_at_the_deadline(kind: str) -> None:
     with served(kind) as bench:
-        axis = bench.open(stall_s=5.0)
+        axis = bench.open(margin_s=0.05, stall_s=5.0)
         bench.emulator.faults.add(Fault("slow", amount=1e-5))
-        motion = axis.start_move(30.0)
+        motion = axis.start_move(20.0)
         with pytest.raises(MotionFailed, match="deadline"):
             motion.wait()
 
 
 def test_a_silent_device_fails_with_the_reason(kind: str) -> None:
-    with served(kind, speed=1.0) as bench:
-        axis = bench.open(reply_s=0.1)
+    with served(kind, speed=2.0) as bench:
+        axis = bench.open(reply_s=0.06)
         motion = axis.start_move(90.0)
         bench.emulator.faults.add(Fault("silent"))
         with pytest.raises(MotionFailed, match="nothing within") as caught:
@@ -237,7 +237,8 @@ def test_a_silent_device_fails_with_the_reason(kind: str) -> None:
         with pytest.raises(ReplyTimeout, match="power"):
             axis.read_position()
         bench.emulator.faults.clear()
-        time.sleep(0.3)
+        while bench.emulator.axes[0].is_moving():
+            time.sleep(0.01)
         assert axis.read_position().deg == pytest.approx(bench.emulator.true_deg(0), abs=0.01)
 
 
@@ -268,7 +269,7 @@ def test_a_passing_fault_never_gives_a_wrong_position(kind: str, fault: str) -> 
 @pytest.mark.parametrize("fault", ["garbled", "foreign"])
 def test_a_lasting_fault_ends_in_an_error(kind: str, fault: str) -> None:
     with served(kind) as bench:
-        axis = bench.open(reply_s=0.05)
+        axis = bench.open(reply_s=0.03)
         bench.emulator.faults.add(Fault(fault))  # type: ignore[arg-type]
         with pytest.raises((ReplyError, ReplyTimeout, MotionFailed)):
             axis.start_move(33.0).wait()

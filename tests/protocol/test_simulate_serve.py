@@ -1,5 +1,6 @@
 """The `simulate serve` command as somebody else's client meets it."""
 
+import contextlib
 import signal
 import subprocess
 import sys
@@ -15,19 +16,23 @@ SERVE = [sys.executable, "-c", "from simulators.cli import main; main()", "serve
 KINDS = ["elliptec", "zaber", "apt-k10cr1", "apt-kdc101", "smc100", "esp301"]
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_first_line_is_the_port_and_sigterm_ends_it(kind: str) -> None:
-    with subprocess.Popen([*SERVE, kind, "--homed"], stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        path = process.stdout.readline().strip()
-        emulator = served_kinds()[kind](ServeOptions())
-        with LineRegistry() as lines:
-            axis = open_axis("axis", axis_configs(emulator, path, homed=True)[0], lines)
-            assert axis.is_homed()
-            # A full turn takes 1 to 2 seconds.
-            assert 1.0 <= axis.move_time_s(360.0) <= 2.0
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(5) == 0
+def test_first_line_is_the_port_and_sigterm_ends_it() -> None:
+    with contextlib.ExitStack() as stack:
+        served = {
+            kind: stack.enter_context(subprocess.Popen([*SERVE, kind, "--homed"], stdout=subprocess.PIPE, text=True))
+            for kind in KINDS
+        }
+        for kind, process in served.items():
+            assert process.stdout is not None
+            path = process.stdout.readline().strip()
+            emulator = served_kinds()[kind](ServeOptions())
+            with LineRegistry() as lines:
+                axis = open_axis("axis", axis_configs(emulator, path, homed=True)[0], lines)
+                assert axis.is_homed()
+                # A full turn takes 1 to 2 seconds.
+                assert 1.0 <= axis.move_time_s(360.0) <= 2.0
+            process.send_signal(signal.SIGTERM)
+        assert {kind: process.wait(5) for kind, process in served.items()} == dict.fromkeys(KINDS, 0)
 
 
 def test_options_reach_the_emulator() -> None:

@@ -70,8 +70,6 @@ def test_pylablib_elliptec() -> None:
             assert emulator.true_deg(0) == pytest.approx(-20, abs=0.01)
             motor.move_to(10, addr=1)
             assert emulator.true_deg(1) == pytest.approx(10, abs=0.01)
-            motor.set_velocity(70)
-            assert motor.get_velocity() == 70
         finally:
             motor.close()
 
