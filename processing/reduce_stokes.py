@@ -21,7 +21,7 @@ from processing.reduce import Progress, relative_exposure, sample_states
 from processing.reduce_facts import in_words
 
 #: The method that docs/mosaic.md found best.
-DEFAULT_METHOD = "difference"
+DEFAULT_METHOD = "oriented"
 LINEAR = 3
 
 _COVARIANCE = "covariance of (s0, s1, s2): 00, 11, 22, 01, 02, 12"

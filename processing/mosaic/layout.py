@@ -32,6 +32,16 @@ class MosaicLayout:
             raise MosaicError(f"a mosaic is 2 x 2 and names each channel once; got {mosaic} for {', '.join(channels)}")
         return cls(tuple(channels), tuple(where[name] for name in channels))
 
+    @property
+    def azimuths_deg(self) -> tuple[float, ...]:
+        """Analyzer azimuths, which the names of the channels are. Raises MosaicError for another kind of name."""
+        try:
+            return tuple(float(name) for name in self.channels)
+        except ValueError:
+            raise MosaicError(
+                f"this method needs channels named by their azimuth in degrees (0, 45, 90, 135); got {self.channels}"
+            ) from None
+
     def check(self, shape: tuple[int, int]) -> None:
         """Raise MosaicError unless a frame (rows, columns) holds whole super-pixels and at least four of them."""
         if shape[0] % 2 or shape[1] % 2 or min(shape) < 4:

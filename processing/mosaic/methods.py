@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.mosaic import oriented as lmmse
 from processing.mosaic.layout import Frame, MosaicError, MosaicLayout
 
 #: 1D kernels that fill the gaps between samples two pixels apart: tent, and cubic convolution (a = -1/2).
@@ -21,9 +22,9 @@ CUBIC = np.array([-1 / 16, 0, 9 / 16, 1, 9 / 16, 0, -1 / 16], np.float32)
 #: Mean of the four channels around each pixel, each with the same weight.
 PANCHROMATIC = np.array([0.25, 0.5, 0.25], np.float32)
 
-#: Guided filter: window radius in pixels, and regularization as a part of the guide's variance.
+#: Guided filter: window radius in pixels, and the contrast, as a part of the mean level, that counts as an edge.
 GUIDE_RADIUS = 3
-GUIDE_EPSILON = 1e-3
+GUIDE_CONTRAST = 0.03
 
 # Reflection about the border pixel keeps the parity of the mosaic.
 _BORDER = cv2.BORDER_REFLECT_101
@@ -64,7 +65,7 @@ def guided_residual(frame: Frame, layout: MosaicLayout) -> NDArray[np.float32]:
     The guided filter is opencv-contrib's (`cv2.ximgproc.guidedFilter`), its source the bilinear channel.
     """
     guide = difference(frame, layout).mean(axis=0)
-    epsilon = GUIDE_EPSILON * max(float(guide.var()), 1e-12)
+    epsilon = max((GUIDE_CONTRAST * float(np.abs(guide).mean())) ** 2, 1e-20)
     out = np.empty((len(layout.channels), *frame.shape), np.float32)
     for k, channel in enumerate(bilinear(frame, layout)):
         out[k] = cv2.ximgproc.guidedFilter(guide, channel, GUIDE_RADIUS, epsilon)
@@ -74,7 +75,14 @@ def guided_residual(frame: Frame, layout: MosaicLayout) -> NDArray[np.float32]:
 
 
 #: Pixels from which a value is taken lie within this distance; next to an edge of the scene they mix both sides.
-REACH = {"superpixel": 1, "bilinear": 1, "bicubic": 3, "difference": 2, "guided-residual": 2 * GUIDE_RADIUS + 2}
+REACH = {
+    "superpixel": 1,
+    "bilinear": 1,
+    "bicubic": 3,
+    "difference": 2,
+    "guided-residual": 2 * GUIDE_RADIUS + 2,
+    "oriented": lmmse.REACH,
+}
 
 METHODS: dict[str, Method] = {
     "superpixel": superpixel,
@@ -82,6 +90,7 @@ METHODS: dict[str, Method] = {
     "bicubic": bicubic,
     "difference": difference,
     "guided-residual": guided_residual,
+    "oriented": lmmse.oriented,
 }
 
 

@@ -1,0 +1,155 @@
+"""Demosaicing: exact where it must be, better than its rivals where it claims to be, with honest noise."""
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from processing.mosaic.fused import bilinear_stokes
+from processing.mosaic.layout import MosaicError, MosaicLayout
+from processing.mosaic.methods import METHODS, REACH, demosaic
+from processing.mosaic.noise import stokes_covariance
+from processing.reduce_stokes import DEFAULT_METHOD
+
+NAMES = ("0", "45", "90", "135")
+LAYOUT = MosaicLayout.of((("90", "45"), ("135", "0")), NAMES)
+ANALYZERS = np.array([[0.5, 0.5 * np.cos(2 * t), 0.5 * np.sin(2 * t)] for t in np.deg2rad([0.0, 45, 90, 135])])
+FULL_SIZE = [m for m in METHODS if m != "superpixel"]
+
+
+def mosaic(channels: np.ndarray, layout: MosaicLayout = LAYOUT) -> np.ndarray:
+    frame = np.empty(channels.shape[1:])
+    for k, (r, c) in enumerate(layout.offsets):
+        frame[r::2, c::2] = channels[k, r::2, c::2]
+    return frame
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.float64])
+def test_even_light_stays_even(method: str, dtype: type) -> None:
+    values = np.array([120.0, 80.0, 40.0, 82.0])
+    channels = np.broadcast_to(values[:, None, None], (4, 24, 28))
+    found = demosaic(mosaic(channels).astype(dtype), LAYOUT, method)
+    assert found.dtype == np.float32
+    assert found.shape == ((4, 12, 14) if method == "superpixel" else (4, 24, 28))
+    np.testing.assert_allclose(found, np.broadcast_to(values[:, None, None], found.shape), rtol=2e-3)
+
+
+@pytest.mark.parametrize("method", FULL_SIZE)
+def test_gradients_and_the_place_of_the_pixels(method: str) -> None:
+    y, x = np.indices((40, 48), dtype=float)
+    stokes = np.stack([1000 + 6 * x + 3 * y, 200 + 2 * x, 100 - 1.5 * y])
+    truth = np.tensordot(ANALYZERS, stokes, axes=1)
+    found = demosaic(mosaic(truth), LAYOUT, method)
+    inner = np.s_[:, 8:-8, 8:-8]
+    # Half a pixel of shift would be an error of 2 counts or more in every channel.
+    assert np.max(np.abs(found[inner] - truth[inner])) < 0.7
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_any_arrangement_of_the_super_pixel(method: str) -> None:
+    rng = np.random.default_rng(1)
+    stokes = np.stack([1000 + 50 * rng.normal(size=(32, 32)), np.full((32, 32), 300.0), np.full((32, 32), -200.0)])
+    truth = np.tensordot(ANALYZERS, stokes, axes=1)
+    other = MosaicLayout.of((("0", "135"), ("45", "90")), NAMES)
+    turned = demosaic(mosaic(truth, other), other, method)
+    # The same scene turned by 180 degrees has the first arrangement.
+    straight = demosaic(mosaic(truth, other)[::-1, ::-1].copy(), LAYOUT, method)[:, ::-1, ::-1]
+    inner = np.s_[:, 5:-5, 5:-5]
+    np.testing.assert_allclose(turned[inner], straight[inner], atol=0.2)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_noise_of_stokes_is_what_the_covariance_says(method: str) -> None:
+    rng = np.random.default_rng(2)
+    values = np.array([1400.0, 1000.0, 500.0, 900.0])
+    variance = values / 3.0 + 2.0
+    channels = np.broadcast_to(values[:, None, None], (4, 200, 200))
+    sigma = np.sqrt(np.broadcast_to(variance[:, None, None], channels.shape))
+    solve = np.linalg.pinv(ANALYZERS)
+    found = np.stack(
+        [
+            np.tensordot(
+                solve, demosaic(mosaic(channels + sigma * rng.normal(size=sigma.shape)), LAYOUT, method), axes=1
+            )
+            for _ in range(4)
+        ]
+    )
+    shape = found.shape[2:]
+    told = stokes_covariance(
+        np.broadcast_to(variance[:, None, None], (4, *shape)).astype(np.float32), LAYOUT, method, solve
+    )
+    truth = solve @ values
+    inner = np.s_[..., 10:-10, 10:-10]
+    deviation = (found - truth[None, :, None, None])[inner]
+    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    for k, (a, b) in enumerate(pairs):
+        measured = np.mean(deviation[:, a] * deviation[:, b])
+        scale = np.sqrt(np.mean(told[a][inner]) * np.mean(told[b][inner]))
+        assert measured / scale == pytest.approx(np.mean(told[k][inner]) / scale, abs=0.06), (a, b)
+
+
+@pytest.fixture(scope="module")
+def quality() -> ModuleType:
+    file = Path(__file__).resolve().parents[2] / "benchmarks/mosaic_quality.py"
+    spec = importlib.util.spec_from_file_location("mosaic_quality", file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_default_is_the_best_of_the_table(quality: ModuleType, noise: float) -> None:
+    found = quality.compare(size=256, seed=11, noise=noise)
+    for scene in quality.SCENES:
+        best = max(METHODS, key=lambda m, s=scene: found[s, m]["psnr"])
+        margin = found[scene, best]["psnr"] - found[scene, DEFAULT_METHOD]["psnr"]
+        assert margin < 0.2, (scene, best)
+        assert found[scene, DEFAULT_METHOD]["psnr"] > found[scene, "difference"]["psnr"] - 0.1
+        assert found[scene, DEFAULT_METHOD]["psnr"] > found[scene, "bilinear"]["psnr"]
+
+
+def test_reach_is_how_far_a_pixel_is_felt() -> None:
+    for method in FULL_SIZE:
+        flat = np.full((64, 64), 1000.0)
+        poked = flat.copy()
+        poked[32, 32] += 5
+        moved = np.abs(demosaic(poked, LAYOUT, method) - demosaic(flat, LAYOUT, method)).max(axis=0)
+        felt = np.argwhere(moved > 0.005)
+        assert np.max(np.abs(felt - 32)) <= REACH[method], method
+
+
+def test_bad_layouts_and_frames() -> None:
+    with pytest.raises(MosaicError, match="2 x 2"):
+        MosaicLayout.of((("0", "45", "90"),), NAMES)
+    with pytest.raises(MosaicError, match="names each channel once"):
+        MosaicLayout.of((("90", "45"), ("135", "135")), NAMES)
+    with pytest.raises(MosaicError, match="even number of rows"):
+        demosaic(np.zeros((5, 8)), LAYOUT, "bilinear")
+    with pytest.raises(MosaicError, match="none of superpixel"):
+        demosaic(np.zeros((8, 8)), LAYOUT, "magic")
+    odd = MosaicLayout.of((("a", "b"), ("c", "d")), ("a", "b", "c", "d"))
+    with pytest.raises(MosaicError, match="named by their azimuth"):
+        demosaic(np.zeros((8, 8)), odd, "oriented")
+    assert demosaic(np.zeros((8, 8)), odd, "bilinear").shape == (4, 8, 8)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+@pytest.mark.parametrize("arrangement", [(("90", "45"), ("135", "0")), (("0", "135"), ("45", "90"))])
+def test_one_pass_equals_the_long_way(dtype: type, arrangement: tuple[tuple[str, ...], ...]) -> None:
+    layout = MosaicLayout.of(arrangement, NAMES)
+    rng = np.random.default_rng(3)
+    frame = rng.integers(1, 250, (36, 50)).astype(dtype)
+    solve = np.linalg.pinv(ANALYZERS)
+    found = bilinear_stokes(frame, layout, solve)
+    s = np.tensordot(solve, demosaic(frame, layout, "bilinear").astype(float), axes=1)
+    for plane, expected in zip(found[:3], s, strict=True):
+        np.testing.assert_allclose(plane, expected, atol=2e-4)
+    np.testing.assert_allclose(found.dolp, np.hypot(s[1], s[2]) / s[0], atol=1e-5)
+    difference = (found.aolp - 0.5 * np.arctan2(s[2], s[1]) + np.pi / 2) % np.pi - np.pi / 2
+    assert np.max(np.abs(difference)) < 2e-6
+    assert np.all((found.aolp >= 0) & (found.aolp <= np.float32(np.pi)))
