@@ -111,6 +111,8 @@ class Motion:
         axis._do_check_fault()
         self._last = axis.read_position()
         if not self._last.confirmed:
+            if now_s - self._start_s > self.allowed_s:
+                raise self._stop_and_describe("says both that it moves and that it is idle, at the deadline")
             return
         if self.target_deg is None:
             short = None if axis.is_homed() else "the axis is idle but has no reference"
@@ -295,9 +297,10 @@ class MotionAxis(ABC):
                     "the controller has no reference position",
                     "Look whether the way is free, then home the axis (acquire home)",
                 )
-            distance_deg = target_deg - self.read_position().deg
-            expected_s = self.move_time_s(distance_deg)
+            start = self.read_position()
+            expected_s = self.move_time_s(target_deg - start.deg)
             motion = Motion(self, target_deg, expected_s, SLACK * expected_s + self.config.margin_s)
+            motion._last = start
             self._begin(motion, self._to_device_deg(target_deg) * self.counts_per_deg)
         return motion
 

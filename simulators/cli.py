@@ -19,7 +19,7 @@ def _simulate() -> None:
 
 @app.command()
 def serve(
-    kind: Annotated[str, typer.Argument(help="elliptec, zaber, apt-k10cr1, apt-kdc101, smc100 or esp301")],
+    kind: Annotated[str, typer.Argument(help="elliptec, zaber, apt-k10cr1, apt-kdc101, smc100, esp301 and others")],
     model: Annotated[str | None, typer.Option(help="model that it says it is")] = None,
     axes: Annotated[int | None, typer.Option(min=1, max=16, help="number of devices, modules or axes")] = None,
     limits: Annotated[str | None, typer.Option(help="travel of every axis as MIN:MAX in degrees")] = None,
@@ -30,8 +30,8 @@ def serve(
     fault: Annotated[
         list[str] | None,
         typer.Option(
-            help="KIND[@COMMAND|@TIMEs][xCOUNT][:AMOUNT], repeatable; KIND silent, stuck, slow, garbled, late, "
-            "foreign or not_homed; garbled@12x1 spoils the reply to the 12th command"
+            help="silent, stuck, slow, garbled, late, foreign or not_homed; repeatable. garbled@12x1 spoils one reply "
+            "from the 12th command on, slow@3.5s:0.2 slows to a fifth after 3.5 s, late:0.4 delays by 0.4 s"
         ),
     ] = None,
     seed: Annotated[int, typer.Option(help="of the garbled bytes")] = 0,

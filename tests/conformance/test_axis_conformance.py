@@ -211,8 +211,7 @@ def test_a_stuck_axis_fails_in_bounded_time_and_is_named(kind: str) -> None:
         error = caught.value
         assert (error.axis, error.target_deg) == ("axis0", 20.0)
         assert error.elapsed_s < motion.allowed_s + 0.5
-        if error.last_deg is not None:
-            assert error.last_deg == pytest.approx(10.0, abs=0.05)
+        assert error.last_deg == pytest.approx(10.0, abs=0.05)
         with pytest.raises(MotionFailed):
             motion.wait()
 

@@ -5,11 +5,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from drivers.apt_frames import apt_framer
 from drivers.axes import apt, elliptec, esp301, smc100, zaber
 from drivers.errors import CommandRejected, NotHomedError, ReplyError
-from drivers.serial_link import LineRegistry
+from drivers.serial_link import LONGEST_FRAME, LineRegistry, line_framer
 from simulators.pty_port import PtyPort
 
 
@@ -211,3 +213,15 @@ def test_readings_that_disagree_are_no_position() -> None:
         arm = smc100.open("arm", smc100.Config(port=path), lines)
         with pytest.raises(ReplyError, match="contradict"):
             arm.read_position()
+
+
+@given(st.lists(st.binary(max_size=300), max_size=20))
+def test_framers_take_any_bytes_and_keep_little(pieces: list[bytes]) -> None:
+    for framer, longest in ((line_framer, LONGEST_FRAME + 300), (apt_framer, 6 + 84)):
+        buffer = bytearray()
+        for piece in pieces:
+            buffer += piece
+            while (frame := framer(buffer)) is not None:
+                assert frame
+                zaber.parse_reply(frame)
+        assert len(buffer) <= longest
