@@ -8,7 +8,6 @@ stand.
 from __future__ import annotations
 
 import contextlib
-import importlib
 import threading
 from collections.abc import Callable
 
@@ -27,7 +26,7 @@ from simulators.pixel_stamp import stamp
 from simulators.pty_port import PtyPort
 from simulators.rig_model import SimulatorConfig
 from simulators.scene import Scene
-from simulators.serve import ServeOptions
+from simulators.serve import ServeOptions, served_kinds
 
 #: Exposure indices of one state: tries of it come this far apart.
 RETAKE_STRIDE = 1_000_000
@@ -67,10 +66,10 @@ class SimulatedRig:
 
     def _emulator(self, name: str) -> Emulator:
         port = self.config.ports[name]
-        try:
-            module = importlib.import_module(f"simulators.controllers.{port.kind}")
-        except ImportError as error:
-            raise ConfigError(f"simulator.ports.{name}: there is no emulator of kind {port.kind!r}") from error
+        kinds = served_kinds()
+        if port.kind not in kinds:
+            known = ", ".join(kinds)
+            raise ConfigError(f"simulator.ports.{name}: there is no emulator of kind {port.kind!r}, only {known}")
         options = ServeOptions(
             axes=port.axes,
             limits_deg=port.limits_deg,
@@ -80,8 +79,7 @@ class SimulatedRig:
             clock=self.clock,
             faults=FaultSchedule(seed=self.config.seed),
         )
-        emulator: Emulator = module.SERVES[port.kind](options)
-        return emulator
+        return kinds[port.kind](options)
 
     def stop(self) -> None:
         """End the emulators; the first failure is raised after all were tried."""
