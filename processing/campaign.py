@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.campaign_tasks import CaptureMeasure, CaptureTask, measure
+from processing.campaign_tasks import CaptureMeasure, CaptureTask, locate, measure, task_view
 from processing.capture import Capture, CaptureError
 from processing.deviation import rmsd
 from processing.errors import NotDetermined, ProcessError
@@ -127,7 +127,7 @@ def run_campaign(
     geometry, stokes_geometry : geometry files of the Mueller polarimeter and of the Stokes camera.
     material : reflectance model.
     pool : where the captures are worked on.
-    register : take centre and scale of the sphere from each image instead of from the geometry file.
+    register : take centre and scale of the sphere from the images instead of from the geometry file.
     border_px : pixels nearer than this to the outline do not count.
 
     Raises
@@ -143,11 +143,12 @@ def run_campaign(
             raise ProcessError(f"{twin.name} and {path.name} are both {kind} captures at {nm:g} nm, {omega:g} degrees.")
     other = stokes_geometry or geometry
     tasks = [
-        CaptureTask(
-            str(p), kind, str(out), str(geometry if kind == "mueller" else other), str(material), register, border_px
-        )
+        CaptureTask(str(p), kind, str(out), str(geometry if kind == "mueller" else other), str(material), border_px)
         for p, kind, _, _ in captures
     ]
+    if register:
+        tasks = _registered(tasks, pool)
+    views = {task.kind: task_view(task) for task in tasks}
     futures = [pool.submit(measure, task) for task in tasks]
     measures = []
     for done, future in enumerate(futures, 1):
@@ -155,7 +156,21 @@ def run_campaign(
         if progress:
             progress(done, len(futures))
     tables = _merged_tables(measures, out)
-    return CampaignResult(tuple(_rows(measures, tables, other)), simulated, tuple(left_out), tables)
+    return CampaignResult(tuple(_rows(measures, tables, views)), simulated, tuple(left_out), tables)
+
+
+def _registered(tasks: Sequence[CaptureTask], pool: Executor) -> list[CaptureTask]:
+    # Camera and sphere stand still while the arm turns: each instrument takes its best image, mostly a side view.
+    best: dict[str, tuple[float, str]] = {}
+    futures = [pool.submit(locate, task) for task in tasks]
+    for task, future in zip(tasks, futures, strict=True):
+        found = future.result()
+        if found is not None and (task.kind not in best or found < best[task.kind]):
+            best[task.kind] = found
+    lacking = sorted({t.kind for t in tasks} - set(best))
+    if lacking:
+        raise NotDetermined(f"no sphere could be found in any {' or '.join(lacking)} image; leave --register away.")
+    return [replace(task, view_json=best[task.kind][1]) for task in tasks]
 
 
 def _merged_tables(measures: Sequence[CaptureMeasure], out: Path) -> dict[tuple[str, float], Path]:
@@ -175,7 +190,9 @@ def _merged_tables(measures: Sequence[CaptureMeasure], out: Path) -> dict[tuple[
     return tables
 
 
-def _rows(measures: Sequence[CaptureMeasure], tables: dict[tuple[str, float], Path], geometry: Path) -> list[Row]:
+def _rows(
+    measures: Sequence[CaptureMeasure], tables: dict[tuple[str, float], Path], views: dict[str, ViewingGeometry]
+) -> list[Row]:
     rows: list[Row] = []
     for nm in sorted({m.wavelength_nm for m in measures}):
         loaded = {k: ScatteringTable.load(tables[k, nm]) for k in ("mueller", "stokes") if (k, nm) in tables}
@@ -187,12 +204,9 @@ def _rows(measures: Sequence[CaptureMeasure], tables: dict[tuple[str, float], Pa
                 values |= {"psi_deg": m.psi_deg, "magnitude_percent": m.magnitude_percent}
                 values["eigenvalue_deviation"] = m.eigenvalue_deviation
             if "stokes" in here and len(loaded) == 2:
-                view = (
-                    ViewingGeometry.model_validate_json(here["stokes"].view_json)
-                    if here["stokes"].view_json
-                    else (ViewingGeometry.load(geometry))
+                values |= compare_on_sphere(
+                    loaded["mueller"], loaded["stokes"], views["stokes"], omega, here["stokes"].shape
                 )
-                values |= compare_on_sphere(loaded["mueller"], loaded["stokes"], view, omega, here["stokes"].shape)
             rows.append(Row(nm, omega, **values))
     return rows
 

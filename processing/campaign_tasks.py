@@ -12,6 +12,7 @@ from scipy.ndimage import binary_erosion
 from processing.capture import Capture
 from processing.cloude import coherency_eigenvalues, xi0_and_dominant
 from processing.deviation import linear_diattenuation, magnitude, orientation_difference, rmsd
+from processing.geometry.errors import OutlineNotFound
 from processing.geometry.frames import GeometryImage
 from processing.geometry.outline import find_sphere, registered
 from processing.geometry.viewing import ViewingGeometry
@@ -37,8 +38,9 @@ class CaptureTask:
     out: str
     geometry: str
     material: str
-    register: bool
     border_px: int
+    #: Geometry found in the images; empty: the one of the file.
+    view_json: str = ""
 
 
 @dataclass(frozen=True)
@@ -54,14 +56,35 @@ class CaptureMeasure:
     magnitude_percent: float
     eigenvalue_deviation: float
     pixels: int
-    view_json: str
 
 
 def measure(task: CaptureTask) -> CaptureMeasure:
     """Reduce a capture (unless its product is newer) and measure it."""
     product = reduced_product(Path(task.capture), Path(task.out), task.kind)
-    view = ViewingGeometry.load(task.geometry)
+    view = task_view(task)
     return (_measure_mueller if task.kind == "mueller" else _measure_stokes)(task, product, view)
+
+
+def locate(task: CaptureTask) -> tuple[float, str] | None:
+    """Find the sphere in a capture's image: relative error of its radius and geometry as text; None if not found."""
+    product = reduced_product(Path(task.capture), Path(task.out), task.kind)
+    if task.kind == "mueller":
+        intensity: NDArray[np.floating] = MuellerImage.load(product).values[0, 0]
+    else:
+        intensity = StokesImage.load(product).values[0]
+    try:
+        circle = find_sphere(intensity)
+    except OutlineNotFound:
+        return None
+    view = registered(task_view(task), circle, *intensity.shape)
+    return circle.radius_stderr / circle.radius, view.model_dump_json()
+
+
+def task_view(task: CaptureTask) -> ViewingGeometry:
+    """The geometry that a task is to use."""
+    if task.view_json:
+        return ViewingGeometry.model_validate_json(task.view_json)
+    return ViewingGeometry.load(task.geometry)
 
 
 def reduced_product(path: Path, out: Path, kind: str) -> Path:
@@ -82,7 +105,7 @@ def reduced_product(path: Path, out: Path, kind: str) -> Path:
 def _measure_mueller(task: CaptureTask, product: Path, view: ViewingGeometry) -> CaptureMeasure:
     image = MuellerImage.load(product)
     m = image.matrices
-    view, geometry = _geometry(task, view, image.values[0, 0], image.header.omega_deg)
+    geometry = view.at(float(image.header.omega_deg or 0.0), *image.mask.shape)
     model = load_reflectance(task.material).mueller_jones(geometry.points, image.header.wavelength_nm)
     inside = m[geometry.mask].astype(float)
     xi0, m0 = xi0_and_dominant(inside)
@@ -108,14 +131,13 @@ def _measure_mueller(task: CaptureTask, product: Path, view: ViewingGeometry) ->
         magnitude_percent=100 * rmsd((magnitude(modelled) - magnitude(measured))[good]),
         eigenvalue_deviation=float(np.percentile(deviation, 99)) if good.any() else float("nan"),
         pixels=int(good.sum()),
-        view_json=view.model_dump_json() if task.register else "",
     )
 
 
 def _measure_stokes(task: CaptureTask, product: Path, view: ViewingGeometry) -> CaptureMeasure:
     image = StokesImage.load(product)
     header = image.header
-    view, geometry = _geometry(task, view, image.values[0], header.omega_deg)
+    geometry = view.at(float(header.omega_deg or 0.0), *image.mask.shape)
     model = load_reflectance(task.material).mueller_jones(geometry.points, header.wavelength_nm)
     found = estimate_from_stokes(image, np.asarray(geometry.fill(model), dtype=float))
     inside = geometry.mask
@@ -131,17 +153,7 @@ def _measure_stokes(task: CaptureTask, product: Path, view: ViewingGeometry) -> 
         magnitude_percent=float("nan"),
         eigenvalue_deviation=float("nan"),
         pixels=int(good.sum()),
-        view_json=view.model_dump_json() if task.register else "",
     )
-
-
-def _geometry(
-    task: CaptureTask, view: ViewingGeometry, intensity: NDArray[np.floating], omega_deg: float | None
-) -> tuple[ViewingGeometry, GeometryImage]:
-    rows, columns = intensity.shape
-    if task.register:
-        view = registered(view, find_sphere(intensity), rows, columns)
-    return view, view.at(float(omega_deg or 0.0), rows, columns)
 
 
 def _inner(geometry: GeometryImage, border_px: int) -> NDArray[np.bool_]:

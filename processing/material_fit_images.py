@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import binary_erosion
 
 from processing.cloude import xi0_and_dominant
 from processing.errors import ProcessError
@@ -17,6 +18,8 @@ from processing.product import Product
 
 #: At most so many pixels of each image go into a fit.
 PIXELS = 3000
+#: Pixels nearer than this to the outline are left out.
+BORDER_PX = 3
 
 
 def fit_products(sources: Sequence[Path], geometry_file: Path) -> tuple[MaterialFit, float, bool]:
@@ -82,7 +85,9 @@ def _fit_stokes(sources: Sequence[Path], view: ViewingGeometry) -> MaterialFit:
 def _sample(view: ViewingGeometry, product: Product) -> tuple[ScatteringGeometry, np.ndarray]:
     # Lit and reduced pixels, evenly thinned: geometry and flat index.
     image = view.at(float(product.header.omega_deg or 0.0), *product.shape)
-    good = np.flatnonzero(product.get("pixel_mask")[image.mask] == 0)
+    # Pixels on the outline mix object and background, in a mosaic most of all.
+    inner = binary_erosion(image.mask, iterations=BORDER_PX)
+    good = np.flatnonzero(inner[image.mask] & (product.get("pixel_mask")[image.mask] == 0))
     if good.size == 0:
         raise ProcessError(f"{product.path}: no good pixel sees the object; check the geometry file.")
     chosen = good[np.linspace(0, good.size - 1, min(good.size, PIXELS)).astype(np.int64)]

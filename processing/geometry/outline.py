@@ -60,8 +60,8 @@ def find_sphere(image: ArrayLike, seed: int = 0) -> Circle:
     """
     img = np.nan_to_num(np.asarray(image, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0)
     contour, inside = _bright_contour(img)
-    start = _consensus(contour, inside, np.random.default_rng(seed))
     smooth = cv2.GaussianBlur(img, (0, 0), 1.0)
+    start = _consensus(_sharp(contour, smooth), inside, np.random.default_rng(seed))
     circle = start
     for _ in range(3):
         _check_frame(circle, img.shape)
@@ -148,6 +148,13 @@ def _bright_contour(img: FloatArray) -> tuple[FloatArray, NDArray[np.uint8]]:
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     xy = max(contours, key=len)[:, 0, :]
     return xy[:, ::-1].astype(float), mask
+
+
+def _sharp(contour: FloatArray, smooth: FloatArray) -> FloatArray:
+    # The border of the shadow falls off over the whole radius, the limb within two pixels.
+    slope = cv2.dilate(np.hypot(*np.gradient(smooth)), np.ones((7, 7)))
+    steepness = slope[contour[:, 0].astype(int), contour[:, 1].astype(int)]
+    return np.asarray(contour[steepness > 0.3 * np.percentile(steepness, 95)])
 
 
 def _consensus(contour: FloatArray, mask: NDArray[np.uint8], rng: np.random.Generator) -> FloatArray:

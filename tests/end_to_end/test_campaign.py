@@ -93,7 +93,7 @@ def test_campaign_of_a_true_model_has_small_deviations(folder, configs, process)
 
 def test_workers_give_the_same_numbers(folder, here, configs, tmp_path):
     files = configs / "geometries/one_inch_sphere.yaml", configs / "materials/red_print.yaml"
-    task = CaptureTask(str(folder / "drr_35.h5"), "mueller", str(tmp_path), *map(str, files), False, BORDER_PX)
+    task = CaptureTask(str(folder / "drr_35.h5"), "mueller", str(tmp_path), *map(str, files), BORDER_PX)
     with executor(2) as pool:
         there = pool.submit(measure, task).result()
     assert there.psi_deg == here.rows[0].psi_deg
