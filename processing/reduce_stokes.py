@@ -122,7 +122,7 @@ def reduce_stokes(
     frame, mask = mean_frame(capture, states, correction, progress)
     channels = demosaic(frame, layout, method)
     frames = float(capture.column("repeats")[states].sum())
-    found = stokes(channels, analyzers, layout, method, noise, frames, correction.dark_frames)
+    found = stokes(channels, analyzers, layout, method, noise, frames, correction.dark_frames, frame)
     found["pixel_mask"] = _spread(mask, channels.shape[1:])
     lost = (found["pixel_mask"] != 0) | ~(found["s0"] > 0)
     found["pixel_mask"][~(found["s0"] > 0) & (found["pixel_mask"] == 0)] = np.uint8(Mask.NOT_DETERMINED)
@@ -147,6 +147,7 @@ def stokes(
     noise: NoiseModel | None,
     frames: float = 1,
     dark_frames: int = 0,
+    frame: NDArray[np.float32] | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Stokes planes and their errors from demosaiced channels (4, rows, columns); names as in PLANES.
 
@@ -164,7 +165,7 @@ def stokes(
     else:
         floor = noise.floor / frames + (noise.floor / dark_frames if dark_frames else 0.0)
         variance = (noise.slope / frames * np.maximum(channels, 0.0) + floor).astype(np.float32)
-    covariance = stokes_covariance(variance, layout, method, solve)
+    covariance = stokes_covariance(variance, layout, method, solve, frame)
     with np.errstate(divide="ignore", invalid="ignore"):
         linear = np.hypot(s1, s2)
         dolp = linear / s0

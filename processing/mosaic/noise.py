@@ -12,6 +12,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.mosaic import oriented
 from processing.mosaic.layout import MosaicLayout
 from processing.mosaic.methods import METHODS, demosaic
 
@@ -51,17 +52,31 @@ def noise_gain(layout: MosaicLayout, method: str, solve: tuple[tuple[float, ...]
 
 
 def stokes_covariance(
-    variance: NDArray[np.float32], layout: MosaicLayout, method: str, solve: NDArray[np.float64]
+    variance: NDArray[np.float32],
+    layout: MosaicLayout,
+    method: str,
+    solve: NDArray[np.float64],
+    frame: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
     """Covariance (6, rows, columns) of (S0, S1, S2): 00, 11, 22, 01, 02, 12.
 
     Parameters
     ----------
     variance : (channels, rows, columns), counts^2, of a raw pixel of each channel at the level found there.
+    frame : the mosaic frame; the kernels of the method "oriented" depend on it. None: no edges.
     """
-    gain = noise_gain(layout, method, tuple(tuple(float(v) for v in row) for row in solve))
     pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
     out = np.empty((6, *variance.shape[1:]), np.float32)
+    if method == "oriented" and frame is not None:
+        direction = oriented.directions(frame, layout)
+        every = oriented.noise_gain(layout, solve)
+        packed = np.stack([every[..., a, b] for a, b in pairs]).astype(np.float32)
+        for i in range(2):
+            for j in range(2):
+                weights = packed[:, direction[i::2, j::2], i, j]
+                out[:, i::2, j::2] = np.einsum("kxyc,cxy->kxy", weights, variance[:, i::2, j::2])
+        return out
+    gain = noise_gain(layout, method, tuple(tuple(float(v) for v in row) for row in solve))
     step = 1 if METHODS[method] is METHODS["superpixel"] else 2
     for i in range(step):
         for j in range(step):

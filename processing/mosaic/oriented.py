@@ -41,14 +41,46 @@ _BORDER = cv2.BORDER_REFLECT_101
 
 def oriented(frame: Frame, layout: MosaicLayout) -> NDArray[np.float32]:
     """Channels (4, rows, columns) of a mosaic frame; see the module's text."""
+    out, direction = _first_pass(frame, layout)
+    _fill(frame, layout, direction, True, out)
+    return out
+
+
+def directions(frame: Frame, layout: MosaicLayout) -> NDArray[np.uint8]:
+    """Kernels that `oriented` uses (rows, columns): 0 without direction, k > 0: edge along 180 (k - 1)/16 degrees."""
+    return _first_pass(frame, layout)[1]
+
+
+def noise_gain(layout: MosaicLayout, solve: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Covariance of S for unit variance of one channel: (1 + DIRECTIONS, 2, 2, channels, 3, 3).
+
+    As `processing.mosaic.noise.noise_gain`, for each set of kernels.
+    """
+    kernels = _kernels(layout).astype(float)
+    side = np.arange(-REACH, REACH + 1)
+    dy, dx = (a.ravel() for a in np.meshgrid(side, side, indexing="ij"))
+    to_stokes = np.einsum("sc,dijtc->dijts", solve, kernels)
+    out = np.zeros((*kernels.shape[:3], len(layout.channels), 3, 3))
+    for i in range(2):
+        for j in range(2):
+            for channel, (r, c) in enumerate(layout.offsets):
+                taps = to_stokes[:, i, j, ((i + dy) % 2 == r) & ((j + dx) % 2 == c)]
+                out[:, i, j, channel] = np.einsum("dts,dtu->dsu", taps, taps)
+    return out
+
+
+def _first_pass(frame: Frame, layout: MosaicLayout) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    out = np.empty((len(layout.channels), *frame.shape), np.float32)
+    _fill(frame, layout, np.zeros(frame.shape, np.uint8), False, out)
+    return out, _edges(out.mean(axis=0))
+
+
+def _fill(
+    frame: Frame, layout: MosaicLayout, direction: NDArray[np.uint8], edges_only: bool, out: NDArray[np.float32]
+) -> None:
     kernels = _kernels(layout)
     padded = cv2.copyMakeBorder(frame, REACH, REACH, REACH, REACH, _BORDER)
-    out = np.empty((len(layout.channels), *frame.shape), np.float32)
-    everywhere = np.zeros(frame.shape, np.uint8)
-    for_ranges(frame.shape[0], lambda a, b: _apply(padded, kernels, everywhere, False, out, a, b), 2, 64)
-    direction = _edges(out.mean(axis=0))
-    for_ranges(frame.shape[0], lambda a, b: _apply(padded, kernels, direction, True, out, a, b), 2, 64)
-    return out
+    for_ranges(frame.shape[0], lambda a, b: _apply(padded, kernels, direction, edges_only, out, a, b), 2, 64)
 
 
 def _edges(mean: Frame) -> NDArray[np.uint8]:

@@ -11,6 +11,7 @@ from processing.mosaic.fused import bilinear_stokes
 from processing.mosaic.layout import MosaicError, MosaicLayout
 from processing.mosaic.methods import METHODS, REACH, demosaic
 from processing.mosaic.noise import stokes_covariance
+from processing.mosaic.oriented import directions
 from processing.reduce_stokes import DEFAULT_METHOD
 
 NAMES = ("0", "45", "90", "135")
@@ -89,6 +90,30 @@ def test_noise_of_stokes_is_what_the_covariance_says(method: str) -> None:
         measured = np.mean(deviation[:, a] * deviation[:, b])
         scale = np.sqrt(np.mean(told[a][inner]) * np.mean(told[b][inner]))
         assert measured / scale == pytest.approx(np.mean(told[k][inner]) / scale, abs=0.06), (a, b)
+
+
+def test_noise_along_edges_is_that_of_the_kernels_there() -> None:
+    y, x = np.indices((160, 160), dtype=float)
+    level = 2000 + 1500 * np.tanh(np.sin((x + 0.4 * y) / 12) * 2)
+    stokes = np.stack([level, 0.2 * level, -0.1 * level])
+    frame = mosaic(np.tensordot(ANALYZERS, stokes, axes=1))
+    used = directions(frame.astype(np.float32), LAYOUT)
+    assert (used > 0).mean() > 0.3
+    rng = np.random.default_rng(5)
+    solve, sigma = np.linalg.pinv(ANALYZERS), 3.0
+    runs = [
+        np.tensordot(solve, demosaic(frame + sigma * rng.normal(size=frame.shape), LAYOUT, "oriented"), axes=1)
+        for _ in range(30)
+    ]
+    variance = np.full((4, *frame.shape), sigma**2, np.float32)
+    told = stokes_covariance(variance, LAYOUT, "oriented", solve, frame.astype(np.float32))
+    inner = np.s_[..., 10:-10, 10:-10]
+    for k in range(3):
+        found = np.var(np.stack([r[k] for r in runs]), axis=0, ddof=1)
+        for chosen in (used > 0, used == 0):
+            ratio = np.median(found[inner][chosen[inner]]) / np.median(told[k][inner][chosen[inner]])
+            # The median of a variance from 30 runs is 0.977 of its mean.
+            assert ratio == pytest.approx(0.977, abs=0.05)
 
 
 @pytest.fixture(scope="module")
