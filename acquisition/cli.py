@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from acquisition import hand_commands
+
 if TYPE_CHECKING:
     from acquisition.stop_request import StopRequest
 
@@ -66,6 +68,9 @@ def capture(
     from acquisition import campaign_command
 
     raise typer.Exit(_stoppable(lambda stop: campaign_command.run(options, campaign, stop)))
+
+
+hand_commands.register(app)
 
 
 def _stoppable(action: Callable[[StopRequest], int]) -> int:

@@ -75,24 +75,48 @@ class Rig:
             error.add_note(f"closing the rig failed too: {failure}")
 
     def _open(self) -> None:
-        config = self.config
-        if config.simulator is not None:
-            self.simulation = SimulatedRig(config.simulator, with_camera=self._with_camera)
-            self.simulation.start()
-        for name, entry in config.axes.items():
-            entry = self._at_port(entry)
-            self.axes[name] = open_axis(name, entry, self._lines)
-            if self.simulation is not None:
-                self.simulation.connect(name, entry.direction, entry.zero_deg)
-        if config.source is not None:
-            entry = self._at_port(config.source)
-            module = _driver("drivers.sources", entry.kind)
-            self.source = module.open(entry, self._lines)
+        if self.config.simulator is not None:
+            self.start_simulation()
+        for name in self.config.axes:
+            self.open_axis(name)
+        if self.config.source is not None:
+            self.open_source()
         if self._with_camera:
-            entry = config.camera
-            if self.simulation is not None:
-                entry = entry.model_copy(update={"device": self.simulation.camera_device()})
-            self.camera = _driver("drivers.cameras", entry.kind).open("camera", entry)
+            self.open_camera()
+
+    def start_simulation(self) -> str:
+        """Start the emulators of a simulated rig; returns what was started."""
+        if self.config.simulator is None:
+            raise AcquisitionError(f"rig {self.config.name!r} has no `simulator` section")
+        self.simulation = SimulatedRig(self.config.simulator, with_camera=self._with_camera)
+        self.simulation.start()
+        return ", ".join(self.config.simulator.ports)
+
+    def open_axis(self, name: str) -> MotionAxis:
+        """Open one axis of the rig file; moves nothing."""
+        entry = self._at_port(self.config.axes[name])
+        if self.simulation is not None:
+            self.simulation.connect(name, entry.direction, entry.zero_deg)
+        self.axes[name] = open_axis(name, entry, self._lines)
+        return self.axes[name]
+
+    def open_source(self) -> LightSource:
+        """Open the light source; changes no light."""
+        if self.config.source is None:
+            raise AcquisitionError(f"rig {self.config.name!r} has no source")
+        entry = self._at_port(self.config.source)
+        source: LightSource = _driver("drivers.sources", entry.kind).open(entry, self._lines)
+        self.source = source
+        return source
+
+    def open_camera(self) -> Camera:
+        """Open the camera; exposes nothing."""
+        entry = self.config.camera
+        if self.simulation is not None:
+            entry = entry.model_copy(update={"device": self.simulation.camera_device()})
+        camera: Camera = _driver("drivers.cameras", entry.kind).open("camera", entry)
+        self.camera = camera
+        return camera
 
     def _at_port(self, entry: Any) -> Any:
         if not entry.port.startswith(SCHEME):

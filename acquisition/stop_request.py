@@ -12,9 +12,14 @@ class StopRequest:
     """Counts requests to stop. The second one interrupts the measuring thread with KeyboardInterrupt.
 
     As a context manager in the main thread it takes SIGINT and SIGTERM; the live page calls `request`.
+
+    Parameters
+    ----------
+    patience : which request interrupts at once; 1 where there is no state to finish.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, patience: int = 2) -> None:
+        self._patience = patience
         self._count = 0
         self._previous: dict[int, Any] = {}
         self._lock = threading.Lock()
@@ -23,11 +28,6 @@ class StopRequest:
     def requested(self) -> bool:
         """True after the first request."""
         return self._count > 0
-
-    @property
-    def immediate(self) -> bool:
-        """True after the second."""
-        return self._count > 1
 
     def request(self) -> None:
         """What Ctrl-C does, from any thread."""
@@ -39,7 +39,7 @@ class StopRequest:
             return self._count
 
     def _heard(self, number: int, frame: FrameType | None) -> None:
-        if self._add() == 2:
+        if self._add() == self._patience:
             raise KeyboardInterrupt
 
     def __enter__(self) -> Self:

@@ -1,0 +1,111 @@
+"""`acquire doctor`: what is there, what is not and why. Moves nothing, changes no light."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from acquisition.cleanup import run_all
+from acquisition.errors import AcquisitionError
+from acquisition.header import versions
+from acquisition.rig import Rig
+from acquisition.rig_config import RigConfig
+from drivers.camera import Camera
+from drivers.errors import DeviceError, FrameLost
+from drivers.motion import MotionAxis
+from processing.errors import ProcessError
+from processing.instrument import InstrumentModel
+
+#: Frames of the packet-loss test, and their exposure.
+FRAMES = 20
+EXPOSURE_S = 0.001
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing looked at. `well` is None for plain information."""
+
+    what: str
+    well: bool | None
+    found: str
+
+
+def examine(config: RigConfig, folder: Path) -> Iterator[Finding]:
+    """Look at everything that a measurement needs, one finding after another; no device's failure hides another's."""
+    yield Finding("versions", None, ", ".join(f"{name} {number}" for name, number in versions().items()))
+    free = shutil.disk_usage(folder).free
+    yield Finding("disc", free > 1e9, f"{free / 1e9:.1f} GB free in {folder.resolve()}")
+    for name, mode in config.modes.items():
+        yield _guarded(f"mode {name}", lambda mode=mode: _instrument(mode.instrument))  # type: ignore[misc]
+    rig = Rig(config)
+    try:
+        yield _guarded("emulators", rig.start_simulation) if config.simulator else Finding("rig", None, config.name)
+        for name in config.axes:
+            yield _guarded(f"axis {name}", lambda name=name: _axis(rig.open_axis(name)))  # type: ignore[misc]
+        if config.source is not None:
+            yield _guarded("source", lambda: _source(rig))
+        yield _guarded("camera", lambda: _camera(rig.open_camera()))
+    finally:
+        failure = run_all([("close the rig", rig.close)])
+    if failure is not None:
+        yield Finding("closing", False, str(failure))
+
+
+def _guarded(what: str, look: Callable[[], str]) -> Finding:
+    try:
+        return Finding(what, True, look())
+    except (DeviceError, AcquisitionError, ProcessError, ImportError, ValueError) as error:
+        return Finding(what, False, str(error))
+
+
+def _instrument(path: Path) -> str:
+    model = InstrumentModel.load(path)
+    return f"{model.name} ({path.name})"
+
+
+def _axis(axis: MotionAxis) -> str:
+    who = axis.describe()
+    limits = axis.limits
+    ends = " to ".join("no limit" if end is None else f"{end:g}" for end in (limits.min_deg, limits.max_deg))
+    homed = "homed" if axis.is_homed() else "NOT homed"
+    moving = ", MOVING" if axis.is_moving() else ""
+    position = f"at {axis.read_position().deg:.4f} deg, " if axis.is_homed() else ""
+    warnings = "".join(f", warning: {text}" for text in axis.warnings())
+    stop = "" if axis.can_stop_a_move else ", cannot be stopped once it moves"
+    name = f"{who.kind} {who.model}, serial {who.serial_number}, firmware {who.firmware}"
+    return f"{name}, {who.port}: {homed}{moving}, {position}limits {ends}{stop}{warnings}"
+
+
+def _source(rig: Rig) -> str:
+    source = rig.open_source()
+    state = "light on" if source.is_on() else "light off"
+    if source.interlock_open():
+        raise AcquisitionError(f"{source.describe()['model']}: {state}, INTERLOCK OPEN. Close the door.")
+    return f"{source.describe()['model']}: {state}, interlock closed"
+
+
+def _camera(camera: Camera) -> str:
+    from drivers.camera import CameraSettings
+
+    who = camera.describe()
+    camera.configure(CameraSettings(exposure_s=EXPOSURE_S, frame_average=1, trigger="software"))
+    lost = 0
+    for _ in range(FRAMES):
+        try:
+            camera.trigger().frame()
+        except FrameLost:
+            lost += 1
+    statistics = camera.statistics()
+    temperature = camera.temperature_c()
+    warm = "" if temperature is None else f", {temperature:.1f} C"
+    found = (
+        f"{who.library}: {who.vendor} {who.model}, serial {who.serial_number}, "
+        f"{who.sensor_width} x {who.sensor_height} {who.pixel_format} ({who.bits} bits), packets of {who.packet_size} bytes on {who.interface}{warm}; "
+        f"{lost} of {FRAMES} frames lost, {statistics.missing_packets} packets missing, "
+        f"{statistics.resent_packets} resent"
+    )
+    if lost:
+        raise AcquisitionError(found + ". Check cable, packet size and network load.")
+    return found
