@@ -12,6 +12,7 @@ from processing.capture import Capture, CaptureError
 from processing.correction import Correction, Mask
 from processing.errors import NotDetermined
 from processing.instrument import InstrumentModel
+from processing.mosaic.calibration import correct
 from processing.mosaic.layout import MosaicLayout
 from processing.mosaic.methods import demosaic
 from processing.mosaic.noise import stokes_covariance
@@ -99,12 +100,14 @@ def reduce_stokes(
     method: str = DEFAULT_METHOD,
     correction: Correction | None = None,
     noise: NoiseModel | None = None,
+    response: NDArray[np.float32] | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Write the Stokes image of a mosaic capture; returns the facts that the product holds.
 
-    Several states with the same angles are averaged first.
+    Several states with the same angles are averaged first. `response` (3, rows, columns) holds the analysis vectors of
+    the raw pixels, where they were calibrated; else the channels' ideal ones.
 
     Raises
     ------
@@ -120,6 +123,8 @@ def reduce_stokes(
     correction = correction or Correction.of(capture)
     noise = noise or NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
     frame, mask = mean_frame(capture, states, correction, progress)
+    if response is not None:
+        frame = correct(frame, response, layout, analyzers)
     channels = demosaic(frame, layout, method)
     frames = float(capture.column("repeats")[states].sum())
     found = stokes(channels, analyzers, layout, method, noise, frames, correction.dark_frames, frame)

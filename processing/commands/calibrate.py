@@ -14,6 +14,7 @@ POOR_FIT = 0.05
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
     app.command("calibrate")(calibrate_command)
+    app.command("calibrate-mosaic")(calibrate_mosaic_command)
 
 
 def calibrate_command(
@@ -49,6 +50,26 @@ def calibrate_command(
         note = f"process calibrate of {capture.name}, residual {100 * result.residual_over_mean:.2f} % of the mean"
         write_fitted(instrument, write, result, wavelength, note)
         typer.echo(str(write))
+
+
+def calibrate_mosaic_command(
+    capture: Annotated[Path, typer.Argument(help="Mosaic capture of an even field behind a turning polarizer.")],
+    instrument: Annotated[Path | None, typer.Option(help="Instrument file; default: the one in the capture.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Product file; default: beside the capture.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
+) -> None:
+    """Fit the analysis vector of every pixel of a polarization sensor (Powell and Gruev)."""
+    from processing.capture import Capture
+    from processing.commands.reduce import summary
+    from processing.mosaic.calibration import fit_response
+    from processing.product import Step, file_identity
+    from processing.reduce import choose_model
+
+    product = out or capture.with_suffix(".analyzers.h5")
+    with Capture(capture) as source:
+        step = Step("calibrate-mosaic", {"capture": capture.name}, (file_identity(capture),))
+        facts = fit_response(source, choose_model(source, instrument), product, step, overwrite)
+        summary(product, facts, source.simulated)
 
 
 def _region(text: str | None, shape: tuple[int, int]) -> tuple[slice, slice]:

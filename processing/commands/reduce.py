@@ -33,11 +33,14 @@ def reduce_command(
     dark: Annotated[Path | None, typer.Option(help="Other capture whose dark states are subtracted.")] = None,
     flat: Annotated[Path | None, typer.Option(help="Other capture whose flat states are divided out.")] = None,
     demosaic: Annotated[str | None, typer.Option(help="Mosaic method; default: the best of docs/mosaic.md.")] = None,
+    analyzers: Annotated[
+        Path | None, typer.Option(help="Mosaic: analysis vectors of the pixels, from `process calibrate-mosaic`.")
+    ] = None,
     figure: Annotated[Path | None, typer.Option(help="Also draw the image (PNG).")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
 ) -> None:
     """Invert W per pixel: Mueller image, or Stokes image of a polarization mosaic, with standard errors."""
-    options = ReduceOptions(instrument, weighted, covariance, physical, camera, dark, flat, demosaic)
+    options = ReduceOptions(instrument, weighted, covariance, physical, camera, dark, flat, demosaic, analyzers)
     product, facts, simulated = reduce_file(capture, out, options, overwrite)
     summary(product, facts, simulated)
     if figure is not None:
@@ -59,6 +62,7 @@ class ReduceOptions:
     dark: Path | None = None
     flat: Path | None = None
     demosaic: str | None = None
+    analyzers: Path | None = None
 
 
 def reduce_file(path: Path, out: Path | None, options: ReduceOptions, overwrite: bool) -> tuple[Path, Any, bool]:
@@ -83,14 +87,15 @@ def reduce_file(path: Path, out: Path | None, options: ReduceOptions, overwrite:
         correction = Correction.of(capture, bad, dark, flat)
         kind = "stokes" if capture.header.mosaic else "mueller"
         product = out or path.with_suffix(f".{kind}.h5")
-        files = [p for p in (path, options.instrument, options.camera, options.dark, options.flat) if p is not None]
+        given = (path, options.instrument, options.camera, options.dark, options.flat, options.analyzers)
+        files = [p for p in given if p is not None]
         arguments = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(options).items()}
         steps = (Step("reduce", {"capture": path.name} | arguments, tuple(file_identity(p) for p in files)),)
         model = choose_model(capture, options.instrument)
         tick = stack.enter_context(progress_bar("reducing", "rows" if kind == "mueller" else "states"))
         if kind == "mueller":
-            if options.demosaic:
-                raise ProcessError(f"--demosaic: {path} is not a mosaic capture.")
+            if options.demosaic or options.analyzers:
+                raise ProcessError(f"--demosaic and --analyzers: {path} is not a mosaic capture.")
             choice = Choice(options.weighted, options.covariance, options.physical, noise)
             facts = reduce_mueller(capture, model, product, steps, correction, choice, overwrite, tick)
         else:
@@ -100,10 +105,12 @@ def reduce_file(path: Path, out: Path | None, options: ReduceOptions, overwrite:
                     "--weighted, --covariance and --physical are for Mueller captures."
                 )
             # Imported here: OpenCV is not needed for a Mueller capture.
+            from processing.mosaic.calibration import read_response
             from processing.reduce_stokes import DEFAULT_METHOD, reduce_stokes
 
             method = options.demosaic or DEFAULT_METHOD
-            facts = reduce_stokes(capture, model, product, steps, method, correction, noise, overwrite, tick)
+            response = read_response(options.analyzers, capture.frame_shape) if options.analyzers else None
+            facts = reduce_stokes(capture, model, product, steps, method, correction, noise, response, overwrite, tick)
         return product, facts, capture.simulated
 
 
