@@ -23,6 +23,7 @@ from drivers.motion import Motion, MotionAxis, Position
 from drivers.registry import open_axis
 from drivers.serial_link import LineRegistry
 from drivers.source import LightSource
+from drivers.sources.manual import Ask, ManualSource
 from processing.states import StateTable
 from simulators.rig import SimulatedRig
 from simulators.rig_model import SCHEME
@@ -44,9 +45,20 @@ class Rig:
     camera : Camera or None where it was not asked for
     source : LightSource or None where the rig has none
     simulation : SimulatedRig or None
+
+    Parameters
+    ----------
+    ask : shows the operator what a source without a cable needs and returns True when it is done.
     """
 
-    def __init__(self, config: RigConfig, *, with_camera: bool = True, transcripts: Path | None = None) -> None:
+    def __init__(
+        self,
+        config: RigConfig,
+        *,
+        with_camera: bool = True,
+        transcripts: Path | None = None,
+        ask: Ask | None = None,
+    ) -> None:
         self.config = config
         self.axes: dict[str, MotionAxis] = {}
         self.camera: Camera | None = None
@@ -55,6 +67,7 @@ class Rig:
         self._asked: CameraSettings | None = None
         self._read_back = CameraSettings()
         self._with_camera = with_camera
+        self._ask = ask
         self._lines = LineRegistry(transcripts)
 
     def __enter__(self) -> Self:
@@ -106,6 +119,10 @@ class Rig:
             raise AcquisitionError(f"rig {self.config.name!r} has no source")
         entry = self._at_port(self.config.source)
         source: LightSource = _driver("drivers.sources", entry.kind).open(entry, self._lines)
+        if isinstance(source, ManualSource):
+            source.ask = self._ask
+            if self.simulation is not None:
+                self.simulation.uncovered = source.is_on
         self.source = source
         return source
 
@@ -119,7 +136,8 @@ class Rig:
         return camera
 
     def _at_port(self, entry: Any) -> Any:
-        if not entry.port.startswith(SCHEME):
+        # What is switched by hand has no port.
+        if not getattr(entry, "port", "").startswith(SCHEME):
             return entry
         if self.simulation is None:
             raise AcquisitionError(
@@ -196,7 +214,8 @@ class Rig:
         if not boxes:
             return
         concerned = {axis for box in boxes for axis in box.ranges_deg if axis in self.axes}
-        here = {axis: self.axes[axis].read_position().deg for axis in concerned}
+        # Where an axis without a reference stands is not known, whatever it reads.
+        here = {axis: self.axes[axis].read_position().deg for axis in concerned if self.axes[axis].is_homed()}
         box = find_forbidden(boxes, here, here | dict(targets_deg))
         if box is not None:
             raise AcquisitionError(f"move to {dict(targets_deg)} meets a {describe(box)}. Nothing was moved.")
@@ -287,7 +306,7 @@ class Rig:
             devices["source"] = self.source.describe()
         # The port as the rig file has it: a pseudo-terminal's number means nothing tomorrow.
         for name, entry in (*self.config.axes.items(), ("source", self.config.source)):
-            if name in devices and entry is not None:
+            if name in devices and hasattr(entry, "port"):
                 devices[name]["port"] = entry.port
         return devices
 

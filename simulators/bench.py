@@ -103,7 +103,7 @@ class SimulatedBench:
         exposure_s: float,
         index: int,
         *,
-        light: bool = True,
+        light: float = 1.0,
         omega_deg: float = 180.0,
     ) -> NDArray[np.uint16]:
         """Counts of one exposure.
@@ -112,7 +112,7 @@ class SimulatedBench:
         ----------
         angles_deg : true angle of each axis that the instrument names, degrees.
         index : number of the exposure; it seeds the noise.
-        light : False with the shutter closed.
+        light : what the source gives of its nominal light; 0 with the shutter closed.
         omega_deg : true angle of the arm, unless `angles_deg` has "arm".
 
         Returns
@@ -133,22 +133,22 @@ class SimulatedBench:
         exposure_s: float,
         index: int = 0,
         *,
-        light: bool = True,
+        light: float = 1.0,
         omega_deg: float = 180.0,
     ) -> Image:
         """Expected photo-electrons of an exposure, without dark current and noise; same shape as `expose`."""
         return self._expected(angles_deg, exposure_s, index, light, omega_deg)[0]
 
     def _expected(
-        self, angles_deg: Mapping[str, float], exposure_s: float, index: int, light: bool, omega_deg: float
+        self, angles_deg: Mapping[str, float], exposure_s: float, index: int, light: float, omega_deg: float
     ) -> tuple[Image, Shot]:
         angles = dict(angles_deg)
-        shot = Shot(index, exposure_s, index * self.state_period_s, self.seed, dict(angles))
+        shot = Shot(index, exposure_s, index * self.state_period_s, self.seed, dict(angles), float(light))
         model = self.instrument
         for effect in self.effects:
             angles = effect.angles(angles, shot)
             model = effect.train(model, shot)
-        level = 1.0
+        level = float(light)
         for effect in self.effects:
             level = effect.source(level, shot)
         mosaic = model.mosaic is not None

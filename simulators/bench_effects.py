@@ -23,13 +23,17 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Shot:
-    """One exposure, as the effects see it. `time_s` is scheduled time, not wall time, so that runs repeat."""
+    """One exposure, as the effects see it. `time_s` is scheduled time, not wall time, so that runs repeat.
+
+    `light` is what the source gives of its nominal light.
+    """
 
     index: int
     exposure_s: float
     time_s: float
     seed: int
     angles_deg: Mapping[str, float] = field(default_factory=dict)
+    light: float = 1.0
 
     def random(self, name: str) -> np.random.Generator:
         """Random numbers of one cause in this exposure: same seed and index, same numbers."""
@@ -204,7 +208,7 @@ class StrayLight(BenchEffect):
 
     def optics(self, electrons: Image, shot: Shot) -> Image:
         ramp = 1 + self.gradient * np.linspace(-0.5, 0.5, electrons.shape[-1], dtype=np.float32)
-        return np.asarray(electrons + self.e_per_s * shot.exposure_s * ramp, dtype=np.float32)
+        return np.asarray(electrons + self.e_per_s * shot.light * shot.exposure_s * ramp, dtype=np.float32)
 
 
 class VeilingGlare(BenchEffect):

@@ -192,6 +192,10 @@ class Emulator(ABC):
         with self._lock:
             return self.axes[axis].true_deg()
 
+    def light_at(self, wavelength_nm: float) -> float:
+        """Relative light, 0 to 1, that it lets through or gives at a wavelength; 1 for what is no light source."""
+        return 1.0
+
     def receive(self, data: bytes) -> None:
         """Take bytes from the host, in any portions."""
         with self._lock:

@@ -8,6 +8,7 @@ stand.
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 from collections.abc import Callable
 
@@ -18,7 +19,6 @@ from processing.instrument import InstrumentModel
 from processing.yaml_file import ConfigError
 from simulators.bench import SimulatedBench
 from simulators.clock import Clock
-from simulators.controllers.sc10 import SC10Emulator
 from simulators.emulator import Emulator
 from simulators.faults import FaultSchedule, parse_fault
 from simulators.gige_camera import GigeCamera
@@ -45,6 +45,8 @@ class SimulatedRig:
         self.emulators: dict[str, Emulator] = {}
         self.bench: SimulatedBench | None = None
         self.camera: GigeCamera | None = None
+        #: What the operator does with a source that has no cable: False while it is covered.
+        self.uncovered: Callable[[], bool] = lambda: True
         self._with_camera = with_camera
         self._ports: dict[str, PtyPort] = {}
         self._user_angle: dict[str, Callable[[float], float]] = {}
@@ -154,10 +156,10 @@ class SimulatedRig:
             angles[name] = self._user_angle.get(name, float)(device_deg)
         return angles
 
-    def light(self) -> bool:
-        """True if the shutter lets light through; without one it always does."""
-        shutters = [e for e in self.emulators.values() if isinstance(e, SC10Emulator)]
-        return all(shutter.is_open() for shutter in shutters)
+    def light(self) -> float:
+        """Relative light on the sample now, 0 to 1; without a shutter or LED driver it is always 1."""
+        wavelength_nm = math.nan if self.bench is None else self.bench.wavelength_nm
+        return self.uncovered() * math.prod(e.light_at(wavelength_nm) for e in self.emulators.values())
 
     def expose(self, exposure_s: float) -> NDArray[np.uint16]:
         """Counts (rows, columns) of an exposure that happens now."""

@@ -56,7 +56,7 @@ def _fill_in(tree: Any, simulation: SimulatedRig, folder: Path) -> None:
     for name, entry in tree["axes"].items():
         simulation.connect(name, int(entry.get("direction", 1)), float(entry.get("zero_deg", 0.0)))
     for entry in (*tree["axes"].values(), tree.get("source")):
-        if entry is not None and str(entry["port"]).startswith(SCHEME):
+        if entry is not None and str(entry.get("port", "")).startswith(SCHEME):
             entry["port"] = simulation.port(str(entry["port"]).removeprefix(SCHEME))
     for mode in tree["modes"].values():
         mode["instrument"] = str(folder / mode["instrument"])

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import re
 import time
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -49,6 +49,9 @@ class Config(BaseModel):
     port: str = Field(description="device path, /dev/serial/by-id path or socket://host:port")
     channels: dict[float, int] = Field(
         default={}, description="wavelength in nm to channel 1 to 4; empty: as the LEDs say themselves"
+    )
+    percent: dict[float, Annotated[float, Field(ge=0, le=100)]] = Field(
+        default={}, description="brightness by wavelength in nm, set when it is selected; others stay as the box has them"
     )
     reply_s: float = Field(default=1.0, gt=0, description="longest wait for a reply")
 
@@ -86,13 +89,15 @@ class LedDriver(LightSource):
         return tuple(self._nominal_nm[channel] for channel in self._present)
 
     def select(self, wavelength_nm: float) -> None:
-        """Choose the LED of a wavelength; if light was on, the old LED goes off and then the new one on."""
+        """Choose the LED of a wavelength and its `percent`; if light was on, the old LED goes off, then the new one on."""
         channel = self._channel_of(wavelength_nm)
         on = self.is_on()
         self._selected = channel
         for other in self._present:
             if other != channel:
                 self._switch(other, False)
+        if wavelength_nm in self.config.percent:
+            self.set_level(self.config.percent[wavelength_nm])
         if on:
             self._switch(channel, True)
 

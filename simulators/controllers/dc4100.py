@@ -13,6 +13,8 @@ from simulators.emulator import Emulator
 from simulators.faults import FaultSchedule
 from simulators.serve import ServeOptions
 
+#: Half the width of the filter that stands on the bench for each wavelength.
+FILTER_NM = 15.0
 _UNKNOWN, _RANGE, _NO_LED, _HOT = (1, "unknown command"), (2, "out of range"), (3, "no LED"), (4, "over temperature")
 
 
@@ -57,6 +59,10 @@ class DC4100Emulator(Emulator):
                 for channel, nm in enumerate(self.wavelengths_nm)
                 if nm is not None and self._on[channel]
             }
+
+    def light_at(self, wavelength_nm: float) -> float:
+        """Light of the LEDs near a wavelength; a filter keeps that of the others from the sample."""
+        return sum(level for nm, level in self.light().items() if abs(nm - wavelength_nm) <= FILTER_NM)
 
     def overheat(self, too_hot: bool = True) -> None:
         """Let the box get too hot, which shuts off all LEDs, or cool down."""

@@ -33,6 +33,10 @@ class SC10Emulator(Emulator):
         with self._lock:
             return self._blade_open()
 
+    def light_at(self, wavelength_nm: float) -> float:
+        """1 or 0: a blade knows no colour."""
+        return float(self.is_open())
+
     def trip(self, tripped: bool) -> None:
         """Open (True) or close the interlock circuit; an open one disables the shutter."""
         with self._lock:
