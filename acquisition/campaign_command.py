@@ -20,7 +20,7 @@ from acquisition.operator import Operator
 from acquisition.progress import ConsoleProgress
 from acquisition.rig import Rig
 from acquisition.rig_config import load_rig
-from acquisition.single import Options, say_simulated, seeded, show_checks
+from acquisition.single import Options, live_page, say_simulated, seeded, show_checks
 from acquisition.stop_request import StopRequest
 
 
@@ -42,8 +42,9 @@ def run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Obs
     held = CampaignFolder(folder, campaign)
     try:
         operator = Operator(console.print, stop, options.yes, rig_config.simulated)
-        watchers = [ConsoleProgress(console), *observers]
-        done = CampaignRun(campaign, rig_config, held, operator, stop, watchers, options.home).run(jobs)
+        with live_page(options.live, rig_config, stop, console) as page:
+            watchers = [ConsoleProgress(console), *page, *observers]
+            done = CampaignRun(campaign, rig_config, held, operator, stop, watchers, options.home).run(jobs)
         complete = sum(entry.get("status") == "complete" for entry in held.index.values())
     finally:
         held.close()

@@ -132,7 +132,8 @@ class CampaignRun:
             done = self._states_done(capture)
             try:
                 rig = self._open_rig()
-                changed = self.operator.prepare(capture.plan)
+                selects = rig.source is not None and rig.source.selects_wavelength
+                changed = self.operator.prepare(capture.plan, source_selects=selects)
                 self.folder.log("capture started", capture=capture.name, states_done=done, operator=changed)
                 self.folder.record(capture.name, status="running", reference=capture.reference)
                 result = self._take_once(capture, job, rig)
@@ -194,7 +195,7 @@ class CampaignRun:
 
     def _open_rig(self) -> Rig:
         if self._rig is None:
-            rig = Rig(self.config)
+            rig = Rig(self.config, ask=self.operator.confirm)
             rig.__enter__()
             self._rig = rig
         return self._rig

@@ -50,6 +50,7 @@ def capture(
     home: Annotated[bool, typer.Option("--home", help="home axes that have no reference")] = False,
     campaign: Annotated[Path | None, typer.Option(help="campaign file: run what is missing of it")] = None,
     resume: Annotated[Path | None, typer.Option(help="go on with this partial capture")] = None,
+    live: Annotated[bool, typer.Option("--live", help="show the run on a local web page")] = False,
     yes: Annotated[bool, typer.Option("--yes", help="answer every question with yes")] = False,
 ) -> None:
     """Take a capture: `acquire --omega 35`."""
@@ -61,7 +62,7 @@ def capture(
     from acquisition import single
 
     options = single.Options(
-        omega, mode, wavelength, sample, exposure, rig, plan, out, seed, dry_run, home, resume, yes
+        omega, mode, wavelength, sample, exposure, rig, plan, out, seed, dry_run, home, resume, live, yes
     )
     if campaign is None:
         raise typer.Exit(_stoppable(lambda stop: single.run(options, stop)))

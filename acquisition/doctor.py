@@ -102,7 +102,8 @@ def _camera(camera: Camera) -> str:
     warm = "" if temperature is None else f", {temperature:.1f} C"
     found = (
         f"{who.library}: {who.vendor} {who.model}, serial {who.serial_number}, "
-        f"{who.sensor_width} x {who.sensor_height} {who.pixel_format} ({who.bits} bits), packets of {who.packet_size} bytes on {who.interface}{warm}; "
+        f"{who.sensor_width} x {who.sensor_height} {who.pixel_format} ({who.bits} bits), "
+        f"packets of {who.packet_size} bytes on {who.interface}{warm}; "
         f"{lost} of {FRAMES} frames lost, {statistics.missing_packets} packets missing, "
         f"{statistics.resent_packets} resent"
     )

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from drivers.motion import Position
 from processing.states import StateTable
 
+#: Names of the channels over the super-pixel, row by row from the top left.
+Mosaic = tuple[tuple[str, ...], ...]
+
 
 @dataclass(frozen=True)
 class StateReport:
@@ -32,8 +35,8 @@ class Observer:
     def campaign_progress(self, number: int, total: int, name: str) -> None:
         """A campaign comes to its capture `number`, counted from 0."""
 
-    def run_started(self, title: str, table: StateTable, pending: int) -> None:
-        """A capture begins with so many states to take."""
+    def run_started(self, title: str, table: StateTable, pending: int, mosaic: Mosaic | None) -> None:
+        """A capture begins with so many states to take; `mosaic` lays out the analyzers of a polarization camera."""
 
     def activity(self, text: str) -> None:
         """What the rig does now, in a few words."""

@@ -30,8 +30,12 @@ class Operator:
         self._simulated = simulated
         self._before: MeasurementPlan | None = None
 
-    def prepare(self, plan: MeasurementPlan) -> list[str]:
+    def prepare(self, plan: MeasurementPlan, *, source_selects: bool = False) -> list[str]:
         """Have done what this capture needs and the one before did not; returns what was changed.
+
+        Parameters
+        ----------
+        source_selects : the source sees to its wavelength itself, even if only by asking.
 
         Raises
         ------
@@ -44,7 +48,7 @@ class Operator:
         changes = []
         if before is None or before.sample != plan.sample:
             changes.append(f"place the sample: {plan.sample.name or plan.sample.kind}")
-        if before is None or before.wavelength_nm != plan.wavelength_nm:
+        if not source_selects and (before is None or before.wavelength_nm != plan.wavelength_nm):
             changes.append(f"set the source to {plan.wavelength_nm:g} nm")
         if before is None or before.mode != plan.mode:
             changes.append(f"set the bench up for mode {plan.mode}")
@@ -52,16 +56,23 @@ class Operator:
             self._ask(change)
         return changes
 
+    def confirm(self, question: str) -> bool:
+        """Ask for what a source without a cable needs; True once it is done. Raises as `prepare`."""
+        return self._answer(question, f"{question} Press Enter for yes, n for no.") != "n"
+
     def _ask(self, change: str) -> None:
+        self._answer(change, f"Please {change}, then press Enter.")
+
+    def _answer(self, what: str, prompt: str) -> str:
         if self._simulated or self._yes:
-            self._tell(f"{change} ({'simulated' if self._simulated else '--yes'})")
-            return
+            self._tell(f"{what} ({'simulated' if self._simulated else '--yes'})")
+            return ""
         if not sys.stdin.isatty():
             raise AcquisitionError(
-                f"somebody has to {change}, but there is no terminal to ask at. Use --yes if it is done."
+                f"somebody has to do this: {what}. There is no terminal to ask at; use --yes if it is done."
             )
-        self._tell(f"Please {change}, then press Enter.")
+        self._tell(prompt)
         while not select.select([sys.stdin], [], [], LOOK_S)[0]:
             if self._stop.requested:
                 raise Stopped("stopped while waiting for the operator")
-        sys.stdin.readline()
+        return sys.stdin.readline().strip().lower()[:1]

@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from acquisition.observer import Observer, StateReport
+from acquisition.observer import Mosaic, Observer, StateReport
 from processing.states import StateTable
 
 #: Seconds between two lines where the output is a file or a pipe.
@@ -27,7 +27,7 @@ class ConsoleProgress(Observer):
         self._start_s = self._line_s = time.monotonic()
         self._warned: set[str] = set()
 
-    def run_started(self, title: str, table: StateTable, pending: int) -> None:
+    def run_started(self, title: str, table: StateTable, pending: int, mosaic: Mosaic | None) -> None:
         self._done, self._total, self._pending = 0, len(table), pending
         self._start_s = time.monotonic()
         self._console.print(f"{title}: {pending} states" + (f" of {len(table)}" if pending < len(table) else ""))

@@ -118,7 +118,7 @@ def _run(
     status: Status = "failed"
     failure: BaseException | None = None
     for observer in watchers:
-        observer.run_started(title_of(job.plan), job.table, len(pending))
+        observer.run_started(title_of(job.plan), job.table, len(pending), job.instrument.mosaic)
     try:
         _go_to_start(job, rig, watchers)
         if _take_states(job, runner, pending):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from acquisition.cli import CONFIGS, DEFAULT_RIG, INTERRUPTED
 from acquisition.estimate import capture_seconds
 from acquisition.header import default_name
 from acquisition.job import Job, Result, check_with_devices, job_of, prepare
+from acquisition.observer import Observer
 from acquisition.plan import MeasurementPlan
 from acquisition.progress import ConsoleProgress
 from acquisition.rig import Rig
@@ -40,6 +43,7 @@ class Options:
     dry_run: bool
     home: bool
     resume: Path | None
+    live: bool
     yes: bool
 
 
@@ -64,7 +68,8 @@ def run(options: Options, stop: StopRequest) -> int:
         if stop.requested:
             return INTERRUPTED
         take = session.take if options.resume is None else session.resume
-        result = take(job, rig, path, stop, [ConsoleProgress(console)], home=options.home)
+        with live_page(options.live, job.rig, stop, console) as page:
+            result = take(job, rig, path, stop, [ConsoleProgress(console), *page], home=options.home)
     summarize(job, result)
     return INTERRUPTED if result.status == "aborted" else 0
 
@@ -103,6 +108,20 @@ def seeded(rig: RigConfig, seed: int | None) -> RigConfig:
     if rig.simulator is None:
         raise ConfigError(f"--seed {seed}: rig {rig.name!r} has no simulator, its noise has no seed")
     return rig.model_copy(update={"simulator": rig.simulator.model_copy(update={"seed": seed})})
+
+
+@contextmanager
+def live_page(wanted: bool, rig: RigConfig, stop: StopRequest, console: Console) -> Iterator[list[Observer]]:
+    """The live page as a list of observers, empty where it is not wanted; prints its address."""
+    if not wanted:
+        yield []
+        return
+    from acquisition.live_view import LiveServer, LiveState
+
+    state = LiveState(rig.simulated, rig.detector.black_level_counts, (1 << (rig.detector.bits or 16)) - 1)
+    with LiveServer(state, stop) as server:
+        console.print(f"live view: {server.url}", soft_wrap=True, highlight=False, markup=False)
+        yield [state]
 
 
 def say_simulated(console: Console, rig: RigConfig) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from types import FrameType, TracebackType
@@ -31,7 +32,10 @@ class StopRequest:
 
     def request(self) -> None:
         """What Ctrl-C does, from any thread."""
-        signal.raise_signal(signal.SIGINT) if self._previous else self._add()
+        if self._previous:
+            os.kill(os.getpid(), signal.SIGINT)
+        else:
+            self._add()
 
     def _add(self) -> int:
         with self._lock:

@@ -1,0 +1,202 @@
+"""`acquire --live`: the page shows a running capture in a real browser, and its stop button does what Ctrl-C does."""
+
+import base64
+import contextlib
+import itertools
+import json
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from processing.capture import Capture
+
+
+class Browser:
+    """Headless Chromium, driven over its debugging pipe."""
+
+    def __init__(self, program, profile):
+        to_child, self._write = os.pipe()
+        self._read, from_child = os.pipe()
+
+        def connect():
+            # Chromium reads commands from descriptor 3 and answers on 4.
+            first, second = os.dup(to_child), os.dup(from_child)
+            os.dup2(first, 3)
+            os.dup2(second, 4)
+
+        flags = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--remote-debugging-pipe"]
+        self._child = subprocess.Popen(
+            [program, *flags, f"--user-data-dir={profile}", "about:blank"],
+            preexec_fn=connect,
+            close_fds=False,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        os.close(to_child)
+        os.close(from_child)
+        self._numbers = itertools.count(1)
+        self._buffer = b""
+        self._session = None
+        target = self.call("Target.createTarget", url="about:blank")["targetId"]
+        self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+
+    def call(self, method, **parameters):
+        number = next(self._numbers)
+        message = {"id": number, "method": method, "params": parameters}
+        if self._session:
+            message["sessionId"] = self._session
+        os.write(self._write, json.dumps(message).encode() + b"\0")
+        while True:
+            while b"\0" not in self._buffer:
+                data = os.read(self._read, 1 << 20)
+                assert data, "the browser has ended"
+                self._buffer += data
+            text, _, self._buffer = self._buffer.partition(b"\0")
+            answer = json.loads(text)
+            if answer.get("id") == number:
+                assert "error" not in answer, answer
+                return answer["result"]
+
+    def evaluate(self, expression):
+        return self.call("Runtime.evaluate", expression=expression, awaitPromise=True)["result"].get("value")
+
+    def wait_for(self, expression, timeout_s=20):
+        end_s = time.monotonic() + timeout_s
+        while not (value := self.evaluate(expression)):
+            assert time.monotonic() < end_s, f"{expression} stayed {value!r}"
+            time.sleep(0.1)
+        return value
+
+    def screenshot(self, path):
+        Path(path).write_bytes(base64.b64decode(self.call("Page.captureScreenshot")["data"]))
+
+    def close(self):
+        self._child.kill()
+        self._child.wait()
+        os.close(self._read)
+        os.close(self._write)
+
+
+@pytest.fixture
+def browser(tmp_path):
+    program = shutil.which("chromium-headless-shell") or shutil.which("chromium")
+    if program is None:
+        if os.environ.get("CI"):
+            pytest.fail("CI needs chromium")
+        pytest.skip("no chromium here")
+    window = Browser(program, tmp_path / "profile")
+    yield window
+    window.close()
+
+
+@pytest.fixture
+def running(small_rig, tmp_path):
+    """A capture that takes a while, with its live page; yields process, address and folder."""
+    rig = small_rig(clock_speed=1.5, rows=256, columns=320)
+    child = subprocess.Popen(
+        [sys.executable, "-m", "acquisition.cli", "--omega", "35", "--rig", rig, "--out", tmp_path / "out", "--live"],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    url = None
+    for line in child.stderr:
+        found = re.search(r"live view: (http://\S+)", line)
+        if found:
+            url = found[1]
+            break
+    assert url, child.communicate()
+    yield child, url, tmp_path / "out"
+    child.kill()
+    child.communicate()
+
+
+def _get(url, path, host=None, method="GET"):
+    base, query = url.split("/?")
+    request = urllib.request.Request(base + path.replace("TOKEN", query), method=method)
+    if host:
+        request.add_header("Host", host)
+    with urllib.request.urlopen(request, timeout=10) as answer:
+        return answer.status, answer.read()
+
+
+def test_page_shows_the_capture_and_its_button_stops_it(running, browser):
+    child, url, folder = running
+    browser.call("Emulation.setDeviceMetricsOverride", width=390, height=844, deviceScaleFactor=2, mobile=True)
+    browser.call("Page.navigate", url=url)
+    browser.wait_for("document.getElementById('bar').value >= 6")
+    assert browser.evaluate("document.getElementById('simulated').hidden") is False
+    assert "red_sphere" in browser.evaluate("document.getElementById('title').textContent")
+    assert "psg" in browser.evaluate("document.getElementById('axes').textContent")
+    browser.wait_for("document.getElementById('frame').naturalWidth == 320")
+    browser.wait_for("document.getElementById('quick').naturalWidth == 320")
+    # Readable on a phone: nothing is wider than the screen.
+    assert browser.evaluate("document.documentElement.scrollWidth <= 390")
+    # Nothing came from elsewhere.
+    resources = browser.evaluate("performance.getEntriesByType('resource').map(e => e.name).join(' ')")
+    assert all(name.startswith("http://127.0.0.1:") for name in resources.split())
+    if path := os.environ.get("UMOV_SCREENSHOT"):
+        browser.call("Emulation.setDeviceMetricsOverride", width=1080, height=760, deviceScaleFactor=1, mobile=False)
+        browser.wait_for("document.getElementById('bar').value >= 25", 60)
+        time.sleep(1)
+        browser.screenshot(path)
+    browser.evaluate("document.getElementById('stop').click()")
+    out, err = child.communicate(timeout=30)
+    assert child.returncode == 130, out + err
+    (final,) = folder.glob("*.h5")
+    with Capture(final) as capture:
+        assert capture.status == "aborted"
+        assert 6 <= len(capture.done) < 44
+
+
+def test_actions_need_the_token_and_a_local_host(running):
+    child, url, _ = running
+    for path, host, method in (
+        ("/stop", None, "POST"),
+        ("/stop?token=wrong", None, "POST"),
+        ("/stop?TOKEN", "evil.example", "POST"),
+        ("/state", "evil.example", "GET"),
+    ):
+        with pytest.raises(urllib.error.HTTPError) as refused:
+            _get(url, path, host, method)
+        assert refused.value.code == 403
+        refused.value.close()
+    assert json.loads(_get(url, "/state")[1])["simulated"] is True
+    assert child.poll() is None
+
+
+def test_a_browser_that_stops_reading_does_not_slow_the_capture(small_rig, acquire, tmp_path, monkeypatch):
+    from acquisition.live_view import LiveServer
+
+    stuck = []
+    enter = LiveServer.__enter__
+
+    def with_stuck_browsers(self):
+        enter(self)
+        for _ in range(5):
+            # Asks for much and never reads.
+            link = socket.create_connection(("127.0.0.1", self._server.server_address[1]))
+            link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)
+            link.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" * 200)
+            stuck.append(link)
+        return self
+
+    monkeypatch.setattr(LiveServer, "__enter__", with_stuck_browsers)
+    start_s = time.monotonic()
+    code, _, err = acquire("--omega", 35, "--rig", small_rig(), "--out", tmp_path / "a", "--live")
+    assert code == 0, err
+    assert len(stuck) == 5
+    # Not a measure of speed: a measuring thread that waited for them would hang for their ten seconds each.
+    assert time.monotonic() - start_s < 40
+    for link in stuck:
+        with contextlib.suppress(OSError):
+            link.close()
