@@ -56,7 +56,7 @@ def stokes_design_figure(predictions: Mapping[float, Sequence[Prediction]]) -> F
     for panel, (nm, ranked) in zip(panels, predictions.items(), strict=True):
         shown = {p.name: p for p in ranked if p.name in ("horizontal", "vertical")} | {ranked[0].name: ranked[0]}
         for name, p in shown.items():
-            (line,) = panel.semilogy(p.omega_deg, p.rms, marker="o", label=f"{name}, rms")
+            (line,) = panel.semilogy(p.omega_deg, p.p90, marker="o", label=f"{name}, 90 % of pixels")
             panel.semilogy(p.omega_deg, p.median, color=line.get_color(), linestyle="--", label=f"{name}, median")
         panel.set_title(f"{nm:g} nm", fontsize=10)
         panel.set_xlabel("$\\Omega$ / degrees")

@@ -50,22 +50,22 @@ class Assumptions:
 class Prediction:
     """Standard error of xi0 of one illumination over the object: one entry for each arm angle.
 
-    `rms` is over all lit pixels, `median` of them, `lost` the fraction whose standard error is over 0.1 or whose
-    condition number is over 100; `rms` counts a pixel as at most 1, the whole range that xi0 can have.
+    `p90` is the 90th percentile of all lit pixels (the dark border of the shadow makes any mean depend on a few of
+    them), `median` their median, `lost` the fraction whose standard error is over 0.1 or condition number over 100.
     """
 
     name: str
     stokes: FloatArray
     omega_deg: FloatArray
-    rms: FloatArray
+    p90: FloatArray
     median: FloatArray
     lost: FloatArray
     condition: FloatArray
 
     @property
     def score(self) -> float:
-        """Root mean square over all arm angles; smaller is better."""
-        return float(np.sqrt(np.mean(self.rms**2)))
+        """Root mean square of `p90` over all arm angles; smaller is better."""
+        return float(np.sqrt(np.mean(self.p90**2)))
 
 
 def predict(
@@ -99,8 +99,8 @@ def predict(
             progress(done, len(omega_deg))
     found = []
     for name, stokes in states.items():
-        rms, median, lost, condition = np.array(columns[name]).T
-        found.append(Prediction(name, stokes, np.asarray(omega_deg, dtype=float), rms, median, lost, condition))
+        p90, median, lost, condition = np.array(columns[name]).T
+        found.append(Prediction(name, stokes, np.asarray(omega_deg, dtype=float), p90, median, lost, condition))
     return sorted(found, key=lambda p: p.score)
 
 
@@ -119,9 +119,8 @@ def predicted(
 
 def _summary(e: Xi0Estimate) -> tuple[float, float, float, float]:
     stderr = np.nan_to_num(e.xi0_stderr, nan=1.0, posinf=1.0)
-    bounded = np.minimum(stderr, 1.0)
     return (
-        float(np.sqrt(np.mean(bounded**2))),
+        float(np.percentile(stderr, 90)),
         float(np.median(stderr)),
         float(np.mean(~e.valid)),
         float(np.nanmax(e.condition)),

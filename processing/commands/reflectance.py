@@ -45,7 +45,7 @@ def design_command(
         for p in ranked[nm]:
             worst = int(p.median.argmax())
             typer.echo(
-                f"  {p.name:>16}: rms {p.score:.4f}, median at worst {p.median[worst]:.4f} (Omega "
+                f"  {p.name:>16}: 90 % of pixels {p.score:.4f}, median at worst {p.median[worst]:.4f} (Omega "
                 f"{p.omega_deg[worst]:g}), pixels lost there {100 * p.lost[worst]:.0f} %"
             )
         typer.echo(f"  recommended: {ranked[nm][0].name}")

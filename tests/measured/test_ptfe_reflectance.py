@@ -76,7 +76,7 @@ def explained(data: Ptfe, model: np.ndarray) -> float:
 #: Found on these data (docs/reflectance.md): by the pixel's own dominant process, by the fitted model, and by Fresnel
 #: reflection at PTFE's refractive index 1.35.
 FOUND = {
-    0.351: (0.825, 0.616, 0.450),
+    0.351: (0.825, 0.616, 0.457),
     0.532: (0.932, 0.742, 0.510),
     0.633: (0.924, 0.718, 0.486),
     1.064: (0.880, 0.621, 0.408),
