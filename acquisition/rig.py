@@ -32,6 +32,8 @@ log = logging.getLogger(__name__)
 
 #: An endless axis unwinds once it has come this far: position counters are not endless.
 ENDLESS_UP_TO_DEG = 36_000.0
+#: Shortest pause between two looks at a moving axis.
+SHORTEST_LOOK_S = 0.002
 #: Longest wait for moves that were started and given up.
 REST_WITHIN_S = 60.0
 
@@ -235,6 +237,7 @@ class Rig:
     ) -> dict[str, Position]:
         left = dict(motions)
         positions: dict[str, Position] = {}
+        start_s = time.monotonic()
         try:
             while left:
                 for name, motion in list(left.items()):
@@ -244,7 +247,7 @@ class Rig:
                 if tick is not None:
                     tick(motions)
                 if left:
-                    time.sleep(min(self.axes[name].config.poll_s for name in left))
+                    time.sleep(self._next_look_s(left, time.monotonic() - start_s))
         except MotionFailed as failure:
             others = self.stop()
             if others is not None:
@@ -264,6 +267,13 @@ class Rig:
                     self.stop()
                     raise AcquisitionError(f"axis {axis.name} still moves after {REST_WITHIN_S:g} s; it was stopped")
                 time.sleep(axis.config.poll_s)
+
+    def _next_look_s(self, left: Mapping[str, Motion], elapsed_s: float) -> float:
+        """Pause before the next look at moving axes: short around the time at which the last should arrive."""
+        slowest = max(left.values(), key=lambda motion: motion.expected_s)
+        off_s = abs(slowest.expected_s / self.time_scale - elapsed_s)
+        longest_s = min(self.axes[name].config.poll_s for name in left)
+        return min(max(off_s / 2, SHORTEST_LOOK_S), longest_s)
 
     def positions(self) -> dict[str, Position]:
         """Positions of all axes, read now."""
@@ -306,8 +316,8 @@ class Rig:
             devices["source"] = self.source.describe()
         # The port as the rig file has it: a pseudo-terminal's number means nothing tomorrow.
         for name, entry in (*self.config.axes.items(), ("source", self.config.source)):
-            if name in devices and hasattr(entry, "port"):
-                devices[name]["port"] = entry.port
+            if name in devices and (port := getattr(entry, "port", None)) is not None:
+                devices[name]["port"] = port
         return devices
 
     def close(self) -> Exception | None:

@@ -51,7 +51,7 @@ class Config(BaseModel):
         default={}, description="wavelength in nm to channel 1 to 4; empty: as the LEDs say themselves"
     )
     percent: dict[float, Annotated[float, Field(ge=0, le=100)]] = Field(
-        default={}, description="brightness by wavelength in nm, set when it is selected; others stay as the box has them"
+        default={}, description="brightness by wavelength in nm, set when that is selected"
     )
     reply_s: float = Field(default=1.0, gt=0, description="longest wait for a reply")
 
@@ -89,7 +89,10 @@ class LedDriver(LightSource):
         return tuple(self._nominal_nm[channel] for channel in self._present)
 
     def select(self, wavelength_nm: float) -> None:
-        """Choose the LED of a wavelength and its `percent`; if light was on, the old LED goes off, then the new one on."""
+        """Choose the LED of a wavelength, and its brightness where the rig file gives one.
+
+        If light was on, the old LED goes off and then the new one on.
+        """
         channel = self._channel_of(wavelength_nm)
         on = self.is_on()
         self._selected = channel
