@@ -8,14 +8,17 @@ import typer
 
 from processing.command_line import run
 from processing.commands import (
+    axostep,
     calibrate,
     camera,
     campaign,
     design,
     geometry,
     importing,
+    quantities,
     reduce,
     reflectance,
+    report,
     tables,
     xi0,
 )
@@ -30,10 +33,13 @@ app = typer.Typer(
 )
 
 # One line a module that brings commands. It must not import anything heavy at its top: `--help` is fast.
+axostep.register(app)
 calibrate.register(app)
 camera.register(app)
 importing.register(app)
+quantities.register(app)
 reduce.register(app)
+report.register(app)
 campaign.register(app)
 design.register(app)
 geometry.register(app)

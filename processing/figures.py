@@ -53,6 +53,10 @@ def product_figure(product: Product) -> Figure:
             ("valid", valid, {"cmap": "gray", "vmin": 0, "vmax": 1}),
         ]
         return map_figure(panels, _title(product), product.simulated)
+    if product.kind == "quantities":
+        from processing.quantities_figures import quantities_figure
+
+        return quantities_figure(product, _title(product))
     if product.kind == "camera":
         return photon_transfer_figure(product)
     raise ProcessError(f"{product.path}: no figure is defined for a {product.kind} image.")

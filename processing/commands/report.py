@@ -1,0 +1,28 @@
+"""`process report`: one self-contained HTML about a measurement."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    app.command("report")(report_command)
+
+
+def report_command(
+    sources: Annotated[list[Path], typer.Argument(help="Captures, products, CSV, pictures, or folders of them.")],
+    out: Annotated[Path, typer.Option(help="HTML file to write.")] = Path("report.html"),
+    title: Annotated[str, typer.Option(help="Heading.")] = "Mueller polarimetry report",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a report of that name.")] = False,
+) -> None:
+    """One HTML file with figures, numbers, provenance, time ledger and warnings; needs nothing else to be read."""
+    from processing.console import progress_bar
+    from processing.report import write_report
+
+    with progress_bar("reporting", "files") as tick:
+        written = write_report(sources, out, title, overwrite, tick)
+    typer.echo(str(written))

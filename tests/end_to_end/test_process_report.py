@@ -1,0 +1,78 @@
+"""`process report`: one HTML file that needs nothing else, and tells simulated from measured."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from processing.capture import Capture
+from processing.cli import main
+from processing.instrument import InstrumentModel
+from processing.product import Step
+from processing.reduce import reduce_mueller
+
+
+def run(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, str]:
+    with pytest.raises(SystemExit) as ended:
+        main([str(a) for a in args])
+    err = capsys.readouterr().err
+    assert "Traceback" not in err
+    return int(ended.value.code or 0), err
+
+
+@pytest.fixture
+def campaign(configs: Path, synthetic_capture, tmp_path: Path) -> Path:
+    """A folder with a capture, its product, a table and a picture."""
+    model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
+    angles = {"psg": 9.0 * np.arange(40), "psa": 4.91 * 9.0 * np.arange(40)}
+    frames = np.einsum("nck,k->nc", model.rows(angles), 900 * np.eye(4).reshape(16))
+    frames = np.broadcast_to(frames[..., None, None], (40, 1, 8, 10)) + np.random.default_rng(1).normal(
+        0, 1, (40, 1, 8, 10)
+    )
+    path = synthetic_capture(frames, angles, title="air <& mirror>", plan_yaml="kind: plan")
+    with Capture(path) as capture:
+        step = Step("reduce", {"capture": "capture.h5", "weighted": False})
+        reduce_mueller(capture, model, tmp_path / "capture.mueller.h5", (step,))
+    (tmp_path / "rmsd.csv").write_text("omega_deg,psi_deg\n10,1.5\n20,2.5\n", encoding="utf-8")
+    (tmp_path / "curve.svg").write_text("<svg xmlns='http://www.w3.org/2000/svg'/>", encoding="utf-8")
+    return tmp_path
+
+
+def test_report_is_self_contained(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = campaign / "report.html"
+    code, err = run(capsys, "report", campaign, "--out", out, "--title", "Air & co")
+    assert (code, err) == (0, "")
+    text = out.read_text(encoding="utf-8")
+    assert "SIMULATED" in text
+    assert "<h1>Air &amp; co</h1>" in text
+    assert "air &lt;&amp; mirror&gt;" in text
+    # Nothing is fetched: every picture is inside, no script, no link but those within the page.
+    sources = re.findall(r'src="([^"]{0,40})', text)
+    assert len(sources) >= 4
+    assert all(s.startswith("data:image/") for s in sources)
+    assert all(h.startswith("#") for h in re.findall(r'href="([^"]*)"', text))
+    assert "<script" not in text
+    for expected in ("condition number", "7.14", "residual of the fit", "reduce(capture=capture.h5", "rmsd.csv", "2.5"):
+        assert expected in text, expected
+    assert "nothing was subtracted" in text
+    code, err = run(capsys, "report", campaign, "--out", out)
+    assert code == 2
+    assert "exists" in err
+    assert run(capsys, "report", campaign / "rmsd.csv", "--out", out, "--overwrite")[0] == 0
+
+
+def test_report_refuses_to_mix_and_to_be_empty(
+    campaign: Path, synthetic_capture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    synthetic_capture(np.ones((2, 1, 4, 4)), {}, name="real.h5", simulated=False)
+    code, err = run(capsys, "report", campaign, "--out", campaign / "r.html")
+    assert code == 2
+    assert "never mixed" in err
+    assert not (campaign / "r.html").exists()
+    (campaign / "empty").mkdir()
+    for source, message in (("empty", "nothing to report"), ("none", "no such file"), ("x.txt", "takes .h5")):
+        (campaign / "x.txt").write_text("x", encoding="utf-8")
+        code, err = run(capsys, "report", campaign / source, "--out", campaign / "r.html")
+        assert code == 2
+        assert message in err
