@@ -73,4 +73,4 @@ class ViewingGeometry(BaseModel):
             lit[lit] = ~self.shape.occluded(points[lit], to_source[lit])
         mask = hit.copy()
         mask[hit] = lit
-        return GeometryImage(mask, ScatteringGeometry(normal[lit], to_source[lit], to_camera[lit]))
+        return GeometryImage(mask, ScatteringGeometry(normal[lit], to_source[lit], to_camera[lit]), hit)
