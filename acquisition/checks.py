@@ -67,6 +67,9 @@ def check_plan(plan: MeasurementPlan, rig: RigConfig) -> list[Check]:
     )
     if plan.sample.kind == "air" and abs(plan.omega_deg - 180) > 0.5:
         checks.append(Check("sample", False, f"air needs omega 180 (straight through), not {plan.omega_deg:g}"))
+    if plan.darks and rig.source is None:
+        found = f"{plan.darks} dark states, but the rig has no source that shuts off the light. "
+        checks.append(Check("darks", False, found + "Set darks to 0, or give the rig `source: {kind: manual}`"))
     low, high = rig.exposure_s
     if not isinstance(plan.exposure_s, AutoExposure):
         longest = plan.exposure_s * max(plan.bracket)

@@ -86,7 +86,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     Exit codes: 0 done, 1 the run failed, 2 bad input, 130 interrupted.
     """
-    from acquisition.errors import AcquisitionError, PlanRefused
+    from acquisition.errors import AcquisitionError, PlanRefused, Stopped
     from drivers.errors import DeviceError
     from processing.errors import ProcessError
 
@@ -94,6 +94,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         app(args=None if argv is None else list(argv))
     except (PlanRefused, ProcessError) as error:
         _report(error, 2)
+    except Stopped as error:
+        _report(error, INTERRUPTED)
     except (AcquisitionError, DeviceError, OSError) as error:
         _report(error, 1)
     except KeyboardInterrupt as error:

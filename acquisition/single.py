@@ -18,6 +18,7 @@ from acquisition.estimate import capture_seconds
 from acquisition.header import default_name
 from acquisition.job import Job, Result, check_with_devices, job_of, prepare
 from acquisition.observer import Observer
+from acquisition.operator import Operator
 from acquisition.plan import MeasurementPlan
 from acquisition.progress import ConsoleProgress
 from acquisition.rig import Rig
@@ -57,7 +58,8 @@ def run(options: Options, stop: StopRequest) -> int:
         job = prepare(plan_of(options), rig_of(options))
         path = options.out / default_name(job.plan)
     say_simulated(console, job.rig)
-    with Rig(job.rig) as rig:
+    operator = Operator(console.print, stop, options.yes, job.rig.simulated)
+    with Rig(job.rig, ask=operator.confirm) as rig:
         checks = check_with_devices(job, rig, path.parent)
         if options.dry_run:
             show_checks(Console(), (*job.checks, *checks))
