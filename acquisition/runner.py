@@ -141,10 +141,14 @@ class CaptureRunner:
             raise
         return not self._pending
 
+    def tell(self, text: str) -> None:
+        """Tell the observers what the rig does now."""
+        for observer in self.observers:
+            observer.activity(text)
+
     def find_exposure(self, instrument: InstrumentModel, sample: str, auto: AutoExposure) -> None:
         """Probe the brightest states and take the exposure that they ask for. Moves the axes, lights the sample."""
-        for observer in self.observers:
-            observer.activity("looking for the exposure")
+        self.tell("looking for the exposure")
         with self.ledger.time("probing"):
             found_s = find_exposure(self.rig, self.table, instrument, sample, auto, self.observers, self.warn)
         self._light = None
@@ -187,8 +191,6 @@ class CaptureRunner:
         with self.ledger.time("settling"):
             time.sleep(settle_s)
         self.ledger.unavoidable_s += longest_s + settle_s
-        if not self._interlocks_closed(state, "before"):
-            return None
         return self._expose(state, targets, positions)
 
     def _expose(self, state: int, targets: Mapping[str, float], moved: dict[str, Position]) -> _Exposed | None:
@@ -196,6 +198,7 @@ class CaptureRunner:
         for observer in self.observers:
             observer.exposing(state, retake)
         camera = self.rig.require_camera()
+        start_s = time.monotonic()
         with self.ledger.time("exposure"):
             try:
                 exposure = camera.trigger()
@@ -205,10 +208,17 @@ class CaptureRunner:
             except FrameLost as error:
                 self._again(state, error)
                 return None
-        self.ledger.unavoidable_s += float(self.table.exposure_s[state] * self.table.repeats[state])
+        light_s = float(self.table.exposure_s[state] * self.table.repeats[state])
+        # The camera's own delay from trigger to the end of the exposure, beyond the exposure itself.
+        readout_s = max(0.0, time.monotonic() - start_s - light_s)
+        self.ledger.readout_s += readout_s
+        self.ledger.unavoidable_s += light_s + readout_s
         positions = moved | still
         self._require_on_target(state, targets, positions)
-        if not self._interlocks_closed(state, "during"):
+        # Looked at after the exposure: it also tells of an interlock that was open before it.
+        blocked = self.interlocks.open_now()
+        if blocked is not None:
+            self._discard(state, f"{blocked} in state {state}")
             return None
         return _Exposed(state, exposure, {axis: positions[axis] for axis in targets}, retake)
 
@@ -280,14 +290,6 @@ class CaptureRunner:
                     f"state {state}: axis {axis} should stand at {target:.4f} deg and reads "
                     f"{positions[axis].deg:.4f} deg after it had arrived. Something moved it; the state is not kept."
                 )
-
-    def _interlocks_closed(self, state: int, when: str) -> bool:
-        """False if the state has to be taken again; waits where the plan goes on by itself."""
-        blocked = self.interlocks.open_now()
-        if blocked is None:
-            return True
-        self._discard(state, f"{blocked} {when} state {state}")
-        return False
 
     def _discard(self, state: int, why: str) -> None:
         self._pending.appendleft(state)

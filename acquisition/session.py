@@ -80,7 +80,9 @@ def place_sample(job: Job, rig: Rig) -> None:
         return
     truth = config.truth.get(job.plan.mode)
     instrument = InstrumentModel.load(truth) if truth else job.instrument
-    simulation.prepare(job.plan.sample.name or job.plan.sample.kind, instrument, job.plan.wavelength_nm)
+    plan = job.plan
+    omega_deg = plan.omega_deg if ARM in job.rig.axes else None
+    simulation.prepare(plan.sample.name or plan.sample.kind, instrument, plan.wavelength_nm, omega_deg)
 
 
 class Announcer(Observer):
@@ -120,7 +122,7 @@ def _run(
     for observer in watchers:
         observer.run_started(title_of(job.plan), job.table, len(pending), job.instrument.mosaic)
     try:
-        _go_to_start(job, rig, watchers)
+        _go_to_start(job, rig, runner)
         if _take_states(job, runner, pending):
             status = "complete"
         else:
@@ -173,19 +175,22 @@ def _require_reference(rig: Rig, home: bool) -> None:
         )
 
 
-def _go_to_start(job: Job, rig: Rig, observers: Sequence[Observer]) -> None:
+def _go_to_start(job: Job, rig: Rig, runner: CaptureRunner) -> None:
     unhomed = rig.unhomed()
     if unhomed:
-        for observer in observers:
-            observer.activity(f"homing {', '.join(unhomed)}")
-        rig.home(unhomed)
+        runner.tell(f"homing {', '.join(unhomed)}")
+        with runner.ledger.time("homing"):
+            rig.home(unhomed)
+    if rig.source is not None and rig.source.selects_wavelength:
+        rig.source.select(job.plan.wavelength_nm)
     first = {axis: float(column[0]) for axis, column in job.table.angles_deg.items()}
     # The arm goes first and alone: what stands on it and the sample are what it can hit.
     for axes in ([ARM], [axis for axis in first if axis != ARM]):
         targets = {axis: first[axis] for axis in axes if axis in first}
-        for observer in observers:
-            observer.activity("moving " + ", ".join(f"{axis} to {angle:g}" for axis, angle in targets.items()))
-        rig.move(targets)
+        if targets:
+            runner.tell("moving " + ", ".join(f"{axis} to {angle:g}" for axis, angle in targets.items()))
+            with runner.ledger.time("approach"):
+                rig.move(targets)
 
 
 def _park(rig: Rig, observers: Sequence[Observer]) -> None:

@@ -97,6 +97,10 @@ class SimulatedBench:
         self.wavelength_nm = wavelength_nm
         self._scene_key = None
 
+    def look(self, omega_deg: float) -> None:
+        """Compute the scene for an arm angle ahead of the exposures there."""
+        self._planes(omega_deg)
+
     def expose(
         self,
         angles_deg: Mapping[str, float],

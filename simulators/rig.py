@@ -81,7 +81,10 @@ class SimulatedRig:
             clock=self.clock,
             faults=FaultSchedule(seed=self.config.seed),
         )
-        return kinds[port.kind](options)
+        try:
+            return kinds[port.kind](options)
+        except ValueError as error:
+            raise ConfigError(f"simulator.ports.{name}: {error}") from error
 
     def stop(self) -> None:
         """End the emulators; the first failure is raised after all were tried."""
@@ -131,8 +134,13 @@ class SimulatedRig:
             raise ConfigError(f"simulator.axes: axis {axis!r} of the rig is not there")
         self._user_angle[axis] = lambda device_deg: direction * (device_deg - zero_deg)
 
-    def prepare(self, sample: str, instrument: InstrumentModel, wavelength_nm: float) -> None:
-        """Place a sample, put in the optics and the filter: what an operator does between captures."""
+    def prepare(
+        self, sample: str, instrument: InstrumentModel, wavelength_nm: float, omega_deg: float | None = None
+    ) -> None:
+        """Place a sample, put in the optics and the filter: what an operator does between captures.
+
+        With `omega_deg` the scene is computed for that arm angle now, instead of in the first exposure there.
+        """
         if sample not in self.config.samples:
             known = ", ".join(sorted(self.config.samples))
             raise ConfigError(f"sample {sample!r}: the simulated rig has {known}")
@@ -142,6 +150,8 @@ class SimulatedRig:
                 self.bench = self._new_bench(scene, instrument, wavelength_nm)
             else:
                 self.bench.put(scene, instrument, wavelength_nm)
+            if omega_deg is not None:
+                self.bench.look(omega_deg)
 
     def announce(self, index: int, retake: int = 0) -> None:
         """The next exposure is that of this state."""
