@@ -299,6 +299,8 @@ def make(options: ServeOptions) -> SMC100Emulator:
     """One controller at address 1 that is NOT REFERENCED, with travel from 0 to 180 degrees."""
     controllers = []
     low, high = options.limits_deg or (0.0, 180.0)
+    if low is None or high is None:
+        raise ValueError("an SMC100 has software limits at both ends; give both")
     for index in range(options.axes or 1):
         controller = SMC100Controller(index + 1, options.axis(low, high, 25.0))
         if options.model is not None:
