@@ -1,0 +1,59 @@
+"""Every committed rig, plan and campaign loads, keeps its meaning through YAML, and passes its checks."""
+
+import itertools
+from pathlib import Path
+
+import pytest
+
+from acquisition import campaign_run, schemas
+from acquisition.campaign import Campaign, captures
+from acquisition.job import prepare
+from acquisition.plan import MeasurementPlan
+from acquisition.rig_config import RigConfig, load_rig
+from processing.yaml_file import dump_yaml, parse_yaml
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+
+
+def _files(folder):
+    return sorted((CONFIGS / folder).glob("*.yaml"))
+
+
+@pytest.mark.parametrize("name", list(schemas.MODELS))
+def test_committed_schema_is_fresh(name):
+    assert schemas.path_of(name).read_text() == schemas.text_of(name), "run: python -m acquisition.schemas"
+
+
+@pytest.mark.parametrize("path", _files("rigs"), ids=lambda p: p.stem)
+def test_rig_loads_and_round_trips(path):
+    rig = load_rig(path)
+    assert parse_yaml(dump_yaml(rig), RigConfig) == rig
+    for mode in rig.modes.values():
+        assert mode.instrument.exists()
+
+
+@pytest.mark.parametrize("path", _files("plans"), ids=lambda p: p.stem)
+def test_plan_loads_round_trips_and_fits_the_simulated_rig(path):
+    plan = MeasurementPlan.load(path)
+    assert parse_yaml(dump_yaml(plan), MeasurementPlan) == plan
+    assert all(check.passed for check in prepare(plan, load_rig(CONFIGS / "rigs" / "simulated.yaml")).checks)
+
+
+@pytest.mark.parametrize("path", _files("campaigns"), ids=lambda p: p.stem)
+def test_campaign_loads_round_trips_and_fits_the_simulated_rig(path):
+    campaign = Campaign.load(path)
+    assert parse_yaml(dump_yaml(campaign), Campaign) == campaign
+    jobs = campaign_run.prepare(campaign, load_rig(CONFIGS / "rigs" / "simulated.yaml"))
+    assert len({capture.name for capture, _ in jobs}) == len(jobs)
+
+
+def test_red_sphere_campaign_is_what_the_issue_asks_for():
+    campaign = Campaign.load(CONFIGS / "campaigns" / "red_sphere.yaml")
+    taken = [capture for capture in captures(campaign) if not capture.reference]
+    assert len(taken) == 2 * 2 * 15
+    assert [capture.plan.omega_deg for capture in taken[:15]] == [20 + 5 * k for k in range(15)]
+    references = [capture for capture in captures(campaign) if capture.reference]
+    assert all(capture.plan.sample.kind == "air" and capture.plan.omega_deg == 180 for capture in references)
+    # What needs a person changes once.
+    wavelengths = [capture.plan.wavelength_nm for capture in taken]
+    assert sum(a != b for a, b in itertools.pairwise(wavelengths)) == 1
