@@ -122,6 +122,13 @@ class Scene:
         """Name for headers and reports."""
         return self.spec.name
 
+    @property
+    def object(self) -> ObjectScene:
+        """The object's description. Raises SceneError for air and mirror."""
+        if not isinstance(self.spec, ObjectScene):
+            raise SceneError(f"scene {self.name!r} is {self.spec.kind} and has no object")
+        return self.spec
+
     def mueller_image(self, omega_deg: float, wavelength_nm: float, rows: int, columns: int) -> NDArray[np.float32]:
         """True Mueller image (rows, columns, 4, 4), float32, throughput included.
 
