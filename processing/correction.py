@@ -9,6 +9,7 @@ from enum import IntFlag
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.applied_effects import CountsCorrection
 from processing.capture import Capture, CaptureError
 from processing.noise import NoiseModel
 
@@ -94,11 +95,22 @@ class Correction:
                     "no dark states and no black level in the capture: nothing was subtracted, and a pedestal would "
                     "show as depolarization. Take dark states, or import with --black-level."
                 )
-        saturation = None
-        if detector.bits is not None and capture.integer_counts:
-            saturation = float(2**detector.bits - 1)
+        saturation = _saturation(capture)
         flat = _flat(flat_from, black) if flat_from else _flat(capture, black)
         return cls(black, dark_frames, source, flat, bad, saturation, tuple(warnings))
+
+
+def _saturation(capture: Capture) -> float | None:
+    """Counts from which on a pixel is saturated: the end of the range, or the full well where that comes first."""
+    detector = capture.header.detector
+    if detector.bits is None or not capture.integer_counts:
+        return None
+    top = float(2**detector.bits - 1)
+    if detector.full_well_e is None or detector.gain_e_per_count is None:
+        return top
+    well = detector.black_level_counts + detector.full_well_e / detector.gain_e_per_count
+    # Read noise spreads a full well's counts.
+    return min(top, well - 4 * (detector.read_noise_e or 0.0) / detector.gain_e_per_count)
 
 
 def _check_partner(capture: Capture, other: Capture, role: str) -> None:
@@ -137,24 +149,36 @@ def _flat(capture: Capture, black: float | NDArray[np.float32]) -> NDArray[np.fl
 class BlockReader:
     """Corrected signal of the sample states, tile by tile, with the mask filled in passing."""
 
-    def __init__(self, capture: Capture, states: NDArray[np.int64], correction: Correction) -> None:
-        self.capture, self.states, self.correction = capture, states, correction
+    def __init__(
+        self,
+        capture: Capture,
+        states: NDArray[np.int64],
+        correction: Correction,
+        counts: CountsCorrection | None = None,
+    ) -> None:
+        self.capture, self.states, self.correction, self.counts = capture, states, correction, counts
         self.repeats = capture.column("repeats")[states].astype(float)
         self._buffer: NDArray[np.generic] | None = None
-        self._rows = slice(0, 0)
+        #: First row of the block that was read last.
+        self.first_row = 0
         self._black: NDArray[np.float32] | np.float32 = np.float32(0)
         self._gain: NDArray[np.float32] | None = None
         self._bad: NDArray[np.bool_] | None = None
 
     def read(self, rows: slice) -> NDArray[np.generic]:
         """Counts (states, channels, pixels) of a row block as stored; the memory is used again by the next call."""
+        self.first_row = rows.start
         height, width = rows.stop - rows.start, self.capture.frame_shape[1]
         channels = self.capture.channels
         shape = (len(self.states), channels, height, width)
         if self._buffer is None or self._buffer.size < math.prod(shape):
-            self._buffer = np.empty(math.prod(shape), self.capture.dtype)
+            moved = self.counts is not None and self.counts.moves
+            self._buffer = np.empty(math.prod(shape), np.float32 if moved else self.capture.dtype)
         block = self._buffer[: math.prod(shape)].reshape(shape)
-        self.capture.read_block(self.states, rows, block)
+        if self.counts is not None and self.counts.moves:
+            self._read_moved(rows, block, self.counts.shift_px)
+        else:
+            self.capture.read_block(self.states, rows, block)
         black, flat, bad = self.correction.black, self.correction.flat, self.correction.bad
         if isinstance(black, np.ndarray):
             self._black = np.ascontiguousarray(black[:, rows].reshape(channels, -1))
@@ -163,6 +187,30 @@ class BlockReader:
         self._gain = None if flat is None else 1.0 / flat[:, rows].reshape(channels, -1)
         self._bad = None if bad is None else bad[rows].reshape(-1)
         return block.reshape(len(self.states), channels, -1)
+
+    def _read_moved(self, rows: slice, block: NDArray[np.generic], shift_px: NDArray[np.float64]) -> None:
+        """Fill `block` with counts of images moved back by their drift; a border of that width repeats its edge.
+
+        The black is moved with them, which matters only where it differs from pixel to pixel.
+        """
+        import cv2
+
+        margin = math.ceil(float(np.abs(shift_px).max())) + 3
+        height, width = self.capture.frame_shape
+        first, last = max(rows.start - margin, 0), min(rows.stop + margin, height)
+        for k, state in enumerate(self.states):
+            x, y = shift_px[k]
+            back = np.array([[1.0, 0.0, x], [0.0, 1.0, y]])
+            frame = self.capture.frames(int(state), slice(first, last)).astype(np.float32)
+            for channel, image in enumerate(frame):
+                moved = cv2.warpAffine(
+                    image,
+                    back,
+                    (width, last - first),
+                    flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+                    borderMode=cv2.BORDER_REPLICATE,
+                )
+                block[k, channel] = moved[rows.start - first : rows.stop - first]
 
     def load(
         self, frames: NDArray[np.generic], start: int, stop: int, out: NDArray[np.float32], mask: NDArray[np.uint8]
@@ -188,10 +236,11 @@ class BlockReader:
             out -= self._black[:, pixels]
         elif self._black:
             out -= self._black
-        if self._gain is None:
-            return None
-        gain = self._gain[:, pixels]
-        out *= gain
+        gain = None if self._gain is None else self._gain[:, pixels]
+        if gain is not None:
+            out *= gain
+        if self.counts is not None:
+            self.counts.apply(out)
         return gain
 
     def black_variance(self, noise: NoiseModel) -> float:

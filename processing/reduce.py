@@ -14,9 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.applied_effects import at_place, capture_changes, counts_correction
 from processing.capture import Capture, CaptureError
+from processing.changes import Changes
 from processing.correction import BlockReader, Correction, Mask
 from processing.errors import ProcessError
+from processing.field_solver import FieldSolver, MatrixAt
 from processing.instrument import InstrumentModel
 from processing.inversion import Inversion
 from processing.mueller_solver import MuellerSolver
@@ -26,6 +29,8 @@ from processing.product import Plane, ProductWriter, Step
 from processing.reduce_facts import mueller_facts
 from processing.weighted import WeightedSolver
 from processing.weighted_kernels import PACKED
+
+Solver = MuellerSolver | WeightedSolver | FieldSolver
 
 #: Called with (rows done, rows in all).
 Progress = Callable[[int, int], None]
@@ -68,12 +73,14 @@ class Choice:
         if self.physical not in (None, *PHYSICAL):
             raise ProcessError(f"physical estimate {self.physical!r} is none of {', '.join(PHYSICAL)}")
         if not self.weighted and (self.covariance or self.physical == "likelihood"):
-            raise ProcessError(
-                "a stored covariance and the most likely physical matrix need the weighted estimate"
-            )
+            raise ProcessError("a stored covariance and the most likely physical matrix need the weighted estimate")
 
-    def solver(self, plain: MuellerSolver) -> MuellerSolver | WeightedSolver:
-        """The solver that the choice asks for."""
+    def solver(self, plain: MuellerSolver, matrix_at: MatrixAt | None = None) -> Solver:
+        """The solver that the choice asks for; `matrix_at` where W varies over the image."""
+        if matrix_at is not None:
+            if self.weighted:
+                raise ProcessError("--weighted is not available for an instrument with field_retardance; leave it out")
+            return FieldSolver(plain, matrix_at)
         if not self.weighted:
             return plain
         return WeightedSolver(plain, self.covariance, self.physical == "likelihood")
@@ -91,15 +98,22 @@ class Choice:
 
 
 def sample_states(capture: Capture) -> NDArray[np.int64]:
-    """Positions of the states that look at the sample (or at air), dark and flat ones left out."""
-    states = np.flatnonzero([r not in ("dark", "flat") for r in capture.role])
+    """Positions of the states that look at the sample, or at air where a capture has no others."""
+    states = capture.states_with("sample")
+    if states.size == 0:
+        states = capture.states_with("air")
     if states.size == 0:
         raise CaptureError(f"{capture.path} has no state of the sample that is done; there is nothing to reduce.")
     return states
 
 
-def measurement_matrix(capture: Capture, model: InstrumentModel, states: NDArray[np.int64]) -> NDArray[np.float64]:
-    """W (states, channels, 16) from the read-back angles, rows scaled with the exposure (longest = 1)."""
+def measurement_matrix(
+    capture: Capture, model: InstrumentModel, states: NDArray[np.int64], changes: Changes | None = None
+) -> NDArray[np.float64]:
+    """W (states, channels, 16) from the read-back angles, rows scaled with the exposure (longest = 1).
+
+    `changes` is what the model's effects do to this capture (`applied_effects.capture_changes`).
+    """
     angles = {name: value[states] for name, value in capture.angles_deg.items()}
     missing = [axis for axis in model.axes if axis not in angles]
     if missing:
@@ -108,13 +122,26 @@ def measurement_matrix(capture: Capture, model: InstrumentModel, states: NDArray
             f"{capture.path}: instrument {model.name!r} turns {', '.join(missing)}, but the capture has angles of: "
             f"{have}. Use the instrument file that belongs to the capture."
         )
-    w = model.rows(angles)
+    w = model.rows(angles, changes)
     bad = ~np.all(np.isfinite(w.reshape(len(states), -1)), axis=1)
     if np.any(bad):
         raise CaptureError(
             f"{capture.path}: no read-back angle in state(s) {_some(states[bad])}; they cannot be reduced."
         )
     return w * relative_exposure(capture, states)[:, None, None]
+
+
+def field_matrix(
+    capture: Capture, model: InstrumentModel, states: NDArray[np.int64], changes: Changes | None
+) -> MatrixAt | None:
+    """W at any place of the image, where a retardance varies over it; None where W is the same everywhere."""
+    if changes is None or not changes.field_retardance_rad:
+        return None
+
+    def matrix_at(x: float, y: float) -> NDArray[np.float64]:
+        return measurement_matrix(capture, model, states, at_place(changes, x, y)).reshape(-1, 16)
+
+    return matrix_at
 
 
 def relative_exposure(capture: Capture, states: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -162,12 +189,14 @@ def reduce_mueller(
     CaptureError : angles or frames are missing or not finite.
     """
     states = sample_states(capture)
-    w = measurement_matrix(capture, model, states)
+    changes = capture_changes(capture, model, states)
+    w = measurement_matrix(capture, model, states, changes)
     inversion = Inversion.of(w.reshape(-1, 16), what=f"{capture.path}: ")
     correction = correction or Correction.of(capture)
+    reader = BlockReader(capture, states, correction, counts_correction(changes))
     choice = choice or Choice()
     noise = choice.noise or NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
-    solver = choice.solver(MuellerSolver(inversion, BlockReader(capture, states, correction), noise))
+    solver = choice.solver(MuellerSolver(inversion, reader, noise), field_matrix(capture, model, states, changes))
     planes = choice.planes(known_noise=noise is not None)
     with ProductWriter(out, "mueller", capture.header, capture.frame_shape, planes, steps, overwrite) as product:
         product.array("measurement_matrix", w, "", "W (state, channel, 16): intensity = W . vec(M), row-major")
@@ -190,7 +219,7 @@ def reduce_mueller(
     return facts
 
 
-def _store_noise(product: ProductWriter, noise: NoiseModel | None, solver: MuellerSolver | WeightedSolver) -> None:
+def _store_noise(product: ProductWriter, noise: NoiseModel | None, solver: Solver) -> None:
     # variance of intensity n = slope[n] * signal + floor[n]; NaN: estimated from the residual.
     nothing = np.full(len(solver.repeats), np.nan)
     slope = noise.slope / solver.repeats if noise else nothing
@@ -199,7 +228,7 @@ def _store_noise(product: ProductWriter, noise: NoiseModel | None, solver: Muell
     product.array("noise_floor", floor, "count2", "variance without light, for each row of W")
 
 
-def _block(solver: MuellerSolver | WeightedSolver, rows: slice, planes: Mapping[str, Plane]) -> dict[str, NDArray[Any]]:
+def _block(solver: Solver, rows: slice, planes: Mapping[str, Plane]) -> dict[str, NDArray[Any]]:
     frames = solver.reader.read(rows)
     found = solver.solve(frames)
     mask = found["pixel_mask"]

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.applied_effects import capture_changes, counts_correction
 from processing.capture import Capture, CaptureError
+from processing.changes import Changes
 from processing.correction import Correction, Mask
 from processing.errors import NotDetermined
 from processing.instrument import InstrumentModel
@@ -44,7 +46,7 @@ PLANES = {
 
 
 def channel_rows(
-    capture: Capture, model: InstrumentModel, states: NDArray[np.int64]
+    capture: Capture, model: InstrumentModel, states: NDArray[np.int64], changes: Changes | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Rows of W (4, 16), and analyzer rows (4, 3) for (S0, S1, S2), the same in all states.
 
@@ -54,17 +56,24 @@ def channel_rows(
     NotDetermined : the channels do not determine a linear Stokes vector.
     """
     angles = {name: values[states] for name, values in capture.angles_deg.items()} if model.axes else {}
-    rows = model.rows(angles)
-    if np.ptp(rows, axis=0).max(initial=0.0) > 1e-6:
+    if changes is None:
+        rows = model.rows(angles)
+        light = model.generator_states(angles)
+    else:
+        every = angles or {"": np.zeros(len(states))}
+        rows, light = model.rows(every, changes), model.generator_states(every, changes)
+    if np.ptp(model.rows(angles), axis=0).max(initial=0.0) > 1e-6:
         raise CaptureError(
             f"{capture.path}: the {len(states)} states of this mosaic capture have different angles, and one Stokes "
             "image comes from frames that are alike. Capture one generator state, or split the capture."
         )
-    analyzers = model.analyzer_states(angles)[0][:, :LINEAR]
+    # The mean frame belongs to the mean row. rows = kron(a, g), also with what effects do to the channels.
+    mean = np.asarray(rows.mean(axis=0))
+    analyzers = (mean.reshape(-1, 4, 4) @ light[0] / (light[0] @ light[0]))[:, :LINEAR]
     rank = int(np.linalg.matrix_rank(analyzers))
     if rank < LINEAR:
         raise NotDetermined(f"{capture.path}: the mosaic's analyzers have rank {rank}; a linear Stokes vector needs 3.")
-    return np.asarray(rows[0]), np.asarray(analyzers)
+    return mean, np.asarray(analyzers)
 
 
 def mean_frame(
@@ -119,10 +128,16 @@ def reduce_stokes(
         raise CaptureError(f"{capture.path} is not a mosaic capture; it reduces to a Mueller image.")
     layout = MosaicLayout.of(mosaic, [c.name for c in model.channels])
     states = sample_states(capture)
-    model_rows, analyzers = channel_rows(capture, model, states)
+    changes = capture_changes(capture, model, states)
+    model_rows, analyzers = channel_rows(capture, model, states, changes)
     correction = correction or Correction.of(capture)
     noise = noise or NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
     frame, mask = mean_frame(capture, states, correction, progress)
+    counts = counts_correction(changes)
+    if counts is not None:
+        signal = frame.reshape(1, 1, -1)
+        counts.apply(signal)
+        frame = signal.reshape(frame.shape)
     if response is not None:
         frame = correct(frame, response, layout, analyzers)
     channels = demosaic(frame, layout, method)

@@ -1,0 +1,109 @@
+"""What an instrument file's effects (found by `diagnose`) mean for one capture that is about to be reduced."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from copy import copy
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.capture import Capture
+from processing.changes import Changes, Conditions, elapsed
+from processing.instrument import InstrumentModel
+
+#: Signals below this part of full scale have the logarithm of this.
+_TINY = np.float32(1e-6)
+
+
+@dataclass(frozen=True)
+class CountsCorrection:
+    """Correction of the signal u = counts above black over full scale: u + sum of coefficient times feature(u).
+
+    Attributes
+    ----------
+    full_scale : counts above black.
+    response : feature to coefficient, one number or one for each intensity (states, channels).
+    shift_px : (states, 2), by how much the image moved to the right and down; it is moved back.
+    """
+
+    full_scale: float
+    response: dict[str, NDArray[np.float64]]
+    shift_px: NDArray[np.float64]
+
+    @property
+    def moves(self) -> bool:
+        """Whether any state's image has moved."""
+        return bool(np.any(self.shift_px))
+
+    def apply(self, signal: NDArray[np.float32]) -> None:
+        """Correct signals (states, channels, pixels) in counts above black, in place."""
+        if not self.response:
+            return
+        u = signal / np.float32(self.full_scale)
+        added = np.zeros_like(u)
+        for name, coefficient in self.response.items():
+            c = np.asarray(coefficient, dtype=np.float32)
+            added += (c.reshape(*c.shape, 1) if c.ndim == 2 else c) * _feature(name, u)
+        signal += added * np.float32(self.full_scale)
+
+
+def capture_name(capture: Capture) -> str:
+    """Identity of a capture in the list of captures of an effect."""
+    return f"{capture.header.title} ({capture.path.name})"
+
+
+def full_scale(capture: Capture, states: NDArray[np.int64]) -> float:
+    """Top of the range above black, counts; for floating frames, their largest value."""
+    detector = capture.header.detector
+    if capture.integer_counts and detector.bits:
+        return float(2**detector.bits - 1) - detector.black_level_counts
+    return float(max(np.nanmax(capture.frames(int(k))) for k in states)) - detector.black_level_counts
+
+
+def capture_changes(capture: Capture, model: InstrumentModel, states: NDArray[np.int64]) -> Changes | None:
+    """What the model's effects change in some states of a capture; None for a model without effects.
+
+    Effects that belong to single captures (a slip, a drift) count only for those.
+    """
+    if not model.effects:
+        return None
+    from processing.effects.base import changes_of
+
+    angles = {name: value[states] for name, value in capture.angles_deg.items()}
+    channels = tuple(c.name for c in model.channels)
+    when = elapsed(capture.column("host_time_s")[states], len(states))
+    conditions = Conditions(angles, len(states), channels, when, full_scale(capture, states))
+    return changes_of(model, conditions, capture_name(capture))
+
+
+def at_place(changes: Changes, x: float, y: float) -> Changes:
+    """The changes at one place of the image, x and y from -1 to 1, to the right and down."""
+    from processing.effects.field_retardance import terms
+
+    smooth = terms(np.asarray(x), np.asarray(y))
+    here = defaultdict(lambda: np.zeros(()), changes.retardance_rad)
+    for element, coefficients in changes.field_retardance_rad.items():
+        here[element] = here[element] + float(coefficients @ smooth)
+    out = copy(changes)
+    out.retardance_rad = here
+    return out
+
+
+def counts_correction(changes: Changes | None) -> CountsCorrection | None:
+    """The part of the changes that acts on the counts; None if there is none."""
+    if changes is None or not (changes.response or np.any(changes.shift_px)):
+        return None
+    response = {name: np.asarray(value, dtype=float) for name, value in changes.response.items() if np.any(value)}
+    return CountsCorrection(changes.conditions.full_scale, response, changes.shift_px)
+
+
+def _feature(name: str, u: NDArray[np.float32]) -> NDArray[np.float32] | np.float32:
+    if name == "one":
+        return np.float32(1.0)
+    powers = {"square": 2, "cube": 3, "fourth": 4}
+    if name in powers:
+        return np.asarray(u ** powers[name])
+    log = np.log(np.maximum(u, _TINY))
+    return np.asarray(u * log if name == "log" else u * log * log)

@@ -1,0 +1,167 @@
+"""What `diagnose` writes into an instrument file, the next reduction takes out."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from processing import mueller
+from processing.capture import Capture
+from processing.changes import Conditions
+from processing.effects.base import all_effects, changes_of
+from processing.effects.field_retardance import terms
+from processing.images import MuellerImage
+from processing.instrument import AppliedEffect, EffectParameter, InstrumentModel
+from processing.product import Step
+from processing.reduce import reduce_mueller
+
+SHAPE = (24, 30)
+FULL_SCALE = 4095.0
+ANGLES = {"psg": 9.0 * np.arange(40), "psa": 4.91 * 9.0 * np.arange(40)}
+
+
+@pytest.fixture
+def rgb950(configs: Path) -> InstrumentModel:
+    return InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
+
+
+def smooth_scene() -> np.ndarray:
+    """Mueller image (4, 4, rows, columns) of m00 about 4000 counts that varies slowly."""
+    y, x = np.indices(SHAPE) / 12
+    level = 4000 * (1 + 0.2 * np.sin(x) * np.cos(y))
+    m = 0.6 * mueller.retarder(0.3, 1.1) @ mueller.diattenuator(0.4, 1.0, 0.7) + 0.3 * mueller.IDEAL_DEPOLARIZER
+    return m[..., None, None] * level
+
+
+def effect(kind: str, element: str | None = None, captures: tuple[str, ...] = (), **parameters: float) -> AppliedEffect:
+    scope = "capture" if captures else "instrument"
+    values = {k: EffectParameter(value=v, unit="1") for k, v in parameters.items()}
+    return AppliedEffect(kind=kind, element=element, parameters=values, scope=scope, captures=captures)
+
+
+def reduced(path: Path, model: InstrumentModel) -> MuellerImage:
+    out = path.with_suffix(".m.h5")
+    with Capture(path) as capture:
+        reduce_mueller(capture, model, out, (Step("reduce", {}),), overwrite=True)
+    return MuellerImage.load(out)
+
+
+def error(image: MuellerImage, truth: np.ndarray) -> float:
+    """Largest error of an element over m00, away from the border."""
+    inner = np.s_[..., 4:-4, 4:-4]
+    return float(np.max(np.abs((image.values - truth)[inner]) / truth[0, 0][inner[1:]]))
+
+
+def capture_of(write, signal: np.ndarray) -> Path:
+    return write(signal, ANGLES, title="test")
+
+
+@pytest.mark.parametrize(
+    ("kind", "element", "parameters"),
+    [
+        ("psg_azimuth", "psg_retarder", {"error_deg": 1.5}),
+        ("psa_retardance", "psa_retarder", {"error_deg": 3.0}),
+    ],
+)
+def test_effects_of_the_optics_go_into_w(
+    kind: str, element: str, parameters: dict[str, float], rgb950: InstrumentModel, synthetic_capture
+) -> None:
+    conditions = Conditions.of(ANGLES)
+    names = [p.name for p in all_effects()[kind].parameters(rgb950, conditions, element)]
+    applied = effect(kind, element, **dict(zip(names, parameters.values(), strict=True)))
+    real = rgb950.model_copy(update={"effects": (applied,)})
+    truth = smooth_scene()
+    signal = np.einsum("nck,kxy->ncxy", real.rows(ANGLES), truth.reshape(16, *SHAPE))
+    path = capture_of(synthetic_capture, signal)
+    assert error(reduced(path, rgb950), truth) > 0.01
+    assert error(reduced(path, real), truth) < 1e-5
+
+
+def test_drift_of_the_source_counts_for_its_capture_alone(rgb950: InstrumentModel, synthetic_capture) -> None:
+    conditions = Conditions.of(ANGLES)
+    drift = all_effects()["source_drift"]
+    place = drift.places(rgb950, conditions)[0]
+    names = [p.name for p in drift.parameters(rgb950, conditions, place)]
+    values = dict.fromkeys(names, 0.0) | {names[0]: 0.08}
+    applied = effect("source_drift", place or None, ("test (capture.h5)",), **values)
+    real = rgb950.model_copy(update={"effects": (applied,)})
+    rows = rgb950.rows(ANGLES, changes_of(real, conditions, "test (capture.h5)"))
+    truth = smooth_scene()
+    signal = np.einsum("nck,kxy->ncxy", rows, truth.reshape(16, *SHAPE))
+    path = capture_of(synthetic_capture, signal)
+    plain = error(reduced(path, rgb950), truth)
+    assert plain > 0.01
+    assert error(reduced(path, real), truth) < 1e-5
+    other = real.model_copy(update={"effects": (applied.model_copy(update={"captures": ("test (b.h5)",)}),)})
+    assert error(reduced(path, other), truth) == pytest.approx(plain, rel=1e-3)
+
+
+def test_counts_are_corrected(rgb950: InstrumentModel, synthetic_capture) -> None:
+    truth = smooth_scene()
+    light = np.einsum("nck,kxy->ncxy", rgb950.rows(ANGLES), truth.reshape(16, *SHAPE))
+    bent = light * (1 - 0.05 * light / FULL_SCALE) + 12.0
+    # Floating frames have no bits: the top of the range is their largest value.
+    top = bent.max()
+    path = synthetic_capture(bent, ANGLES, title="test")
+    real = rgb950.model_copy(
+        update={
+            "effects": (
+                effect("detector_offset", offset=12.0),
+                effect("detector_nonlinearity", lost_at_full_scale=0.05 * top / FULL_SCALE),
+            )
+        }
+    )
+    assert error(reduced(path, rgb950), truth) > 0.005
+    assert error(reduced(path, real), truth) < 5e-4
+
+
+def test_a_moving_image_is_moved_back(rgb950: InstrumentModel, synthetic_capture) -> None:
+    truth = smooth_scene()
+    elapsed = np.linspace(-0.5, 0.5, 40)
+    w = rgb950.rows(ANGLES)
+    y, x = np.indices(SHAPE).astype(float)
+    frames = np.empty((40, 1, *SHAPE))
+    for n in range(40):
+        # The scene stands 1.6 pixels further right and 0.8 further up at the end than at the start.
+        yy, xx = (y + 0.8 * elapsed[n]) / 12, (x - 1.6 * elapsed[n]) / 12
+        level = 4000 * (1 + 0.2 * np.sin(xx) * np.cos(yy))
+        frames[n, 0] = level * (w[n, 0] @ (truth / truth[0, 0]).reshape(16, *SHAPE)[:, 0, 0]) * truth[0, 0, 0, 0] / 4000
+    scale = truth[0, 0, 0, 0] / 4000
+    path = synthetic_capture(frames, ANGLES, title="test")
+    applied = effect("image_drift", None, ("test (capture.h5)",), x=1.6, y=-0.8)
+    real = rgb950.model_copy(update={"effects": (applied,)})
+    level = 4000 * (1 + 0.2 * np.sin(x / 12) * np.cos(y / 12))
+    expected = (truth / truth[0, 0])[..., 0, 0][..., None, None] * level * scale
+    before, after = error(reduced(path, rgb950), expected), error(reduced(path, real), expected)
+    assert before > 0.004
+    assert after < before / 5
+
+
+def test_retardance_that_varies_over_the_image(rgb950: InstrumentModel, synthetic_capture) -> None:
+    applied = effect("field_retardance", "psa_retarder", x=4.0, y=-2.0, x2=3.0, xy=1.0, y2=0.0)
+    real = rgb950.model_copy(update={"effects": (applied,)})
+    truth = smooth_scene()
+    y, x = np.meshgrid(np.linspace(-1, 1, SHAPE[0]), np.linspace(-1, 1, SHAPE[1]), indexing="ij")
+    extra = np.tensordot([4.0, -2.0, 3.0, 1.0, 0.0], terms(x, y), axes=1)
+    frames = np.empty((40, 1, *SHAPE))
+    for r in range(SHAPE[0]):
+        for c in range(SHAPE[1]):
+            retarder = rgb950.analyzer[0].model_copy(update={"retardance_deg": 94.78 + extra[r, c]})
+            here = rgb950.model_copy(update={"analyzer": (retarder, rgb950.analyzer[1])})
+            frames[:, 0, r, c] = here.rows(ANGLES)[:, 0] @ truth[..., r, c].reshape(16)
+    path = synthetic_capture(frames, ANGLES, title="test")
+    assert error(reduced(path, rgb950), truth) > 0.02
+    found = reduced(path, real)
+    assert error(found, truth) < 2e-4
+    assert np.nanmax(found.residual_rms) < 0.5
+
+
+def test_air_states_are_not_mixed_with_the_sample(rgb950: InstrumentModel, synthetic_capture) -> None:
+    truth = smooth_scene()
+    signal = np.einsum("nck,kxy->ncxy", rgb950.rows(ANGLES), truth.reshape(16, *SHAPE))
+    frames = np.concatenate([signal[:5] * 3, signal])
+    angles = {axis: np.concatenate([v[:5], v]) for axis, v in ANGLES.items()}
+    path = synthetic_capture(frames, angles, role=("air",) * 5 + ("sample",) * 40)
+    image = reduced(path, rgb950)
+    assert image.facts["states"] == 40
+    assert error(image, truth) < 1e-5
