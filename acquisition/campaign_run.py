@@ -11,7 +11,7 @@ from acquisition import session
 from acquisition.campaign import Campaign, CampaignCapture, captures
 from acquisition.campaign_log import CampaignFolder
 from acquisition.capture_writer import PARTIAL, bytes_needed, check_space
-from acquisition.checks import Check
+from acquisition.checks import Check, refuse_failed
 from acquisition.errors import AcquisitionError, PlanRefused, Stopped
 from acquisition.estimate import capture_seconds
 from acquisition.job import Job, Result, check_with_devices, existing, job_of
@@ -170,9 +170,9 @@ class CampaignRun:
             partial = final
         if partial.exists():
             job = job_of(partial, self.config)
-            check_with_devices(job, rig, final.parent)
+            refuse_failed(check_with_devices(job, rig, final.parent))
             return session.resume(job, rig, partial, self.stop, self.observers, self.home)
-        check_with_devices(job, rig, final.parent)
+        refuse_failed(check_with_devices(job, rig, final.parent))
         return session.take(job, rig, final, self.stop, self.observers, self.home)
 
     def _complete(self, capture: CampaignCapture) -> bool:
@@ -192,6 +192,11 @@ class CampaignRun:
                 except CaptureError:
                     return 0
         return 0
+
+    @property
+    def rig(self) -> Rig | None:
+        """The rig that is open now, for those who watch a simulated one."""
+        return self._rig
 
     def _open_rig(self) -> Rig:
         if self._rig is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +36,10 @@ class Finding:
 def examine(config: RigConfig, folder: Path) -> Iterator[Finding]:
     """Look at everything that a measurement needs, one finding after another; no device's failure hides another's."""
     yield Finding("versions", None, ", ".join(f"{name} {number}" for name, number in versions().items()))
+    yield Finding("python", None, f"{sys.executable}, packages in {sysconfig.get_path('purelib')}")
+    for name in FROM_ENVIRONMENT:
+        yield _guarded(f"package {name}", lambda name=name: _origin(name))  # type: ignore[misc]
+    yield _guarded("package gi", _aravis)
     free = shutil.disk_usage(folder).free
     yield Finding("disc", free > 1e9, f"{free / 1e9:.1f} GB free in {folder.resolve()}")
     for name, mode in config.modes.items():
@@ -60,6 +65,30 @@ def _guarded(what: str, look: Callable[[], str]) -> Finding:
         return Finding(what, False, str(error))
 
 
+def _origin(name: str) -> str:
+    """Where a package is imported from; it must be this environment, not the system that gi is borrowed from."""
+    folder = Path(str(importlib.import_module(name).__file__)).parent
+    own = {Path(sysconfig.get_path(part)) for part in ("purelib", "platlib")}
+    if name == "umov":
+        return str(folder)
+    if not any(folder.is_relative_to(place) for place in own):
+        raise AcquisitionError(
+            f"it comes from {folder}, not from this environment. Unset PYTHONPATH; run ./lab, which shows only gi to it"
+        )
+    return str(folder)
+
+
+def _aravis() -> str:
+    from drivers.aravis_library import load_aravis
+
+    load_aravis()
+    import gi
+
+    folder = Path(str(gi.__file__)).parent
+    linked = f" -> {folder.resolve()}" if folder.is_symlink() else ""
+    return f"{gi.__version__} in {folder}{linked}; Aravis {library_version()}"
+
+
 def _instrument(path: Path) -> str:
     model = InstrumentModel.load(path)
     return f"{model.name} ({path.name})"
@@ -81,9 +110,11 @@ def _axis(axis: MotionAxis) -> str:
 def _source(rig: Rig) -> str:
     source = rig.open_source()
     state = "light on" if source.is_on() else "light off"
+    who = source.describe()
+    name = ", ".join(f"{key.replace('_', ' ')} {who[key]}" for key in who if key != "model")
     if source.interlock_open():
-        raise AcquisitionError(f"{source.describe()['model']}: {state}, INTERLOCK OPEN. Close the door.")
-    return f"{source.describe()['model']}: {state}, interlock closed"
+        raise AcquisitionError(f"{who['model']}, {name}: {state}, INTERLOCK OPEN. Close the door")
+    return f"{who['model']}, {name}: {state}, interlock closed"
 
 
 def _camera(camera: Camera) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,8 +16,10 @@ RigFile = Annotated[Path | None, typer.Option("--rig", help="rig file; without i
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    for command in (doctor, home, move, stop, snap):
+    for command in (doctor, home, stop, snap):
         app.command()(command)
+    # So that -30 is an angle and not an option.
+    app.command(context_settings={"ignore_unknown_options": True})(move)
 
 
 def doctor(rig: RigFile = None, out: Annotated[Path, typer.Option(help="folder of captures")] = Path()) -> None:
@@ -36,49 +39,76 @@ def doctor(rig: RigFile = None, out: Annotated[Path, typer.Option(help="folder o
 def home(
     axes: Annotated[list[str] | None, typer.Argument(help="axes; without any, all that have no reference")] = None,
     rig: RigFile = None,
+    yes: Annotated[bool, typer.Option("--yes", help="the way is free: do not ask")] = False,
 ) -> None:
-    """Home axes. They turn to their reference switch: look that the way is free."""
-    from acquisition.rig import Rig
+    """Home axes, one after another. They turn to their reference switches: look that the way is free."""
+    from rich.console import Console
 
-    with Rig(_load(rig), with_camera=False) as live:
-        names = _known(live.config, axes) if axes else live.unhomed()
+    from acquisition.rig import Rig
+    from acquisition.stop_request import StopRequest
+
+    config = _load(rig)
+    _known(config, axes or [])
+    with StopRequest(patience=1), Rig(config, with_camera=False) as live:
+        unhomed = live.unhomed()
+        names = [name for name in live.homing_order() if name in (axes or unhomed)]
         if not names:
             typer.echo("every axis has its reference; name an axis to home it again")
+            return
+        typer.echo(f"these will turn to their reference switches, in this order: {', '.join(names)}")
+        _require_consent(config, yes)
         for name in names:
-            typer.echo(f"homing {name}")
-            live.home([name])
-            typer.echo(f"{name} at {live.axes[name].read_position().deg:.4f} deg")
+            with Console(stderr=True).status(f"homing {name}; Ctrl-C stops it"):
+                live.home([name])
+            typer.echo(f"{name} is homed, at {live.axes[name].read_position().deg:.4f} deg")
+    _say_ended(config)
+
+
+def _require_consent(config: RigConfig, yes: bool) -> None:
+    """Ask whether the way is free; emulators have nothing to hit."""
+    from acquisition.errors import Stopped
+
+    if yes or config.simulated:
+        return
+    if not sys.stdin.isatty():
+        raise Stopped("nobody confirmed that the way is free; nothing was moved. Use a terminal, or --yes")
+    if not typer.confirm("Is their way free?"):
+        raise Stopped("the way is not free; nothing was moved")
 
 
 def move(
     axis: Annotated[str, typer.Argument(help="axis of the rig file")],
-    degrees: Annotated[float, typer.Argument(help="absolute angle; write -- before a negative one")],
+    degrees: Annotated[float, typer.Argument(help="absolute angle")],
     rig: RigFile = None,
     home_first: Annotated[bool, typer.Option("--home", help="home the axis if it has no reference")] = False,
 ) -> None:
     """Move one axis to an absolute angle."""
+    from rich.console import Console
+
     from acquisition.rig import Rig
     from acquisition.stop_request import StopRequest
 
-    with StopRequest(patience=1), Rig(_load(rig), with_camera=False) as live:
-        _known(live.config, [axis])
+    config = _load(rig)
+    _known(config, [axis])
+    with StopRequest(patience=1), Rig(config, with_camera=False) as live, Console(stderr=True).status("") as status:
         live.axes[axis].check(degrees)
-        if (home_first or live.config.home_at_start) and axis in live.unhomed():
+        if (home_first or config.home_at_start) and axis in live.unhomed():
+            status.update(f"homing {axis}; Ctrl-C stops it")
             live.home([axis])
+        status.update(f"moving {axis} to {degrees:g} deg; Ctrl-C stops it")
         typer.echo(f"{axis} at {live.move({axis: degrees})[axis].deg:.4f} deg")
+    _say_ended(config)
 
 
 def stop(rig: RigFile = None) -> None:
-    """Stop every axis. A measurement that runs holds the ports: press Ctrl-C twice there instead."""
-    from acquisition.rig import Rig
+    """Stop every axis, and an acquire that measures on this rig, as Ctrl-C twice would."""
+    from acquisition.stop_axes import has_own_emulators, stop_axes
 
-    with Rig(_load(rig), with_camera=False) as live:
-        failure = live.stop()
-        if failure is not None:
-            raise failure
-        for name, axis in live.axes.items():
-            note = "" if axis.can_stop_a_move else " (this kind runs a started move to its end)"
-            typer.echo(f"{name}: stop sent{note}")
+    config = _load(rig)
+    if has_own_emulators(config):
+        typer.echo("the axes of this rig are emulators inside the command that uses it: press Ctrl-C twice there")
+    elif not stop_axes(config, typer.echo):
+        raise typer.Exit(1)
 
 
 def snap(
@@ -104,6 +134,11 @@ def _load(rig: Path | None) -> RigConfig:
     config = load_rig(rig or DEFAULT_RIG)
     say_simulated(Console(stderr=True), config)
     return config
+
+
+def _say_ended(config: RigConfig) -> None:
+    if config.simulator is not None:
+        typer.echo("the emulators of this rig end with this command: the next one finds them as they were at first")
 
 
 def _known(config: RigConfig, names: list[str]) -> list[str]:

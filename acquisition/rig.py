@@ -150,10 +150,13 @@ class Rig:
 
     # --- motion ------------------------------------------------------------------------------------------
 
+    def homing_order(self) -> list[str]:
+        """Names of all axes: those of the rig file's `home_order` first."""
+        return [*self.config.home_order, *(name for name in self.axes if name not in self.config.home_order)]
+
     def unhomed(self) -> list[str]:
         """Names of the axes without a reference, in homing order."""
-        order = [*self.config.home_order, *(name for name in self.axes if name not in self.config.home_order)]
-        return [name for name in order if not self.axes[name].is_homed()]
+        return [name for name in self.homing_order() if not self.axes[name].is_homed()]
 
     def home(self, names: list[str], wait: Callable[[Mapping[str, Motion]], None] | None = None) -> None:
         """Home the axes one after another. Raises MotionFailed; every axis has been sent a stop by then."""

@@ -109,10 +109,11 @@ def intact(configs: Path) -> Callable[[Path], int]:
 
     def check(path: Path) -> int:
         with Capture(path) as capture:
-            axes = sorted(capture.angles_deg)
+            # The stamp holds every axis of the rig; a Stokes capture records those that it sets.
+            axes = ("arm", "psa", "psg")
             for state in range(len(capture.done)):
                 true = dict(zip(axes, read_stamp(capture.frames(state)[0]), strict=True))
-                for axis in axes:
+                for axis in capture.angles_deg:
                     assert true[axis] == pytest.approx(capture.angles_deg[axis][state], abs=5e-4), (state, axis)
             return len(capture.done)
 

@@ -1,0 +1,115 @@
+"""A campaign under random faults, unattended: complete at the end, every state intact, no wrong angle.
+
+`UMOV_FAULTS=500` runs the promise in full: 500 faults over 2 wavelengths x 2 modes x 15 angles and the references.
+"""
+
+import json
+import os
+import random
+import threading
+from collections import Counter
+
+from acquisition import campaign_run
+from acquisition.campaign import Campaign
+from acquisition.campaign_log import CampaignFolder
+from acquisition.campaign_run import CampaignRun
+from acquisition.observer import Observer
+from acquisition.operator import Operator
+from acquisition.rig_config import load_rig
+from acquisition.stop_request import StopRequest
+from simulators.faults import Fault
+
+FAULTS = int(os.environ.get("UMOV_FAULTS", "8"))
+FULL = FAULTS >= 100
+
+SERIAL = ("silent", "stuck", "slow", "garbled", "late", "foreign", "not_homed")
+
+
+class Weather(Observer):
+    """Draws faults at random exposures: device, kind and duration."""
+
+    def __init__(self, faults, exposures, seed):
+        self._random = random.Random(seed)
+        self._due = sorted(self._random.randrange(exposures) for _ in range(faults))
+        self._exposures = 0
+        self.injected = Counter()
+        self.run = None
+
+    def exposing(self, state, retake):
+        self._exposures += 1
+        rig = self.run.rig
+        rig.simulation.camera.lost_ratio = 0.0
+        while self._due and self._due[0] <= self._exposures:
+            self._due.pop(0)
+            self._strike(rig.simulation)
+
+    def _strike(self, simulation):
+        device = self._random.choice(("rotators", "rotators", "arm", "shutter", "camera", "camera", "door"))
+        if device == "camera":
+            kind = self._random.choice(("packets", "vanish"))
+            if kind == "packets":
+                simulation.camera.lost_ratio = self._random.choice((0.2, 1.0))
+            else:
+                simulation.camera.vanish()
+        elif device == "door":
+            kind = "open"
+            simulation.emulators["shutter"].trip(True)
+            threading.Timer(self._random.uniform(0.05, 0.5), simulation.emulators["shutter"].trip, (False,)).start()
+        else:
+            kind = self._random.choice(SERIAL)
+            commands = None if kind in ("stuck", "slow") else self._random.choice((1, 1, 2, 5, None))
+            fault = Fault(kind, from_command=self._random.randint(1, 12), commands=commands, amount=None)
+            simulation.emulators[device].faults.add(fault)
+        self.injected[f"{device} {kind}"] += 1
+
+
+def _campaign(tmp_path, configs):
+    plans = {}
+    for mode in ("drr", "stokes"):
+        text = (configs / "plans" / f"{mode}.yaml").read_text().replace("exposure_s: 0.02", "exposure_s: 0.002")
+        if not FULL:
+            text = text.replace("states: 40, step_deg: 9", "states: 18, step_deg: 20").replace("darks: 4", "darks: 1")
+        plans[mode] = tmp_path / f"{mode}.yaml"
+        plans[mode].write_text(text)
+    file = tmp_path / "campaign.yaml"
+    omega = "{start: 20, stop: 90, step: 5}" if FULL else "[40, 60]"
+    file.write_text(
+        f"kind: campaign\nname: night\nplans: {{drr: {plans['drr']}, stokes: {plans['stokes']}}}\n"
+        f"samples: [{{name: red_sphere}}]\nwavelengths_nm: {'[451, 662]' if FULL else '[662]'}\nomega_deg: {omega}\n"
+        "references: [{sample: {kind: air, name: air}, omega_deg: 180, modes: [drr], every: 8}]\n"
+        "retries: 50\nretry_wait_s: 0.05\ncontinue_after_interlock: true\n"
+    )
+    return Campaign.load(file)
+
+
+def test_unattended_campaign_survives_random_faults(quick_rig, intact, configs, tmp_path):
+    # Short waits, so that a stalled axis does not cost the test its minutes.
+    rig_file = quick_rig(flux_e_per_s=8e6)
+    text = rig_file.read_text()
+    for line in ("port: sim:rotators", "port: sim:arm"):
+        text = text.replace(line, f"{line}, stall_s: 0.4, margin_s: 0.5, reply_s: 0.2")
+    rig_file.write_text(text)
+    config = load_rig(rig_file)
+    campaign = _campaign(tmp_path, configs)
+    jobs = campaign_run.prepare(campaign, config)
+    weather = Weather(FAULTS, sum(len(job.table) for _, job in jobs), seed=FAULTS)
+    stop = StopRequest()
+    folder = CampaignFolder(tmp_path / "night", campaign)
+    weather.run = CampaignRun(
+        campaign, config, folder, Operator(lambda text: None, stop, True, True), stop, [weather], home=True
+    )
+    try:
+        assert weather.run.run(jobs)
+    finally:
+        folder.close()
+    assert sum(weather.injected.values()) == FAULTS
+    states = 0
+    for capture, job in jobs:
+        done = intact(tmp_path / "night" / capture.name)
+        assert done == len(job.table)
+        states += done
+    events = Counter(json.loads(line)["event"] for line in (tmp_path / "night" / "log.jsonl").read_text().splitlines())
+    index = json.loads((tmp_path / "night" / "index.json").read_text())
+    assert {entry["status"] for entry in index.values()} == {"complete"}
+    print(f"{FAULTS} faults, {len(jobs)} captures, {states} states intact, {events['capture failed']} runs resumed")
+    print(dict(sorted(weather.injected.items())))
