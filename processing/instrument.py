@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from processing import mueller
+from processing.changes import Changes, Conditions
 from processing.errors import ProcessError
 from processing.yaml_file import load_yaml
 
@@ -56,8 +57,8 @@ class Element(_Part):
             azimuth = azimuth + self.ratio * np.asarray(angles_deg[self.axis], dtype=float)
         return np.asarray(np.deg2rad(azimuth))
 
-    def mueller(self, azimuth_rad: Row) -> Row:
-        """Mueller matrices (states, 4, 4) of the element at each azimuth."""
+    def mueller(self, azimuth_rad: Row, changes: Changes | None = None) -> Row:
+        """Mueller matrices (states, 4, 4) of the element at each azimuth, with what effects change in it."""
         raise NotImplementedError
 
 
@@ -67,8 +68,9 @@ class Polarizer(Element):
     kind: Literal["polarizer"]
     extinction: Dispersive = 0.0
 
-    def mueller(self, azimuth_rad: Row) -> Row:
-        return mueller.polarizer(azimuth_rad, _number(self.extinction))
+    def mueller(self, azimuth_rad: Row, changes: Changes | None = None) -> Row:
+        extinction = _number(self.extinction) + (changes.extinction[self.name] if changes else 0.0)
+        return mueller.polarizer(azimuth_rad, extinction)
 
 
 class Retarder(Element):
@@ -78,10 +80,11 @@ class Retarder(Element):
     retardance_deg: Dispersive
     diattenuation: Dispersive = 0.0
 
-    def mueller(self, azimuth_rad: Row) -> Row:
-        plain = mueller.retarder(azimuth_rad, np.deg2rad(_number(self.retardance_deg)))
-        d = _number(self.diattenuation)
-        if d == 0.0:
+    def mueller(self, azimuth_rad: Row, changes: Changes | None = None) -> Row:
+        retardance = np.deg2rad(_number(self.retardance_deg)) + (changes.retardance_rad[self.name] if changes else 0.0)
+        plain = mueller.retarder(azimuth_rad, retardance)
+        d = _number(self.diattenuation) + (changes.diattenuation[self.name] if changes else 0.0)
+        if np.all(d == 0.0):
             return plain
         return mueller.diattenuator(azimuth_rad, 1 + d, 1 - d) @ plain
 
@@ -93,7 +96,7 @@ class Diattenuator(Element):
     t_max: Dispersive = 1.0
     t_min: Dispersive
 
-    def mueller(self, azimuth_rad: Row) -> Row:
+    def mueller(self, azimuth_rad: Row, changes: Changes | None = None) -> Row:
         return mueller.diattenuator(azimuth_rad, _number(self.t_max), _number(self.t_min))
 
 
@@ -116,6 +119,9 @@ class AppliedEffect(_Part):
     parameters: dict[str, EffectParameter]
     evidence: float | None = None
     captures: tuple[str, ...] = ()
+    scope: Literal["instrument", "capture"] = "instrument"
+    wavelength_nm: float | None = None
+    indistinguishable_from: tuple[str, ...] = ()
 
 
 class EffectParameter(_Part):
@@ -132,6 +138,8 @@ class InstrumentModel(_Part):
 
     `mosaic`, for a division-of-focal-plane sensor, lays out the channel names over the super-pixel, row by
     row from the top left, e.g. (("90", "45"), ("135", "0")).
+    `calibrate` names values ("element.field") that are only nominal: `diagnose` fits them to captures of known samples.
+    An effect of scope "capture" holds for the captures that it names and for no other.
     """
 
     kind: Literal["instrument"] = "instrument"
@@ -142,6 +150,7 @@ class InstrumentModel(_Part):
     analyzer: tuple[AnyElement, ...]
     channels: tuple[Channel, ...] = (Channel(name="camera"),)
     mosaic: tuple[tuple[str, ...], ...] | None = None
+    calibrate: tuple[str, ...] = ()
     effects: tuple[AppliedEffect, ...] = ()
 
     @model_validator(mode="after")
@@ -185,28 +194,52 @@ class InstrumentModel(_Part):
                 f"asked for {wavelength_nm:g} nm. Use an instrument file that has it."
             )
         resolved = _resolve(self.model_dump(), wavelength_nm, self.name)
+        # An effect was found at one wavelength and is not carried over to another.
+        resolved["effects"] = [
+            e for e in resolved["effects"] if e["wavelength_nm"] is None or _listed(wavelength_nm, [e["wavelength_nm"]])
+        ]
         return InstrumentModel.model_validate(resolved | {"wavelengths_nm": (wavelength_nm,)})
 
-    def generator_states(self, angles_deg: Mapping[str, ArrayLike]) -> Row:
+    def generator_states(self, angles_deg: Mapping[str, ArrayLike], changes: Changes | None = None) -> Row:
         """Stokes vectors g (states, 4): first column of the generator train's Mueller matrix."""
         n = _state_count(angles_deg)
-        return _train(self.generator, angles_deg, n)[..., :, 0]
+        stokes = np.zeros((n, 4))
+        stokes[:, 0] = 1.0
+        for element in self.generator:
+            stokes = np.einsum("nij,nj->ni", _matrices(element, angles_deg, n, changes), stokes)
+        return stokes
 
-    def analyzer_states(self, angles_deg: Mapping[str, ArrayLike]) -> Row:
+    def analyzer_states(self, angles_deg: Mapping[str, ArrayLike], changes: Changes | None = None) -> Row:
         """Analyzer vectors a (states, channels, 4): first row of each channel's train."""
         n = _state_count(angles_deg)
-        common = _train(self.analyzer, angles_deg, n)
-        rows = [c.gain * (_train(c.elements, angles_deg, n) @ common)[..., 0, :] for c in self.channels]
-        return np.stack(rows, axis=1)
+        common = [_matrices(e, angles_deg, n, changes) for e in self.analyzer]
+        out = np.empty((n, len(self.channels), 4))
+        for k, channel in enumerate(self.channels):
+            own = [_matrices(e, angles_deg, n, changes) for e in channel.elements]
+            row = np.zeros((n, 4))
+            row[:, 0] = channel.gain
+            for matrix in reversed(common + own):
+                row = np.einsum("ni,nij->nj", row, matrix)
+            out[:, k] = row
+        return out
 
-    def rows(self, angles_deg: Mapping[str, ArrayLike]) -> Row:
+    def rows(self, angles_deg: Mapping[str, ArrayLike], changes: Changes | None = None) -> Row:
         """Measurement matrix W (states, channels, 16): row = kron(a, g), so that P = W . vec(M), row-major.
 
-        The model must be resolved at a wavelength (`at`). Angles are those read back, in degrees.
+        The model must be resolved at a wavelength (`at`). Angles are those read back, in degrees. `changes` is
+        what effects do to this capture; without it the instrument's own effects apply, those that belong to
+        one capture alone left out (`processing.effects.base.capture_changes` has them).
         """
-        g = self.generator_states(angles_deg)
-        a = self.analyzer_states(angles_deg)
-        return np.asarray((a[..., :, None] * g[:, None, None, :]).reshape(*a.shape[:2], 16))
+        if changes is None and self.effects:
+            from processing.effects.base import changes_of
+
+            names = tuple(c.name for c in self.channels)
+            arrays = {k: np.asarray(v, dtype=float).reshape(-1) for k, v in angles_deg.items()}
+            changes = changes_of(self, Conditions.of(arrays, names))
+        g = self.generator_states(angles_deg, changes)
+        a = self.analyzer_states(angles_deg, changes)
+        w = np.asarray((a[..., :, None] * g[:, None, None, :]).reshape(*a.shape[:2], 16))
+        return w if changes is None else _detected(w, changes)
 
 
 def condition_number(w: ArrayLike) -> float:
@@ -220,11 +253,22 @@ def rank(w: ArrayLike) -> int:
     return int(np.linalg.matrix_rank(np.asarray(w, dtype=float).reshape(-1, 16), rtol=1e-8))
 
 
-def _train(elements: Sequence[Element], angles_deg: Mapping[str, ArrayLike], states: int) -> Row:
-    total = np.broadcast_to(np.eye(4), (states, 4, 4))
-    for element in elements:
-        total = element.mueller(element.azimuth_rad(angles_deg, states)) @ total
-    return total
+def _matrices(element: Element, angles_deg: Mapping[str, ArrayLike], states: int, changes: Changes | None) -> Row:
+    azimuth = element.azimuth_rad(angles_deg, states)
+    if changes is None:
+        return element.mueller(azimuth)
+    matrix = element.mueller(azimuth + changes.azimuth_rad[element.name], changes)
+    return changes.after[element.name] @ matrix if element.name in changes.after else matrix
+
+
+def _detected(w: Row, changes: Changes) -> Row:
+    if changes.stray:
+        # Light that no element modulates: the same for every state, as strong as the fraction of the mean signal.
+        w = w.copy()
+        w[..., 0] += changes.stray * float(np.mean(w[..., 0]))
+    if changes.mixing is not None:
+        w = np.einsum("ck,nkj->ncj", changes.mixing, w)
+    return np.asarray(w * changes.gain[..., None])
 
 
 def _state_count(angles_deg: Mapping[str, ArrayLike]) -> int:

@@ -64,7 +64,7 @@ def diattenuator(azimuth: ArrayLike, t_max: ArrayLike, t_min: ArrayLike) -> Floa
     hi, lo = np.asarray(t_max, dtype=float), np.asarray(t_min, dtype=float)
     t, hi, lo = np.broadcast_arrays(t, hi, lo)
     c, s = np.cos(t), np.sin(t)
-    a, b, g = (hi + lo) / 2, (hi - lo) / 2, np.sqrt(hi * lo)
+    a, b, g = (hi + lo) / 2, (hi - lo) / 2, np.sqrt(np.maximum(hi * lo, 0.0))
     z = np.zeros_like(c)
     return _assemble(
         [

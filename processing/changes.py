@@ -1,0 +1,94 @@
+"""What effects change in the forward model of one capture: elements, gains and counts, state by state."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What the states of one capture have in common with any other, and what sets them apart.
+
+    Attributes
+    ----------
+    angles_deg : axis name to (N,), as read back.
+    states : N.
+    channels : names of the detector channels.
+    elapsed : (N,), time since the middle of the capture over its whole length, -0.5 to 0.5; state number
+        instead of time where the capture has no clock.
+    full_scale : counts at the top of the detector's range.
+    """
+
+    angles_deg: Mapping[str, Array]
+    states: int
+    channels: tuple[str, ...]
+    elapsed: Array
+    full_scale: float = 1.0
+
+    @classmethod
+    def of(cls, angles_deg: Mapping[str, Array], channels: tuple[str, ...] = ("camera",)) -> Conditions:
+        """Conditions of bare angles: equal steps in time, full scale 1."""
+        sizes = {np.size(v) for v in angles_deg.values()} or {1}
+        n = sizes.pop()
+        arrays = {k: np.asarray(v, dtype=float).reshape(-1) for k, v in angles_deg.items()}
+        return cls(arrays, n, channels, elapsed(None, n))
+
+
+def elapsed(time_s: Array | None, states: int) -> Array:
+    """Time (N,) scaled to -0.5 ... 0.5; state number where no time is known."""
+    t = np.arange(states, dtype=float)
+    if time_s is not None and np.all(np.isfinite(time_s)) and np.ptp(time_s) > 0:
+        t = np.asarray(time_s, dtype=float)
+    span = np.ptp(t)
+    return np.asarray((t - t.min()) / span - 0.5 if span > 0 else np.zeros(states))
+
+
+def _zeros() -> defaultdict[str, Array]:
+    return defaultdict(lambda: np.zeros(()))
+
+
+@dataclass
+class Changes:
+    """Sum of what all effects ask for; an empty one is the model as it stands.
+
+    Light side, all by element name: `azimuth_rad`, `retardance_rad` (each () or (N,)), `extinction`, `diattenuation`,
+    `after` (a Mueller matrix (4, 4) that follows the element), `field_retardance_rad` (5,) coefficients of
+    x, y, x^2, x y, y^2 with x and y from -1 to 1 over the image.
+    Detector side: `gain` (N, channels), `stray` (fraction of the mean signal that bypasses the optics), `mixing`
+    (channels, channels). Count side, what is added to the counts: `response` by feature of the counts, () or
+    (N, channels); `shift_px` (N, 2), by how much the image has moved to the right and down.
+    """
+
+    conditions: Conditions
+    azimuth_rad: defaultdict[str, Array] = field(default_factory=_zeros)
+    retardance_rad: defaultdict[str, Array] = field(default_factory=_zeros)
+    extinction: defaultdict[str, Array] = field(default_factory=_zeros)
+    diattenuation: defaultdict[str, Array] = field(default_factory=_zeros)
+    after: dict[str, Array] = field(default_factory=dict)
+    field_retardance_rad: dict[str, Array] = field(default_factory=dict)
+    gain: Array = field(init=False)
+    stray: float = 0.0
+    mixing: Array | None = None
+    response: defaultdict[str, Array] = field(default_factory=_zeros)
+    shift_px: Array = field(init=False)
+    drop_clipped: bool = False
+
+    def __post_init__(self) -> None:
+        self.gain = np.ones((self.conditions.states, len(self.conditions.channels)))
+        self.shift_px = np.zeros((self.conditions.states, 2))
+
+    def turn_axis(self, axis: str, error_deg: Array, elements: Mapping[str, float]) -> None:
+        """The axis stands `error_deg` (N,) from where it says; `elements` are the ratios of those that it turns."""
+        for name, ratio in elements.items():
+            self.azimuth_rad[name] = self.azimuth_rad[name] + ratio * np.deg2rad(error_deg)
+
+    def follow(self, element: str, mueller: Array) -> None:
+        """Put a Mueller matrix behind an element."""
+        self.after[element] = mueller @ self.after[element] if element in self.after else mueller

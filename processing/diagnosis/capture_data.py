@@ -1,0 +1,183 @@
+"""What `diagnose` keeps of a capture: the signal of all states, its noise, and what is known of the sample."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.calibrate import known_mueller
+from processing.capture import Capture, CaptureError
+from processing.changes import Conditions, elapsed
+from processing.correction import Correction
+from processing.instrument import InstrumentModel
+from processing.noise import NoiseModel
+from processing.reduce import measurement_matrix, relative_exposure, sample_states
+
+Array = NDArray[np.float64]
+
+#: Values of a capture that are kept; a larger one is averaged over squares of pixels first.
+MOST_VALUES = 40_000_000
+#: Below this number of pixels their scatter says nothing about the noise.
+FEWEST_PIXELS = 30
+
+
+@dataclass(frozen=True)
+class CaptureData:
+    """One capture, ready to be compared with a model.
+
+    Attributes
+    ----------
+    name : identity for reports: title and file name.
+    signal : (N, channels, rows, columns) float32, counts above black over full scale.
+    exposure : (N,) relative; multiplies the rows of W.
+    sample : (16,) known Mueller matrix up to a throughput, or None.
+    slope, floor : variance of a signal u is slope[n] * u + floor[n], in units of full scale squared, each (N,).
+    noise_known : False if no noise could be found (few pixels and no detector constants): then slope is 0, and
+        what is left over after the fit is the only measure.
+    noise_source : in words.
+    clipped : (rows, columns) True where some state is at the top of the range.
+    usable : (rows, columns) True where every state has a number.
+    binned : side of the squares over which pixels were averaged.
+    """
+
+    name: str
+    signal: NDArray[np.float32]
+    conditions: Conditions
+    exposure: Array
+    sample: Array | None
+    slope: Array
+    floor: Array
+    noise_known: bool
+    noise_source: str
+    clipped: NDArray[np.bool_]
+    usable: NDArray[np.bool_]
+    simulated: bool
+    wavelength_nm: float
+    binned: int = 1
+
+    @property
+    def values_per_pixel(self) -> int:
+        """Intensities of one pixel: states times channels."""
+        return int(self.signal.shape[0] * self.signal.shape[1])
+
+    @property
+    def row_exposure(self) -> Array:
+        """Exposure (values_per_pixel,) of each row of W."""
+        return np.repeat(self.exposure, self.signal.shape[1])
+
+    def variance(self, u: NDArray[np.floating]) -> Array:
+        """Variance (N, ...) of signals u (N, ...), in full scale squared."""
+        shape = (-1,) + (1,) * (u.ndim - 1)
+        return np.asarray(self.slope.reshape(shape) * np.maximum(u, 0) + self.floor.reshape(shape))
+
+
+def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
+    """Read the sample states of a capture; `model` is resolved at its wavelength.
+
+    Raises
+    ------
+    CaptureError : nothing to compare, or angles that the model does not have.
+    """
+    states = sample_states(capture)
+    measurement_matrix(capture, model, states)
+    correction = Correction.of(capture)
+    raw, clipped = _frames(capture, model, states, correction)
+    names = tuple(c.name for c in model.channels)
+    if raw.shape[1] != len(names):
+        raise CaptureError(
+            f"{capture.path}: {raw.shape[1]} channel(s), the instrument {model.name!r} has {len(names)}. "
+            "Use the instrument file that belongs to the capture."
+        )
+    detector, integer = capture.header.detector, capture.integer_counts
+    top = float(2**detector.bits - 1) - detector.black_level_counts if integer and detector.bits else float(raw.max())
+    angles = {name: value[states] for name, value in capture.angles_deg.items()}
+    when = elapsed(capture.column("host_time_s")[states], len(states))
+    exposure = relative_exposure(capture, states)
+    kind = capture.header.sample.kind
+    data = CaptureData(
+        name=f"{capture.header.title} ({capture.path.name})",
+        signal=raw / np.float32(top),
+        conditions=Conditions(angles, len(states), names, when, top),
+        exposure=exposure,
+        sample=None if kind == "unknown" else known_mueller(capture.header.sample).reshape(16),
+        slope=np.zeros(len(states)),
+        floor=np.full(len(states), (1e-3 * float(np.mean(raw)) / top) ** 2),
+        noise_known=False,
+        noise_source="not known: too few pixels and no detector constants; the residual itself is the measure",
+        clipped=clipped,
+        usable=np.isfinite(raw).all(axis=(0, 1)),
+        simulated=capture.simulated,
+        wavelength_nm=capture.header.wavelength_nm,
+    )
+    data = replace(data, signal=np.nan_to_num(data.signal))
+    repeats = np.maximum(capture.column("repeats")[states].astype(float), 1)
+    noise = NoiseModel.of(detector, integer)
+    if noise is not None:
+        slope, floor = noise.slope / repeats / top, noise.averaged_floor(repeats) / top**2
+        data = replace(data, slope=slope, floor=floor, noise_known=True, noise_source=noise.source)
+    data = _binned(data)
+    if noise is None and data.usable.sum() >= FEWEST_PIXELS:
+        from processing.diagnosis.noise_estimate import estimated_noise
+
+        data = estimated_noise(data)
+    return data
+
+
+def _frames(
+    capture: Capture, model: InstrumentModel, states: NDArray[np.int64], correction: Correction
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    level = _clip_level(capture, correction)
+    frames, clipped = [], np.zeros(capture.frame_shape, dtype=bool)
+    for k in states:
+        frame = capture.frames(int(k)).astype(np.float32)
+        if level is not None:
+            clipped |= (frame >= level).any(axis=0)
+        frame -= np.float32(correction.black) if np.isscalar(correction.black) else np.asarray(correction.black)
+        frames.append(frame if correction.flat is None else frame / correction.flat)
+    raw = np.stack(frames)
+    if model.mosaic is None:
+        return raw, clipped
+    rows, columns = len(model.mosaic), len(model.mosaic[0])
+    height, width = raw.shape[2] // rows * rows, raw.shape[3] // columns * columns
+    raw = raw[:, :, :height, :width]
+    where = {name: (r, c) for r, line in enumerate(model.mosaic) for c, name in enumerate(line)}
+    planes = [raw[:, 0, where[c.name][0] :: rows, where[c.name][1] :: columns] for c in model.channels]
+    blocks = clipped[:height, :width].reshape(height // rows, rows, width // columns, columns)
+    return np.stack(planes, axis=1), blocks.any(axis=(1, 3))
+
+
+def _clip_level(capture: Capture, correction: Correction) -> float | None:
+    detector, level = capture.header.detector, correction.saturation
+    if detector.full_well_e is not None and detector.gain_e_per_count is not None:
+        well = detector.black_level_counts + detector.full_well_e / detector.gain_e_per_count
+        spread = 4 * (detector.read_noise_e or 0.0) / detector.gain_e_per_count
+        level = well - spread if level is None else min(level, well - spread)
+    return level
+
+
+def _binned(data: CaptureData) -> CaptureData:
+    n, c, height, width = data.signal.shape
+    side = int(np.ceil(np.sqrt(data.signal.size / MOST_VALUES)))
+    # Many states: the second moments of the states would be larger than the pixels themselves.
+    if n * c > 160:
+        side = max(side, int(np.ceil(np.sqrt(height * width / 64))))
+    if side <= 1:
+        return data
+    h, w = height // side, width // side
+    squares = data.signal[:, :, : h * side, : w * side].reshape(n, c, h, side, w, side)
+
+    def whole(mask: NDArray[np.bool_], how: str) -> NDArray[np.bool_]:
+        blocks = mask[: h * side, : w * side].reshape(h, side, w, side)
+        return np.asarray(getattr(blocks, how)(axis=(1, 3)))
+
+    return replace(
+        data,
+        signal=squares.mean(axis=(3, 5), dtype=np.float64).astype(np.float32),
+        slope=data.slope / side**2,
+        floor=data.floor / side**2 if data.noise_known else data.floor,
+        clipped=whole(data.clipped, "any"),
+        usable=whole(data.usable, "all"),
+        binned=side,
+    )

@@ -1,0 +1,254 @@
+"""From what the search found to a verdict: named only if the evidence allows no other reading."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.diagnosis.candidate import Candidate
+from processing.diagnosis.fit import covariance, minimize
+from processing.diagnosis.problem import InstrumentProblem, Space
+from processing.diagnosis.recommend import recommended
+from processing.diagnosis.result import (
+    CaptureReport,
+    Diagnosis,
+    Empirical,
+    Error,
+    FoundEffect,
+    Ranked,
+    Unexplained,
+    Verdict,
+)
+from processing.diagnosis.search import CHANCE, Found, Say, Search
+from processing.diagnosis.structure import LIMIT, Residual, description, residual
+from processing.instrument import EffectParameter
+
+Array = NDArray[np.float64]
+
+#: Share of the excess that must be explained before anything is named while structure is left.
+SHARE = 0.9
+#: An information about a parameter below this, in chi-square for its typical size, is none.
+SEEN = 4.0
+#: Autocorrelation over the states, in standard deviations, from which on a residual of few pixels is not white.
+WHITE = 4.0
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The diagnosis, and the residuals before and after for the report."""
+
+    diagnosis: Diagnosis
+    found: Found
+    before: tuple[Residual, ...]
+    after: tuple[Residual, ...]
+
+
+def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
+    """Search, test what is left, and judge."""
+    search = Search(problem, say)
+    found = search.run()
+    say("testing what is left over")
+    captures = range(len(problem.captures))
+    before = tuple(residual(problem, k, found.base, found.before_fit) for k in captures)
+    after = tuple(residual(problem, k, found.space, found.fit) for k in captures)
+    verdict = _verdict(problem, found, after)
+    if verdict == "unexplained" and found.effects:
+        tried = found.effects
+        found.space, found.fit, found.after = found.base, found.before_fit, found.before
+        after = before
+    else:
+        tried = tuple(t.candidate for t in found.ranking[:5]) if verdict == "unexplained" else ()
+    unseen = _unobservable(found)
+    rivals = [c for e in found.effects for c in (e, *found.sets.get(e, ())) if found.sets.get(e)]
+    unexplained = None
+    if verdict in ("unexplained", "partly_explained"):
+        empirical = _empirical(problem, search, found) if verdict == "unexplained" else None
+        lines = tuple(line for r in after for line in description(r))
+        unexplained = Unexplained(description=lines, tried=tuple(c.label for c in tried), empirical=empirical)
+    diagnosis = Diagnosis(
+        verdict=verdict,
+        error_before=_error(problem, found.before),
+        error_after=_error(problem, found.after),
+        noise_floor_percent=_floor(problem),
+        effects=tuple(_effect(problem, search, found, c) for c in found.effects),
+        unobservable=unseen,
+        recommendation=recommended(problem, found.space, found.fit, rivals, _missing(problem, found)),
+        unexplained=unexplained,
+        calibrated=_calibrated(problem, search, found),
+        ranking=tuple(
+            Ranked(candidate=t.candidate.label, evidence=round(t.evidence, 1), rms_percent=100 * t.out.rms)
+            for t in found.ranking[:10]
+        ),
+        captures=tuple(_capture(problem, k, found, before[k], after[k]) for k in captures),
+        instrument=problem.model.name,
+        wavelength_nm=problem.captures[0].wavelength_nm,
+        simulated=any(c.simulated for c in problem.captures),
+    )
+    return Judged(diagnosis, found, before, after)
+
+
+def _verdict(problem: InstrumentProblem, found: Found, after: Sequence[Residual]) -> Verdict:
+    structure = any(value > LIMIT for r in after for value in r.tests.values())
+    if not problem.noise_known:
+        structure = any(not _white(r) for r in after)
+        if not found.effects and not structure:
+            return "consistent"
+    if not structure:
+        return "explained" if found.effects else "consistent"
+    if not found.effects:
+        return "unexplained"
+    explained = 1 - max(found.after.excess, 0.0) / max(found.before.excess, 1e-300)
+    sure = all(found.chance.get(c, 1.0) < CHANCE for c in found.effects)
+    return "partly_explained" if explained >= SHARE and sure else "unexplained"
+
+
+def _white(r: Residual) -> bool:
+    mean = r.mean[np.isfinite(r.mean)]
+    if mean.size < 8 or not np.any(mean):
+        return True
+    centred = mean - mean.mean()
+    lag = float(centred[1:] @ centred[:-1] / (centred @ centred))
+    return abs(lag) * np.sqrt(mean.size) < WHITE
+
+
+def _error(problem: InstrumentProblem, out: object) -> Error:
+    held = "; ".join(dict.fromkeys(m.held_out for m in problem.moments))
+    return Error(
+        rms_percent=100 * getattr(out, "rms", 0.0), chi2_reduced=getattr(out, "chi2_reduced", 0.0), held_out=held
+    )
+
+
+def _floor(problem: InstrumentProblem) -> float | None:
+    if not problem.noise_known:
+        return None
+    return 100 * float(np.sqrt(np.mean([m.noise_floor**2 for m in problem.moments])))
+
+
+def _spread(search: Search, found: Found) -> float:
+    unit = 1.0 if search.problem.noise_known else 0.0
+    return unit + search.structure(found.after, found.space.size)
+
+
+def _parameters(candidate: Candidate, values: Array, stderr: Array) -> dict[str, EffectParameter]:
+    if candidate.kind == "saturation":
+        return {"left_out": EffectParameter(value=1.0, unit="1", note="pixels with a clipped state are left out")}
+    if candidate.effect.per_state:
+        unit = candidate.parameters[0].unit
+        return {"states": EffectParameter(value=tuple(values.tolist()), stderr=tuple(stderr.tolist()), unit=unit)}
+    return {
+        p.name: EffectParameter(value=float(v), stderr=float(s), unit=p.unit)
+        for p, v, s in zip(candidate.parameters, values, stderr, strict=True)
+    }
+
+
+def _effect(problem: InstrumentProblem, search: Search, found: Found, candidate: Candidate) -> FoundEffect:
+    error = np.sqrt(np.maximum(np.diag(covariance(problem, found.space, found.fit, _spread(search, found))), 0))
+    part = found.space.slices[found.space.candidates.index(candidate)]
+    return FoundEffect(
+        kind=candidate.kind,
+        element=candidate.place or None,
+        parameters=_parameters(candidate, found.fit.values[part], error[part]),
+        evidence=found.evidence.get(candidate, 0.0),
+        indistinguishable_from=tuple(dict.fromkeys(c.short for c in found.sets.get(candidate, ()))),
+        scope=candidate.effect.scope,
+        capture=None if candidate.capture is None else problem.captures[candidate.capture].name,
+        removal_chance=found.chance.get(candidate, 1.0),
+    )
+
+
+def _calibrated(problem: InstrumentProblem, search: Search, found: Found) -> dict[str, EffectParameter]:
+    if not found.base.candidates:
+        return {}
+    error = np.sqrt(np.maximum(np.diag(covariance(problem, found.space, found.fit, _spread(search, found))), 0))
+    out = {}
+    for candidate in found.base.candidates:
+        index = found.space.slices[found.space.candidates.index(candidate)].start
+        element, _, field = candidate.place.rpartition(".")
+        start = float(next(getattr(e, field) for e in problem.model.elements() if e.name == element))
+        value = start + float(found.fit.values[index])
+        out[candidate.place] = EffectParameter(
+            value=value, stderr=float(error[index]), unit=candidate.parameters[0].unit
+        )
+    return out
+
+
+def _unobservable(found: Found) -> tuple[str, ...]:
+    names = []
+    for candidate, information in found.information.items():
+        gain = np.diag(information) * candidate.typical**2
+        if "@" not in candidate.place and np.all(gain < SEEN):
+            names.append(candidate.short)
+    names += [f"{c.short} (as many values as the data have)" for c in found.untestable]
+    return tuple(dict.fromkeys(names))
+
+
+def _missing(problem: InstrumentProblem, found: Found) -> list[Candidate]:
+    # Only what another sample could show is worth a recommendation.
+    return [
+        c
+        for c, information in found.information.items()
+        if "@" not in c.place
+        and not c.effect.corrects_counts
+        and np.all(np.diag(information) * c.typical**2 < SEEN)
+        and c.kind != "field_retardance"
+    ]
+
+
+def _empirical(problem: InstrumentProblem, search: Search, found: Found) -> Empirical | None:
+    """The best of: a gain for each state, an angle for each state, a bend of the response."""
+    best: tuple[float, Candidate, Array, float] | None = None
+    fits = []
+    for candidate in search.pool:
+        if not (candidate.effect.per_state or candidate.kind == "detector_nonlinearity"):
+            continue
+        space = Space((*found.space.candidates, candidate))
+        fit = minimize(problem, space, np.concatenate([found.fit.values, np.zeros(candidate.size)]))
+        rms = float(np.sqrt(fit.sums.square.sum() / fit.sums.count.sum()))
+        fits.append((candidate, fit.excess))
+        if best is None or fit.excess < best[0]:
+            best = (fit.excess, candidate, fit.values[space.slices[-1]], rms)
+    if best is None or best[0] > 0.9 * found.fit.excess:
+        return None
+    excess, candidate, values, rms = best
+    names = {"source_flicker": "gain_per_state", "angle_per_state": "angle_per_state"}
+    near = excess + 0.02 * (found.fit.excess - excess) + 3 * search.noise_of(found.after)
+    return Empirical(
+        kind=names.get(candidate.kind, "response"),
+        rms_percent_in_sample=100 * rms,
+        values=tuple(values.tolist()),
+        unit=candidate.parameters[0].unit,
+        would_also_fit=tuple(dict.fromkeys(c.short for c, e in fits if e <= near)),
+    )
+
+
+def _capture(problem: InstrumentProblem, k: int, found: Found, before: Residual, after: Residual) -> CaptureReport:
+    data = problem.captures[k]
+    sample = "unknown" if data.sample is None else "known up to a throughput for each pixel"
+    return CaptureReport(
+        name=data.name,
+        sample=sample,
+        simulated=data.simulated,
+        noise=data.noise_source,
+        binned=data.binned,
+        clipped_fraction=float(np.mean(data.clipped)),
+        tests_before=before.tests,
+        tests_after=after.tests,
+        closure_before_percent=_closure(problem, k, found.base, found.before_fit.values),
+        closure_after_percent=_closure(problem, k, found.space, found.fit.values),
+    )
+
+
+def _closure(problem: InstrumentProblem, k: int, space: Space, values: Array) -> float | None:
+    """Mean of I0 + I90 - I45 - I135 over mean S0, percent, after dividing by the gains of the channels."""
+    model, data = problem.model, problem.captures[k]
+    if model.mosaic is None or {c.name for c in model.channels} != {"0", "45", "90", "135"}:
+        return None
+    changes = problem.changes(k, space, values)
+    names = [c.name for c in model.channels]
+    sign = np.array([1.0 if n in ("0", "90") else -1.0 for n in names])
+    good = data.usable & ~data.clipped
+    means = data.signal[:, :, good].mean(axis=(0, 2), dtype=np.float64) / changes.gain.mean(axis=0)
+    return float(100 * (sign @ means) / (means.sum() / 2))

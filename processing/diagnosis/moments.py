@@ -1,0 +1,244 @@
+"""Second moments of a capture: what makes a fit over all pixels as cheap as over a few hundred.
+
+With the pixels' intensities y (N values each), every sum of squares that a fit needs is tr(P Y Y^T): only the N x N
+matrix Y Y^T matters. Corrections of the counts (offset, curvature, image shift) are linear in features of y (1, y^2,
+y ln y, dy/dx, ...), so the matrix is kept for y and its features together, as a square root Z with Z Z^T = sum over
+pixels. Each pixel is weighted with the inverse of its mean variance; each row later with its own.
+The expected noise of every product is kept beside it, so that an excess over the noise has no bias from noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.diagnosis.capture_data import CaptureData
+
+Array = NDArray[np.float64]
+
+#: Features of a signal u (counts over full scale); corrected counts = u + sum of coefficient times feature.
+FEATURES = ("counts", "one", "square", "cube", "fourth", "log", "log_square", "dx", "dy")
+TINY = 1e-6
+#: Parts that are held out in turn: of the image, or of the states (of which there are few, so each part is smaller).
+FOLDS_OF_TILES = 2
+FOLDS_OF_STATES = 5
+#: Tiles along each side of the image, for effects and structure that vary over it.
+TILES = 10
+#: Captures with more rows, or fewer pixels, than these hold out states, others hold out tiles of the image.
+MOST_ROWS_FOR_TILES = 100
+FEWEST_PIXELS_FOR_TILES = 64
+
+
+@dataclass(frozen=True)
+class Block:
+    """A part of a capture that is fitted or held out together.
+
+    Attributes
+    ----------
+    z : (features, L, R) pseudo-pixels.
+    counts : (L, R') as few pseudo-pixels as the plain counts need.
+    noise : (L, features, features) expected noise of z z^T, row by row.
+    rows : (L',) the rows of the capture that belong to this block.
+    clipped : pixels of which some state is at the top of the range.
+    pixels : how many pixels stand behind it.
+    """
+
+    fold: int
+    z: Array
+    counts: Array
+    noise: Array
+    rows: NDArray[np.int64]
+    clipped: bool
+    pixels: int
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """Second moments of the plain counts in tiles of the image.
+
+    Attributes
+    ----------
+    s : (T, L, L); noise : (T, L); x, y : (T,) centres from -1 to 1; fold : (T,).
+    index : (rows, columns) tile of each pixel; pixels : (T,) how many of them count.
+    """
+
+    s: Array
+    noise: Array
+    x: Array
+    y: Array
+    fold: NDArray[np.int64]
+    index: NDArray[np.int64]
+    pixels: Array
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Blocks and tiles of one capture.
+
+    Attributes
+    ----------
+    sigma : (L,) noise of each row in the weighted units.
+    relative : turns a weighted square into a square relative to the mean signal.
+    spread : mean square over squared mean of the variances: 1 if all pixels and states are equally noisy.
+    noise_floor : rms noise over the mean signal.
+    """
+
+    blocks: tuple[Block, ...]
+    tiles: Tiles | None
+    sigma: Array
+    relative: float
+    spread: float
+    noise_floor: float
+    held_out: str
+
+
+def holds_out_states(data: CaptureData) -> bool:
+    """Whether states are held out (few pixels, or many states) instead of tiles of the image."""
+    return data.values_per_pixel > MOST_ROWS_FOR_TILES or int(data.usable.sum()) < FEWEST_PIXELS_FOR_TILES
+
+
+def moments_of(data: CaptureData, folds: int) -> Moments:
+    """Build the moments of a capture, to be held out in so many parts."""
+    n, c, height, width = data.signal.shape
+    rows = n * c
+    u = data.signal.reshape(rows, height, width)
+    variance = data.variance(data.signal).reshape(rows, height, width)
+    scale = variance.mean(axis=0)
+    good = data.usable & (scale > 0)
+    sigma = np.sqrt(np.mean(variance[:, good] / scale[good], axis=1))
+    tiles = None
+    by_state = holds_out_states(data)
+    index, x, y = _grid(height, width)
+    if by_state:
+        fold_of_pixel = np.zeros((height, width), dtype=np.int64)
+        held = f"every state is predicted by a fit to the states of the other parts ({folds} parts, drawn at random)"
+    else:
+        side = int(np.ceil(np.sqrt(x.size)))
+        fold_of_tile = (np.arange(x.size) // side + np.arange(x.size) % side) % folds
+        fold_of_pixel = fold_of_tile[index]
+        held = f"every tile of the image is predicted by a fit to the tiles of the other parts ({folds} parts, interleaved)"
+        tiles = _tiles(u, variance, scale, good & ~data.clipped, index, x, y, fold_of_tile)
+    blocks: list[Block] = []
+    for clipped in (False, True):
+        for fold in range(1 if by_state else folds):
+            pick = good & (data.clipped == clipped) & (fold_of_pixel == fold)
+            if pick.any():
+                blocks += _blocks(data, u, variance, scale, pick, fold, clipped, folds if by_state else 0)
+    share = variance[:, good] / scale[good] / sigma[:, None] ** 2
+    mean = float(np.mean(u[:, good]))
+    relative = float(np.mean(scale[good])) / mean**2
+    floor = float(np.sqrt(np.mean(variance[:, good]))) / mean
+    return Moments(tuple(blocks), tiles, sigma, relative, float(np.mean(share**2)), floor, held)
+
+
+def _grid(height: int, width: int) -> tuple[NDArray[np.int64], Array, Array]:
+    side = min(TILES, height, width)
+    r = (np.arange(height) * side) // height
+    c = (np.arange(width) * side) // width
+    index = r[:, None] * side + c[None, :]
+    count = np.bincount(index.reshape(-1), minlength=side * side)
+    xs = np.broadcast_to(np.linspace(-1, 1, width) if width > 1 else np.zeros(1), (height, width))
+    ys = np.broadcast_to((np.linspace(-1, 1, height) if height > 1 else np.zeros(1))[:, None], (height, width))
+    x = np.bincount(index.reshape(-1), xs.reshape(-1), side * side) / count
+    y = np.bincount(index.reshape(-1), ys.reshape(-1), side * side) / count
+    return index, x, y
+
+
+def _tiles(
+    u: NDArray[np.float32],
+    variance: Array,
+    scale: Array,
+    pick: NDArray[np.bool_],
+    index: NDArray[np.int64],
+    x: Array,
+    y: Array,
+    fold: NDArray[np.int64],
+) -> Tiles:
+    rows = u.shape[0]
+    s, noise, pixels = np.zeros((x.size, rows, rows)), np.zeros((x.size, rows)), np.zeros(x.size)
+    for t in range(x.size):
+        r, c = np.nonzero((index == t) & pick)
+        part = u[:, r, c] / np.sqrt(scale[r, c])
+        s[t], pixels[t] = part @ part.T, r.size
+        noise[t] = np.sum(variance[:, r, c] / scale[r, c], axis=1)
+    return Tiles(s, noise, x, y, fold, index, pixels)
+
+
+def _blocks(
+    data: CaptureData,
+    u: NDArray[np.float32],
+    variance: Array,
+    scale: Array,
+    pick: NDArray[np.bool_],
+    fold: int,
+    clipped: bool,
+    parts_of_states: int,
+) -> list[Block]:
+    rows = u.shape[0]
+    size = len(FEATURES) * rows
+    pixels = int(pick.sum())
+    gradients = _gradients(u)
+    noise = np.zeros((rows, len(FEATURES), len(FEATURES)))
+    total = np.zeros((size, size)) if pixels > size else None
+    parts = []
+    flat = np.flatnonzero(pick.reshape(-1))
+    for start in range(0, flat.size, 8192):
+        p = flat[start : start + 8192]
+        weight = 1 / np.sqrt(scale.reshape(-1)[p])
+        values = u.reshape(rows, -1)[:, p].astype(np.float64)
+        z, slopes = features(values)
+        z[-2] = gradients[0].reshape(rows, -1)[:, p]
+        z[-1] = gradients[1].reshape(rows, -1)[:, p]
+        z *= weight
+        share = variance.reshape(rows, -1)[:, p] * weight**2
+        noise += np.einsum("flp,glp,lp->lfg", slopes, slopes, share, optimize=True)
+        # A central difference sees the noise of the two neighbours, half of one pixel's variance.
+        for k in (-2, -1):
+            noise[:, k, k] += 0.5 * share.sum(axis=1)
+        if total is None:
+            parts.append(z.reshape(size, -1))
+        else:
+            flat_z = z.reshape(size, -1)
+            total += flat_z @ flat_z.T
+    root = np.concatenate(parts, axis=1) if total is None else _square_root(total)
+    z = root.reshape(len(FEATURES), rows, -1)
+    counts = _square_root(z[0] @ z[0].T)
+    if not parts_of_states:
+        return [Block(fold, z, counts, noise, np.arange(rows), clipped, pixels)]
+    states, channels = data.signal.shape[:2]
+    halves = np.random.default_rng(0).permutation(states) % parts_of_states
+    return [
+        Block(f, z, counts, noise, np.flatnonzero(np.repeat(halves == f, channels)), clipped, pixels)
+        for f in range(parts_of_states)
+    ]
+
+
+def features(u: Array) -> tuple[Array, Array]:
+    """Features (F, ...) of signals and their derivatives by the signal; the gradients of the image are left zero."""
+    z, slope = np.zeros((len(FEATURES), *u.shape)), np.zeros((len(FEATURES), *u.shape))
+    log = np.log(np.maximum(u, TINY))
+    z[0], slope[0] = u, 1.0
+    z[1] = 1.0
+    z[2], slope[2] = u**2, 2 * u
+    z[3], slope[3] = u**3, 3 * u**2
+    z[4], slope[4] = u**4, 4 * u**3
+    z[5], slope[5] = u * log, log + 1
+    z[6], slope[6] = u * log**2, log**2 + 2 * log
+    return z, slope
+
+
+def _gradients(u: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    dx, dy = np.zeros_like(u), np.zeros_like(u)
+    if u.shape[2] > 2:
+        dx = np.gradient(u, axis=2)
+    if u.shape[1] > 2:
+        dy = np.gradient(u, axis=1)
+    return dx, dy
+
+
+def _square_root(s: Array) -> Array:
+    value, vector = np.linalg.eigh(s)
+    keep = value > 1e-15 * value[-1]
+    return np.asarray(vector[:, keep] * np.sqrt(value[keep]))

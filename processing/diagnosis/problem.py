@@ -1,0 +1,312 @@
+"""Measured intensities against an instrument model: excess over the noise, its gradient and curvature.
+
+For every capture the model gives a matrix A (L rows): W for an unknown sample, W vec(M) for a known one. What a pixel's
+own unknowns (M, or the throughput) can take up is projected out: residual = P y with P = 1 - A A+. The excess is the sum
+of squares of the residuals in units of the noise, minus what the noise is expected to give.
+Derivative of the residual: -P dA A+ y (variable projection after Kaufman, BIT 15, 49, 1975) + P dc Z for corrections
+of the counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.changes import Changes
+from processing.diagnosis.candidate import Candidate
+from processing.diagnosis.capture_data import CaptureData
+from processing.diagnosis.moments import (
+    FEATURES,
+    FOLDS_OF_STATES,
+    FOLDS_OF_TILES,
+    Block,
+    Moments,
+    features,
+    holds_out_states,
+    moments_of,
+)
+from processing.effects.base import apply_to, turned_by
+from processing.effects.field_retardance import terms
+from processing.instrument import InstrumentModel
+
+Array = NDArray[np.float64]
+STEP = 1e-4
+RANK = 1e-8
+
+
+@dataclass
+class Sums:
+    """Sums over the data of each fold F.
+
+    Attributes
+    ----------
+    excess : (F,) sum of squares in units of the noise, minus what noise is expected to give (`freedom`, (F,)).
+    square : (F,) sum of squares relative to the mean signal; count : (F,) the degrees of freedom behind it.
+    gradient, curvature : (F, K), (F, K, K), half of the derivatives of the excess.
+    """
+
+    excess: Array
+    freedom: Array
+    square: Array
+    count: Array
+    gradient: Array
+    curvature: Array
+
+    @classmethod
+    def empty(cls, folds: int, parameters: int) -> Sums:
+        """All zero."""
+        f, k = folds, parameters
+        return cls(*(np.zeros(f) for _ in range(4)), np.zeros((f, k)), np.zeros((f, k, k)))
+
+
+@dataclass
+class Space:
+    """Active candidates and where their values stand in the common vector."""
+
+    candidates: tuple[Candidate, ...]
+    slices: tuple[slice, ...] = field(init=False)
+    size: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        start, slices = 0, []
+        for candidate in self.candidates:
+            slices.append(slice(start, start + candidate.size))
+            start += candidate.size
+        self.slices, self.size = tuple(slices), start
+
+    def joined(self, name: str) -> Array:
+        """A property of all candidates, end to end."""
+        return np.concatenate([np.zeros(0), *(getattr(c, name) for c in self.candidates)])
+
+
+class InstrumentProblem:
+    """All captures against one instrument model, resolved at their wavelength."""
+
+    def __init__(self, model: InstrumentModel, captures: Sequence[CaptureData]) -> None:
+        self.model = model
+        self.captures = tuple(captures)
+        self.folds = FOLDS_OF_STATES if any(holds_out_states(c) for c in captures) else FOLDS_OF_TILES
+        self.moments: tuple[Moments, ...] = tuple(moments_of(c, self.folds) for c in captures)
+        self.noise_known = all(c.noise_known for c in captures)
+
+    def changes(self, capture: int, space: Space, values: Array) -> Changes:
+        """Changes of one capture with the instrument's own effects and the active candidates."""
+        data = self.captures[capture]
+        changes = Changes(data.conditions)
+        for applied in self.model.effects:
+            if applied.scope == "instrument" or data.name in applied.captures:
+                apply_to(changes, self.model, applied)
+        for candidate, part in zip(space.candidates, space.slices, strict=True):
+            if candidate.capture in (None, capture):
+                candidate.effect.apply(changes, self.model, candidate.place, values[part])
+        return changes
+
+    def columns(self, capture: int, changes: Changes) -> Array:
+        """A (L, K), rows in units of their noise."""
+        data = self.captures[capture]
+        w = self.model.rows(data.conditions.angles_deg, changes).reshape(-1, 16) * data.row_exposure[:, None]
+        a = w if data.sample is None else (w @ data.sample)[:, None]
+        return np.asarray(a / self.moments[capture].sigma[:, None])
+
+    def coefficients(self, capture: int, changes: Changes) -> Array:
+        """Coefficient of every feature (F, L) in the corrected counts."""
+        rows = self.captures[capture].values_per_pixel
+        channels = len(self.captures[capture].conditions.channels)
+        c = np.zeros((len(FEATURES), rows))
+        c[0] = 1.0
+        for name, value in changes.response.items():
+            c[FEATURES.index(name)] += value
+        c[FEATURES.index("dx")] = np.repeat(changes.shift_px[:, 0], channels)
+        c[FEATURES.index("dy")] = np.repeat(changes.shift_px[:, 1], channels)
+        return c
+
+    def sums(self, space: Space, values: Array, *, derivatives: bool = True) -> Sums:
+        """Excess, and with `derivatives` its half gradient and curvature, of every fold."""
+        out = Sums.empty(self.folds, space.size if derivatives else 0)
+        for k in range(len(self.captures)):
+            changes = self.changes(k, space, values)
+            if changes.field_retardance_rad or (derivatives and self._has_field(space)):
+                self._tile_sums(k, space, values, changes, out, derivatives)
+            else:
+                self._block_sums(k, space, values, changes, out, derivatives)
+        return out
+
+    def _has_field(self, space: Space) -> bool:
+        return any(c.kind == "field_retardance" for c in space.candidates)
+
+    def _block_sums(self, k: int, space: Space, values: Array, changes: Changes, out: Sums, derivatives: bool) -> None:
+        a, c = self.columns(k, changes), self.coefficients(k, changes)
+        da, dc = self._derivatives(k, space, values, a, c) if derivatives else (np.zeros((0, *a.shape)), None)
+        for block in self.moments[k].blocks:
+            if not (block.clipped and changes.drop_clipped):
+                _add_block(block, a, c, da, dc, self.moments[k], out)
+
+    def _derivatives(self, k: int, space: Space, values: Array, a: Array, c: Array) -> tuple[Array, Array]:
+        da, dc = np.zeros((space.size, *a.shape)), np.zeros((space.size, *c.shape))
+        channels = len(self.captures[k].conditions.channels)
+        whole: dict[str, Array] = {}
+        for candidate, part in zip(space.candidates, space.slices, strict=True):
+            if candidate.capture not in (None, k) or candidate.kind == "saturation":
+                continue
+            if candidate.effect.per_state:
+                # Parameter n acts on state n alone: one step of all of them together gives every derivative.
+                moved = values.copy()
+                step = STEP * candidate.typical
+                moved[part] += step
+                slope = (self.columns(k, self.changes(k, space, moved)) - a) / step.repeat(channels)[:, None]
+                for n in range(candidate.size):
+                    rows = slice(n * channels, (n + 1) * channels)
+                    da[part.start + n, rows] = slope[rows]
+                continue
+            first = candidate.effect.first_state(candidate.place)
+            if first and not values[part].any():
+                # The same step of the same axis from another state on: one evaluation serves all of them.
+                axis = candidate.place.partition("@")[0]
+                if axis not in whole:
+                    whole[axis] = self._slope_of_axis(k, space, values, axis, a)
+                da[part.start, first * channels :] = whole[axis][first * channels :]
+                continue
+            for j in range(candidate.size):
+                moved = values.copy()
+                step_j = STEP * candidate.typical[j]
+                moved[part.start + j] += step_j
+                changes = self.changes(k, space, moved)
+                da[part.start + j] = (self.columns(k, changes) - a) / step_j
+                dc[part.start + j] = (self.coefficients(k, changes) - c) / step_j
+        return da, dc
+
+    def _slope_of_axis(self, k: int, space: Space, values: Array, axis: str, a: Array) -> Array:
+        changes = self.changes(k, space, values)
+        states = self.captures[k].conditions.states
+        changes.turn_axis(axis, np.full(states, STEP), turned_by(self.model, axis))
+        return np.asarray((self.columns(k, changes) - a) / STEP)
+
+    def _tile_sums(self, k: int, space: Space, values: Array, changes: Changes, out: Sums, derivatives: bool) -> None:
+        """The same with another A in every tile of the image; the counts are taken as they are."""
+        tiles = self.moments[k].tiles
+        if tiles is None:
+            return
+        a = self.tile_columns(k, changes)
+        da = np.zeros((space.size if derivatives else 0, *a.shape))
+        for candidate, part in zip(space.candidates, space.slices, strict=True):
+            if not derivatives or candidate.capture not in (None, k):
+                continue
+            for j in range(candidate.size):
+                moved = values.copy()
+                step = STEP * candidate.typical[j]
+                moved[part.start + j] += step
+                da[part.start + j] = (self.tile_columns(k, self.changes(k, space, moved)) - a) / step
+        sigma = self.moments[k].sigma
+        s = tiles.s / sigma[:, None] / sigma
+        noise = tiles.noise / sigma**2
+        u, size, vt = np.linalg.svd(a, full_matrices=False)
+        keep = size > RANK * size[:, :1]
+        q = u * keep[:, None, :]
+        pinv = np.einsum("tri,tr,tlr->til", vt, np.where(keep, 1 / np.maximum(size, 1e-300), 0.0), u)
+        ps = s - q @ (q.transpose(0, 2, 1) @ s)
+        free = 1 - np.einsum("tlr,tlr->tl", q, q)
+        excess = np.einsum("tll->t", ps - (ps @ q) @ q.transpose(0, 2, 1)) - np.sum(free * noise, axis=1)
+        np.add.at(out.excess, tiles.fold, excess)
+        np.add.at(out.freedom, tiles.fold, np.sum(free * noise, axis=1))
+        left = np.einsum("tll->tl", ps - (ps @ q) @ q.transpose(0, 2, 1)) @ sigma**2
+        np.add.at(out.square, tiles.fold, left * self.moments[k].relative)
+        np.add.at(out.count, tiles.fold, free.sum(axis=1) * tiles.pixels)
+        if not derivatives or space.size == 0:
+            return
+        # dr_k = -P dA_k A+ y = -B_k y: <r, dr_k> = -tr(P S B_k^T), <dr_k, dr_l> = tr(B_k S B_l^T).
+        da = da - q @ (q.transpose(0, 2, 1) @ da)
+        b = da @ pinv
+        bs = b @ s
+        gradient = -np.sum(ps * b, axis=(2, 3)) + np.sum(np.diagonal(b, axis1=2, axis2=3) * noise, axis=2)
+        for fold in range(self.folds):
+            mine = tiles.fold == fold
+            out.gradient[fold] += gradient[:, mine].sum(axis=1)
+            flat = bs[:, mine].reshape(space.size, -1)
+            out.curvature[fold] += flat @ b[:, mine].reshape(space.size, -1).T
+
+    def tile_columns(self, k: int, changes: Changes) -> Array:
+        """A (tiles, L, K) where a retardance varies over the image, rows in units of their noise."""
+        data, tiles = self.captures[k], self.moments[k].tiles
+        if tiles is None:
+            raise ValueError("this capture has no tiles")
+        smooth = terms(tiles.x, tiles.y)
+        count = tiles.x.size
+        # All tiles at once: the states are repeated tile by tile, each with its own retardance.
+        n = data.conditions.states
+        tiled = _tiled(changes, count, n)
+        for element, coefficients in changes.field_retardance_rad.items():
+            extra = np.repeat(coefficients @ smooth, n)
+            tiled.retardance_rad[element] = tiled.retardance_rad[element] + extra
+        angles = {axis: np.tile(v, count) for axis, v in data.conditions.angles_deg.items()}
+        w = self.model.rows(angles, tiled).reshape(count, -1, 16) * data.row_exposure[:, None]
+        a = w if data.sample is None else (w @ data.sample)[..., None]
+        return np.asarray(a / self.moments[k].sigma[:, None])
+
+
+def add_response(counts: Array, coefficients: Array) -> Array:
+    """Corrected counts (L, rows, columns) from the coefficients of the features (F, L)."""
+    if not np.any(coefficients[1:]):
+        return counts
+    z, _ = features(counts)
+    z[-2] = np.gradient(counts, axis=2) if counts.shape[2] > 2 else 0.0
+    z[-1] = np.gradient(counts, axis=1) if counts.shape[1] > 2 else 0.0
+    return np.einsum("fl,flhw->lhw", coefficients, z)
+
+
+def _tiled(changes: Changes, count: int, states: int) -> Changes:
+    from dataclasses import replace
+
+    conditions = replace(changes.conditions, states=states * count)
+    out = Changes(conditions)
+    for name in ("azimuth_rad", "retardance_rad", "extinction", "diattenuation"):
+        for element, value in getattr(changes, name).items():
+            getattr(out, name)[element] = np.tile(value, count) if np.ndim(value) else value
+    out.after, out.stray, out.mixing = dict(changes.after), changes.stray, changes.mixing
+    out.gain = np.tile(changes.gain, (count, 1))
+    return out
+
+
+def _add_block(block: Block, a: Array, c: Array, da: Array, dc: Array | None, moments: Moments, out: Sums) -> None:
+    rows = block.rows
+    scale = 1 / moments.sigma[rows]
+    # Without corrections of the counts, as few pseudo-pixels as there are rows say the same.
+    plain = not np.any(c[1:]) and (dc is None or not np.any(dc))
+    z, noise = (block.counts[None, rows] if plain else block.z[:, rows]), block.noise[rows]
+    y = _weighted_sum(c[:, rows], z) * scale[:, None]
+    cn = np.einsum("lfg,gl->lf", noise, c[:, rows])
+    n = np.einsum("fl,lf->l", c[:, rows], cn) * scale**2
+    u, size, vt = np.linalg.svd(a[rows], full_matrices=False)
+    keep = size > RANK * size[0]
+    q = u[:, keep]
+    pinv = (vt[keep].T / size[keep]) @ q.T
+    r = y - q @ (q.T @ y)
+    free = 1 - np.sum(q * q, axis=1)
+    f = block.fold
+    out.freedom[f] += free @ n
+    out.excess[f] += float(np.sum(r * r)) - free @ n
+    out.square[f] += float(np.sum((r / scale[:, None]) ** 2)) * moments.relative
+    out.count[f] += free.sum() * block.pixels
+    if dc is None or da.shape[0] == 0:
+        return
+    k = da.shape[0]
+    d = -(da[:, rows].reshape(-1, a.shape[1]) @ (pinv @ y)).reshape(k, rows.size, -1)
+    noise_term = np.zeros(k)
+    counted = np.flatnonzero(np.any(dc != 0, axis=(1, 2)))
+    for j in counted:
+        d[j] += _weighted_sum(dc[j][:, rows], z) * scale[:, None]
+        noise_term[j] += np.sum(free * np.einsum("fl,lf->l", dc[j][:, rows], cn) * scale**2)
+    d -= q @ (q.T @ d)
+    b = np.einsum("kli,il->kl", da[:, rows], pinv)
+    qb = np.einsum("lr,kri,il->kl", q, np.einsum("lr,kli->kri", q, da[:, rows], optimize=True), pinv, optimize=True)
+    noise_term -= np.einsum("kl,l->k", b - qb, n)
+    flat = d.reshape(k, -1)
+    out.gradient[f] += flat @ r.reshape(-1) - noise_term
+    out.curvature[f] += flat @ flat.T
+
+
+def _weighted_sum(c: Array, z: Array) -> Array:
+    used = np.flatnonzero(np.any(c != 0, axis=1))
+    return np.asarray(sum(c[f][:, None] * z[f] for f in used))

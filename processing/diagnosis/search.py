@@ -1,0 +1,341 @@
+"""Which effects the model lacks: score all, fit the leaders, add while decisive, try to take each away again.
+
+What is left over when a model is incomplete is the same in all pixels, not noise of each: a candidate must beat what it
+could explain by chance in the few independent directions that such structure has (`directions`), not in all pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from processing.diagnosis.candidate import Candidate, nominal_values, pool
+from processing.diagnosis.fit import Fit, HeldOut, held_out, minimize, prior, score
+from processing.diagnosis.problem import InstrumentProblem, Space
+
+Array = NDArray[np.float64]
+#: Called with a line that says what is being done.
+Say = Callable[[str], None]
+
+#: Chi-square gain on held-out data from which on an effect is added.
+DECISIVE = 25.0
+#: Two explanations closer than this in chi-square gain are not told apart.
+CLOSE = 14.0
+#: Nor closer than this share of what either explains: models are not exact to that.
+ALIKE = 1e-3
+#: Chance that one candidate explains as much of a structure that it has nothing to do with.
+CHANCE = 1e-4
+#: Growth of the unweighted residual that is still put down to noise.
+WORSE = 1.002
+MOST_EFFECTS = 12
+LEADERS = 4
+#: Relative rms residual above which nominal values are searched for from many starts.
+FAR_OFF = 0.05
+STARTS = 24
+
+
+@dataclass
+class Trial:
+    """A candidate fitted together with the active effects."""
+
+    candidate: Candidate
+    space: Space
+    fit: Fit
+    out: HeldOut
+    evidence: float = 0.0
+    rank: float = 0.0
+
+    @property
+    def at_bound(self) -> bool:
+        """A value stands at a bound: the data ask for something else."""
+        lower, upper = self.space.joined("lower"), self.space.joined("upper")
+        near = np.minimum(self.fit.values - lower, upper - self.fit.values) < 1e-3 * (upper - lower)
+        for candidate, part in zip(self.space.candidates, self.space.slices, strict=True):
+            near[part] &= candidate.kind != "saturation"
+        return bool(near.any())
+
+
+@dataclass
+class Found:
+    """Result of the search: the final space and fit, and for each effect what else could be it."""
+
+    base: Space
+    before: HeldOut
+    before_fit: Fit
+    space: Space
+    fit: Fit
+    after: HeldOut
+    evidence: dict[Candidate, float] = field(default_factory=dict)
+    chance: dict[Candidate, float] = field(default_factory=dict)
+    sets: dict[Candidate, tuple[Candidate, ...]] = field(default_factory=dict)
+    ranking: list[Trial] = field(default_factory=list)
+    information: dict[Candidate, Array] = field(default_factory=dict)  # with no effect active
+    untestable: tuple[Candidate, ...] = ()
+
+    @property
+    def effects(self) -> tuple[Candidate, ...]:
+        """Effects found, without the nominal values of the train."""
+        return self.space.candidates[len(self.base.candidates) :]
+
+
+class Search:
+    """The search over the effects in one problem."""
+
+    def __init__(self, problem: InstrumentProblem, say: Say) -> None:
+        self.problem, self.say = problem, say
+        conditions = [c.conditions for c in problem.captures]
+        known = any(c.sample is not None for c in problem.captures)
+        self.base = Space(nominal_values(problem.model, conditions[0]) if known else ())
+        self.pool = pool(problem.model, conditions)
+        self.n0 = 1.0 if problem.noise_known else 0.0
+        self._power: list[tuple[int, Array]] | None = None
+
+    def run(self) -> Found:
+        """Search; see the module."""
+        base_fit = self._calibrated()
+        before = held_out(self.problem, self.base, base_fit)
+        space, fit, out = self.base, base_fit, before
+        ranking: list[Trial] = []
+        for number in range(MOST_EFFECTS):
+            trials = self._trials(space, fit, out)
+            ranking = ranking or trials
+            # What fits better only where the weights are large makes the residual itself grow: not an explanation.
+            trials = [t for t in trials if t.evidence >= DECISIVE and t.out.rms <= WORSE * out.rms and not t.at_bound]
+            if not trials:
+                break
+            best = trials[0]
+            self.say(f"{best.candidate.label}: {100 * out.rms:.4g} % -> {100 * best.out.rms:.4g} % on held-out data")
+            space, fit, out = best.space, best.fit, best.out
+        found = Found(self.base, before, base_fit, space, fit, out, ranking=ranking)
+        self._prune(found)
+        self._sets(found)
+        self._observability(found)
+        return found
+
+    def _calibrated(self) -> Fit:
+        space = self.base
+        zero = np.zeros(space.size)
+        fit = minimize(self.problem, space, zero)
+        if space.size and _rms(fit) > FAR_OFF:
+            self.say("nominal values are far off: searching from many starts")
+            random = np.random.default_rng(0)
+            width = np.array([45.0 if "azimuth" in c.place else 10.0 for c in space.candidates])
+            for _ in range(STARTS):
+                tried = minimize(self.problem, space, random.uniform(-2, 2, space.size) * width)
+                if tried.excess < fit.excess:
+                    fit = tried
+        return fit
+
+    def directions(self, excess: float) -> tuple[float, float]:
+        """Independent directions of structure: those that weigh, and those that would show at this excess at all."""
+        weighty, visible = 0.0, 0.0
+        for free, power in self._powers():
+            seen = max(excess, 0.0) * power / power.sum()
+            weighty += free * power.sum() ** 2 / float(np.sum(power**2))
+            visible += free * max(1.0, float(np.sum(seen / (1 + seen)))) if self.n0 else free
+        return weighty, max(visible, weighty)
+
+    def _powers(self) -> list[tuple[int, Array]]:
+        """Rows that the unknowns leave over, and the power of each component of the signal, for each capture."""
+        if self._power is None:
+            self._power, empty = [], Space(())
+            for k, moments in enumerate(self.problem.moments):
+                a = self.problem.columns(k, self.problem.changes(k, empty, np.zeros(0)))
+                u, size, _ = np.linalg.svd(a, full_matrices=False)
+                q = u[:, size > 1e-8 * size[0]]
+                z = np.concatenate(
+                    [b.counts for b in moments.blocks[:: self.problem.folds if moments.tiles is None else 1]], axis=1
+                )
+                part = q.T @ (z / moments.sigma[:, None])
+                power = np.maximum(np.linalg.eigvalsh(part @ part.T), 0.0)
+                # With a single state, structure can vary over the image only.
+                patches = (
+                    moments.tiles.x.size if moments.tiles and self.problem.captures[k].conditions.states == 1 else 1
+                )
+                self._power.append(((a.shape[0] - q.shape[1]) * patches, power + 1e-300))
+        return self._power
+
+    def _testable(self, candidate: Candidate, space: Space, excess: float) -> bool:
+        if not candidate.effect.per_state:
+            return True
+        _, visible = self.directions(excess)
+        return candidate.size + space.size < 0.75 * visible
+
+    def _trials(
+        self,
+        space: Space,
+        fit: Fit,
+        out: HeldOut,
+        without: Sequence[Candidate] = (),
+        leaders: int = LEADERS,
+        least: float = 0.0,
+    ) -> list[Trial]:
+        """The leading candidates, fitted jointly with the active ones and scored on held-out data, best first."""
+        scored: dict[str, tuple[float, Candidate]] = {}
+        weighty, _ = self.directions(out.excess)
+        taken = {c.family for c in space.candidates}
+        offered = [c for c in self.pool if c not in without and c.family not in taken]
+        offered = [c for c in offered if self._testable(c, space, out.excess)]
+        for candidate, (gain, _) in self.scores(space, fit, offered).items():
+            if gain < max(least, 0.5 * DECISIVE * self.n0):
+                continue
+            # Rank as a Bayesian information criterion over the directions of structure, not over the pixels.
+            rank = _rank(fit.excess - gain, fit.excess, weighty, candidate.size, self.n0)
+            if candidate.effect.per_state:
+                rank -= 1e6  # one step promises too little where there are many parameters: always fitted
+            if candidate.family not in scored or rank < scored[candidate.family][0]:
+                scored[candidate.family] = (rank, candidate)
+        chosen = [c for _, c in sorted(scored.values(), key=lambda item: item[0])[:leaders]]
+        if _rms(fit) > FAR_OFF:
+            chosen += [c for c in offered if c.starts and c not in chosen]
+        trials = [self._trial(space, fit, out, c, weighty) for c in chosen]
+        return sorted(trials, key=lambda t: t.rank)
+
+    def scores(self, space: Space, fit: Fit, offered: Sequence[Candidate]) -> dict[Candidate, tuple[float, Array]]:
+        """Promised gain of each candidate and the information about it, all from one pass over the data."""
+        out: dict[Candidate, tuple[float, Array]] = {}
+        tiled = [c for c in (*space.candidates, *offered) if c.kind == "field_retardance"]
+        plain = [c for c in offered if c.kind not in ("field_retardance", "saturation")]
+        counts = [c for c in plain if c.effect.corrects_counts]
+        groups = [counts, [c for c in plain if c not in counts]]
+        if any(c in tiled for c in space.candidates):
+            groups = [[c] for c in plain]
+        groups += [[c] for c in offered if c.kind == "field_retardance"]
+        for group in groups:
+            both = Space((*space.candidates, *group))
+            values = np.concatenate([fit.values, np.zeros(both.size - space.size)])
+            sums = self.problem.sums(both, values)
+            weak = prior(both)
+            for candidate, part in zip(group, both.slices[len(space.candidates) :], strict=True):
+                out[candidate] = score(sums, space.size, part, weak)
+        for candidate in offered:
+            if candidate.kind == "saturation":
+                out[candidate] = (self._clipped_excess(space, fit), np.zeros((1, 1)))
+        return out
+
+    def _clipped_excess(self, space: Space, fit: Fit) -> float:
+        clipped = next(c for c in self.pool if c.kind == "saturation")
+        both = Space((*space.candidates, clipped))
+        with_all = self.problem.sums(both, np.append(fit.values, 0.0), derivatives=False).excess.sum()
+        without = self.problem.sums(both, np.append(fit.values, 1.0), derivatives=False).excess.sum()
+        return float(with_all - without)
+
+    def _trial(self, space: Space, fit: Fit, out: HeldOut, candidate: Candidate, weighty: float) -> Trial:
+        both = Space((*space.candidates, candidate))
+        best: Fit | None = None
+        for start in (np.zeros(candidate.size), *candidate.starts):
+            first = np.ones(1) if candidate.kind == "saturation" else start
+            tried = minimize(self.problem, both, np.concatenate([fit.values, first]))
+            if best is None or tried.excess < best.excess:
+                best = tried
+        if best is None:
+            raise ValueError("a candidate needs at least one start")
+        held = held_out(self.problem, both, best)
+        evidence = self._evidence(out, held, both.size)
+        rank = _rank(held.excess, out.excess, weighty, candidate.size, self.n0)
+        if self.n0 and held.excess < 3 * self.noise_of(held):
+            # Nothing is left beyond noise: ahead of all that leave structure, the simplest first.
+            rank = -1e6 + held.excess + candidate.size * np.log(weighty)
+        return Trial(candidate, both, best, held, evidence, rank)
+
+    def _evidence(self, before: HeldOut, after: HeldOut, parameters: int, scaled: bool = False) -> float:
+        """Chi-square gain on held-out data, in units of the noise; `scaled`, of the structure left as well."""
+        gain = before.excess - after.excess
+        if self.n0 and not scaled:
+            return gain
+        return gain / (self.n0 + self.structure(after, parameters))
+
+    def noise_of(self, out: HeldOut) -> float:
+        """Standard deviation of the excess if there is nothing but noise."""
+        return float(np.sqrt(2 * out.freedom * max(m.spread for m in self.problem.moments)))
+
+    def structure(self, after: HeldOut, parameters: int) -> float:
+        """Chi-square for each direction of structure that is left beyond two standard deviations of the noise."""
+        excess = after.excess - self.n0 * 2 * self.noise_of(after)
+        weighty, _ = self.directions(excess)
+        return float(max(excess, 0.0) / max(weighty - parameters, 1.0))
+
+    def _prune(self, found: Found) -> None:
+        """Take away, weakest first, what is not decisive beside what the rest leaves unexplained."""
+        while found.effects:
+            weakest, least = None, np.inf
+            for candidate in found.effects:
+                rest = Space(tuple(c for c in found.space.candidates if c != candidate))
+                start = _without(found.space, found.fit.values, candidate)
+                fit = minimize(self.problem, rest, start)
+                out = held_out(self.problem, rest, fit)
+                evidence = self._evidence(out, found.after, found.space.size, scaled=True)
+                found.evidence[candidate] = evidence
+                found.chance[candidate] = self._chance(out, found.after, candidate.size, found.space.size)
+                if evidence < least:
+                    weakest, least, kept = candidate, evidence, (rest, fit, out)
+            if weakest is None or least >= DECISIVE:
+                return
+            self.say(f"{weakest.label} is not needed")
+            found.space, found.fit, found.after = kept
+
+    def _chance(self, before: HeldOut, after: HeldOut, size: int, parameters: int) -> float:
+        """Chance that an unrelated candidate explains as much (F test over the directions of structure)."""
+        weighty, _ = self.directions(max(after.excess, 0.0))
+        free = max(weighty - parameters, 1.0)
+        left = self.n0 + self.structure(after, parameters)
+        ratio = (before.excess - after.excess) / size / left
+        return float(stats.f.sf(ratio, size, free)) if ratio > 0 else 1.0
+
+    def _sets(self, found: Found) -> None:
+        """For every effect, all others that would do as well in its place; a simpler one of them replaces it."""
+        for _ in range(MOST_EFFECTS):
+            better = None
+            for candidate in found.effects:
+                rest = Space(tuple(c for c in found.space.candidates if c != candidate))
+                fit = minimize(self.problem, rest, _without(found.space, found.fit.values, candidate))
+                out = held_out(self.problem, rest, fit)
+                needed = 0.7 * max(fit.excess - found.fit.excess, 0.0)
+                trials = self._trials(rest, fit, out, without=(candidate,), leaders=6, least=needed)
+                unit = self.n0 + self.structure(found.after, found.space.size)
+                weighty, _ = self.directions(found.after.excess)
+                close = []
+                for trial in trials:
+                    worse = (trial.out.excess - found.after.excess) / unit
+                    simpler = (candidate.size - trial.candidate.size) * float(np.log(weighty))
+                    alike = max(CLOSE, ALIKE * (out.excess - found.after.excess) / unit)
+                    if worse < alike and trial.candidate.family != candidate.family:
+                        close.append(trial.candidate)
+                    sound = not trial.at_bound and trial.out.rms <= WORSE * found.after.rms
+                    if sound and worse < simpler - 2 and (better is None or worse - simpler < better[0]):
+                        better = (worse - simpler, candidate, trial)
+                found.sets[candidate] = tuple(close)
+            if better is None:
+                return
+            _, old, trial = better
+            self.say(f"{trial.candidate.label} does as well as {old.label}, and is simpler")
+            found.space, found.fit, found.after = trial.space, trial.fit, trial.out
+            found.sets.clear()
+            self._prune(found)
+
+    def _observability(self, found: Found) -> None:
+        """Information about every candidate that the nominal values leave."""
+        offered = [c for c in self.pool if c.kind != "saturation"]
+        testable = [c for c in offered if self._testable(c, found.base, max(found.before.excess, 0.0))]
+        untestable = [c for c in offered if c not in testable]
+        found.information = {c: info for c, (_, info) in self.scores(found.base, found.before_fit, testable).items()}
+        found.untestable = tuple(untestable)
+
+
+def _rank(left: float, before: float, directions: float, size: int, n0: float) -> float:
+    floor = n0 * directions
+    ratio = (max(left, 0.0) + floor + 1e-9) / (max(before, 0.0) + floor + 1e-9)
+    return float(directions * np.log(ratio) + size * np.log(directions))
+
+
+def _without(space: Space, values: Array, candidate: Candidate) -> Array:
+    parts = [values[s] for c, s in zip(space.candidates, space.slices, strict=True) if c != candidate]
+    return np.concatenate([np.zeros(0), *parts])
+
+
+def _rms(fit: Fit) -> float:
+    return float(np.sqrt(fit.sums.square.sum() / max(fit.sums.count.sum(), 1.0)))

@@ -1,0 +1,204 @@
+"""Is anything but noise left over, and what does it look like: tests of the residual, and a description in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.changes import Changes
+from processing.diagnosis.fit import Fit
+from processing.diagnosis.problem import InstrumentProblem, Space, add_response
+from processing.effects.field_retardance import terms
+
+Array = NDArray[np.float64]
+
+#: Standard deviations beyond which a test says "structure".
+LIMIT = 5.0
+HARMONICS = 4
+
+
+@dataclass(frozen=True)
+class Residual:
+    """What one capture leaves over.
+
+    Attributes
+    ----------
+    image : (L, rows, columns) residual in units of the noise; NaN where a pixel is not used.
+    per_state : (L,) rms over the pixels; mean : (L,) mean over the pixels.
+    tests : name to standard deviations from what noise gives.
+    harmonics : axis to amplitudes (HARMONICS,) of the state means, in units of the noise of one intensity.
+    correlates : name to correlation of the rms map or of the residual with it.
+    leading : (L,) leading component over the states, with its share of the sum of squares.
+    """
+
+    image: NDArray[np.float32]
+    per_state: Array
+    mean: Array
+    tests: dict[str, float]
+    harmonics: dict[str, Array]
+    correlates: dict[str, float]
+    leading: Array
+    leading_share: float
+
+    @property
+    def worst(self) -> tuple[str, float]:
+        """The test that is furthest off."""
+        name = max(self.tests, key=lambda k: self.tests[k])
+        return name, self.tests[name]
+
+
+def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -> Residual:
+    """Residual of a capture at the values of a fit, pixel by pixel, and its tests."""
+    data, moments = problem.captures[capture], problem.moments[capture]
+    changes = problem.changes(capture, space, fit.values)
+    a = problem.columns(capture, changes) * moments.sigma[:, None]
+    rows = a.shape[0]
+    height, width = data.signal.shape[2:]
+    used = data.usable & ~data.clipped if changes.drop_clipped else data.usable
+    y = add_response(
+        data.signal.reshape(rows, height, width).astype(np.float64), problem.coefficients(capture, changes)
+    )
+    variance = data.variance(data.signal).reshape(rows, height, width)
+    level = np.sqrt(moments.sigma**2)
+    r = np.full((rows, height, width), np.nan, dtype=np.float32)
+    free = np.zeros((rows, height, width), dtype=np.float32)
+    signal = np.zeros((rows, height, width), dtype=np.float32)
+    for mask, columns in _parts(problem, capture, changes, a, used):
+        q = _basis(columns / level[:, None])
+        part = y[:, mask] / level[:, None]
+        fitted = q @ (q.T @ part)
+        scale = np.sqrt(variance[:, mask].mean(axis=0))
+        r[:, mask] = (part - fitted) / scale
+        signal[:, mask] = fitted * level[:, None]
+        free[:, mask] = (1 - np.sum(q * q, axis=1))[:, None]
+    noise = variance / level[:, None, None] ** 2 / np.maximum(variance.mean(axis=0), 1e-300)
+    expected = (free * noise).astype(np.float32)
+    good = np.isfinite(r).all(axis=0)
+    tests = _tests(r, signal, expected, good, a.shape[1], moments.spread, data.noise_known)
+    n, channels = data.signal.shape[:2]
+    mean = r[:, good].mean(axis=1) if good.any() else np.zeros(rows)
+    states = mean.reshape(n, channels).mean(axis=1)
+    harmonics = {
+        axis: np.array([2 * abs(np.mean(states * np.exp(1j * h * np.deg2rad(v)))) for h in range(1, HARMONICS + 1)])
+        for axis, v in data.conditions.angles_deg.items()
+    }
+    flat = r[:, good]
+    moment = flat @ flat.T / max(flat.shape[1], 1)
+    value, vector = np.linalg.eigh(moment.astype(np.float64))
+    return Residual(
+        image=r,
+        per_state=np.sqrt(np.mean(flat**2, axis=1)) if good.any() else np.zeros(rows),
+        mean=mean,
+        tests=tests,
+        harmonics=harmonics,
+        correlates=_correlates(r, signal, good),
+        leading=vector[:, -1],
+        leading_share=float(value[-1] / max(value.sum(), 1e-300)),
+    )
+
+
+def _parts(
+    problem: InstrumentProblem, capture: int, changes: Changes, a: Array, used: NDArray[np.bool_]
+) -> list[tuple[NDArray[np.bool_], Array]]:
+    tiles = problem.moments[capture].tiles
+    if not changes.field_retardance_rad or tiles is None:
+        return [(used, a)]
+    columns = problem.tile_columns(capture, changes) * problem.moments[capture].sigma[:, None]
+    return [(used & (tiles.index == t), columns[t]) for t in range(tiles.x.size)]
+
+
+def _basis(a: Array) -> Array:
+    u, size, _ = np.linalg.svd(a, full_matrices=False)
+    return np.asarray(u[:, size > 1e-8 * size[0]])
+
+
+def _tests(
+    r: NDArray[np.float32],
+    signal: NDArray[np.float32],
+    expected: NDArray[np.float32],
+    good: NDArray[np.bool_],
+    columns: int,
+    spread: float,
+    noise_known: bool,
+) -> dict[str, float]:
+    count = int(good.sum())
+    if count < 30 or not noise_known:
+        return {}
+    flat, wanted = r[:, good].astype(np.float64), expected[:, good].astype(np.float64)
+    freedom = wanted.sum()
+    out = {"sum of squares": (np.sum(flat**2) - freedom) / np.sqrt(2 * freedom * spread)}
+    # Linear in the signal: every pixel's residual against the leading components of the fitted signal.
+    s = signal[:, good].astype(np.float64)
+    _, size, vt = np.linalg.svd(s @ s.T)
+    keep = min(columns, int(np.sum(size > 1e-10 * size[0])))
+    weights = (vt[:keep] @ s) / np.sqrt(np.maximum(size[:keep], 1e-300))[:, None]
+    linear = flat @ weights.T
+    null = wanted @ (weights.T**2)
+    out["linear in the signal"] = (np.sum(linear**2) - null.sum()) / np.sqrt(2 * null.sum() * spread)
+    # Brightness: against the square of the signal, its linear part taken away.
+    square = s**2
+    square -= (square @ weights.T) @ weights
+    norm = np.sqrt(np.sum(square**2, axis=1, keepdims=True)) + 1e-300
+    along = np.sum(flat * square / norm, axis=1)
+    expectation = np.sum(wanted * (square / norm) ** 2, axis=1)
+    out["brightness"] = (np.sum(along**2) - expectation.sum()) / np.sqrt(2 * np.sum(expectation**2) * spread + 1e-300)
+    # Neighbours: noise of two pixels is independent.
+    for name, axis in (("neighbours, rows", 1), ("neighbours, columns", 2)):
+        if r.shape[axis] > 2:
+            first, second = np.delete(r, -1, axis), np.delete(r, 0, axis)
+            both = np.isfinite(first) & np.isfinite(second)
+            product = (first * second)[both].astype(np.float64)
+            if product.size > 100:
+                out[name] = float(product.sum() / np.sqrt(np.sum(product**2)))
+    # Tiles: mean residual of every row over patches of the image.
+    out["patches"] = _patches(r, expected, spread)
+    return {k: float(v) for k, v in out.items()}
+
+
+def _patches(r: NDArray[np.float32], expected: NDArray[np.float32], spread: float) -> float:
+    side = max(r.shape[1] // 8, 1)
+    h, w = r.shape[1] // side * side, r.shape[2] // side * side
+    shape = (r.shape[0], h // side, side, w // side, side)
+    total = np.nansum(r[:, :h, :w].reshape(shape), axis=(2, 4), dtype=np.float64)
+    null = np.where(np.isfinite(r[:, :h, :w]), expected[:, :h, :w], 0).reshape(shape).sum(axis=(2, 4), dtype=np.float64)
+    return float((np.sum(total**2) - null.sum()) / np.sqrt(2 * np.sum(null**2) * spread + 1e-300))
+
+
+def _correlates(r: NDArray[np.float32], signal: NDArray[np.float32], good: NDArray[np.bool_]) -> dict[str, float]:
+    if good.sum() < 30 or min(r.shape[1:]) < 3:
+        return {}
+    loud = np.sqrt(np.mean(np.nan_to_num(r) ** 2, axis=0))
+    mean = signal.mean(axis=0)
+    gy, gx = np.gradient(mean)
+    ys, xs = np.mgrid[-1 : 1 : r.shape[1] * 1j, -1 : 1 : r.shape[2] * 1j]
+    maps = {"brightness": mean, "gradient of the image": np.hypot(gx, gy)}
+    maps |= dict(zip(("x", "y", "x2", "xy", "y2"), terms(xs, ys), strict=True))
+    out = {}
+    for name, image in maps.items():
+        x, y = loud[good], image[good]
+        if x.std() > 0 and y.std() > 0:
+            out[name] = float(np.corrcoef(x, y)[0, 1])
+    return out
+
+
+def description(found: Residual, threshold: float = LIMIT) -> list[str]:
+    """Sentences about what is left over; empty if nothing is."""
+    lines = []
+    for name, value in sorted(found.tests.items(), key=lambda item: -item[1]):
+        if value > threshold:
+            lines.append(f"{name}: {value:.0f} standard deviations above noise")
+    if not lines:
+        return []
+    order = np.argsort(-np.abs(found.mean))[:3]
+    lines.append("states that are furthest off on average: " + ", ".join(str(int(k)) for k in order))
+    if found.leading_share > 0:
+        lines.append(f"the leading component over the states holds {100 * found.leading_share:.0f} % of what is left")
+    for axis, amplitudes in found.harmonics.items():
+        h = int(np.argmax(amplitudes))
+        lines.append(f"strongest harmonic of {axis}: {h + 1} a turn, {amplitudes[h]:.2g} of the noise of one intensity")
+    if found.correlates:
+        name = max(found.correlates, key=lambda k: abs(found.correlates[k]))
+        lines.append(f"its map goes with {name} (correlation {found.correlates[name]:+.2f})")
+    return lines

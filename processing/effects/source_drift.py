@@ -1,0 +1,29 @@
+"""The source grows brighter or fainter steadily during the capture.
+
+Cause: warming up, ageing, a thermal drift of the fibre coupling.
+Mend: warm up for an hour, monitor the source with a second detector and divide, close the loop on its power.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from processing.changes import Changes, Conditions
+from processing.effects.base import Array, Effect, Parameter
+from processing.instrument import InstrumentModel
+
+
+class This(Effect):
+    """Relative change of the source from the first to the last state."""
+
+    group = "source"
+    scope = "capture"
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        return ("",) if conditions.states > 1 else ()
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return (Parameter("fraction", "1", -0.9, 0.9, 0.02),)
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        changes.gain = changes.gain * (1 + values[0] * changes.conditions.elapsed)[:, None]
