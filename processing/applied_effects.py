@@ -78,14 +78,21 @@ def capture_changes(capture: Capture, model: InstrumentModel, states: NDArray[np
     return changes_of(model, conditions, capture_name(capture))
 
 
-def at_place(changes: Changes, x: float, y: float) -> Changes:
-    """The changes at one place of the image, x and y from -1 to 1, to the right and down."""
+def extra_retardance(changes: Changes, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Retardance (elements, pixels), radians, that varies over the image, in the order of `field_retardance_rad`.
+
+    x, y (pixels,) run from -1 to 1, to the right and down.
+    """
     from processing.effects.field_retardance import terms
 
-    smooth = terms(np.asarray(x), np.asarray(y))
+    return np.stack([coefficients @ terms(x, y) for coefficients in changes.field_retardance_rad.values()])
+
+
+def with_extra(changes: Changes, extra: NDArray[np.float64]) -> Changes:
+    """The changes at a place with these extra retardances (elements,)."""
     here = defaultdict(lambda: np.zeros(()), changes.retardance_rad)
-    for element, coefficients in changes.field_retardance_rad.items():
-        here[element] = here[element] + float(coefficients @ smooth)
+    for element, value in zip(changes.field_retardance_rad, extra, strict=True):
+        here[element] = here[element] + float(value)
     out = copy(changes)
     out.retardance_rad = here
     return out

@@ -1,13 +1,14 @@
 """Inversion where W differs from pixel to pixel: a retardance that varies smoothly over the image.
 
-A pseudo-inverse for each pixel would take minutes. W and its pseudo-inverse are smooth functions of the place, so they
-are worked out at a few nodes and interpolated by polynomials; every pixel then costs one matrix product with the nodes'
-stacked matrices. More nodes are taken until the interpolation is good to TOLERANCE.
+A pseudo-inverse for each pixel would take minutes. W and its pseudo-inverse are smooth functions of the few retardances
+that vary, so they are worked out at a few nodes of these and interpolated by polynomials; every pixel then costs one
+matrix product with the nodes' stacked matrices. More nodes are taken until the interpolation is good to TOLERANCE.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,10 +24,21 @@ from processing.threads import for_ranges
 TILE = 2048
 #: Largest error of an interpolated pseudo-inverse, relative to its largest element.
 TOLERANCE = 1e-5
-NODES = (3, 4, 5, 7)
+NODES = (3, 4, 5, 6, 8, 11)
 
-#: W (L, 16) at a place; x and y from -1 to 1 over the image, to the right and down.
-MatrixAt = Callable[[float, float], NDArray[np.float64]]
+
+@dataclass(frozen=True)
+class Field:
+    """What varies over the image.
+
+    Attributes
+    ----------
+    matrix : from the extra retardances (E,) of the E elements, radians, to W (L, 16), rows scaled with the exposure.
+    extra : from x, y (pixels,) to the extra retardances (E, pixels); x and y from -1 to 1, to the right and down.
+    """
+
+    matrix: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+    extra: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
 
 class FieldSolver:
@@ -38,17 +50,23 @@ class FieldSolver:
     Parameters
     ----------
     plain : solver with W of the centre.
-    matrix_at : W at any place, rows scaled with the exposure.
+    field : W and what varies over the image.
 
     Raises
     ------
     NotDetermined : W changes too fast over the image for this method.
     """
 
-    def __init__(self, plain: MuellerSolver, matrix_at: MatrixAt) -> None:
+    def __init__(self, plain: MuellerSolver, field: Field) -> None:
         self.plain, self.reader, self.inversion = plain, plain.reader, plain.inversion
         self.noise, self.repeats = plain.noise, plain.repeats
-        self.nodes, self._pinv, self._w = _interpolation(matrix_at)
+        self.field = field
+        y, x = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 41), np.linspace(-1, 1, 41), indexing="ij"))
+        extra = field.extra(x, y)
+        self._middle = (extra.max(axis=1) + extra.min(axis=1)) / 2
+        # A little room, because the extremes between the samples may lie outside.
+        self._half = np.maximum(1.02 * (extra.max(axis=1) - extra.min(axis=1)) / 2, 1e-9)
+        self.nodes, self._pinv, self._w = _interpolation(field, self._middle, self._half)
 
     def solve(self, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
         """Mueller elements, errors, residual and mask of frames (N, channels, pixels) that the reader just read."""
@@ -77,13 +95,12 @@ class FieldSolver:
                 found["mueller_errors"][:, a:b] *= ratio
 
     def _basis(self, pixels: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Polynomials (nodes^2, pixels) at pixels of the block that was read last."""
+        """Polynomials (nodes^E, pixels) at pixels of the block that was read last."""
         height, width = self.reader.capture.frame_shape
         row, column = np.divmod(pixels, width)
-        y = _centred(row + self.reader.first_row, height)
-        x = _centred(column, width)
-        tx, ty = chebyshev.chebvander(x, self.nodes - 1), chebyshev.chebvander(y, self.nodes - 1)
-        return np.asarray(np.einsum("pi,pj->ijp", ty, tx).reshape(-1, len(pixels)), dtype=np.float32)
+        extra = self.field.extra(_centred(column, width), _centred(row + self.reader.first_row, height))
+        scaled = (extra - self._middle[:, None]) / self._half[:, None]
+        return np.ascontiguousarray(_products(scaled, self.nodes), dtype=np.float32)
 
 
 def _centred(index: NDArray[np.int64], size: int) -> NDArray[np.float64]:
@@ -91,27 +108,40 @@ def _centred(index: NDArray[np.int64], size: int) -> NDArray[np.float64]:
 
 
 def _sum(stacked: NDArray[np.float32], basis: NDArray[np.float32], rows: int) -> NDArray[np.float32]:
-    return np.asarray(np.einsum("krp,kp->rp", stacked.reshape(len(basis), rows, -1), basis))
+    out = stacked[:rows] * basis[0]
+    for k in range(1, len(basis)):
+        out += stacked[k * rows : (k + 1) * rows] * basis[k]
+    return np.asarray(out)
 
 
-def _interpolation(matrix_at: MatrixAt) -> tuple[int, NDArray[np.float32], NDArray[np.float32]]:
-    """Number of nodes a side, and stacked Chebyshev coefficients of pinv(W) and W over the image."""
-    places = ((-0.9, 0.55), (0.37, -0.81), (1.0, 1.0), (0.13, 0.02))
+def _products(scaled: NDArray[np.float64], nodes: int) -> NDArray[np.float64]:
+    """Products (nodes^E, pixels) of Chebyshev polynomials of E variables (E, pixels) from -1 to 1."""
+    out = np.ones((1, scaled.shape[1]))
+    for variable in scaled:
+        table = chebyshev.chebvander(variable, nodes - 1).T
+        out = (out[:, None] * table[None]).reshape(-1, scaled.shape[1])
+    return out
+
+
+def _interpolation(
+    field: Field, middle: NDArray[np.float64], half: NDArray[np.float64]
+) -> tuple[int, NDArray[np.float32], NDArray[np.float32]]:
+    """Number of nodes for each variable, and stacked coefficients of pinv(W) and W."""
+    trials = np.random.default_rng(0).uniform(-1, 1, (len(middle), 6))
+    true = [np.linalg.pinv(field.matrix(middle + half * t)) for t in trials.T]
+    worst = np.inf
     for nodes in NODES:
-        at = chebyshev.chebpts1(nodes)
-        w = np.stack([[matrix_at(x, y) for x in at] for y in at])
-        back = np.linalg.inv(chebyshev.chebvander(at, nodes - 1))
-        both = [np.einsum("ia,jb,abrc->ijrc", back, back, grid) for grid in (np.linalg.pinv(w), w)]
-        worst = 0.0
-        for x, y in places:
-            tx, ty = chebyshev.chebvander([x], nodes - 1)[0], chebyshev.chebvander([y], nodes - 1)[0]
-            pinv = np.einsum("i,j,ijrc->rc", ty, tx, both[0])
-            true = np.linalg.pinv(matrix_at(x, y))
-            worst = max(worst, float(np.max(np.abs(pinv - true)) / np.max(np.abs(true))))
+        axis = chebyshev.chebpts1(nodes)
+        at = np.stack([a.ravel() for a in np.meshgrid(*[axis] * len(middle), indexing="ij")])
+        w = np.stack([field.matrix(middle + half * p) for p in at.T])
+        back = np.linalg.inv(_products(at, nodes).T)
+        pinv, rows = (np.einsum("kp,prc->krc", back, grid) for grid in (np.linalg.pinv(w), w))
+        found = np.einsum("kp,krc->prc", _products(trials, nodes), pinv)
+        worst = max(float(np.max(np.abs(f - t)) / np.max(np.abs(t))) for f, t in zip(found, true, strict=True))
         if worst < TOLERANCE:
-            stacks = [np.ascontiguousarray(b.reshape(-1, b.shape[-1]), dtype=np.float32) for b in both]
+            stacks = [np.ascontiguousarray(b.reshape(-1, b.shape[-1]), dtype=np.float32) for b in (pinv, rows)]
             return nodes, stacks[0], stacks[1]
     raise NotDetermined(
-        f"the instrument's field_retardance changes W so fast that {NODES[-1]} nodes a side leave an error of "
+        f"the instrument's field_retardance changes W so fast that {NODES[-1]} nodes a retarder leave an error of "
         f"{worst:.1g}; check its coefficients."
     )

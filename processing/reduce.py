@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.applied_effects import at_place, capture_changes, counts_correction
+from processing.applied_effects import capture_changes, counts_correction, extra_retardance, with_extra
 from processing.capture import Capture, CaptureError
 from processing.changes import Changes
 from processing.correction import BlockReader, Correction, Mask
 from processing.errors import ProcessError
-from processing.field_solver import FieldSolver, MatrixAt
+from processing.field_solver import Field, FieldSolver
 from processing.instrument import InstrumentModel
 from processing.inversion import Inversion
 from processing.mueller_solver import MuellerSolver
@@ -75,12 +75,12 @@ class Choice:
         if not self.weighted and (self.covariance or self.physical == "likelihood"):
             raise ProcessError("a stored covariance and the most likely physical matrix need the weighted estimate")
 
-    def solver(self, plain: MuellerSolver, matrix_at: MatrixAt | None = None) -> Solver:
-        """The solver that the choice asks for; `matrix_at` where W varies over the image."""
-        if matrix_at is not None:
+    def solver(self, plain: MuellerSolver, field: Field | None = None) -> Solver:
+        """The solver that the choice asks for; `field` where W varies over the image."""
+        if field is not None:
             if self.weighted:
                 raise ProcessError("--weighted is not available for an instrument with field_retardance; leave it out")
-            return FieldSolver(plain, matrix_at)
+            return FieldSolver(plain, field)
         if not self.weighted:
             return plain
         return WeightedSolver(plain, self.covariance, self.physical == "likelihood")
@@ -131,17 +131,17 @@ def measurement_matrix(
     return w * relative_exposure(capture, states)[:, None, None]
 
 
-def field_matrix(
+def field_of(
     capture: Capture, model: InstrumentModel, states: NDArray[np.int64], changes: Changes | None
-) -> MatrixAt | None:
-    """W at any place of the image, where a retardance varies over it; None where W is the same everywhere."""
+) -> Field | None:
+    """W where retardances vary over the image; None where W is the same everywhere."""
     if changes is None or not changes.field_retardance_rad:
         return None
 
-    def matrix_at(x: float, y: float) -> NDArray[np.float64]:
-        return measurement_matrix(capture, model, states, at_place(changes, x, y)).reshape(-1, 16)
+    def matrix(extra: NDArray[np.float64]) -> NDArray[np.float64]:
+        return measurement_matrix(capture, model, states, with_extra(changes, extra)).reshape(-1, 16)
 
-    return matrix_at
+    return Field(matrix, lambda x, y: extra_retardance(changes, x, y))
 
 
 def relative_exposure(capture: Capture, states: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -196,7 +196,7 @@ def reduce_mueller(
     reader = BlockReader(capture, states, correction, counts_correction(changes))
     choice = choice or Choice()
     noise = choice.noise or NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
-    solver = choice.solver(MuellerSolver(inversion, reader, noise), field_matrix(capture, model, states, changes))
+    solver = choice.solver(MuellerSolver(inversion, reader, noise), field_of(capture, model, states, changes))
     planes = choice.planes(known_noise=noise is not None)
     with ProductWriter(out, "mueller", capture.header, capture.frame_shape, planes, steps, overwrite) as product:
         product.array("measurement_matrix", w, "", "W (state, channel, 16): intensity = W . vec(M), row-major")
