@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
 from processing.geometry.errors import GeometryError
+from processing.threads import for_ranges
 
 FloatArray = NDArray[np.float64]
 
@@ -50,33 +53,47 @@ class Mesh(BaseModel):
         Raises GeometryError when the file cannot be read or the mesh has holes.
         """
         del omega_deg
-        mesh, caster = self._world()
-        flat = rays.reshape(-1, 3)
-        face = _first_hits(caster, np.asarray(origin_mm, dtype=float), flat)
+        world = self._world()
+        flat = np.ascontiguousarray(rays.reshape(-1, 3))
+        origin = np.asarray(origin_mm, dtype=float)
+        face = _first_hits(world.scene, origin, flat)
         hit = face >= 0
-        corner = mesh.triangles[face[hit]]
-        normal = mesh.face_normals[face[hit]]
-        # Meet the triangle's plane in double precision: embree's own distance is single.
-        d = flat[hit]
-        t = np.einsum("ij,ij->i", corner[:, 0] - origin_mm, normal) / np.einsum("ij,ij->i", d, normal)
-        points = origin_mm + d * t[:, None]
-        if self.smooth_normals:
-            normal = _smooth(mesh, face[hit], corner, points, normal)
+        index = np.flatnonzero(hit)
+        points, normal = np.empty((index.size, 3)), np.empty((index.size, 3))
+        corners = world.corner_normals if self.smooth_normals else world.flat_normals
+        for_ranges(
+            index.size,
+            lambda start, stop: _meet(
+                index, face, flat, origin, world.triangles, world.face_normals, corners, points, normal, start, stop
+            ),
+        )
         return hit.reshape(rays.shape[:-1]), points, normal
 
     def occluded(self, points_mm: FloatArray, towards: FloatArray) -> NDArray[np.bool_]:
         """Whether the mesh itself stands between points (N, 3) and the directions (N, 3) towards the source."""
-        mesh, caster = self._world()
-        start = points_mm + towards * (1e-4 * float(mesh.scale))
-        return np.asarray(_first_hits(caster, start, towards) >= 0)
+        world = self._world()
+        start = points_mm + towards * (1e-4 * world.size_mm)
+        return np.asarray(_first_hits(world.scene, start, towards) >= 0)
 
-    def _world(self) -> tuple[Any, Any]:
+    def _world(self) -> _World:
         path = Path(self.file)
         try:
             stamp = path.stat().st_mtime_ns
         except OSError as error:
             raise GeometryError(f"{path}: no such mesh file ({error.strerror}). Check the path.") from error
         return _load(path, stamp, self.scale_mm, self.rotation_deg, self.translation_mm, self.allow_holes)
+
+
+@dataclass(frozen=True)
+class _World:
+    """A mesh in world coordinates: arrays for the compiled loop, and embree's scene."""
+
+    triangles: FloatArray
+    face_normals: FloatArray
+    corner_normals: FloatArray
+    flat_normals: FloatArray
+    size_mm: float
+    scene: Any
 
 
 @lru_cache(maxsize=4)
@@ -87,7 +104,7 @@ def _load(
     rotation_deg: tuple[float, float, float],
     translation_mm: tuple[float, float, float],
     allow_holes: bool,
-) -> tuple[Any, Any]:
+) -> _World:
     del stamp  # a part of the cache's key: the file may change
     import trimesh
     from embreex import rtcore_scene
@@ -112,7 +129,15 @@ def _load(
     # Embree itself: trimesh's wrapper around it makes several copies of all rays.
     scene = rtcore_scene.EmbreeScene()
     TriangleMesh(scene, np.ascontiguousarray(mesh.triangles, dtype=np.float32))
-    return mesh, scene
+    faces = np.ascontiguousarray(mesh.face_normals)
+    return _World(
+        triangles=np.ascontiguousarray(mesh.triangles),
+        face_normals=faces,
+        corner_normals=np.ascontiguousarray(mesh.vertex_normals[mesh.faces]),
+        flat_normals=np.ascontiguousarray(np.repeat(faces[:, None], 3, axis=1)),
+        size_mm=float(mesh.scale),
+        scene=scene,
+    )
 
 
 def _first_hits(scene: Any, origin: FloatArray, rays: FloatArray) -> NDArray[np.int64]:
@@ -122,13 +147,32 @@ def _first_hits(scene: Any, origin: FloatArray, rays: FloatArray) -> NDArray[np.
     return np.asarray(scene.run(origins, rays.astype(np.float32)), dtype=np.int64)
 
 
-def _smooth(mesh: Any, face: NDArray[np.int64], corner: FloatArray, points: FloatArray, flat: FloatArray) -> FloatArray:
-    # Normals of the corners, weighted with barycentric coordinates from the three small areas.
-    a, b, c = corner[:, 0], corner[:, 1], corner[:, 2]
+@numba.njit(nogil=True, cache=True)
+def _meet(index, face, rays, origin, triangles, face_normals, corner_normals, points, normals, start, stop):  # type: ignore[no-untyped-def]
+    # Meet the plane of the triangle in double precision (embree's own distance is single), then weigh the normals
+    # of its corners with barycentric coordinates, which are ratios of areas.
+    for k in range(start, stop):
+        ray = index[k]
+        f = face[ray]
+        n0, n1, n2 = face_normals[f, 0], face_normals[f, 1], face_normals[f, 2]
+        a, b, c = triangles[f, 0], triangles[f, 1], triangles[f, 2]
+        up = (a[0] - origin[0]) * n0 + (a[1] - origin[1]) * n1 + (a[2] - origin[2]) * n2
+        t = up / (rays[ray, 0] * n0 + rays[ray, 1] * n1 + rays[ray, 2] * n2)
+        x, y, z = origin[0] + t * rays[ray, 0], origin[1] + t * rays[ray, 1], origin[2] + t * rays[ray, 2]
+        points[k, 0], points[k, 1], points[k, 2] = x, y, z
+        wa = _area(b[0] - x, b[1] - y, b[2] - z, c[0] - x, c[1] - y, c[2] - z, n0, n1, n2)
+        wb = _area(c[0] - x, c[1] - y, c[2] - z, a[0] - x, a[1] - y, a[2] - z, n0, n1, n2)
+        wc = _area(a[0] - x, a[1] - y, a[2] - z, b[0] - x, b[1] - y, b[2] - z, n0, n1, n2)
+        length = 0.0
+        for i in range(3):
+            v = wa * corner_normals[f, 0, i] + wb * corner_normals[f, 1, i] + wc * corner_normals[f, 2, i]
+            normals[k, i] = v
+            length += v * v
+        length = np.sqrt(length)
+        for i in range(3):
+            normals[k, i] /= length
 
-    def area(p: FloatArray, q: FloatArray, r: FloatArray) -> FloatArray:
-        return np.asarray(np.einsum("ij,ij->i", np.cross(q - p, r - p), flat))
 
-    weights = np.stack([area(b, c, points), area(c, a, points), area(a, b, points)], axis=-1)
-    normals = np.einsum("ij,ijk->ik", weights, mesh.vertex_normals[mesh.faces[face]])
-    return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+@numba.njit(inline="always")
+def _area(px, py, pz, qx, qy, qz, n0, n1, n2):  # type: ignore[no-untyped-def]
+    return (py * qz - pz * qy) * n0 + (pz * qx - px * qz) * n1 + (px * qy - py * qx) * n2
