@@ -88,17 +88,14 @@ class ElliptecLine:
         """Sort what has arrived without waiting."""
         with self.link.lock:
             while (frame := self.link.read_frame(0.0)) is not None:
-                self._sort(frame)
+                self._note(*_parse(frame))
 
-    def _sort(self, frame: bytes) -> tuple[str, str, str] | None:
-        match = _FRAME.fullmatch(frame.decode("ascii", "replace"))
-        if match is None:
-            return None
-        address, letters, data = match[1], match[2], match[3]
-        whole = (letters == "PO" and len(data) == 8) or (letters == "GS" and len(data) == 2)
-        if whole and (letters, data) != ("GS", f"{BUSY:02X}"):
+    def _note(self, address: str, letters: str, data: str) -> None:
+        """Keep what a module says unasked: the end of its move, or an error that ended it."""
+        if (letters == "PO" and len(data) == 8) or (
+            letters == "GS" and len(data) == 2 and int(data, 16) not in (0, BUSY)
+        ):
             self.ended[address] = (letters, data)
-        return address, letters, data
 
     def ask(self, address: str, command: str, letters: str, digits: int, *, tries: int = 2) -> str:
         """Ask a question and return the hex digits of the reply with these letters.
@@ -117,20 +114,25 @@ class ElliptecLine:
                 self.send(address, command)
                 deadline_s = time.monotonic() + self.reply_s
                 while (frame := self.link.read_frame(deadline_s)) is not None:
-                    match = self._sort(frame)
-                    if match is not None and match[0] == address:
-                        if match[1] == letters and len(match[2]) >= digits:
-                            return match[2]
-                        if match[1] == "GS" and len(match[2]) == 2 and letters != "GS":
-                            code = int(match[2], 16)
-                            if code != 0:
-                                word = STATUS.get(code, "unknown")
-                                raise CommandRejected(asked, f"status {code}: {word}", "Look at the module")
+                    sender, said, data = _parse(frame)
+                    if (sender, said) == (address, letters) and len(data) >= digits:
+                        return data
+                    if (sender, said) == (address, "GS") and len(data) == 2 and int(data, 16) != 0:
+                        code = int(data, 16)
+                        word = STATUS.get(code, "unknown")
+                        raise CommandRejected(asked, f"status {code}: {word}", "Look at the module")
+                    self._note(sender, said, data)
                     seen.append(frame)
                 self.link.purge()
         if seen:
             raise ReplyError(asked, f"no valid reply, but {seen[:3]}", "Check cable, and that addresses differ")
         raise ReplyTimeout(asked, f"nothing within {self.reply_s} s", "Check power, cable and address")
+
+
+def _parse(frame: bytes) -> tuple[str, str, str]:
+    """Return address, letters and hex digits; empty strings for noise."""
+    match = _FRAME.fullmatch(frame.decode("ascii", "replace"))
+    return ("", "", "") if match is None else (match[1], match[2], match[3])
 
 
 class ElliptecAxis(SessionReferenceAxis):
@@ -192,22 +194,30 @@ class ElliptecAxis(SessionReferenceAxis):
         return value - (1 << 32) if value >= 1 << 31 else value
 
     def _do_is_moving(self) -> bool:
-        line = self._line
-        line.drain()
-        ended = line.ended.pop(self._address, None) if self._in_motion else None
-        if ended is not None:
-            self._saw_motion = self._saw_motion or ended[0] == "PO"
-            self._status = int(ended[1], 16) if ended[0] == "GS" else self._status
-        # The message at the end can be lost or late: the status decides, and a single "idle" is not believed
-        # without it.
-        for _ in range(1 if ended is not None or not self._in_motion else 2):
-            status = int(line.ask(self._address, "gs", "GS", 2), 16)
+        self._line.drain()
+        # The message at the end can be lost or late: the status decides, and without that message a single "idle"
+        # is not believed.
+        for _ in range(2 if self._in_motion and not self._take_end() else 1):
+            status = int(self._line.ask(self._address, "gs", "GS", 2), 16)
             if status == BUSY:
                 self._saw_motion = True
                 return True
             self._status = status or self._status
+        self._take_end()
         self._in_motion = False
         return False
+
+    def _take_end(self) -> bool:
+        """Take note of the module's message at the end of its move, if it has come."""
+        ended = self._line.ended.pop(self._address, None) if self._in_motion else None
+        if ended is None:
+            return False
+        letters, data = ended
+        if letters == "PO":
+            self._saw_motion = True
+        else:
+            self._status = int(data, 16)
+        return True
 
     def _do_start_move(self, counts: float) -> None:
         self._begin_moving()

@@ -225,3 +225,22 @@ def test_framers_take_any_bytes_and_keep_little(pieces: list[bytes]) -> None:
                 assert frame
                 zaber.parse_reply(frame)
         assert len(buffer) <= longest
+
+
+def test_elliptec_end_message_just_before_the_status_still_proves_the_homing() -> None:
+    # The module's end of homing arrives between the question for its status and the answer to it.
+    opening = [
+        *[(b"0in", b"0IN0E1140050920201501016800023000\r\n")] * 2,
+        *[(b"0gv", b"0GV64\r\n")] * 2,
+        (b"0gs", b"0GS00\r\n"),
+        (b"0ho0", b""),
+        (b"0gs", b"0PO00000000\r\n0GS00\r\n"),
+        *[(b"0gs", b"0GS00\r\n")] * 1,
+        *[(b"0gp", b"0PO00000000\r\n")] * 2,
+        (b"0gs", b"0GS00\r\n"),
+        *[(b"0gp", b"0PO00000000\r\n")] * 2,
+    ]
+    with scripted(*opening) as path, LineRegistry() as lines:
+        config = elliptec.Config(port=path, address="0", pause_before_move_s=0.0)
+        axis = elliptec.open("psg", config, lines)
+        assert axis.home().wait().counts == 0
