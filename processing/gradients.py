@@ -6,16 +6,17 @@ components stack on the left. Angles are in degrees here, as products hold them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
 from processing import quantities
 from processing.cloude import Floats, cloude, xi0_and_dominant
-from processing.decompositions.differential import Differential, differential
+from processing.decompositions.differential import differential, differential_slopes
 from processing.decompositions.lu_chipman import depolarization_power, lu_chipman
-from processing.decompositions.symmetric import symmetric
+from processing.decompositions.symmetric import G, symmetric
 from processing.propagation import Derived, numeric_gradient
+from processing.quantities import State
 
 
 def coherency(m: Floats) -> dict[str, Derived]:
@@ -64,57 +65,51 @@ def polarizance(m: Floats) -> dict[str, Derived]:
 
 
 def _vector(name: str, v: Floats, m00: Floats, elements: tuple[int, int, int]) -> dict[str, Derived]:
-    pixels = v.shape[:-1]
-    slope = np.zeros((3, *pixels, 16))  # d v_i = d m_i / m00 - v_i d m00 / m00
+    slope = np.zeros((3, *v.shape[:-1], 16))  # d v_i = d m_i / m00 - v_i d m00 / m00
     for i, element in enumerate(elements):
         slope[i, ..., element] = 1 / m00
         slope[i, ..., 0] = -v[..., i] / m00
-    size, linear = quantities.magnitude(v), quantities.linear_magnitude(v)
-    v1, v2, v3 = (v[..., i, None] for i in range(3))
+    size = quantities.magnitude(v)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return {
-            name: Derived(size, (v1 * slope[0] + v2 * slope[1] + v3 * slope[2]) / size[..., None]),
-            f"{name}_linear": Derived(linear, (v1 * slope[0] + v2 * slope[1]) / linear[..., None]),
-            f"{name}_circular": Derived(v[..., 2], slope[2]),
-            f"{name}_orientation_deg": Derived(
-                np.rad2deg(quantities.orientation(v)),
-                np.rad2deg(0.5) * (v1 * slope[1] - v2 * slope[0]) / linear[..., None] ** 2,
-            ),
-        }
+        whole = np.sum(np.moveaxis(v, -1, 0)[..., None] * slope, axis=0) / size[..., None]
+    return {name: Derived(size, whole)} | _parts(name, v, slope)
 
 
-DOMINANT = (
-    "dominant_diattenuation_linear",
-    "dominant_diattenuation_circular",
-    "dominant_diattenuation_orientation_deg",
-    "dominant_polarizance_linear",
-    "dominant_polarizance_circular",
-    "dominant_polarizance_orientation_deg",
-)
+def _parts(name: str, v: Floats, slope: Floats) -> dict[str, Derived]:
+    """Linear part, circular part and orientation of a vector v (..., 3) with gradient slope (3, ..., 16)."""
+    linear = quantities.linear_magnitude(v)
+    v1, v2 = v[..., 0, None], v[..., 1, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = (v1 * slope[0] + v2 * slope[1]) / linear[..., None]
+        across = np.rad2deg(0.5) * (v1 * slope[1] - v2 * slope[0]) / linear[..., None] ** 2
+    return {
+        f"{name}_linear": Derived(linear, along),
+        f"{name}_circular": Derived(v[..., 2], slope[2]),
+        f"{name}_orientation_deg": Derived(np.rad2deg(quantities.orientation(v)), across),
+    }
+
+
 RETARDER = ("retardance_deg", "retardance_linear_deg", "retardance_fast_axis_deg", "retardance_circular_deg")
 _RETARDER_PERIOD = (np.inf, np.inf, 180.0, np.inf)
 
 
 def dominant(m: Floats) -> dict[str, Derived]:
-    """Diattenuation and polarizance of the dominant process m0 (the paper's psi and |D|)."""
-
-    def values(mueller: Floats) -> Floats:
-        return np.stack(list(_of_pure(xi0_and_dominant(mueller)[1]).values()), axis=-1)
-
-    return _numeric(values, m, DOMINANT, (np.inf, np.inf, 180.0, np.inf, np.inf, 180.0))
-
-
-def dominant_matrix(m: Floats) -> dict[str, Derived]:
-    """The dominant Mueller-Jones matrix itself (4, 4, ...)."""
+    """The dominant Mueller-Jones matrix m0 (4, 4, ...), its diattenuation and polarizance (the paper's |D| and psi)."""
 
     def values(mueller: Floats) -> Floats:
         m0 = xi0_and_dominant(mueller)[1]
         return m0.reshape(*m0.shape[:-2], 16)
 
-    value = np.moveaxis(values(np.asarray(m, dtype=float)), -1, 0)
+    value = values(np.asarray(m, dtype=float))
     gradient = np.moveaxis(numeric_gradient(values, m), -2, 0)
-    shape = value.shape[1:]
-    return {"dominant_mueller_jones": Derived(value.reshape(4, 4, *shape), gradient.reshape(4, 4, *shape, 16))}
+    first_row, first_column = [1, 2, 3], [4, 8, 12]
+    shape = (4, 4, *value.shape[:-1])
+    matrix = Derived(np.moveaxis(value, -1, 0).reshape(shape), gradient.reshape(*shape, 16))
+    return (
+        {"dominant_mueller_jones": matrix}
+        | _parts("dominant_diattenuation", value[..., first_row], gradient[first_row])
+        | _parts("dominant_polarizance", value[..., first_column], gradient[first_column])
+    )
 
 
 def lu_chipman_quantities(m: Floats) -> dict[str, Derived]:
@@ -129,38 +124,64 @@ def lu_chipman_quantities(m: Floats) -> dict[str, Derived]:
 
 
 def symmetric_quantities(m: Floats) -> dict[str, Derived]:
-    """Diagonal of the symmetric decomposition's depolarizer over its first element; NaN where not defined."""
+    """Diagonal of the symmetric decomposition's depolarizer over its first element; NaN where not defined.
 
-    def values(mueller: Floats) -> Floats:
-        d = np.diagonal(symmetric(mueller).depolarizer, axis1=-2, axis2=-1)
-        return np.asarray(d[..., 1:] / d[..., :1])
-
-    names = tuple(f"symmetric_d{k}" for k in (1, 2, 3))
-    return _numeric(values, m, names, (np.inf,) * 3)
+    The squares of the four elements are the eigenvalues of N = M^T G M G up to one factor; with N v = lambda v the left
+    eigenvector is G v, so d lambda = 2 (G M G v)^T dM (G v) / (v^T G v).
+    """
+    m = np.asarray(m, dtype=float)
+    found = symmetric(m)
+    safe = np.where(found.defined[..., None, None], m, np.diag([1.0, 0.5, 0.4, 0.3]))
+    values, vectors = np.linalg.eig(np.swapaxes(safe, -1, -2) @ G @ safe @ G)
+    order = np.argsort(-values.real, axis=-1)
+    values = np.take_along_axis(values, order, axis=-1).real
+    gv = G @ np.take_along_axis(vectors, order[..., None, :], axis=-1).real
+    left = G @ safe @ gv
+    norm = np.einsum("...ik,...ik->...k", G @ gv, gv)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # d ln lambda_k, (..., k, a, b)
+        slope = 2 * np.einsum("...ak,...bk,...k->...kab", left, gv, 1 / (norm * values))
+        d = np.diagonal(found.depolarizer, axis1=-2, axis2=-1)
+        ratio = d[..., 1:] / d[..., :1]
+        gradient = 0.5 * ratio[..., None, None] * (slope[..., 1:, :, :] - slope[..., :1, :, :])
+    flat = gradient.reshape(*gradient.shape[:-2], 16)
+    return {f"symmetric_d{k}": Derived(ratio[..., k - 1], flat[..., k - 1, :]) for k in (1, 2, 3)}
 
 
 def differential_quantities(m: Floats) -> dict[str, Derived]:
     """Retardance, linear diattenuation and depolarization exponents of the differential decomposition."""
+    found = differential(m)
+    slope = differential_slopes(np.asarray(m, dtype=float), found.defined)
+    retardance, diattenuation = found.retardance(), found.diattenuation()
+    size = quantities.magnitude(retardance)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        whole = np.sum(np.moveaxis(retardance, -1, 0)[..., None] * slope[:3], axis=0) / size[..., None]
+    vector = _parts("", retardance, slope[:3])
+    linear, circular, axis = vector["_linear"], vector["_circular"], vector["_orientation_deg"]
+    to_deg = np.rad2deg(1.0)
+    return {
+        "differential_retardance_deg": Derived(to_deg * size, to_deg * whole),
+        "differential_retardance_linear_deg": Derived(to_deg * linear.value, to_deg * linear.gradient),
+        "differential_retardance_fast_axis_deg": axis,
+        "differential_retardance_circular_deg": Derived(to_deg * circular.value, to_deg * circular.gradient),
+        "differential_diattenuation_linear": _parts("", diattenuation, slope[3:6])["_linear"],
+    } | {
+        f"differential_depolarization_{k}": Derived(found.depolarization()[..., k - 1], slope[5 + k]) for k in (1, 2, 3)
+    }
 
-    def values(mueller: Floats) -> Floats:
-        found: Differential = differential(mueller)
-        linear = quantities.linear_magnitude(found.diattenuation())
-        parts = [*_retardance_deg(found.retardance()), linear, *np.moveaxis(found.depolarization(), -1, 0)]
-        return np.stack(parts, axis=-1)
 
-    retarder = tuple(f"differential_{name}" for name in RETARDER)
-    names = (*retarder, "differential_diattenuation_linear", *(f"differential_depolarization_{k}" for k in (1, 2, 3)))
-    return _numeric(values, m, names, (*_RETARDER_PERIOD, np.inf, np.inf, np.inf, np.inf))
-
-
-def _of_pure(m0: Floats) -> dict[str, Floats]:
-    d, p = quantities.diattenuation_vector(m0), quantities.polarizance_vector(m0)
-    each = [
-        f(v)
-        for v in (d, p)
-        for f in (quantities.linear_magnitude, lambda v: v[..., 2], lambda v: np.rad2deg(quantities.orientation(v)))
-    ]
-    return dict(zip(DOMINANT, each, strict=True))
+def pairs(m: Floats, states: Mapping[str, tuple[State, State]]) -> dict[str, Derived]:
+    """Light between generator and analyzer over m00, for named pairs; linear in M apart from m00."""
+    m = np.asarray(m, dtype=float)
+    m00 = m[..., 0, 0]
+    found = {}
+    for name, (generator, analyzer) in states.items():
+        value = quantities.between(m, generator, analyzer) / m00
+        pair = 0.5 * np.outer(quantities.STATES[analyzer], quantities.STATES[generator]).reshape(16)
+        gradient = np.repeat((1 / m00)[..., None], 16, axis=-1) * pair
+        gradient[..., 0] -= value / m00
+        found[name] = Derived(value, gradient)
+    return found
 
 
 def _retardance_deg(vector: Floats) -> list[Floats]:

@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.axostep import read_rmmd
 from processing.capture_schema import CaptureHeader, Detector, Sample, create_layout, write_closing
 from processing.instrument import InstrumentModel
 from processing.state_csv import ImportFailed, StatesFile, read_states
@@ -149,8 +150,10 @@ def _fluxes(states: StatesFile, names: tuple[str, ...]) -> FrameSource:
 def _stack(text: str, states: StatesFile, names: tuple[str, ...]) -> FrameSource:
     file, _, inside = text.partition("::")
     try:
-        if file.endswith(".npy"):
-            stack: Any = np.load(file, mmap_mode="r")
+        if file.endswith(".rmmd"):
+            stack: Any = read_rmmd(Path(file)).states(len(states))
+        elif file.endswith(".npy"):
+            stack = np.load(file, mmap_mode="r")
         else:
             h5 = h5py.File(file, "r")
             stack = h5[inside or _only_stack(h5, file)]

@@ -21,7 +21,9 @@ def import_command(
         ),
     ],
     wavelength_nm: Annotated[float, typer.Option(help="Wavelength of the measurement.")],
-    stack: Annotated[str | None, typer.Option(help="All frames in one file: .npy, or HDF5 as FILE::/dataset.")] = None,
+    stack: Annotated[
+        str | None, typer.Option(help="All frames in one file: .npy, AxoStep's .rmmd, or HDF5 as FILE::/dataset.")
+    ] = None,
     instrument: Annotated[Path | None, typer.Option(help="Instrument file (YAML).")] = None,
     sample: Annotated[
         str, typer.Option(help="air, mirror, unknown, or a file with 16 numbers (row-major).")

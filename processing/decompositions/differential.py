@@ -71,6 +71,44 @@ def differential(m: Floats) -> Differential:
     return Differential(mean, (logarithm + turned) / 2 - throughput, defined.reshape(m.shape[:-2]))
 
 
+def differential_slopes(m: Floats, defined: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Gradients (9, ..., 16) of the parts of Lm and Lu by the elements of m.
+
+    Order: retardance vector, diattenuation vector, depolarization exponents. With m = V diag(w) V^-1 the derivative of
+    the logarithm is d ln m = V (F * (V^-1 dm V)) V^-1, F holding the divided differences of ln w (Higham, Functions of
+    Matrices, Theorem 3.11). NaN where not defined, and where V is too ill-conditioned to use.
+    """
+    flat = np.where(defined[..., None, None], m, np.diag([1.0, 0.5, 0.4, 0.3])).reshape(-1, 4, 4)
+    values, vectors = np.linalg.eig(flat)
+    w, v = values.astype(complex), vectors.astype(complex)
+    with np.errstate(all="ignore"):
+        inverse = np.linalg.inv(np.where((np.linalg.cond(v) < WORST_EIGENVECTORS)[:, None, None], v, np.nan))
+        difference = w[:, :, None] - w[:, None, :]
+        close = np.abs(difference) < 1e-7 * np.abs(w).max(axis=-1)[:, None, None]
+        quotient = (np.log(w)[:, :, None] - np.log(w)[:, None, :]) / np.where(close, 1, difference)
+    quotient = np.where(close, 2 / (w[:, :, None] + w[:, None, :]), quotient)
+    out = np.empty((9, len(flat), 16))
+    for k, weight in enumerate(_WEIGHTS):
+        # <weight, dL> = <V^-T (F * (V^-1 weight^T V)^T) V^T, dm>
+        inner = quotient * np.swapaxes(inverse @ weight.T @ v, -1, -2)
+        out[k] = (np.swapaxes(inverse, -1, -2) @ inner @ np.swapaxes(v, -1, -2)).real.reshape(-1, 16)
+    out[:, ~defined.reshape(-1)] = np.nan
+    return out.reshape(9, *m.shape[:-2], 16)
+
+
+def _weights() -> NDArray[np.float64]:
+    """Weights (9, 4, 4) whose inner products with L give the nine parts."""
+    out = np.zeros((9, 4, 4))
+    for k, (i, j) in enumerate([(2, 3), (3, 1), (1, 2)]):
+        out[k, i, j], out[k, j, i] = 0.5, -0.5
+        out[3 + k, 0, k + 1] = out[3 + k, k + 1, 0] = 0.5
+        out[6 + k, 0, 0], out[6 + k, k + 1, k + 1] = 1.0, -1.0
+    return out
+
+
+_WEIGHTS = _weights()
+
+
 def _careful_logarithm(m: Floats) -> Floats:
     """Real logarithm by scipy's inverse scaling and squaring; slower, but it needs no eigenvectors."""
     from scipy.linalg import logm

@@ -10,23 +10,29 @@ from numpy.typing import NDArray
 from processing import gradients, mueller
 from processing.instrument import InstrumentModel
 from processing.propagation import Derived, numeric_gradient, standard_error
+from processing.quantities import PAPER_PAIRS
 from processing.states import rotating_retarders
 
 Array = NDArray[np.float64]
 Group = Callable[[Array], dict[str, Derived]]
+
+
+def with_pairs(m: Array) -> dict[str, Derived]:
+    return gradients.pairs(m, PAPER_PAIRS | {"skew": ("45", "right")})
+
 
 CLOSED_FORM: list[Group] = [
     gradients.coherency,
     gradients.depolarization_index,
     gradients.diattenuation,
     gradients.polarizance,
+    gradients.symmetric_quantities,
+    gradients.differential_quantities,
+    with_pairs,
 ]
 NUMERIC: list[Group] = [
     gradients.dominant,
-    gradients.dominant_matrix,
     gradients.lu_chipman_quantities,
-    gradients.symmetric_quantities,
-    gradients.differential_quantities,
 ]
 EVERY = CLOSED_FORM + NUMERIC
 
@@ -60,7 +66,9 @@ def test_closed_form_gradient_is_the_difference_quotient(group: Group) -> None:
 
     for name, derived in group(m).items():
         expected = np.moveaxis(numeric_gradient(values(name), m), -2, 0).reshape(derived.gradient.shape)
-        np.testing.assert_allclose(derived.gradient, expected, atol=1e-6 * np.abs(expected).max(), err_msg=name)
+        # The differential decomposition does not exist for one or another of them: NaN on both sides.
+        assert np.isfinite(expected).mean() > 0.5
+        np.testing.assert_allclose(derived.gradient, expected, atol=1e-6 * np.nanmax(np.abs(expected)), err_msg=name)
 
 
 @pytest.mark.parametrize("group", EVERY, ids=lambda g: g.__name__)

@@ -1,0 +1,63 @@
+"""`process quantities`: all derived maps of a Mueller image, with standard errors."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    app.command("quantities")(quantities_command)
+
+
+def quantities_command(
+    source: Annotated[Path, typer.Argument(help="Mueller product of `process reduce`, or a capture.")],
+    also: Annotated[list[str] | None, typer.Option(help="More decompositions: symmetric, differential.")] = None,
+    pair: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="GENERATOR,ANALYZER: light between two polarizers, e.g. 45,right. Default: the paper's three."
+        ),
+    ] = None,
+    instrument: Annotated[Path | None, typer.Option(help="Instrument file, where a capture is reduced here.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Product file; default: beside the source.")] = None,
+    figure: Annotated[Path | None, typer.Option(help="Also draw the maps (PNG).")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
+) -> None:
+    """Eigenvalues, depolarization, diattenuation, polarizance, retardance and their standard errors."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from processing.commands.reduce import reduced, summary
+    from processing.console import progress_bar
+    from processing.product import Step, file_identity
+    from processing.quantities import PAPER_PAIRS
+    from processing.quantities_image import quantities_of_mueller
+
+    pairs = dict(_pair(text) for text in pair) if pair else PAPER_PAIRS
+    product = reduced(source, instrument)
+    target = out or product.with_name(product.name.removesuffix(".h5").rsplit(".", 1)[0] + ".quantities.h5")
+    step = Step("quantities", {"source": product.name, "also": also, "pairs": pairs}, (file_identity(product),))
+    with progress_bar("quantities", "rows") as tick:
+        facts = quantities_of_mueller(product, target, step, also or (), pairs, overwrite, tick)
+    from processing.product import Product
+
+    with Product(target) as opened:
+        summary(target, facts, opened.simulated)
+    if figure is not None:
+        from processing.figures import draw_product
+
+        draw_product(target, figure)
+        typer.echo(f"figure: {figure}")
+
+
+def _pair(text: str):  # type: ignore[no-untyped-def]
+    from processing.errors import ProcessError
+    from processing.quantities import STATES
+
+    states = tuple(part.strip() for part in text.split(","))
+    if len(states) != 2 or not set(states) <= set(STATES):
+        raise ProcessError(f"--pair {text!r}: give GENERATOR,ANALYZER, each one of: {', '.join(STATES)}")
+    return f"{states[0]}_to_{states[1]}", states
