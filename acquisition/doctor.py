@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import shutil
 import sys
+import sysconfig
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,14 +15,14 @@ from acquisition.errors import AcquisitionError
 from acquisition.header import versions
 from acquisition.rig import Rig
 from acquisition.rig_config import RigConfig
-from drivers.camera import Camera
+from drivers.camera import Camera, CameraIdentity, CameraSettings
 from drivers.errors import DeviceError, FrameLost
 from drivers.motion import MotionAxis
 from processing.errors import ProcessError
 from processing.instrument import InstrumentModel
 
 #: Frames of the packet-loss test, and their exposure.
-FRAMES = 20
+FRAMES = 50
 EXPOSURE_S = 0.001
 
 
@@ -33,13 +35,13 @@ class Finding:
     found: str
 
 
-def examine(config: RigConfig, folder: Path) -> Iterator[Finding]:
+def examine(config: RigConfig, folder: Path, frames: int = FRAMES) -> Iterator[Finding]:
     """Look at everything that a measurement needs, one finding after another; no device's failure hides another's."""
     yield Finding("versions", None, ", ".join(f"{name} {number}" for name, number in versions().items()))
-    yield Finding("python", None, f"{sys.executable}, packages in {sysconfig.get_path('purelib')}")
-    for name in FROM_ENVIRONMENT:
-        yield _guarded(f"package {name}", lambda name=name: _origin(name))  # type: ignore[misc]
-    yield _guarded("package gi", _aravis)
+    yield Finding("umov", None, f"{Path(__file__).parents[1]}, run by {sys.executable}")
+    for name in ("numpy", "h5py"):
+        yield _guarded(name, lambda name=name: _origin(name))  # type: ignore[misc]
+    yield _guarded("aravis", _aravis)
     free = shutil.disk_usage(folder).free
     yield Finding("disc", free > 1e9, f"{free / 1e9:.1f} GB free in {folder.resolve()}")
     for name, mode in config.modes.items():
@@ -51,7 +53,7 @@ def examine(config: RigConfig, folder: Path) -> Iterator[Finding]:
             yield _guarded(f"axis {name}", lambda name=name: _axis(rig.open_axis(name)))  # type: ignore[misc]
         if config.source is not None:
             yield _guarded("source", lambda: _source(rig))
-        yield _guarded("camera", lambda: _camera(rig.open_camera()))
+        yield _guarded("camera", lambda: _camera(rig.open_camera(), config, frames))
     finally:
         failure = run_all([("close the rig", rig.close)])
     if failure is not None:
@@ -69,8 +71,6 @@ def _origin(name: str) -> str:
     """Where a package is imported from; it must be this environment, not the system that gi is borrowed from."""
     folder = Path(str(importlib.import_module(name).__file__)).parent
     own = {Path(sysconfig.get_path(part)) for part in ("purelib", "platlib")}
-    if name == "umov":
-        return str(folder)
     if not any(folder.is_relative_to(place) for place in own):
         raise AcquisitionError(
             f"it comes from {folder}, not from this environment. Unset PYTHONPATH; run ./lab, which shows only gi to it"
@@ -81,12 +81,15 @@ def _origin(name: str) -> str:
 def _aravis() -> str:
     from drivers.aravis_library import load_aravis
 
-    load_aravis()
+    aravis, _ = load_aravis()
+    # The library itself is loaded with the first call.
+    aravis.get_n_interfaces()
     import gi
 
-    folder = Path(str(gi.__file__)).parent
-    linked = f" -> {folder.resolve()}" if folder.is_symlink() else ""
-    return f"{gi.__version__} in {folder}{linked}; Aravis {library_version()}"
+    # The bindings tell the version of the interface only; the file name of the library has all of it.
+    mapped = (line.split()[-1] for line in Path("/proc/self/maps").read_text().splitlines() if "libaravis" in line)
+    library = next(mapped, "its library is not to be seen")
+    return f"{Path(library).resolve()}; gi {gi.__version__} in {Path(str(gi.__file__)).resolve().parent}"
 
 
 def _instrument(path: Path) -> str:
@@ -98,6 +101,7 @@ def _axis(axis: MotionAxis) -> str:
     who = axis.describe()
     limits = axis.limits
     ends = " to ".join("no limit" if end is None else f"{end:g}" for end in (limits.min_deg, limits.max_deg))
+    axis.check_fault()
     homed = "homed" if axis.is_homed() else "NOT homed"
     moving = ", MOVING" if axis.is_moving() else ""
     position = f"at {axis.read_position().deg:.4f} deg, " if axis.is_homed() else ""
@@ -117,13 +121,13 @@ def _source(rig: Rig) -> str:
     return f"{who['model']}, {name}: {state}, interlock closed"
 
 
-def _camera(camera: Camera) -> str:
-    from drivers.camera import CameraSettings
-
+def _camera(camera: Camera, config: RigConfig, frames: int) -> str:
+    """Take frames and count those that were lost; the dark ones of a shut source serve as well."""
+    exposure_s = max(EXPOSURE_S, config.exposure_s[0])
+    camera.configure(CameraSettings(exposure_s=exposure_s, frame_average=1, trigger="software"))
     who = camera.describe()
-    camera.configure(CameraSettings(exposure_s=EXPOSURE_S, frame_average=1, trigger="software"))
     lost = 0
-    for _ in range(FRAMES):
+    for _ in range(frames):
         try:
             camera.trigger().frame()
         except FrameLost:
@@ -134,10 +138,20 @@ def _camera(camera: Camera) -> str:
     found = (
         f"{who.library}: {who.vendor} {who.model}, serial {who.serial_number}, "
         f"{who.sensor_width} x {who.sensor_height} {who.pixel_format} ({who.bits} bits), "
-        f"packets of {who.packet_size} bytes on {who.interface}{warm}; "
-        f"{lost} of {FRAMES} frames lost, {statistics.missing_packets} packets missing, "
+        f"{_packets(who)}{warm}; "
+        f"{lost} of {frames} frames lost, {statistics.missing_packets} packets missing, "
         f"{statistics.resent_packets} resent"
     )
     if lost:
         raise AcquisitionError(found + ". Check cable, packet size and network load.")
+    if config.detector.bits is not None and camera.bits != config.detector.bits:
+        raise AcquisitionError(
+            f"{found}. The rig file says {config.detector.bits} bits under `detector`; correct that or `camera`"
+        )
     return found
+
+
+def _packets(who: CameraIdentity) -> str:
+    if who.packet_size is None:
+        return "not on Ethernet"
+    return f"at {who.address}, packets of {who.packet_size} bytes, {who.interface} takes up to {who.interface_mtu}"

@@ -22,17 +22,33 @@ def register(app: typer.Typer) -> None:
     app.command(context_settings={"ignore_unknown_options": True})(move)
 
 
-def doctor(rig: RigFile = None, out: Annotated[Path, typer.Option(help="folder of captures")] = Path()) -> None:
-    """Tell what is there and what is wrong; moves nothing."""
-    from acquisition.doctor import examine
+def doctor(
+    rig: RigFile = None,
+    out: Annotated[Path, typer.Option(help="folder of captures")] = Path(),
+    frames: Annotated[int, typer.Option(min=1, help="of the packet-loss test")] = 50,
+) -> None:
+    """Tell what is there and what is wrong; moves nothing. Exit code 1 if anything is wrong."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
 
+    from acquisition.doctor import examine
+    from acquisition.stop_request import StopRequest
+
+    config = _load(rig)
+    table = Table(box=None, show_header=False, pad_edge=False)
     failures = 0
-    for finding in examine(_load(rig), out):
-        mark = {True: "ok  ", False: "BAD ", None: "    "}[finding.well]
-        typer.echo(f"{mark} {finding.what:<12} {finding.found}")
-        failures += finding.well is False
+    with StopRequest(patience=1), Console(stderr=True).status("looking at the rig") as status:
+        for finding in examine(config, out, frames):
+            mark = {True: "ok", False: "BAD", None: ""}[finding.well]
+            style = "bold red" if finding.well is False else ""
+            table.add_row(Text(mark, style), Text(finding.what), Text(finding.found, style))
+            failures += finding.well is False
+            status.update(f"looking at the rig: {finding.what} done")
+    # In a file or a pipe every finding stays on its line.
+    Console(width=None if sys.stdout.isatty() else 10_000).print(table)
     if failures:
-        typer.echo(f"{failures} things are not as they should be", err=True)
+        typer.echo(f"{failures} {'thing is' if failures == 1 else 'things are'} not as they should be", err=True)
         raise typer.Exit(1)
 
 
@@ -113,15 +129,19 @@ def stop(rig: RigFile = None) -> None:
 
 def snap(
     exposure: Annotated[float, typer.Option(min=1e-6, help="seconds")] = 0.02,
-    out: Annotated[Path, typer.Option(help="PNG (8 bits, stretched) or TIFF (counts)")] = Path("snap.png"),
+    out: Annotated[Path, typer.Option(help=".png (8 bits, stretched), .tif or .npy (counts)")] = Path("snap.png"),
     rig: RigFile = None,
-    light: Annotated[bool, typer.Option("--light/--dark", help="open the shutter for it")] = True,
+    light: Annotated[bool, typer.Option("--light/--dark", help="let light through for it")] = True,
+    wavelength: Annotated[float | None, typer.Option(help="nm, for a source that selects it")] = None,
     sample: Annotated[str, typer.Option(help="what the simulated rig shows")] = "red_sphere",
 ) -> None:
-    """Take one frame as things stand; moves nothing."""
+    """Take one frame as things stand; moves nothing, and leaves light on or off as it was found."""
     from acquisition.snap import take_frame
+    from acquisition.stop_request import StopRequest
 
-    typer.echo(take_frame(_load(rig), exposure, out, light, sample))
+    config = _load(rig)
+    with StopRequest(patience=1):
+        typer.echo(take_frame(config, exposure, out, light, sample, wavelength))
 
 
 def _load(rig: Path | None) -> RigConfig:

@@ -108,7 +108,7 @@ class Motion:
             if axis._reads_while_moving and now_s > self._next_progress_look_s:
                 self._look_for_progress()
             return
-        axis._do_check_fault()
+        axis.check_fault()
         self._last = axis.read_position()
         if not self._last.confirmed:
             if now_s - self._start_s > self.allowed_s:
@@ -271,6 +271,10 @@ class MotionAxis(ABC):
     def is_moving(self) -> bool:
         """True while the controller says that the axis moves or homes."""
         return self._do_is_moving()
+
+    def check_fault(self) -> None:
+        """Raise a DeviceError if the controller reports a fault; a mere warning is none."""
+        self._do_check_fault()
 
     def warnings(self) -> list[str]:
         """Warning flags in words; an empty list if there are none. Faults are errors, not warnings."""
