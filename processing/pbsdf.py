@@ -7,7 +7,7 @@ the cosine of the angle of incidence is divided out. Each matrix refers to the a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -39,6 +39,7 @@ def export(
     white_m00: float = 1.0,
     empty: Literal["nearest", "nan"] = "nearest",
     pad_wavelengths: bool = True,
+    progress: Callable[[int, int], None] | None = None,
 ) -> float:
     """Write a `.pbsdf` of Mueller tables; returns the fraction of visible bins that no sample filled.
 
@@ -49,6 +50,7 @@ def export(
         Without a radiometric calibration only the polarization is right, not the absolute reflectance.
     empty : what goes into visible bins without samples: the nearest filled bin's value, or NaN (black).
     pad_wavelengths : repeat the outer wavelengths up to the 5 that the renderer reads.
+    progress : called with wavelengths written and in all.
 
     Raises
     ------
@@ -81,13 +83,16 @@ def export(
     fields["theta_d"][0] = np.deg2rad(axes.theta_d_deg)
     fields["phi_d"][0] = np.deg2rad(axes.phi_d_deg)
     fields["wvls"][...] = wavelengths
-    missing = 0.0
+    missing, written = 0.0, 0
     for k, table in enumerate(ordered):
         block, gaps = _dense(table, white_m00, empty)
         missing = max(missing, gaps)
         for slot, source in enumerate(slots):
             if source == k:
                 fields["M"][..., slot, :, :] = block
+                written += 1
+                if progress:
+                    progress(written, len(slots))
     for field in fields.values():
         field.flush()  # type: ignore[attr-defined]
     return missing

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -48,10 +48,13 @@ def export_command(
     keep_gaps: Annotated[bool, typer.Option("--keep-gaps", help="Leave empty bins black.")] = False,
 ) -> None:
     """Write tables as a Mitsuba .pbsdf."""
+    from processing.console import progress_bar
     from processing.pbsdf import export
     from processing.tables import ScatteringTable
 
-    missing = export([ScatteringTable.load(p) for p in tables], out, white_m00, "nan" if keep_gaps else "nearest")
+    with progress_bar("writing", "wavelengths") as tick:
+        gaps: Literal["nearest", "nan"] = "nan" if keep_gaps else "nearest"
+        missing = export([ScatteringTable.load(p) for p in tables], out, white_m00, gaps, progress=tick)
     filled = "left black" if keep_gaps else "filled with the nearest bin"
     typer.echo(f"  visible bins without a sample: {100 * missing:.1f} %, {filled}")
     typer.echo(str(out))
@@ -66,6 +69,7 @@ def import_command(
     from processing.errors import ProcessError
     from processing.pbsdf import load
 
+    typer.echo(f"  reading three million bins of {source}", err=True)
     found = load(source, only_nm=wavelength_nm)
     if not found:
         raise ProcessError(f"{source} has no wavelength {wavelength_nm:g} nm.")

@@ -186,3 +186,25 @@ def test_too_few_boards_are_said():
         calibrate(images, BOARD, pixel_mm=0.01)
     with pytest.raises(GeometryError, match="do not fit"):
         calibrate(images, Board(8, 6, 3.0, 5.0), pixel_mm=0.01)
+
+
+def test_camera_pose_command_writes_a_camera_file(tmp_path, capsys):
+    from processing.cli import main
+    from processing.yaml_file import load_yaml
+
+    images, _, _ = board_views(7)
+    files = []
+    for name, image in images:
+        files.append(str(tmp_path / f"{name}.png"))
+        cv2.imwrite(files[-1], image)
+    given = ["--squares", "8x6", "--square-mm", "5", "--marker-mm", "3.6", "--pixel-mm", "0.01"]
+    out = tmp_path / "camera.yaml"
+    with pytest.raises(SystemExit) as end:
+        main(["camera-pose", *files, *given, "--out", str(out)])
+    assert end.value.code == 0
+    assert "reprojection error" in capsys.readouterr().out
+    assert load_yaml(out, PinholeCamera).focal_length_mm == pytest.approx(20, rel=0.02)
+    with pytest.raises(SystemExit) as end:
+        main(["camera-pose", *files, "--squares", "eight", *given[2:], "--out", str(out)])
+    assert end.value.code == 2
+    assert "8x6" in capsys.readouterr().err
