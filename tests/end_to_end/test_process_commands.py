@@ -12,6 +12,7 @@ import pytest
 from processing.cli import main
 from processing.images import MuellerImage
 from processing.instrument import InstrumentModel
+from processing.product import Product
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -225,3 +226,48 @@ def test_help_names_every_command(process: Run) -> None:
     assert code == 0
     for name in ("reduce", "import", "calibrate"):
         assert name in out
+
+
+def test_noise_options_of_reduce(measured: Measured, tmp_path: Path, instrument: Path, process: Run) -> None:
+    options = ["--wavelength-nm", 662, "--instrument", instrument, "--black-level", 200]
+    assert process("import", "--states", measured.states, *options)[0] == 0
+    capture = tmp_path / "states.h5"
+    code, _, err = process("reduce", capture, "--weighted")
+    assert code == 2
+    assert "this capture does not know its gain" in err
+    code, _, err = process("reduce", capture, "--physical", "closest")
+    assert code == 2
+    assert "none of nearest, likelihood" in err
+    code, _, err = process("reduce", capture, "--demosaic", "bilinear")
+    assert code == 2
+    assert "is not a mosaic capture" in err
+    code, _, err = process("reduce", capture, "--camera", capture)
+    assert code == 2
+    assert "is not a product of `process`" in err
+    noise = ["--gain-e-per-count", 0.5, "--read-noise-e", 2, "--overwrite"]
+    assert process("import", "--states", measured.states, *options, *noise)[0] == 0
+    extra = ["--weighted", "--covariance", "--physical", "likelihood"]
+    code, out, err = process("reduce", capture, *extra)
+    assert (code, err) == (0, "")
+    assert "weighted: True" in out
+    with Product(tmp_path / "states.mueller.h5") as product:
+        assert {"mueller", "mueller_physical", "mueller_covariance"} <= set(product.names)
+        assert product.steps[0].arguments["weighted"] is True
+        assert [Path(i["path"]).name for i in product.steps[0].inputs] == ["states.h5"]
+
+
+def test_camera_of_a_capture_without_repeats(measured: Measured, instrument: Path, process: Run) -> None:
+    options = ["--wavelength-nm", 662, "--instrument", instrument]
+    assert process("import", "--states", measured.states, *options)[0] == 0
+    code, _, err = process("camera", measured.folder / "states.h5")
+    assert code == 2
+    assert "no dark states" in err
+
+
+def test_states_without_angle_or_exposure(measured: Measured, instrument: Path, process: Run) -> None:
+    options = ["--wavelength-nm", 662, "--instrument", instrument, "--overwrite"]
+    measured.states.write_text(measured.states.read_text().replace(",0.01,f3", ",0,f3"), encoding="utf-8")
+    assert process("import", "--states", measured.states, *options)[0] == 0
+    code, _, err = process("reduce", measured.folder / "states.h5")
+    assert code == 2
+    assert "exposure_s" in err
