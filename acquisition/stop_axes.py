@@ -16,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from acquisition.rig_config import RigConfig
-from drivers.errors import DeviceError, PortBusy
+from drivers.errors import CommandRejected, DeviceError, PortBusy
 from drivers.motion import AxisConfig, MotionAxis
 from drivers.registry import open_axis
 from drivers.serial_link import LineRegistry, port_holders
@@ -84,17 +84,46 @@ def _is_acquire(pid: int) -> bool:
 
 def _stop_line(port: str, entries: Mapping[str, AxisConfig], lines: LineRegistry, told: set[int], tell: Tell) -> bool:
     _wait_let_go(port, told)
-    axes: dict[str, MotionAxis] = {}
+    axes = []
+    busy: dict[str, AxisConfig] = {}
     for name, entry in entries.items():
         try:
-            axes[name] = open_axis(name, entry, lines)
-            axes[name].stop()
-        except PortBusy as error:
-            tell(f"{name}: NOT STOPPED. {error}. If it moves: switch its power off")
+            axes.append(_stop_axis(name, entry, lines))
+        except CommandRejected as error:
+            tell(f"{name}: answers no question now ({error.came_back}); asked again until it does")
+            busy[name] = entry
         except DeviceError as error:
-            tell(f"{name}: not known whether it stopped. {error}")
-    rested = [_rests(axis, tell) for axis in axes.values()]
+            _tell_failed(name, error, tell)
+    # An Elliptec module refuses everything while it moves, and would not stop anyway.
+    for name, entry in busy.items():
+        try:
+            axes.append(_stop_when_free(name, entry, lines))
+        except DeviceError as error:
+            _tell_failed(name, error, tell)
+    rested = [_rests(axis, tell) for axis in axes]
     return len(axes) == len(entries) and all(rested)
+
+
+def _stop_axis(name: str, entry: AxisConfig, lines: LineRegistry) -> MotionAxis:
+    axis = open_axis(name, entry, lines)
+    axis.stop()
+    return axis
+
+
+def _stop_when_free(name: str, entry: AxisConfig, lines: LineRegistry) -> MotionAxis:
+    end_s = time.monotonic() + REST_UNSTOPPABLE_S
+    while True:
+        try:
+            return _stop_axis(name, entry, lines)
+        except CommandRejected:
+            if time.monotonic() > end_s:
+                raise
+            time.sleep(0.1)
+
+
+def _tell_failed(name: str, error: DeviceError, tell: Tell) -> None:
+    why = "NOT STOPPED" if isinstance(error, PortBusy) else "not known whether it stopped"
+    tell(f"{name}: {why}. {error}. If it moves, switch its power off")
 
 
 def _wait_let_go(port: str, told: set[int]) -> None:
