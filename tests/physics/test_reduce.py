@@ -1,7 +1,10 @@
 """Reduction of captures with known Mueller images: values, error bars, masks, provenance."""
 
+import subprocess
+import sys
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -286,3 +289,49 @@ def test_missing_axis_is_named(rgb950: InstrumentModel, synthetic_capture) -> No
     path = synthetic_capture(np.ones((40, 1, 4, 6)), {"psg": table()["psg"]})
     with pytest.raises(CaptureError, match=r"turns psa.*angles of: psg"):
         reduced(path, rgb950)
+
+
+SLOW_CHILD = """
+import sys, time
+import subprocess
+import sys
+from pathlib import Path
+import processing.reduce as r
+from processing.capture import Capture
+from processing.product import Step
+r.BLOCK_PIXELS = 4 * 8
+def slowly(done, total):
+    print(done, flush=True)
+    time.sleep(0.05)
+with Capture(sys.argv[1]) as capture:
+    step = (Step("reduce", {"capture": "capture.h5"}),)
+    r.reduce_mueller(capture, capture.instrument, Path(sys.argv[2]), step, progress=slowly)
+"""
+
+
+def test_killed_reduction_leaves_a_partial_file_that_is_resumed(
+    rgb950: InstrumentModel, configs: Path, synthetic_capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(12)
+    frames = noisy(rng, signals(rgb950, table(), scene(rng, (160, 8))))
+    text = (configs / "instruments/rgb950.yaml").read_text(encoding="utf-8")
+    path = synthetic_capture(frames, table(), detector=detector(), instrument_yaml=text)
+    out = path.with_name("killed.h5")
+    child = subprocess.Popen([sys.executable, "-c", SLOW_CHILD, str(path), str(out)], stdout=subprocess.PIPE, text=True)
+    assert child.stdout is not None
+    while int(child.stdout.readline()) < 40:
+        pass
+    child.kill()
+    child.wait()
+    child.stdout.close()
+    assert not out.exists()
+    with h5py.File(out.with_name("killed.h5.partial")) as h5:
+        done = int(h5["entry/rows_done"][()])
+    assert 30 <= done < 160
+    monkeypatch.setattr("processing.reduce.BLOCK_PIXELS", 4 * 8)
+    with Capture(path) as capture:
+        reduce_mueller(capture, rgb950, out, (STEP,))
+    whole = reduced(path, rgb950)
+    again = MuellerImage.load(out)
+    np.testing.assert_array_equal(again.values, whole.values)
+    np.testing.assert_array_equal(again.mask, whole.mask)
