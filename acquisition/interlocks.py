@@ -12,6 +12,8 @@ from acquisition.stop_request import StopRequest
 
 #: How often an open interlock is looked at.
 LOOK_S = 0.05
+#: What an interlock's reason starts with where it can close by itself.
+WAITABLE = ("the door", "the camera")
 
 
 class Interlocks:
@@ -29,11 +31,18 @@ class Interlocks:
         self.go_on = go_on
         self.events: list[dict[str, str | float]] = []
         self._entries = {entry.kind: entry for entry in rig.config.interlocks}
+        self._first_light: float | None = None
+        self._light_at: dict[tuple[float, ...], float] = {}
 
     def open_now(self) -> str | None:
         """Why no state may be taken now, or None."""
         if "door" in self._entries and self.rig.source is not None and self.rig.source.interlock_open():
             return "the door is open"
+        entry = self._entries.get("temperature")
+        if entry is not None:
+            warm = self.rig.require_camera().temperature_c()
+            if warm is not None and warm > entry.limit:
+                return f"the camera has {warm:.1f} C, more than {entry.limit:g} C"
         return None
 
     def judge(self, report: StateReport) -> str | None:
@@ -41,6 +50,18 @@ class Interlocks:
         entry = self._entries.get("saturation")
         if entry is not None and report.saturated_fraction > entry.limit:
             return f"{100 * report.saturated_fraction:.2f} % of the pixels are saturated"
+        return None if report.role == "dark" else self._judge_light(report)
+
+    def _judge_light(self, report: StateReport) -> str | None:
+        if self._first_light is None:
+            self._first_light = report.monitor
+        lamp, drift = self._entries.get("lamp"), self._entries.get("drift")
+        if lamp is not None and report.monitor <= lamp.limit * self._first_light:
+            return f"the light is {100 * report.monitor / self._first_light:.1f} % of that of the first state"
+        pose = (report.exposure_s, *(round(p.deg % 360, 2) % 360 for p in report.positions.values()))
+        before = self._light_at.setdefault(pose, report.monitor)
+        if drift is not None and abs(report.monitor - before) > drift.limit * abs(before):
+            return f"the light has drifted by {100 * (report.monitor / before - 1):+.2f} % since the same pose before"
         return None
 
     def hold(self, state: int, why: str, stop: StopRequest) -> None:
@@ -56,7 +77,8 @@ class Interlocks:
         event: dict[str, str | float] = {"state": float(state), "why": why}
         self.events.append(event)
         self.warn(f"interlock: {why}; the state is discarded, the axes are held")
-        waiting_helps = self.open_now() is not None or "door" in why
+        # A door may be shut again by now; light that was wrong does not come right by waiting.
+        waiting_helps = self.open_now() is not None or why.startswith(WAITABLE)
         if not (self.go_on and waiting_helps):
             raise RunFailed(
                 f"interlock: {why}. State {state} was discarded and the axes stopped. "

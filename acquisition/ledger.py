@@ -8,7 +8,17 @@ from contextlib import contextmanager
 from typing import Literal
 
 Entry = Literal[
-    "homing", "approach", "probing", "moving", "settling", "exposure", "transfer", "writing", "shutter", "interlock"
+    "homing",
+    "approach",
+    "probing",
+    "moving",
+    "settling",
+    "setting",
+    "exposure",
+    "transfer",
+    "writing",
+    "shutter",
+    "interlock",
 ]
 #: What happens before the states, or because of somebody at the door.
 BESIDES = ("homing", "approach", "probing", "interlock")

@@ -91,8 +91,8 @@ class MeasurementPlan(_Part):
     """One capture.
 
     Darks come first: the shutter is closed, the axes stand in the pose of the first state. `repeats` frames are
-    averaged for each state. `bracket` lists factors on the exposure, for instance (1, 8): every state is taken
-    with each and merged, the longest unsaturated exposure of each pixel counts.
+    averaged for each state. `bracket` lists factors on the exposure, for instance (1, 8): every pose is taken with
+    each, darks too, as states of their own; the reduction uses of each pixel what is not saturated.
     """
 
     kind: Literal["plan"] = "plan"
@@ -106,7 +106,8 @@ class MeasurementPlan(_Part):
     exposure_s: float | AutoExposure = Field(default=0.02)
     repeats: int = Field(default=1, ge=1, le=1000)
     darks: int = Field(default=4, ge=0, le=1000)
-    bracket: tuple[Annotated[float, Field(gt=0)], ...] = (1.0,)
+    repeat_first: bool = Field(default=False, description="take the first light state again at the end: a drift check")
+    bracket: tuple[Annotated[float, Field(gt=0)], ...] = Field(default=(1.0,), min_length=1)
     role: Literal["flat", "air", "sample"] | None = Field(
         default=None, description="of the light states; default air for the sample air, else sample"
     )
@@ -138,18 +139,23 @@ class MeasurementPlan(_Part):
         Parameters
         ----------
         pose_deg : angle of every axis that stands still during the capture (the arm, a Stokes pose).
-        exposure_s : exposure of every state, seconds.
+        exposure_s : exposure of every state in seconds, times the factors of the bracket.
         """
         turning = self.states.angles_deg()
-        n, darks = self.states.states, self.darks
+        if self.repeat_first:
+            turning = {name: np.append(column, column[0]) for name, column in turning.items()}
+        n, factors = self.states.states + self.repeat_first, len(self.bracket)
+        darks = self.darks * factors
         columns = {name: np.full(n, float(angle)) for name, angle in pose_deg.items() if name not in turning} | turning
+        columns = {name: np.repeat(column, factors) for name, column in columns.items()}
         dark: Role = "dark"
-        role: tuple[Role, ...] = (dark,) * darks + (self.role or _sample_role(self.sample),) * n
+        role: tuple[Role, ...] = (dark,) * darks + (self.role or _sample_role(self.sample),) * (n * factors)
+        exposures = exposure_s * np.tile(self.bracket, self.darks + n)
         return StateTable(
             angles_deg={k: np.concatenate([np.full(darks, column[0]), column]) for k, column in columns.items()},
-            exposure_s=np.full(darks + n, exposure_s),
+            exposure_s=exposures,
             role=role,
-            repeats=np.full(darks + n, self.repeats, dtype=np.int64),
+            repeats=np.full(len(role), self.repeats, dtype=np.int64),
         )
 
 

@@ -60,8 +60,10 @@ def _maps(
     black = np.float32(capture.header.detector.black_level_counts) if dark is None else dark[0].astype(np.float32)
     total = low = high = None
     levels = []
+    exposure_s = capture.column("exposure_s")
     for k in light:
-        frame = capture.frames(k)[0].astype(np.float32) - black
+        scale = np.float32(exposure_s[light[0]] / exposure_s[k])
+        frame = (capture.frames(k)[0].astype(np.float32) - black) * scale
         levels.append(float(frame.mean()))
         for image in _super_pixels(frame) if mosaic else [frame]:
             thin = image[::step, ::step]

@@ -63,11 +63,13 @@ class ForbiddenPose(_Part):
 class InterlockConfig(_Part):
     """A condition under which states count.
 
-    `door`: the source's interlock circuit is closed. `saturation`: no more than the fraction `limit` of a state's
-    pixels is saturated.
+    `door`: the source's interlock circuit is closed. `temperature`: the camera is not warmer than `limit` degrees
+    Celsius. `saturation`: no more than the fraction `limit` of a state's pixels is saturated. `lamp`: a light
+    state has more than the fraction `limit` of the light of the first. `drift`: a state that repeats an earlier
+    pose and exposure has the same light, to the fraction `limit`.
     """
 
-    kind: Literal["door", "saturation"]
+    kind: Literal["door", "temperature", "saturation", "lamp", "drift"]
     limit: float = Field(default=0.0, ge=0)
 
 

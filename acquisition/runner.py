@@ -152,20 +152,21 @@ class CaptureRunner:
         with self.ledger.time("probing"):
             found_s = find_exposure(self.rig, self.table, instrument, sample, auto, self.observers, self.warn)
         self._light = None
-        self._set_exposure(found_s)
+        self._scale_exposure(found_s / auto.start_s)
 
     def start_darker(self, why: str) -> None:
         """Forget the states taken and go on with a shorter exposure."""
         self.warn(f"{why}; beginning again at {DARKER:g} of the exposure")
         self.writer.forget()
         self.ledger.states = 0
-        self._set_exposure(float(f"{DARKER * self.table.exposure_s[0]:.3g}"))
+        self._scale_exposure(DARKER)
 
-    def _set_exposure(self, exposure_s: float) -> None:
-        self.table = replace(self.table, exposure_s=np.full(len(self.table), exposure_s))
-        self.rig.set_exposure(exposure_s, int(self.table.repeats[0]))
-        self.writer.set_exposure(self.table.exposure_s)
-        self.messages.add(f"exposure {exposure_s:g} s")
+    def _scale_exposure(self, factor: float) -> None:
+        # Three digits: the camera sets no more, and a person can read them.
+        exposure_s = np.array([float(f"{factor * value:.3g}") for value in self.table.exposure_s])
+        self.table = replace(self.table, exposure_s=exposure_s)
+        self.writer.set_exposure(exposure_s)
+        self.messages.add(f"exposure {', '.join(f'{value:g}' for value in np.unique(exposure_s))} s")
 
     def warn(self, text: str) -> None:
         """Keep a warning for the closing record and tell the observers."""
@@ -198,6 +199,8 @@ class CaptureRunner:
         for observer in self.observers:
             observer.exposing(state, retake)
         camera = self.rig.require_camera()
+        with self.ledger.time("setting"):
+            self.rig.set_exposure(float(self.table.exposure_s[state]), int(self.table.repeats[state]))
         start_s = time.monotonic()
         with self.ledger.time("exposure"):
             try:
@@ -230,7 +233,9 @@ class CaptureRunner:
                 self._again(exposed.state, error)
                 return
         report = self._report(exposed, frame)
-        if self._saturation_limit is not None and report.saturated_fraction > self._saturation_limit:
+        # In a bracket the longer exposures are meant to saturate.
+        shortest = report.exposure_s <= 1.001 * float(self.table.exposure_s.min())
+        if self._saturation_limit is not None and shortest and report.saturated_fraction > self._saturation_limit:
             raise TooBright(
                 f"state {exposed.state}: {100 * report.saturated_fraction:.2f} % of the pixels are saturated"
             )

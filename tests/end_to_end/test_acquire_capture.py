@@ -50,7 +50,11 @@ def test_the_capture_says_what_it_is(acquire, small_rig, tmp_path):
         assert capture.instrument.name == "RGB950"
         assert capture.header.seed == 1
         ledger = capture.closing["ledger"]
-        parts = [v for k, v in ledger.items() if k.endswith("_s") and k not in ("total_s", "unavoidable_s", "of_it_readout_s")]
+        parts = [
+            v
+            for k, v in ledger.items()
+            if k.endswith("_s") and k not in ("total_s", "unavoidable_s", "of_it_readout_s")
+        ]
         assert sum(parts) == pytest.approx(ledger["total_s"], abs=0.01)
         assert capture.closing["stream"]["completed"] >= 44
         dark = capture.frames(0)
@@ -104,3 +108,42 @@ def test_averaged_frames_say_so(acquire, small_rig, tmp_path):
     assert code == 0, err
     with Capture(_path(out)) as capture:
         assert capture.column("repeats").tolist() == [5, 5, 5]
+
+
+def test_bracketed_capture_sees_dark_and_bright_pixels(acquire, small_rig, tmp_path):
+    """Eight times the exposure saturates the bright pixels; the reduction takes those from the short one."""
+    plan = tmp_path / "plan.yaml"
+    plan.write_text("kind: plan\nexposure_s: 0.005\nbracket: [1, 8]\ndarks: 2\n")
+    rig = small_rig(flux_e_per_s=3.2e6)
+    code, out, err = acquire("--plan", plan, "--rig", rig, "--out", tmp_path)
+    assert code == 0, err
+    path = _path(out)
+    with Capture(path) as capture:
+        assert capture.role == ("dark",) * 4 + ("sample",) * 80
+        np.testing.assert_allclose(capture.column("exposure_s"), np.tile([0.005, 0.04], 42))
+        saturated = capture.column("saturated_fraction")[4:]
+        assert saturated[0::2].max() == 0
+        assert saturated[1::2].min() > 0.02
+        short = capture.frames(4)[0].astype(float) - 64
+        long = capture.frames(5)[0].astype(float) - 64
+        unsaturated = (long < 3900) & (long > 500)
+        assert (long[unsaturated] / short[unsaturated]).mean() == pytest.approx(8, rel=0.02)
+    merged = _m00(path, "--weighted")
+    code, out, err = acquire("--omega", 35, "--exposure", 0.005, "--rig", rig, "--out", tmp_path / "single")
+    assert code == 0, err
+    single = _m00(_path(out))
+    # m00 is in counts of the longest exposure.
+    bright = single > 0.3 * single.max()
+    ratio = merged[bright] / single[bright]
+    assert np.median(ratio) == pytest.approx(8, rel=0.01)
+    assert np.std(ratio) < 0.3
+
+
+def _m00(capture, *options):
+    from processing import cli
+
+    with pytest.raises(SystemExit) as end:
+        cli.main(["reduce", str(capture), *options])
+    assert end.value.code in (0, None)
+    with h5py.File(capture.with_suffix(".mueller.h5")) as product:
+        return product["entry/data/mueller"][0, 0]

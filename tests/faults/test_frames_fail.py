@@ -98,3 +98,47 @@ def test_saturated_state_ends_the_run_where_the_rig_file_says_so(run_with):
     top = {"interlocks": [{"kind": "door"}, {"kind": "saturation", "limit": 0.01}]}
     error, _ = run_with(plan={"exposure_s": 0.5}, top=top)
     assert "saturated" in str(error)
+
+
+def _light(path):
+    with Capture(path) as capture:
+        return len(capture.done)
+
+
+def test_failed_lamp_and_drifting_lamp_end_the_run(run_with):
+    interlocks = [{"kind": "door"}, {"kind": "lamp", "limit": 0.1}, {"kind": "drift", "limit": 0.03}]
+    top = {"interlocks": interlocks}
+    fails = [{"kind": "source_step", "at_index": 20, "fraction": -0.98}]
+    error, path = run_with(top=top, effects=fails)
+    assert "of that of the first state" in str(error)
+    assert _light(path) == 20
+    # Bench time runs a second a state: seven percent until the first pose comes again.
+    plan = {"repeat_first": True}
+    error, path = run_with(plan=plan, top=top, effects=[{"kind": "source_drift", "fraction_per_hour": 6}])
+    assert "drifted by +" in str(error)
+    assert _light(path) == 44
+    error, path = run_with(plan=plan, top=top)
+    assert error is None
+    assert _light(path) == 45
+
+
+def test_a_hot_camera_is_waited_for(run_with, intact):
+    top = {"interlocks": [{"kind": "temperature", "limit": 50.0}]}
+    looks = []
+
+    def act(rig, state, retake):
+        if state == 9 and not looks:
+            looks.append(0)
+
+            def temperature():
+                looks.append(1)
+                return 61.5 if len(looks) < 4 else 45.0
+
+            rig.camera.temperature_c = temperature
+
+    error, path = run_with(act, plan={"continue_after_interlock": True}, top=top)
+    assert error is None
+    assert intact(path) == 44
+    with Capture(path) as capture:
+        (event,) = capture.closing["interlocks"]
+    assert "61.5 C" in event["why"]
