@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,16 +21,17 @@ from processing.correction import BlockReader, Correction, Mask
 from processing.errors import ProcessError
 from processing.field_solver import Field, FieldSolver
 from processing.instrument import InstrumentModel
-from processing.inversion import Inversion
+from processing.inversion import ELEMENTS, Inversion
 from processing.mueller_solver import MuellerSolver
 from processing.noise import NoiseModel
 from processing.physical import nearest
 from processing.product import Plane, ProductWriter, Step
 from processing.reduce_facts import mueller_facts
-from processing.weighted import WeightedSolver
-from processing.weighted_kernels import PACKED
 
-Solver = MuellerSolver | WeightedSolver | FieldSolver
+if TYPE_CHECKING:
+    from processing.weighted import WeightedSolver
+
+    Solver = MuellerSolver | WeightedSolver | FieldSolver
 
 #: Called with (rows done, rows in all).
 Progress = Callable[[int, int], None]
@@ -45,7 +46,11 @@ PLANES = {
 }
 
 CHI_SQUARE = Plane((), "", "squared residual over what the noise model expects; 1 if the model is complete")
-COVARIANCE = Plane((PACKED,), "count2", "covariance of mueller, lower triangle row by row: 00, 10, 11, 20, 21, 22, ...")
+COVARIANCE = Plane(
+    (ELEMENTS * (ELEMENTS + 1) // 2,),
+    "count2",
+    "covariance of mueller, lower triangle row by row: 00, 10, 11, 20, 21, 22, ...",
+)
 PHYSICAL = {
     "nearest": Plane((4, 4), "count", "physical Mueller matrix nearest to mueller (Frobenius norm)"),
     "likelihood": Plane((4, 4), "count", "physical Mueller matrix of highest likelihood"),
@@ -83,6 +88,9 @@ class Choice:
             return FieldSolver(plain, field)
         if not self.weighted:
             return plain
+        # Imported here: its compiled loops make every start half a second longer.
+        from processing.weighted import WeightedSolver
+
         return WeightedSolver(plain, self.covariance, self.physical == "likelihood")
 
     def planes(self, known_noise: bool) -> dict[str, Plane]:
