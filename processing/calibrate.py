@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from io import StringIO
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,10 @@ FITTABLE = {
     "t_min": (0.01, 0.0, np.inf),
     "ratio": (0.001, -np.inf, np.inf),
 }
+#: A residual above this part of the mean signal is no fit.
+POOR_FIT = 0.05
+#: Other starts turn at most this many azimuths by 45 degrees.
+MOST_TURNED = 5
 #: Parameter directions with a singular value below this, relative to the largest, are not determined.
 UNSEEN = 1e-7
 
@@ -131,8 +136,14 @@ def fit_train(
         throughput = shape @ data / (shape @ shape)
         return np.asarray((data - shape[:, None] * throughput).reshape(-1) / scale)
 
-    inside = np.clip(start, lower + 1e-9 * step, upper - 1e-9 * step)
-    found = least_squares(residual, inside, x_scale=step, bounds=(lower, upper), method="trf", xtol=1e-12, ftol=1e-12)
+    def search(x0: NDArray[np.float64]) -> Any:
+        inside = np.clip(x0, lower + 1e-9 * step, upper - 1e-9 * step)
+        return least_squares(residual, inside, x_scale=step, bounds=(lower, upper), xtol=1e-12, ftol=1e-12)
+
+    found = search(start)
+    if np.sqrt(np.mean(found.fun**2)) > POOR_FIT:
+        # Azimuths have several valleys; a residual like this is the bottom of a wrong one.
+        found = min([found, *(search(x0) for x0 in _other_starts(names, start))], key=lambda f: float(f.cost))
     if not found.success:
         raise NotDetermined(
             f"the fit did not converge ({found.message}); start from an instrument file closer to the truth"
@@ -205,6 +216,17 @@ def _checked(model: InstrumentModel, free: Sequence[str]) -> tuple[str, ...]:
         asked = ", ".join(unknown) or "none given"
         raise CalibrationError(f"free parameter: {asked}. This instrument has: {', '.join(offered)}.")
     return names
+
+
+def _other_starts(names: Sequence[str], start: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    azimuths = [k for k, name in enumerate(names) if name.endswith(".azimuth_deg")][:MOST_TURNED]
+    starts = []
+    for turned in product((0.0, 45.0), repeat=len(azimuths)):
+        if any(turned):
+            x0 = start.copy()
+            x0[azimuths] += turned
+            starts.append(x0)
+    return starts
 
 
 def _fits(element: Element, field: str) -> bool:

@@ -7,9 +7,6 @@ from typing import Annotated
 
 import typer
 
-#: A fit that leaves more than this of the mean signal has probably ended in the wrong valley.
-POOR_FIT = 0.05
-
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
@@ -27,7 +24,7 @@ def calibrate_command(
     write: Annotated[Path | None, typer.Option(help="New instrument file with the fitted values.")] = None,
 ) -> None:
     """Fit element parameters (azimuth_deg, retardance_deg, ...) to region means; the throughput is eliminated."""
-    from processing.calibrate import calibrate, write_fitted
+    from processing.calibrate import POOR_FIT, calibrate, write_fitted
     from processing.capture import Capture
     from processing.instrument import InstrumentModel
 

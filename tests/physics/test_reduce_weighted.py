@@ -76,7 +76,7 @@ def test_equals_weighted_least_squares_of_numpy(rgb950: InstrumentModel, synthet
         )
 
 
-@pytest.mark.parametrize("case", ["plain", "dark", "saturated"])
+@pytest.mark.parametrize("case", ["plain", "dark", "flat", "saturated"])
 def test_unit_variance_and_smaller_errors(case: str, rgb950: InstrumentModel, synthetic_capture) -> None:
     rng = np.random.default_rng(2)
     m = np.broadcast_to(2500 * pure(rng)[..., None, None], (4, 4, 40, 50)).copy()
@@ -91,6 +91,16 @@ def test_unit_variance_and_smaller_errors(case: str, rgb950: InstrumentModel, sy
         angles = {axis: np.concatenate([[0, 0], v]) for axis, v in ANGLES.items()}
         role = ("dark",) * 2 + ("sample",) * 40
         path = synthetic_capture(np.concatenate([dark, frames]), angles, role=role, detector=DETECTOR, **more)
+    if case == "flat":
+        response = 1 + 0.3 * np.cos(np.arange(50) / 9)
+        response = np.broadcast_to(response / response.mean(), (40, 50))
+        path = capture_of(m * response, rng, rgb950, synthetic_capture)
+        with Capture(path) as capture:
+            frames = np.stack([capture.frames(k) for k in range(40)])
+        flat = np.rint(20000 * response + BLACK).astype(np.uint16)[None, None]
+        angles = {axis: np.concatenate([[0], v]) for axis, v in ANGLES.items()}
+        role = ("flat",) + ("sample",) * 40
+        path = synthetic_capture(np.concatenate([flat, frames]), angles, role=role, detector=DETECTOR)
     weighted, plain = (reduced(path, rgb950, Choice(weighted=flag)) for flag in (True, False))
     if case == "saturated":
         assert (weighted.mask & 1).all()
