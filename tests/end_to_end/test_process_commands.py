@@ -271,3 +271,33 @@ def test_states_without_angle_or_exposure(measured: Measured, instrument: Path, 
     code, _, err = process("reduce", measured.folder / "states.h5")
     assert code == 2
     assert "exposure_s" in err
+
+
+def test_xi0_reduces_first_and_reuses_the_product(
+    measured: Measured, tmp_path: Path, instrument: Path, process: Run
+) -> None:
+    noise = ["--black-level", 200, "--gain-e-per-count", 0.5, "--read-noise-e", 2]
+    options = ["--wavelength-nm", 662, "--instrument", instrument, *noise]
+    assert process("import", "--states", measured.states, *options)[0] == 0
+    code, out, err = process("xi0", tmp_path / "states.h5", "--figure", tmp_path / "xi0.png")
+    assert (code, err) == (0, "")
+    assert (tmp_path / "xi0.png").stat().st_size > 10_000
+    with Product(tmp_path / "states.xi0.h5") as product:
+        assert [s.name for s in product.steps] == ["reduce", "xi0"]
+        # A mirror has no depolarization; noise-free but for rounding, so every pixel is valid.
+        assert np.all(product.get("valid") == 1)
+        assert np.max(np.abs(product.get("xi0") - 1)) < 0.01
+    code, out, err = process("xi0", tmp_path / "states.h5", "--overwrite")
+    assert code == 0
+    assert "using" in out
+    code, out, err = process("xi0", tmp_path / "states.xi0.h5", "--out", tmp_path / "y.h5")
+    assert code == 2
+    assert "holds a xi0 image; this needs: mueller" in err
+
+
+def test_instrument_of_another_wavelength(measured: Measured, tmp_path: Path, configs: Path, process: Run) -> None:
+    assert process("import", "--states", measured.states, "--wavelength-nm", 662)[0] == 0
+    other = configs / "instruments/drr_imaging_630nm.yaml"
+    code, _, err = process("reduce", tmp_path / "states.h5", "--instrument", other)
+    assert code == 2
+    assert "is given at 630 nm; asked for 662 nm" in err
