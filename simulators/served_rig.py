@@ -24,7 +24,7 @@ class _RigFile(BaseModel):
 
 @contextmanager
 def serve(
-    rig_file: Path, target: Path, sample: str, mode: str = "drr", wavelength_nm: float = 662
+    rig_file: Path, target: Path, sample: str, mode: str = "drr", wavelength_nm: float = 662, omega_deg: float = 35
 ) -> Iterator[SimulatedRig]:
     """Start the emulators of a rig file and write `target`, the same rig with device paths in place of `sim:` ports.
 
@@ -44,7 +44,7 @@ def serve(
     try:
         _fill_in(tree, simulation, folder)
         instrument = config.truth.get(mode) or Path(tree["modes"][mode]["instrument"])
-        simulation.prepare(sample, InstrumentModel.load(instrument), wavelength_nm)
+        simulation.prepare(sample, InstrumentModel.load(instrument), wavelength_nm, omega_deg)
         with target.open("w") as file:
             yaml.dump(tree, file)
         yield simulation

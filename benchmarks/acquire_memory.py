@@ -1,0 +1,51 @@
+"""Peak memory of `acquire` for 16, 40 and 80 states of 2448 x 2048, the emulators in another process.
+
+Run: .venv/bin/python benchmarks/acquire_memory.py
+"""
+
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from ruamel.yaml import YAML
+
+from simulators.served_rig import serve
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def main() -> None:
+    rows, columns = 2048, 2448
+    for states in (16, 40, 80):
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            yaml = YAML()
+            rig = yaml.load(ROOT / "configs" / "rigs" / "simulated.yaml")
+            rig["simulator"].update({"rows": rows, "columns": columns})
+            for mode in rig["modes"].values():
+                mode["instrument"] = str((ROOT / "configs" / "rigs" / mode["instrument"]).resolve())
+            samples = rig["simulator"]["samples"]
+            samples.update({key: str((ROOT / "configs" / "rigs" / path).resolve()) for key, path in samples.items()})
+            with (folder / "behind.yaml").open("w") as file:
+                yaml.dump(rig, file)
+            with serve(folder / "behind.yaml", folder / "rig.yaml", "red_sphere"):
+                (folder / "plan.yaml").write_text(
+                    f"kind: plan\nstates: {{kind: rotating_retarders, states: {states}, step_deg: {360 / states}}}\n"
+                )
+                options = ["--plan", folder / "plan.yaml", "--rig", folder / "rig.yaml", "--out", folder]
+                run = subprocess.run(
+                    [sys.executable, "-m", "acquisition.cli", *map(str, options)], capture_output=True, text=True
+                )
+            if run.returncode:
+                raise SystemExit(run.stderr)
+            size = next(folder.glob("*.h5")).stat().st_size
+            # ru_maxrss of the children is that of the largest so far, in KiB: growth with the states would show.
+            peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+            print(f"{states} states of {columns} x {rows}: file {size / 1e6:.0f} MB, peak {peak:.0f} MiB")
+            print("\n".join(line for line in run.stdout.splitlines() if line.startswith("seconds")))
+
+
+if __name__ == "__main__":
+    main()
