@@ -37,18 +37,20 @@ def doctor(
 
     config = _load(rig)
     table = Table(box=None, show_header=False, pad_edge=False)
-    failures = 0
+    table.add_column(min_width=3)
+    wrong = []
     with StopRequest(patience=1), Console(stderr=True).status("looking at the rig") as status:
         for finding in examine(config, out, frames):
             mark = {True: "ok", False: "BAD", None: ""}[finding.well]
             style = "bold red" if finding.well is False else ""
             table.add_row(Text(mark, style), Text(finding.what), Text(finding.found, style))
-            failures += finding.well is False
+            if finding.well is False:
+                wrong.append(finding.what)
             status.update(f"looking at the rig: {finding.what} done")
     # In a file or a pipe every finding stays on its line.
     Console(width=None if sys.stdout.isatty() else 10_000).print(table)
-    if failures:
-        typer.echo(f"{failures} {'thing is' if failures == 1 else 'things are'} not as they should be", err=True)
+    if wrong:
+        typer.echo(f"not as it should be: {', '.join(wrong)}", err=True)
         raise typer.Exit(1)
 
 
