@@ -1,0 +1,87 @@
+"""The whole path: `acquire` on the simulated rig, `process`, and the scene's truth within the stated errors."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from processing.cli import main
+from processing.images import MuellerImage
+from processing.product import Product
+from simulators.scene import Scene
+
+
+def taken(out: str) -> Path:
+    found = re.search(r"^capture\s+(\S+)$", out, re.MULTILINE)
+    assert found is not None, out
+    return Path(found[1])
+
+
+def process(*args: object) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([str(a) for a in args])
+    assert not ended.value.code
+
+
+def scaled(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Truth in counts: the source's strength is not part of the scene."""
+    return truth * (np.sum(image * truth) / np.sum(truth**2))
+
+
+def test_mueller_image_and_xi0_agree_with_the_scene(acquire, small_rig, configs: Path, tmp_path: Path) -> None:
+    code, out, err = acquire("--omega", 35, "--rig", small_rig(), "--out", tmp_path)
+    assert code == 0, err
+    capture = taken(out)
+    process("reduce", capture)
+    image = MuellerImage.load(capture.with_suffix(".mueller.h5"))
+    assert image.simulated
+    rows, columns = image.mask.shape
+    scene = Scene.load(configs / "scenes/red_sphere.yaml")
+    truth = scene.truth(35, 662, rows, columns)
+    expected = scene.mueller_image(35, 662, rows, columns)[truth.mask].astype(float)
+    found = image.matrices[truth.mask]
+    errors = np.moveaxis(image.errors, (0, 1), (-2, -1))[truth.mask]
+    pulls = (found - scaled(found, expected)) / errors
+    assert np.mean(pulls**2) == pytest.approx(1.0, abs=0.03)
+    process("xi0", capture)
+    with Product(capture.with_suffix(".xi0.h5")) as product:
+        good = (product.get("valid") > 0) & truth.mask
+        assert good.sum() > 0.8 * truth.mask.sum()
+        pulls = (product.get("xi0") - product.get("xi0_bias") - truth.xi0)[good] / product.get("xi0_errors")[good]
+        # Where the largest eigenvalue is close to the next, xi0 is not Gaussian any more: not valid, or hardly.
+        assert np.mean(pulls**2) == pytest.approx(1.0, abs=0.06)
+
+
+def test_xi0_from_a_stokes_capture_agrees_with_the_scene(acquire, small_rig, configs: Path, tmp_path: Path) -> None:
+    code, out, err = acquire(
+        "--mode", "stokes", "--omega", 35, "--rig", small_rig(rows=256, columns=320), "--out", tmp_path
+    )
+    assert code == 0, err
+    capture = taken(out)
+    geometry, material = configs / "geometries/one_inch_sphere.yaml", configs / "materials/red_print.yaml"
+    process("xi0", capture, "--geometry", geometry, "--material", material)
+    with Product(capture.with_suffix(".xi0.h5")) as product:
+        truth = Scene.load(configs / "scenes/red_sphere.yaml").truth(35, 662, *product.shape)
+        good = product.get("valid") > 0
+        assert good.sum() > 0.8 * truth.mask.sum()
+        pulls = (product.get("xi0") - truth.xi0)[good] / product.get("xi0_errors")[good]
+        assert np.mean(pulls**2) == pytest.approx(1.0, abs=0.08)
+
+
+@pytest.mark.parametrize(
+    ("sample", "omega", "expected"),
+    [("air", 180, np.eye(4)), ("mirror", 10, np.diag([1.0, 1.0, -1.0, -1.0]))],
+)
+def test_known_samples(sample: str, omega: int, expected: np.ndarray, acquire, small_rig, tmp_path: Path) -> None:
+    code, out, err = acquire("--sample", sample, "--omega", omega, "--rig", small_rig(), "--out", tmp_path)
+    assert code == 0, err
+    capture = taken(out)
+    process("reduce", capture)
+    image = MuellerImage.load(capture.with_suffix(".mueller.h5"))
+    good = image.mask == 0
+    found, errors = image.matrices[good], np.moveaxis(image.errors, (0, 1), (-2, -1))[good]
+    pulls = (found - scaled(found, np.broadcast_to(expected, found.shape))) / errors
+    assert np.mean(pulls**2) == pytest.approx(1.0, abs=0.03)
+    mean = found.mean(axis=0) / found[:, 0, 0].mean()
+    assert np.max(np.abs(mean - expected)) < 0.003
