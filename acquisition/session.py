@@ -11,7 +11,7 @@ import numpy as np
 
 from acquisition.capture_writer import PARTIAL, CaptureWriter
 from acquisition.cleanup import run_all
-from acquisition.errors import AcquisitionError
+from acquisition.errors import AcquisitionError, Stopped
 from acquisition.header import capture_header, now, title_of
 from acquisition.job import Job, Result, frame_shape
 from acquisition.observer import Observer
@@ -128,7 +128,7 @@ def _run(
         else:
             status = "aborted"
             _park(rig, watchers)
-    except KeyboardInterrupt as interrupt:
+    except (KeyboardInterrupt, Stopped) as interrupt:
         status, failure = "aborted", interrupt
     except (AcquisitionError, DeviceError) as error:
         failure = error
