@@ -242,7 +242,11 @@ def _facts(
         warnings.append(f"of {mask.size} pixels: {in_words(counts)} (pixel_mask says where)")
     if noise is None:
         warnings.append("the gain is not known: one noise for the whole image, estimated from the channels' closure")
-    some = good & (np.indices(mask.shape).sum(axis=0) % 7 == 0) if good.sum() > 1000 else good
+    # Medians of a ninth of the pixels are plenty.
+    some = good.copy()
+    if good[::3, ::3].sum() > 1000:
+        some[:] = False
+        some[::3, ::3] = good[::3, ::3]
     return {
         "states": states,
         "method": method,

@@ -20,6 +20,8 @@ from processing.mosaic.methods import METHODS, demosaic
 _SIZE, _LEVEL = 32, 1000.0
 #: A step small against the level: the methods that are not linear are linearized about an even scene.
 _STEP = 1.0
+#: Rows whose covariance is worked out at a time; an even number.
+ROWS = 128
 
 
 @lru_cache(maxsize=32)
@@ -71,10 +73,13 @@ def stokes_covariance(
         direction = oriented.directions(frame, layout)
         every = oriented.noise_gain(layout, solve)
         packed = np.stack([every[..., a, b] for a, b in pairs]).astype(np.float32)
-        for i in range(2):
-            for j in range(2):
-                weights = packed[:, direction[i::2, j::2], i, j]
-                out[:, i::2, j::2] = np.einsum("kxyc,cxy->kxy", weights, variance[:, i::2, j::2])
+        # Few rows at a time: the weights of all pixels together would be larger than the image many times over.
+        for first in range(0, variance.shape[1], ROWS):
+            for i in range(2):
+                for j in range(2):
+                    part = np.s_[first + i : first + ROWS : 2, j::2]
+                    weights = packed[:, direction[part], i, j]
+                    out[:, *part] = np.einsum("kxyc,cxy->kxy", weights, variance[:, *part])
         return out
     gain = noise_gain(layout, method, tuple(tuple(float(v) for v in row) for row in solve))
     step = 1 if METHODS[method] is METHODS["superpixel"] else 2
