@@ -9,9 +9,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from datetime import UTC, datetime
-from importlib.metadata import version
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -22,23 +20,16 @@ from numpy.typing import NDArray
 
 from processing.capture_schema import CaptureHeader
 from processing.errors import ProcessError
+from processing.provenance import Step as Step
+from processing.provenance import file_identity as file_identity
+from processing.provenance import jsonable, read_steps, write_steps
+from processing.provenance import step_text as step_text
 
 PRODUCT_VERSION = 1
 
 
 class ProductError(ProcessError):
     """A product file cannot be read or written."""
-
-
-@dataclass(frozen=True)
-class Step:
-    """One step of the provenance: what ran, with which arguments, on which files, when (ISO 8601)."""
-
-    name: str
-    arguments: dict[str, Any]
-    inputs: tuple[dict[str, Any], ...] = ()
-    program: str = field(default_factory=lambda: f"umov {version('umov')}")
-    date: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
 
 
 @dataclass(frozen=True)
@@ -49,13 +40,6 @@ class Plane:
     units: str
     long_name: str
     dtype: Any = np.float32
-
-
-def file_identity(path: Path) -> dict[str, Any]:
-    """Name, size and modification time of an input file, as the provenance keeps them."""
-    stat = path.stat()
-    changed = datetime.fromtimestamp(stat.st_mtime, UTC).isoformat(timespec="microseconds")
-    return {"path": str(path.resolve()), "bytes": stat.st_size, "modified": changed}
 
 
 class ProductWriter:
@@ -165,7 +149,7 @@ class ProductWriter:
 
     def seal(self, facts: Mapping[str, Any]) -> Path:
         """Add the facts (JSON-able: numbers, warnings), close, and give the file its name."""
-        self._h5["entry"].attrs["facts_json"] = json.dumps(dict(facts), default=_plain)
+        self._h5["entry"].attrs["facts_json"] = json.dumps(dict(facts), default=jsonable)
         self._h5.close()
         os.replace(self._partial, self.path)
         return self.path
@@ -270,41 +254,6 @@ def is_product(path: Path) -> bool:
         return False
 
 
-def write_steps(entry: h5py.Group, steps: Sequence[Step]) -> None:
-    """Append steps to an entry as NXprocess groups, numbered after those that are there."""
-    first = 1 + sum(1 for name in entry if name.startswith("process_"))
-    for number, step in enumerate(steps, first):
-        group = entry.create_group(f"process_{number}")
-        group.attrs["NX_class"] = "NXprocess"
-        group["program"], group["date"], group["sequence_index"] = step.program, step.date, number
-        group["step"] = step.name
-        group["arguments_json"] = json.dumps(step.arguments, default=_plain)
-        group["inputs_json"] = json.dumps(step.inputs, default=_plain)
-
-
-def read_steps(entry: h5py.Group) -> tuple[Step, ...]:
-    """Steps of an entry, oldest first."""
-    groups = sorted(
-        (g for n, g in entry.items() if n.startswith("process_")), key=lambda g: int(g["sequence_index"][()])
-    )
-    return tuple(
-        Step(
-            name=g["step"].asstr()[()],
-            arguments=json.loads(g["arguments_json"].asstr()[()]),
-            inputs=tuple(json.loads(g["inputs_json"].asstr()[()])),
-            program=g["program"].asstr()[()],
-            date=g["date"].asstr()[()],
-        )
-        for g in groups
-    )
-
-
-def step_text(step: Step) -> str:
-    """One line for people: step and the arguments that were given."""
-    given = ", ".join(f"{k}={v}" for k, v in asdict(step)["arguments"].items() if v is not None)
-    return f"{step.date} {step.program}: {step.name}({given})"
-
-
 def _early(parent: h5py.Group, name: str, shape: tuple[int, ...], dtype: Any) -> h5py.Dataset:
     # Contiguous and allocated now: a full disc fails at the start, and a killed run leaves a readable file.
     create = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
@@ -313,11 +262,3 @@ def _early(parent: h5py.Group, name: str, shape: tuple[int, ...], dtype: Any) ->
     space = h5py.h5s.create_simple(shape)
     kind = h5py.h5t.py_create(np.dtype(dtype), logical=True)
     return h5py.Dataset(h5py.h5d.create(parent.id, name.encode(), kind, space, dcpl=create))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return str(value)
