@@ -1,4 +1,4 @@
-"""JSON Schemas of the files that `acquire` reads, for editors that complete and check YAML.
+"""JSON Schemas of rig, plan, campaign and instrument files, for editors that complete and check YAML.
 
 `python -m acquisition.schemas` writes them; a test fails while the committed ones are stale.
 """
@@ -13,9 +13,15 @@ from pydantic import BaseModel
 from acquisition.campaign import Campaign
 from acquisition.plan import MeasurementPlan
 from acquisition.rig_config import RigConfig
+from processing.instrument import InstrumentModel
 
 FOLDER = Path(__file__).resolve().parents[1] / "configs" / "schemas"
-MODELS: dict[str, type[BaseModel]] = {"rig": RigConfig, "plan": MeasurementPlan, "campaign": Campaign}
+MODELS: dict[str, type[BaseModel]] = {
+    "rig": RigConfig,
+    "plan": MeasurementPlan,
+    "campaign": Campaign,
+    "instrument": InstrumentModel,
+}
 
 
 def text_of(name: str) -> str:

@@ -176,13 +176,14 @@ def _require_reference(rig: Rig, home: bool) -> None:
 
 
 def _go_to_start(job: Job, rig: Rig, runner: CaptureRunner) -> None:
+    # A wavelength that the source does not have ends the run before anything turns.
+    if rig.source is not None and rig.source.selects_wavelength:
+        rig.source.select(job.plan.wavelength_nm)
     unhomed = rig.unhomed()
     if unhomed:
         runner.tell(f"homing {', '.join(unhomed)}")
         with runner.ledger.time("homing"):
             rig.home(unhomed)
-    if rig.source is not None and rig.source.selects_wavelength:
-        rig.source.select(job.plan.wavelength_nm)
     first = {axis: float(column[0]) for axis, column in job.table.angles_deg.items()}
     # The arm goes first and alone: what stands on it and the sample are what it can hit.
     for axes in ([ARM], [axis for axis in first if axis != ARM]):
