@@ -74,6 +74,6 @@ def _show(planned: Sequence[Planned], checks: Sequence[Check], folder: Path) -> 
     show_checks(console, tuple(checks))
     seconds, size = sum(p.seconds for p in planned), sum(p.size for p in planned)
     typer.echo(
-        f"{len(planned)} captures, about {seconds / 60:.0f} min without homing, arm and operator, {size / 1e9:.2f} GB; "
+        f"{len(planned)} captures, about {seconds / 60:.0f} min without homing and operator, {size / 1e9:.2f} GB; "
         "nothing was moved"
     )

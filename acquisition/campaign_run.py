@@ -13,7 +13,7 @@ from acquisition.campaign_log import CampaignFolder
 from acquisition.capture_writer import PARTIAL, bytes_needed, check_space
 from acquisition.checks import Check, refuse_failed
 from acquisition.errors import AcquisitionError, PlanRefused, Stopped
-from acquisition.estimate import capture_seconds
+from acquisition.estimate import capture_seconds, last_pose_deg
 from acquisition.job import Job, Result, check_with_devices, existing, job_of
 from acquisition.job import prepare as prepare_job
 from acquisition.observer import Observer
@@ -53,13 +53,15 @@ def prepare(campaign: Campaign, rig: RigConfig) -> list[tuple[CampaignCapture, J
 def check_all(jobs: Sequence[tuple[CampaignCapture, Job]], rig: Rig, folder: Path) -> tuple[list[Planned], list[Check]]:
     """Check every capture against the devices and the disc; nothing moves. Returns failures and passes alike."""
     planned = []
+    pose: dict[str, float] = {}
     seen: dict[tuple[str, str], Check] = {}
     for capture, job in jobs:
         for check in check_with_devices(job, rig, folder):
             seen.setdefault((check.what, check.found), check)
         settings = rig.require_camera().settings
         size = bytes_needed(len(job.table), 1, (settings.height or 0, settings.width or 0))
-        planned.append(Planned(capture, job, capture_seconds(job, rig), size))
+        planned.append(Planned(capture, job, capture_seconds(job, rig, pose), size))
+        pose = pose | last_pose_deg(job)
     checks = list(seen.values())
     missing = sum(p.size for p in planned if not (folder / p.capture.name).exists())
     try:

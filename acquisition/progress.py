@@ -54,6 +54,9 @@ class ConsoleProgress(Observer):
         self._done += 1
         angles = " ".join(f"{axis} {position.deg:8.3f}" for axis, position in report.positions.items())
         text = f"state {report.state:3d} {report.role:6s} {angles}"
+        if report.role != "dark":
+            saturated, dim = 100 * report.saturated_fraction, 100 * report.near_black_fraction
+            text += f"  saturated {saturated:.2f} %, dark {dim:.0f} %"
         if report.saturated_fraction > 0 and "saturated" not in self._warned:
             self._warned.add("saturated")
             self._print(f"warning: state {report.state}: {100 * report.saturated_fraction:.3f} % of pixels saturated")

@@ -96,7 +96,7 @@ def test_camera_not_there(refused, small_rig):
     def camera_only(rig):
         far(rig)
         rig["axes"].clear()
-        del rig["source"]
+        rig["source"] = {"kind": "manual"}
         rig["modes"] = {"stokes": {"instrument": rig["modes"]["stokes"]["instrument"]}}
         rig["interlocks"] = []
         rig["home_order"] = []
