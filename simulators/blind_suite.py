@@ -1,7 +1,7 @@
 """A blind test of `diagnose`: captures with undeclared faults, the truth in a file that `diagnose` never opens.
 
-`make` writes captures and truth.json; `judge` compares what `diagnose` said with the truth and counts. Seeds are in three
-ranges that are never mixed: below 1000 for development, 1000 for CI, 5000 for the reported run.
+`make` writes captures and truth.json; `judge` compares what `diagnose` said with the truth and counts. Seeds are in
+three ranges that are never mixed: below 1000 for development, 1000 for CI, 5000 for the reported run.
 """
 
 from __future__ import annotations
@@ -64,9 +64,7 @@ def make(folder: Path, count: int, seed: int, configs: Path) -> list[Case]:
     cases = []
     for k, group in enumerate(groups):
         random = np.random.default_rng([seed, k])
-        if group == "single":
-            chosen = [names[group][used[group] % len(names[group])]]
-        elif group == "unlisted":
+        if group in ("single", "unlisted"):
             chosen = [names[group][used[group] % len(names[group])]]
         elif group == "two":
             pair = [n for n in names["two"] if n not in ALONE]
@@ -145,7 +143,7 @@ def _excess(bench: Bench, scene: Scene, angles: dict[str, Array], air: bool, ins
 
 def said(result: dict[str, Any]) -> tuple[set[str], set[str]]:
     """Kinds that a diagnosis names, and those that it names or cannot tell from them."""
-    named = {e["kind"] for e in result["effects"]}
+    named = {e["kind"] for e in result["effects"] if e["confident"]}
     around = {text.partition("[")[0] for e in result["effects"] for text in e["indistinguishable_from"]}
     left = result.get("unexplained") or {}
     empirical = left.get("empirical") or {}

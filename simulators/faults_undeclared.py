@@ -1,7 +1,7 @@
 """Faults of a lab that a declared model does not know, by physics; each changes a Bench and says what it did.
 
-`LISTED` are causes that `processing/effects` knows, by its kinds; `UNLISTED` are causes that it does not know. A truth is
-(kind, place, parameters in the units of the effect): only what can be compared number by number.
+`LISTED` are causes that `processing/effects` knows, by its kinds; `UNLISTED` are causes that it does not know. A truth
+is (kind, place, parameters in the units of the effect): only what can be compared number by number.
 """
 
 from __future__ import annotations

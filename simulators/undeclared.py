@@ -128,7 +128,7 @@ def _analyzer(jones: Complex) -> Array:
 
 
 class Scene:
-    """Mueller matrices as a smooth function of position: four materials mixed by slow waves, or one matrix everywhere."""
+    """Mueller matrices as a smooth function of position: four materials mixed by slow waves, or one everywhere."""
 
     def __init__(self, random: np.random.Generator, mueller: Array | None = None, brightness: float = 0.6) -> None:
         self.mueller = mueller
@@ -220,7 +220,7 @@ def digitize(bench: Bench, electrons: Array, random: np.random.Generator) -> NDA
 def write_capture(
     path: Path, bench: Bench, counts: NDArray[np.uint16], angles_deg: dict[str, Array], sample: Sample, instrument: str
 ) -> None:
-    """A capture file as the bench's own program would write it, with the declared instrument and no word of the fault."""
+    """A capture file as the bench's own program would write it: the declared instrument, no word of the fault."""
     detector = Detector(
         black_level_counts=BLACK,
         gain_e_per_count=bench.gain,

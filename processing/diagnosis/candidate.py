@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,11 @@ class Candidate:
         return len(self.parameters)
 
     @property
+    def cost(self) -> float:
+        """Parameters that a fit has to pay for; the state of a slip is chosen among many."""
+        return self.size + (3.0 if "@" in self.place else 0.0)
+
+    @property
     def family(self) -> str:
         """Name without the state that a slip starts at."""
         return f"{self.kind}:{self.place.partition('@')[0]}:{self.capture}"
@@ -74,7 +80,7 @@ class NominalValue(Effect):
     """A value of the train that the instrument file gives as only nominal (`calibrate`)."""
 
     group = "optics"
-    FIELDS = {
+    FIELDS: ClassVar[dict[str, Parameter]] = {
         "azimuth_deg": Parameter("azimuth", "degree", -400, 400, 30.0),
         "retardance_deg": Parameter("retardance", "degree", -200, 200, 30.0),
         "extinction": Parameter("extinction", "1", -0.02, 1.0, 0.1),

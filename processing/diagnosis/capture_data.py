@@ -38,6 +38,7 @@ class CaptureData:
         what is left over after the fit is the only measure.
     noise_source : in words.
     clipped : (rows, columns) True where some state is at the top of the range.
+    clipped_states : (N,) True for states in which some pixel is.
     usable : (rows, columns) True where every state has a number.
     binned : side of the squares over which pixels were averaged.
     """
@@ -52,6 +53,7 @@ class CaptureData:
     noise_known: bool
     noise_source: str
     clipped: NDArray[np.bool_]
+    clipped_states: NDArray[np.bool_]
     usable: NDArray[np.bool_]
     simulated: bool
     wavelength_nm: float
@@ -83,7 +85,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     states = sample_states(capture)
     measurement_matrix(capture, model, states)
     correction = Correction.of(capture)
-    raw, clipped = _frames(capture, model, states, correction)
+    raw, clipped, clipped_states = _frames(capture, model, states, correction)
     names = tuple(c.name for c in model.channels)
     if raw.shape[1] != len(names):
         raise CaptureError(
@@ -107,6 +109,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
         noise_known=False,
         noise_source="not known: too few pixels and no detector constants; the residual itself is the measure",
         clipped=clipped,
+        clipped_states=clipped_states,
         usable=np.isfinite(raw).all(axis=(0, 1)),
         simulated=capture.simulated,
         wavelength_nm=capture.header.wavelength_nm,
@@ -127,25 +130,28 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
 
 def _frames(
     capture: Capture, model: InstrumentModel, states: NDArray[np.int64], correction: Correction
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
     level = _clip_level(capture, correction)
     frames, clipped = [], np.zeros(capture.frame_shape, dtype=bool)
-    for k in states:
+    clipped_states = np.zeros(len(states), dtype=bool)
+    for n, k in enumerate(states):
         frame = capture.frames(int(k)).astype(np.float32)
         if level is not None:
-            clipped |= (frame >= level).any(axis=0)
+            over = (frame >= level).any(axis=0)
+            clipped |= over
+            clipped_states[n] = over.any()
         frame -= np.float32(correction.black) if np.isscalar(correction.black) else np.asarray(correction.black)
         frames.append(frame if correction.flat is None else frame / correction.flat)
     raw = np.stack(frames)
     if model.mosaic is None:
-        return raw, clipped
+        return raw, clipped, clipped_states
     rows, columns = len(model.mosaic), len(model.mosaic[0])
     height, width = raw.shape[2] // rows * rows, raw.shape[3] // columns * columns
     raw = raw[:, :, :height, :width]
     where = {name: (r, c) for r, line in enumerate(model.mosaic) for c, name in enumerate(line)}
     planes = [raw[:, 0, where[c.name][0] :: rows, where[c.name][1] :: columns] for c in model.channels]
     blocks = clipped[:height, :width].reshape(height // rows, rows, width // columns, columns)
-    return np.stack(planes, axis=1), blocks.any(axis=(1, 3))
+    return np.stack(planes, axis=1), blocks.any(axis=(1, 3)), clipped_states
 
 
 def _clip_level(capture: Capture, correction: Correction) -> float | None:

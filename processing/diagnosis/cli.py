@@ -95,8 +95,9 @@ def show(d: Diagnosis) -> None:
 
 
 def _show_effect(effect: FoundEffect) -> None:
+    doubt = "" if effect.confident else " (helps, but explains less than what is left: its name may be wrong)"
     where = f" of {effect.element}" if effect.element else ""
-    typer.echo(f"  {effect.kind}{where}: evidence {effect.evidence:.0f}")
+    typer.echo(f"  {effect.kind}{where}: evidence {effect.evidence:.0f}{doubt}")
     for name, p in effect.parameters.items():
         if isinstance(p.value, tuple):
             typer.echo(f"      {name}: {len(p.value)} values, {min(p.value):.4g} to {max(p.value):.4g} {p.unit}")

@@ -46,7 +46,7 @@ def minimize(
     use = list(range(problem.folds) if folds is None else folds)
     weak = prior(space)
     lower, upper = space.joined("lower"), space.joined("upper")
-    free = np.ones(space.size, dtype=bool) if free is None else free
+    free = (np.ones(space.size, dtype=bool) if free is None else free) & ~space.fixed
     x = np.clip(start, lower, upper)
     sums = problem.sums(space, x)
     cost = sums.excess[use].sum() + weak @ x**2
@@ -157,7 +157,8 @@ def _one_step(full: Fit, space: Space, folds: Sequence[int]) -> Array:
     g = full.sums.gradient[folds].sum(axis=0) + weak * full.values
     h = full.sums.curvature[folds].sum(axis=0) + np.diag(weak)
     lower, upper = space.joined("lower"), space.joined("upper")
-    return np.asarray(np.clip(full.values - np.linalg.solve(h, g), lower, upper))
+    step = np.where(space.fixed, 0.0, np.linalg.solve(h, g))
+    return np.asarray(np.clip(full.values - step, lower, upper))
 
 
 def covariance(problem: InstrumentProblem, space: Space, fit: Fit, spread: float) -> Array:

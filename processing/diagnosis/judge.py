@@ -29,7 +29,9 @@ from processing.instrument import EffectParameter
 Array = NDArray[np.float64]
 
 #: Share of the excess that must be explained before anything is named while structure is left.
-SHARE = 0.9
+SHARE = 0.97
+#: Share of the scatter of values that belong to one state each which a single wave may hold, if they are to be random.
+ONE_WAVE = 0.6
 #: An information about a parameter below this, in chi-square for its typical size, is none.
 SEEN = 4.0
 #: Autocorrelation over the states, in standard deviations, from which on a residual of few pixels is not white.
@@ -54,7 +56,8 @@ def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
     captures = range(len(problem.captures))
     before = tuple(residual(problem, k, found.base, found.before_fit) for k in captures)
     after = tuple(residual(problem, k, found.space, found.fit) for k in captures)
-    verdict = _verdict(problem, found, after)
+    _unname(problem, search, found, after)
+    verdict = _verdict(problem, search, found, after)
     if verdict == "unexplained" and found.effects:
         tried = found.effects
         found.space, found.fit, found.after = found.base, found.before_fit, found.before
@@ -90,18 +93,51 @@ def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
     return Judged(diagnosis, found, before, after)
 
 
-def _verdict(problem: InstrumentProblem, found: Found, after: Sequence[Residual]) -> Verdict:
+def _unname(problem: InstrumentProblem, search: Search, found: Found, after: Sequence[Residual]) -> None:
+    """Take back what was added but cannot be called by a name: less than what is left, or values that are one wave."""
+    structure = any(value > LIMIT for r in after for value in r.tests.values())
+    structure |= not problem.noise_known and bool(found.effects)
+    left = max(found.after.excess - problem.noise_known * 2 * search.noise_of(found.after), 0.0)
+    small = [c for c in found.effects if structure and found.gain.get(c, np.inf) < left]
+    part = dict(zip(found.space.candidates, found.space.slices, strict=True))
+    waves = [c for c in found.effects if c.effect.per_state and _one_wave(found.fit.values[part[c]]) > ONE_WAVE]
+    for candidate in (*small, *waves):
+        found.nameless.append(candidate)
+
+
+def _one_wave(values: Array) -> float:
+    """Largest share of the scatter of values (N,) that one sine over the states holds."""
+    n = values.size
+    centred = values - values.mean()
+    total = float(centred @ centred)
+    if total == 0.0:
+        return 0.0
+    k = np.arange(n)
+    best = 0.0
+    for rate in np.linspace(0.5 / n, 0.5, 8 * n):
+        wave = np.stack([np.cos(2 * np.pi * rate * k), np.sin(2 * np.pi * rate * k)], axis=1)
+        q, _ = np.linalg.qr(wave - wave.mean(axis=0))
+        best = max(best, float(np.sum((q.T @ centred) ** 2)) / total)
+    return best
+
+
+def _verdict(problem: InstrumentProblem, search: Search, found: Found, after: Sequence[Residual]) -> Verdict:
     structure = any(value > LIMIT for r in after for value in r.tests.values())
     if not problem.noise_known:
         structure = any(not _white(r) for r in after)
         if not found.effects and not structure:
             return "consistent"
-    if not structure:
-        return "explained" if found.effects else "consistent"
     if not found.effects:
+        return "unexplained" if structure else "consistent"
+    if any(c.effect.per_state for c in found.nameless):
+        # A pattern over the states that is regular is not what this name means, and no other name fits.
         return "unexplained"
-    explained = 1 - max(found.after.excess, 0.0) / max(found.before.excess, 1e-300)
-    sure = all(found.chance.get(c, 1.0) < CHANCE for c in found.effects)
+    if not structure:
+        return "explained"
+    unexplained = max(found.after.excess - problem.noise_known * 2 * search.noise_of(found.after), 0.0)
+    explained = 1 - unexplained / max(found.before.excess, 1e-300)
+    named = [c for c in found.effects if c not in found.nameless]
+    sure = bool(named) and all(found.chance.get(c, 1.0) < CHANCE for c in named)
     return "partly_explained" if explained >= SHARE and sure else "unexplained"
 
 
@@ -133,7 +169,7 @@ def _spread(search: Search, found: Found) -> float:
 
 
 def _parameters(candidate: Candidate, values: Array, stderr: Array) -> dict[str, EffectParameter]:
-    if candidate.kind == "saturation":
+    if candidate.effect.switch:
         return {"left_out": EffectParameter(value=1.0, unit="1", note="pixels with a clipped state are left out")}
     if candidate.effect.per_state:
         unit = candidate.parameters[0].unit
@@ -156,6 +192,7 @@ def _effect(problem: InstrumentProblem, search: Search, found: Found, candidate:
         scope=candidate.effect.scope,
         capture=None if candidate.capture is None else problem.captures[candidate.capture].name,
         removal_chance=found.chance.get(candidate, 1.0),
+        confident=candidate not in found.nameless,
     )
 
 

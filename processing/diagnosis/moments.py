@@ -19,8 +19,26 @@ from processing.diagnosis.capture_data import CaptureData
 Array = NDArray[np.float64]
 
 #: Features of a signal u (counts over full scale); corrected counts = u + sum of coefficient times feature.
-FEATURES = ("counts", "one", "square", "cube", "fourth", "log", "log_square", "dx", "dy")
+FEATURES = ("counts", "one", "square", "cube", "fourth", "log", "log_square", "dx", "dy", "dxx", "dxy", "dyy")
+#: The last of them are derivatives of the image by position.
+DERIVATIVES = 5
 TINY = 1e-6
+#: Savitzky-Golay filters of seven points: value (third order), first and second derivative (fourth and fifth order).
+VALUE = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21
+FIRST = np.array([22.0, -67.0, -58.0, 0.0, 58.0, 67.0, -22.0]) / 252
+SECOND = np.array([-13.0, 67.0, -19.0, -70.0, -19.0, 67.0, -13.0]) / 132
+MARGIN = 3
+#: Noise of each derivative for unit noise of the pixels.
+DERIVATIVE_NOISE = {
+    name: float(np.sum(first**2) * np.sum(second**2))
+    for name, first, second in (
+        ("dx", FIRST, VALUE),
+        ("dy", VALUE, FIRST),
+        ("dxx", SECOND, VALUE),
+        ("dxy", FIRST, FIRST),
+        ("dyy", VALUE, SECOND),
+    )
+}
 #: Parts that are held out in turn: of the image, or of the states (of which there are few, so each part is smaller).
 FOLDS_OF_TILES = 2
 FOLDS_OF_STATES = 5
@@ -42,6 +60,7 @@ class Block:
     noise : (L, features, features) expected noise of z z^T, row by row.
     rows : (L',) the rows of the capture that belong to this block.
     clipped : pixels of which some state is at the top of the range.
+    sound : (L',) rows of states in which no pixel is clipped; all rows in a block that is not clipped.
     pixels : how many pixels stand behind it.
     """
 
@@ -52,6 +71,7 @@ class Block:
     rows: NDArray[np.int64]
     clipped: bool
     pixels: int
+    sound: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -106,7 +126,7 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
     u = data.signal.reshape(rows, height, width)
     variance = data.variance(data.signal).reshape(rows, height, width)
     scale = variance.mean(axis=0)
-    good = data.usable & (scale > 0)
+    good = data.usable & (scale > 0) & inside(height, width)
     sigma = np.sqrt(np.mean(variance[:, good] / scale[good], axis=1))
     tiles = None
     by_state = holds_out_states(data)
@@ -118,7 +138,7 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
         side = int(np.ceil(np.sqrt(x.size)))
         fold_of_tile = (np.arange(x.size) // side + np.arange(x.size) % side) % folds
         fold_of_pixel = fold_of_tile[index]
-        held = f"every tile of the image is predicted by a fit to the tiles of the other parts ({folds} parts, interleaved)"
+        held = f"every tile of the image is predicted by a fit to the other tiles ({folds} parts, interleaved)"
         tiles = _tiles(u, variance, scale, good & ~data.clipped, index, x, y, fold_of_tile)
     blocks: list[Block] = []
     for clipped in (False, True):
@@ -131,6 +151,14 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
     relative = float(np.mean(scale[good])) / mean**2
     floor = float(np.sqrt(np.mean(variance[:, good]))) / mean
     return Moments(tuple(blocks), tiles, sigma, relative, float(np.mean(share**2)), floor, held)
+
+
+def inside(height: int, width: int) -> NDArray[np.bool_]:
+    """Pixels whose derivatives need nothing beyond the edge; all of them where the image is too small for that."""
+    out = np.ones((height, width), dtype=bool)
+    if min(height, width) > 2 * MARGIN + 2:
+        out[:MARGIN], out[-MARGIN:], out[:, :MARGIN], out[:, -MARGIN:] = False, False, False, False
+    return out
 
 
 def _grid(height: int, width: int) -> tuple[NDArray[np.int64], Array, Array]:
@@ -179,39 +207,41 @@ def _blocks(
     rows = u.shape[0]
     size = len(FEATURES) * rows
     pixels = int(pick.sum())
-    gradients = _gradients(u)
+    around = image_derivatives(u).reshape(DERIVATIVES, rows, -1)
     noise = np.zeros((rows, len(FEATURES), len(FEATURES)))
     total = np.zeros((size, size)) if pixels > size else None
-    parts = []
+    chunks = []
     flat = np.flatnonzero(pick.reshape(-1))
     for start in range(0, flat.size, 8192):
         p = flat[start : start + 8192]
         weight = 1 / np.sqrt(scale.reshape(-1)[p])
         values = u.reshape(rows, -1)[:, p].astype(np.float64)
         z, slopes = features(values)
-        z[-2] = gradients[0].reshape(rows, -1)[:, p]
-        z[-1] = gradients[1].reshape(rows, -1)[:, p]
+        z[-DERIVATIVES:] = around[:, :, p]
         z *= weight
         share = variance.reshape(rows, -1)[:, p] * weight**2
         noise += np.einsum("flp,glp,lp->lfg", slopes, slopes, share, optimize=True)
-        # A central difference sees the noise of the two neighbours, half of one pixel's variance.
-        for k in (-2, -1):
-            noise[:, k, k] += 0.5 * share.sum(axis=1)
+        # Neighbours are taken to be as noisy as the pixel itself.
+        for name, part in DERIVATIVE_NOISE.items():
+            k = FEATURES.index(name)
+            noise[:, k, k] += part * share.sum(axis=1)
         if total is None:
-            parts.append(z.reshape(size, -1))
+            chunks.append(z.reshape(size, -1))
         else:
             flat_z = z.reshape(size, -1)
             total += flat_z @ flat_z.T
-    root = np.concatenate(parts, axis=1) if total is None else _square_root(total)
+    root = np.concatenate(chunks, axis=1) if total is None else _square_root(total)
     z = root.reshape(len(FEATURES), rows, -1)
     counts = _square_root(z[0] @ z[0].T)
+    free = np.repeat(~data.clipped_states, data.signal.shape[1]) if clipped else np.ones(rows, dtype=bool)
     if not parts_of_states:
-        return [Block(fold, z, counts, noise, np.arange(rows), clipped, pixels)]
+        return [Block(fold, z, counts, noise, np.arange(rows), clipped, pixels, np.flatnonzero(free))]
     states, channels = data.signal.shape[:2]
     halves = np.random.default_rng(0).permutation(states) % parts_of_states
+    parts = [np.repeat(halves == f, channels) for f in range(parts_of_states)]
     return [
-        Block(f, z, counts, noise, np.flatnonzero(np.repeat(halves == f, channels)), clipped, pixels)
-        for f in range(parts_of_states)
+        Block(f, z, counts, noise, np.flatnonzero(p), clipped, pixels, np.flatnonzero(p & free))
+        for f, p in enumerate(parts)
     ]
 
 
@@ -229,13 +259,17 @@ def features(u: Array) -> tuple[Array, Array]:
     return z, slope
 
 
-def _gradients(u: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    dx, dy = np.zeros_like(u), np.zeros_like(u)
-    if u.shape[2] > 2:
-        dx = np.gradient(u, axis=2)
-    if u.shape[1] > 2:
-        dy = np.gradient(u, axis=1)
-    return dx, dy
+def image_derivatives(u: NDArray[np.floating]) -> NDArray[np.float32]:
+    """dx, dy, dxx, dxy, dyy (5, L, rows, columns) of images (L, rows, columns); zero if the image is too small."""
+    from scipy.ndimage import correlate1d
+
+    out = np.zeros((DERIVATIVES, *u.shape), dtype=np.float32)
+    if min(u.shape[1:]) <= 2 * MARGIN + 2:
+        return out
+    pairs = ((VALUE, FIRST), (FIRST, VALUE), (VALUE, SECOND), (FIRST, FIRST), (SECOND, VALUE))
+    for k, (along_y, along_x) in enumerate(pairs):
+        out[k] = correlate1d(correlate1d(u, along_x, axis=2), along_y, axis=1)
+    return out
 
 
 def _square_root(s: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Noise of a camera whose gain is not known, from the scatter over pixels that no linear model of the states explains."""
+"""Noise of a camera whose gain is not known, from the scatter over pixels that no linear model explains."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Measured intensities against an instrument model: excess over the noise, its gradient and curvature.
 
 For every capture the model gives a matrix A (L rows): W for an unknown sample, W vec(M) for a known one. What a pixel's
-own unknowns (M, or the throughput) can take up is projected out: residual = P y with P = 1 - A A+. The excess is the sum
-of squares of the residuals in units of the noise, minus what the noise is expected to give.
+own unknowns (M, or the throughput) can take up is projected out: residual = P y with P = 1 - A A+. The excess is the
+sum of squares of the residuals in units of the noise, minus what the noise is expected to give.
 Derivative of the residual: -P dA A+ y (variable projection after Kaufman, BIT 15, 49, 1975) + P dc Z for corrections
 of the counts.
 """
@@ -10,7 +10,7 @@ of the counts.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from processing.changes import Changes
 from processing.diagnosis.candidate import Candidate
 from processing.diagnosis.capture_data import CaptureData
 from processing.diagnosis.moments import (
+    DERIVATIVES,
     FEATURES,
     FOLDS_OF_STATES,
     FOLDS_OF_TILES,
@@ -26,6 +27,7 @@ from processing.diagnosis.moments import (
     Moments,
     features,
     holds_out_states,
+    image_derivatives,
     moments_of,
 )
 from processing.effects.base import apply_to, turned_by
@@ -77,6 +79,11 @@ class Space:
             start += candidate.size
         self.slices, self.size = tuple(slices), start
 
+    @property
+    def fixed(self) -> NDArray[np.bool_]:
+        """(K,) values that are on or off and not fitted."""
+        return np.array([c.effect.switch for c in self.candidates for _ in c.parameters], dtype=bool)
+
     def joined(self, name: str) -> Array:
         """A property of all candidates, end to end."""
         return np.concatenate([np.zeros(0), *(getattr(c, name) for c in self.candidates)])
@@ -119,8 +126,10 @@ class InstrumentProblem:
         c[0] = 1.0
         for name, value in changes.response.items():
             c[FEATURES.index(name)] += value
-        c[FEATURES.index("dx")] = np.repeat(changes.shift_px[:, 0], channels)
-        c[FEATURES.index("dy")] = np.repeat(changes.shift_px[:, 1], channels)
+        # What the shift took away, to second order, from derivatives of the fitted image (which has no shift).
+        x, y = np.repeat(changes.shift_px, channels, axis=0).T
+        for name, value in (("dx", x), ("dy", y), ("dxx", -x * x / 2), ("dxy", -x * y), ("dyy", -y * y / 2)):
+            c[FEATURES.index(name)] = value
         return c
 
     def sums(self, space: Space, values: Array, *, derivatives: bool = True) -> Sums:
@@ -141,7 +150,12 @@ class InstrumentProblem:
         a, c = self.columns(k, changes), self.coefficients(k, changes)
         da, dc = self._derivatives(k, space, values, a, c) if derivatives else (np.zeros((0, *a.shape)), None)
         for block in self.moments[k].blocks:
-            if not (block.clipped and changes.drop_clipped):
+            if block.clipped and changes.drop_clipped:
+                # What is left of a clipped pixel is its states without any clipping, if they are enough.
+                if block.sound.size < 1.5 * a.shape[1]:
+                    continue
+                block = replace(block, rows=block.sound)
+            if block.rows.size:
                 _add_block(block, a, c, da, dc, self.moments[k], out)
 
     def _derivatives(self, k: int, space: Space, values: Array, a: Array, c: Array) -> tuple[Array, Array]:
@@ -149,7 +163,7 @@ class InstrumentProblem:
         channels = len(self.captures[k].conditions.channels)
         whole: dict[str, Array] = {}
         for candidate, part in zip(space.candidates, space.slices, strict=True):
-            if candidate.capture not in (None, k) or candidate.kind == "saturation":
+            if candidate.capture not in (None, k) or candidate.effect.switch:
                 continue
             if candidate.effect.per_state:
                 # Parameter n acts on state n alone: one step of all of them together gives every derivative.
@@ -246,19 +260,20 @@ class InstrumentProblem:
         return np.asarray(a / self.moments[k].sigma[:, None])
 
 
-def add_response(counts: Array, coefficients: Array) -> Array:
-    """Corrected counts (L, rows, columns) from the coefficients of the features (F, L)."""
+def add_response(counts: Array, coefficients: Array, a: Array) -> Array:
+    """Corrected counts (L, rows, columns) from the coefficients of the features (F, L); a (L, K) in units of noise."""
     if not np.any(coefficients[1:]):
         return counts
     z, _ = features(counts)
-    z[-2] = np.gradient(counts, axis=2) if counts.shape[2] > 2 else 0.0
-    z[-1] = np.gradient(counts, axis=1) if counts.shape[1] > 2 else 0.0
+    if np.any(coefficients[-DERIVATIVES:]):
+        u, size, _ = np.linalg.svd(a, full_matrices=False)
+        q = u[:, size > RANK * size[0]]
+        fitted = (q @ (q.T @ counts.reshape(counts.shape[0], -1))).reshape(counts.shape)
+        z[-DERIVATIVES:] = image_derivatives(fitted)
     return np.einsum("fl,flhw->lhw", coefficients, z)
 
 
 def _tiled(changes: Changes, count: int, states: int) -> Changes:
-    from dataclasses import replace
-
     conditions = replace(changes.conditions, states=states * count)
     out = Changes(conditions)
     for name in ("azimuth_rad", "retardance_rad", "extinction", "diattenuation"):
@@ -275,12 +290,14 @@ def _add_block(block: Block, a: Array, c: Array, da: Array, dc: Array | None, mo
     # Without corrections of the counts, as few pseudo-pixels as there are rows say the same.
     plain = not np.any(c[1:]) and (dc is None or not np.any(dc))
     z, noise = (block.counts[None, rows] if plain else block.z[:, rows]), block.noise[rows]
-    y = _weighted_sum(c[:, rows], z) * scale[:, None]
-    cn = np.einsum("lfg,gl->lf", noise, c[:, rows])
-    n = np.einsum("fl,lf->l", c[:, rows], cn) * scale**2
     u, size, vt = np.linalg.svd(a[rows], full_matrices=False)
     keep = size > RANK * size[0]
     q = u[:, keep]
+    if not plain and (np.any(c[-DERIVATIVES:]) or (dc is not None and np.any(dc[:, -DERIVATIVES:]))):
+        z, noise = _smooth_derivatives(z, noise, q, scale)
+    y = _weighted_sum(c[:, rows], z) * scale[:, None]
+    cn = np.einsum("lfg,gl->lf", noise, c[:, rows])
+    n = np.einsum("fl,lf->l", c[:, rows], cn) * scale**2
     pinv = (vt[keep].T / size[keep]) @ q.T
     r = y - q @ (q.T @ y)
     free = 1 - np.sum(q * q, axis=1)
@@ -305,6 +322,20 @@ def _add_block(block: Block, a: Array, c: Array, da: Array, dc: Array | None, mo
     flat = d.reshape(k, -1)
     out.gradient[f] += flat @ r.reshape(-1) - noise_term
     out.curvature[f] += flat @ flat.T
+
+
+def _smooth_derivatives(z: Array, noise: Array, q: Array, scale: Array) -> tuple[Array, Array]:
+    """Derivatives of the fitted image in place of those of the noisy frames, and the noise that is left in them."""
+    z, noise = z.copy(), noise.copy()
+    hat = q @ q.T
+    relative = scale[None, :] / scale[:, None]
+    for f in range(-DERIVATIVES, 0):
+        z[f] = (hat @ (z[f] * scale[:, None])) / scale[:, None]
+        # The fitted image has the noise that the projection takes away: none is shared with what it leaves.
+        noise[:, :-DERIVATIVES, f] = noise[:, f, :-DERIVATIVES] = 0.0
+        for g in range(-DERIVATIVES, 0):
+            noise[:, f, g] = (hat * relative) ** 2 @ noise[:, f, g] if f <= g else noise[:, g, f]
+    return z, noise
 
 
 def _weighted_sum(c: Array, z: Array) -> Array:

@@ -24,7 +24,10 @@ class Error(_Part):
 
 
 class FoundEffect(_Part):
-    """One effect with its values, the chi-square it explains on held-out data, and what else it could be."""
+    """One effect with its values, the chi-square it explains on held-out data, and what else it could be.
+
+    `confident` is False for a correction that explains less than what is left over: its name may be wrong.
+    """
 
     kind: str
     element: str | None
@@ -34,6 +37,7 @@ class FoundEffect(_Part):
     scope: Literal["instrument", "capture"]
     capture: str | None = None
     removal_chance: float
+    confident: bool
 
 
 class Ranked(_Part):

@@ -55,7 +55,7 @@ class Trial:
         lower, upper = self.space.joined("lower"), self.space.joined("upper")
         near = np.minimum(self.fit.values - lower, upper - self.fit.values) < 1e-3 * (upper - lower)
         for candidate, part in zip(self.space.candidates, self.space.slices, strict=True):
-            near[part] &= candidate.kind != "saturation"
+            near[part] &= not candidate.effect.switch
         return bool(near.any())
 
 
@@ -71,10 +71,12 @@ class Found:
     after: HeldOut
     evidence: dict[Candidate, float] = field(default_factory=dict)
     chance: dict[Candidate, float] = field(default_factory=dict)
+    gain: dict[Candidate, float] = field(default_factory=dict)
     sets: dict[Candidate, tuple[Candidate, ...]] = field(default_factory=dict)
     ranking: list[Trial] = field(default_factory=list)
     information: dict[Candidate, Array] = field(default_factory=dict)  # with no effect active
     untestable: tuple[Candidate, ...] = ()
+    nameless: list[Candidate] = field(default_factory=list)
 
     @property
     def effects(self) -> tuple[Candidate, ...]:
@@ -100,7 +102,7 @@ class Search:
         before = held_out(self.problem, self.base, base_fit)
         space, fit, out = self.base, base_fit, before
         ranking: list[Trial] = []
-        for number in range(MOST_EFFECTS):
+        for _ in range(MOST_EFFECTS):
             trials = self._trials(space, fit, out)
             ranking = ranking or trials
             # What fits better only where the weights are large makes the residual itself grow: not an explanation.
@@ -184,7 +186,7 @@ class Search:
             if gain < max(least, 0.5 * DECISIVE * self.n0):
                 continue
             # Rank as a Bayesian information criterion over the directions of structure, not over the pixels.
-            rank = _rank(fit.excess - gain, fit.excess, weighty, candidate.size, self.n0)
+            rank = _rank(fit.excess - gain, fit.excess, weighty, candidate.cost, self.n0)
             if candidate.effect.per_state:
                 rank -= 1e6  # one step promises too little where there are many parameters: always fitted
             if candidate.family not in scored or rank < scored[candidate.family][0]:
@@ -199,7 +201,7 @@ class Search:
         """Promised gain of each candidate and the information about it, all from one pass over the data."""
         out: dict[Candidate, tuple[float, Array]] = {}
         tiled = [c for c in (*space.candidates, *offered) if c.kind == "field_retardance"]
-        plain = [c for c in offered if c.kind not in ("field_retardance", "saturation")]
+        plain = [c for c in offered if c.kind != "field_retardance" and not c.effect.switch]
         counts = [c for c in plain if c.effect.corrects_counts]
         groups = [counts, [c for c in plain if c not in counts]]
         if any(c in tiled for c in space.candidates):
@@ -213,12 +215,12 @@ class Search:
             for candidate, part in zip(group, both.slices[len(space.candidates) :], strict=True):
                 out[candidate] = score(sums, space.size, part, weak)
         for candidate in offered:
-            if candidate.kind == "saturation":
+            if candidate.effect.switch:
                 out[candidate] = (self._clipped_excess(space, fit), np.zeros((1, 1)))
         return out
 
     def _clipped_excess(self, space: Space, fit: Fit) -> float:
-        clipped = next(c for c in self.pool if c.kind == "saturation")
+        clipped = next(c for c in self.pool if c.effect.switch)
         both = Space((*space.candidates, clipped))
         with_all = self.problem.sums(both, np.append(fit.values, 0.0), derivatives=False).excess.sum()
         without = self.problem.sums(both, np.append(fit.values, 1.0), derivatives=False).excess.sum()
@@ -228,7 +230,7 @@ class Search:
         both = Space((*space.candidates, candidate))
         best: Fit | None = None
         for start in (np.zeros(candidate.size), *candidate.starts):
-            first = np.ones(1) if candidate.kind == "saturation" else start
+            first = np.ones(1) if candidate.effect.switch else start
             tried = minimize(self.problem, both, np.concatenate([fit.values, first]))
             if best is None or tried.excess < best.excess:
                 best = tried
@@ -236,10 +238,10 @@ class Search:
             raise ValueError("a candidate needs at least one start")
         held = held_out(self.problem, both, best)
         evidence = self._evidence(out, held, both.size)
-        rank = _rank(held.excess, out.excess, weighty, candidate.size, self.n0)
+        rank = _rank(held.excess, out.excess, weighty, candidate.cost, self.n0)
         if self.n0 and held.excess < 3 * self.noise_of(held):
             # Nothing is left beyond noise: ahead of all that leave structure, the simplest first.
-            rank = -1e6 + held.excess + candidate.size * np.log(weighty)
+            rank = -1e6 + held.excess + candidate.cost * np.log(weighty)
         return Trial(candidate, both, best, held, evidence, rank)
 
     def _evidence(self, before: HeldOut, after: HeldOut, parameters: int, scaled: bool = False) -> float:
@@ -270,6 +272,7 @@ class Search:
                 out = held_out(self.problem, rest, fit)
                 evidence = self._evidence(out, found.after, found.space.size, scaled=True)
                 found.evidence[candidate] = evidence
+                found.gain[candidate] = out.excess - found.after.excess
                 found.chance[candidate] = self._chance(out, found.after, candidate.size, found.space.size)
                 if evidence < least:
                     weakest, least, kept = candidate, evidence, (rest, fit, out)
@@ -301,7 +304,7 @@ class Search:
                 close = []
                 for trial in trials:
                     worse = (trial.out.excess - found.after.excess) / unit
-                    simpler = (candidate.size - trial.candidate.size) * float(np.log(weighty))
+                    simpler = (candidate.cost - trial.candidate.cost) * float(np.log(weighty))
                     alike = max(CLOSE, ALIKE * (out.excess - found.after.excess) / unit)
                     if worse < alike and trial.candidate.family != candidate.family:
                         close.append(trial.candidate)
@@ -319,14 +322,14 @@ class Search:
 
     def _observability(self, found: Found) -> None:
         """Information about every candidate that the nominal values leave."""
-        offered = [c for c in self.pool if c.kind != "saturation"]
+        offered = [c for c in self.pool if not c.effect.switch]
         testable = [c for c in offered if self._testable(c, found.base, max(found.before.excess, 0.0))]
         untestable = [c for c in offered if c not in testable]
         found.information = {c: info for c, (_, info) in self.scores(found.base, found.before_fit, testable).items()}
         found.untestable = tuple(untestable)
 
 
-def _rank(left: float, before: float, directions: float, size: int, n0: float) -> float:
+def _rank(left: float, before: float, directions: float, size: float, n0: float) -> float:
     floor = n0 * directions
     ratio = (max(left, 0.0) + floor + 1e-9) / (max(before, 0.0) + floor + 1e-9)
     return float(directions * np.log(ratio) + size * np.log(directions))

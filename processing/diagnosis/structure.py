@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from processing.changes import Changes
 from processing.diagnosis.fit import Fit
+from processing.diagnosis.moments import inside
 from processing.diagnosis.problem import InstrumentProblem, Space, add_response
 from processing.effects.field_retardance import terms
 
@@ -56,10 +57,9 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     a = problem.columns(capture, changes) * moments.sigma[:, None]
     rows = a.shape[0]
     height, width = data.signal.shape[2:]
-    used = data.usable & ~data.clipped if changes.drop_clipped else data.usable
-    y = add_response(
-        data.signal.reshape(rows, height, width).astype(np.float64), problem.coefficients(capture, changes)
-    )
+    used = (data.usable & ~data.clipped if changes.drop_clipped else data.usable) & inside(height, width)
+    counts = data.signal.reshape(rows, height, width).astype(np.float64)
+    y = add_response(counts, problem.coefficients(capture, changes), problem.columns(capture, changes))
     variance = data.variance(data.signal).reshape(rows, height, width)
     level = np.sqrt(moments.sigma**2)
     r = np.full((rows, height, width), np.nan, dtype=np.float32)

@@ -56,6 +56,7 @@ class Effect(ABC):
     scope : "capture" if another capture of the same instrument would have other values.
     per_state : parameter k acts on state k alone (which also makes its derivative cheap).
     corrects_counts : it is undone in the counts, not put into the rows of W.
+    switch : it is on or off; its parameter is not fitted.
     """
 
     kind: str = ""
@@ -63,6 +64,7 @@ class Effect(ABC):
     scope: ClassVar[Scope] = "instrument"
     per_state: ClassVar[bool] = False
     corrects_counts: ClassVar[bool] = False
+    switch: ClassVar[bool] = False
 
     def first_state(self, place: str) -> int:
         """State from which on an axis error of one parameter acts; 0 for every other effect."""

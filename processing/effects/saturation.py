@@ -1,7 +1,8 @@
 """Pixels are clipped at the top of the range in some states.
 
 Cause: too long an exposure for the brightest state, a glint.
-Mend: shorten the exposure or bracket it. What was clipped cannot be brought back: the correction leaves those pixels out.
+Mend: shorten the exposure or bracket it. What was clipped
+cannot be brought back: the correction leaves those pixels out.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ class This(Effect):
 
     group = "detector"
     scope = "capture"
+    switch = True
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",)
