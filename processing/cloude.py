@@ -59,7 +59,7 @@ def cloude(m: Floats) -> Cloude:
     return Cloude(np.moveaxis(xi.reshape(4, *shape), 0, -1), matrices)
 
 
-def xi0_and_dominant(m: Floats) -> tuple[Floats, Floats]:
+def xi0_and_dominant(m: Floats, out: tuple[Floats, Floats] | None = None) -> tuple[Floats, Floats]:
     """Largest coherency eigenvalue xi0 and the dominant Mueller-Jones matrix m0.
 
     Newton's method on the characteristic polynomial and the adjugate, in float64; where the largest eigenvalues
@@ -68,6 +68,8 @@ def xi0_and_dominant(m: Floats) -> tuple[Floats, Floats]:
     Parameters
     ----------
     m : (..., 4, 4), float32 or float64, as in `coherency_eigenvalues`.
+    out : what an earlier call for the same shape returned, to fill again: the first touch of new memory costs as much
+        as the arithmetic.
 
     Returns
     -------
@@ -76,8 +78,12 @@ def xi0_and_dominant(m: Floats) -> tuple[Floats, Floats]:
         depolarizer, which has no dominant process.
     """
     planar, shape = as_planar(m)
-    xi0 = np.empty(planar.shape[1], planar.dtype)
-    m0 = np.empty((16, planar.shape[1]), planar.dtype)
+    if out is None:
+        xi0, m0 = np.empty(planar.shape[1], planar.dtype), np.empty((16, planar.shape[1]), planar.dtype)
+    else:
+        xi0, m0 = out[0].reshape(-1), np.moveaxis(out[1], (-2, -1), (0, 1)).reshape(16, -1)
+        if xi0.size != planar.shape[1] or not (np.shares_memory(xi0, out[0]) and np.shares_memory(m0, out[1])):
+            raise ValueError("`out` must be what an earlier call for the same shape returned")
     for_chunks(kernels.dominant, planar, xi0, m0)
     return xi0.reshape(shape), np.moveaxis(m0.reshape(4, 4, *shape), (0, 1), (-2, -1))
 

@@ -123,6 +123,12 @@ def test_layout_and_type_do_not_matter() -> None:
     single, m0_single = xi0_and_dominant(m.astype(np.float32))
     assert single.dtype == m0_single.dtype == np.float32
     np.testing.assert_allclose(single, xi0, atol=1e-6)
+    first = xi0_and_dominant(m)
+    second = xi0_and_dominant(2 * np.swapaxes(m, -1, -2), out=first)
+    assert np.shares_memory(second[1], first[1])
+    np.testing.assert_array_equal(second[0], xi0_and_dominant(2 * np.swapaxes(m, -1, -2))[0])
+    with pytest.raises(ValueError, match="an earlier call"):
+        xi0_and_dominant(m[:3], out=first)
     with pytest.raises(ValueError, match=r"shape \(\.\.\., 4, 4\); got \(16, 7\)"):
         xi0_and_dominant(np.zeros((16, 7)))
 
