@@ -3,10 +3,11 @@
 Run: .venv/bin/python benchmarks/acquire_memory.py
 """
 
-import resource
+import contextlib
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 from ruamel.yaml import YAML
@@ -35,16 +36,28 @@ def main() -> None:
                     f"kind: plan\nstates: {{kind: rotating_retarders, states: {states}, step_deg: {360 / states}}}\n"
                 )
                 options = ["--plan", folder / "plan.yaml", "--rig", folder / "rig.yaml", "--out", folder]
-                run = subprocess.run(
-                    [sys.executable, "-m", "acquisition.cli", *map(str, options)], capture_output=True, text=True
+                run = subprocess.Popen(
+                    [sys.executable, "-m", "acquisition.cli", *map(str, options)], stdout=subprocess.PIPE, text=True
                 )
+                peak = 0
+                while run.poll() is None:
+                    peak = max(peak, _peak_mib(run.pid))
+                    time.sleep(0.1)
+                out, _ = run.communicate()
             if run.returncode:
-                raise SystemExit(run.stderr)
+                raise SystemExit(f"the run ended with {run.returncode}")
             size = next(folder.glob("*.h5")).stat().st_size
-            # ru_maxrss of the children is that of the largest so far, in KiB: growth with the states would show.
-            peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
-            print(f"{states} states of {columns} x {rows}: file {size / 1e6:.0f} MB, peak {peak:.0f} MiB")
-            print("\n".join(line for line in run.stdout.splitlines() if line.startswith("seconds")))
+            print(f"{states} states of {columns} x {rows}: file {size / 1e6:.0f} MB, peak {peak} MiB")
+            print("\n".join(line for line in out.splitlines() if line.startswith("seconds")))
+
+
+def _peak_mib(pid: int) -> int:
+    # Not getrusage: a child's figure there begins with the memory of the process that it was forked from.
+    with contextlib.suppress(OSError):
+        for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) // 1024
+    return 0
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ def _moving(simulation):
     return [axis.is_moving() for emulator in simulation.emulators.values() for axis in emulator.axes]
 
 
-def test_once_finishes_the_state_parks_and_seals(spawn, partial_of, served, intact, tmp_path):
+def test_once_finishes_the_state_parks_and_seals_and_the_capture_goes_on(spawn, partial_of, served, intact, tmp_path):
     simulation, rig = served
     child = spawn("--omega", 35, "--rig", rig, "--out", tmp_path / "out")
     partial_of(tmp_path / "out", child, states=5)
@@ -35,15 +35,6 @@ def test_once_finishes_the_state_parks_and_seals(spawn, partial_of, served, inta
     assert f"--resume {final}" in out
     assert simulation.true_angles_deg()["arm"] == pytest.approx(90, abs=0.01)
     assert not simulation.light()
-
-
-def test_aborted_capture_goes_on(spawn, partial_of, served, intact, tmp_path):
-    _, rig = served
-    child = spawn("--omega", 35, "--rig", rig, "--out", tmp_path / "out")
-    partial_of(tmp_path / "out", child, states=30)
-    child.send_signal(signal.SIGINT)
-    child.communicate(timeout=30)
-    (final,) = (tmp_path / "out").glob("*.h5")
     child = spawn("--resume", final)
     _, err = child.communicate(timeout=60)
     assert child.returncode == 0, err
