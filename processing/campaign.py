@@ -24,8 +24,8 @@ from processing.geometry.viewing import ViewingGeometry
 from processing.reduce import Progress
 from processing.tables import ScatteringTable
 
-#: A mosaic's interpolation reaches so far across the outline.
-BORDER_PX = 3
+#: The default demosaicing reaches so far across the outline (`processing.mosaic.methods.REACH`).
+BORDER_PX = 4
 
 
 @dataclass(frozen=True)

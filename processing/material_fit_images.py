@@ -18,8 +18,8 @@ from processing.product import Product
 
 #: At most so many pixels of each image go into a fit.
 PIXELS = 3000
-#: Pixels nearer than this to the outline are left out.
-BORDER_PX = 3
+#: Pixels nearer than this to the outline are left out: the default demosaicing reaches across it.
+BORDER_PX = 4
 
 
 def fit_products(sources: Sequence[Path], geometry_file: Path) -> tuple[MaterialFit, float, bool]:

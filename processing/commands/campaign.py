@@ -23,7 +23,7 @@ def campaign_command(
     stokes_geometry: Annotated[Path | None, typer.Option(help="Geometry of the Stokes camera, if another.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: FOLDER/campaign.")] = None,
     registered: Annotated[bool, typer.Option("--register", help="Find the sphere in the images.")] = False,
-    border: Annotated[int, typer.Option(min=0, help="Pixels along the outline that do not count.")] = 3,
+    border: Annotated[int, typer.Option(min=0, help="Pixels along the outline that do not count.")] = 4,
     workers: Annotated[int, typer.Option(min=1, help="Processes on this machine.")] = 1,
     scheduler: Annotated[str | None, typer.Option(help="Address of a dask.distributed scheduler.")] = None,
 ) -> None:

@@ -96,8 +96,9 @@ def test_workers_give_the_same_numbers(folder, here, configs, tmp_path):
     task = CaptureTask(str(folder / "drr_35.h5"), "mueller", str(tmp_path), *map(str, files), BORDER_PX)
     with executor(2) as pool:
         there = pool.submit(measure, task).result()
-    assert there.psi_deg == here.rows[0].psi_deg
-    assert there.magnitude_percent == here.rows[0].magnitude_percent
+    # Another process may cut the float32 products into other tiles: equal to their rounding, not to the bit.
+    assert there.psi_deg == pytest.approx(here.rows[0].psi_deg, rel=1e-6)
+    assert there.magnitude_percent == pytest.approx(here.rows[0].magnitude_percent, rel=1e-6)
 
 
 def test_a_cluster_gives_the_same_numbers(folder, here, configs, tmp_path):
