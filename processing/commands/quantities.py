@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
+
+if TYPE_CHECKING:
+    from processing.quantities import State
 
 
 def register(app: typer.Typer) -> None:
@@ -53,11 +56,12 @@ def quantities_command(
         typer.echo(f"figure: {figure}")
 
 
-def _pair(text: str):  # type: ignore[no-untyped-def]
+def _pair(text: str) -> tuple[str, tuple[State, State]]:
     from processing.errors import ProcessError
     from processing.quantities import STATES
 
-    states = tuple(part.strip() for part in text.split(","))
-    if len(states) != 2 or not set(states) <= set(STATES):
+    names = [part.strip() for part in text.split(",")]
+    if len(names) != 2 or not set(names) <= set(STATES):
         raise ProcessError(f"--pair {text!r}: give GENERATOR,ANALYZER, each one of: {', '.join(STATES)}")
-    return f"{states[0]}_to_{states[1]}", states
+    generator, analyzer = (cast("State", name) for name in names)
+    return f"{generator}_to_{analyzer}", (generator, analyzer)
