@@ -227,7 +227,7 @@ def test_a_slow_axis_fails_at_the_deadline(kind: str) -> None:
 
 def test_a_silent_device_fails_with_the_reason(kind: str) -> None:
     with served(kind, speed=2.0) as bench:
-        axis = bench.open(reply_s=0.06)
+        axis = bench.open(reply_s=0.15)
         motion = axis.start_move(90.0)
         bench.emulator.faults.add(Fault("silent"))
         with pytest.raises(MotionFailed, match="nothing within") as caught:
@@ -246,14 +246,14 @@ def test_a_passing_fault_never_gives_a_wrong_position(kind: str, fault: str) -> 
     """One spoiled reply, at every place of the exchange: the move ends right, or with an error."""
     right = 0
     with served(kind) as bench:
-        axis = bench.open(reply_s=0.03)
+        axis = bench.open(reply_s=0.1)
         for place in range(1, 13) if fault == "garbled" else (1, 4, 7, 10):
-            bench.emulator.faults.add(Fault(fault, from_command=place, commands=1, amount=0.04))  # type: ignore[arg-type]
+            bench.emulator.faults.add(Fault(fault, from_command=place, commands=1, amount=0.13))  # type: ignore[arg-type]
             target_deg = 7.0 * place
             try:
                 position = axis.start_move(target_deg).wait()
             except DeviceError:
-                time.sleep(0.05)
+                time.sleep(0.15)
                 if not axis.is_homed():
                     break
                 continue
@@ -268,7 +268,7 @@ def test_a_passing_fault_never_gives_a_wrong_position(kind: str, fault: str) -> 
 @pytest.mark.parametrize("fault", ["garbled", "foreign"])
 def test_a_lasting_fault_ends_in_an_error(kind: str, fault: str) -> None:
     with served(kind) as bench:
-        axis = bench.open(reply_s=0.03)
+        axis = bench.open(reply_s=0.1)
         bench.emulator.faults.add(Fault(fault))  # type: ignore[arg-type]
         with pytest.raises((ReplyError, ReplyTimeout, MotionFailed)):
             axis.start_move(33.0).wait()
