@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.diagnosis.problem import InstrumentProblem, Space, Sums
+from processing.diagnosis.problem import Problem, Space, Sums
 
 Array = NDArray[np.float64]
 
@@ -35,7 +35,7 @@ def prior(space: Space) -> Array:
 
 
 def minimize(
-    problem: InstrumentProblem,
+    problem: Problem,
     space: Space,
     start: Array,
     folds: Sequence[int] | None = None,
@@ -122,13 +122,13 @@ class HeldOut:
         return float(np.sqrt(self.square / self.count))
 
 
-def held_out(problem: InstrumentProblem, space: Space, full: Fit) -> HeldOut:
+def held_out(problem: Problem, space: Space, full: Fit) -> HeldOut:
     """Predict every fold from a fit to the other folds.
 
     Values that belong to one state alone cannot come from other states: where states are held out they are fitted to
     the state itself, and each takes away a degree of freedom (and counts one more, as fitted noise would gain).
     """
-    by_state = any(m.tiles is None for m in problem.moments)
+    by_state = problem.holds_out_states
     local = np.zeros(space.size, dtype=bool)
     for candidate, part in zip(space.candidates, space.slices, strict=True):
         local[part] = candidate.effect.per_state and by_state
@@ -161,7 +161,7 @@ def _one_step(full: Fit, space: Space, folds: Sequence[int]) -> Array:
     return np.asarray(np.clip(full.values - step, lower, upper))
 
 
-def covariance(problem: InstrumentProblem, space: Space, fit: Fit, spread: float) -> Array:
+def covariance(problem: Problem, space: Space, fit: Fit, spread: float) -> Array:
     """Covariance (K, K) of the values; `spread` scales the noise where structure is left over."""
     h = fit.sums.curvature.sum(axis=0) + np.diag(prior(space))
     return np.asarray(np.linalg.inv(h) * spread)

@@ -30,6 +30,10 @@ Array = NDArray[np.float64]
 
 #: Share of the excess that must be explained before anything is named while structure is left.
 SHARE = 0.97
+#: Share of the excess that one effect explains by itself, if it is to be named beside much that is unexplained; and
+#: standard deviations of the worst test that are not yet much.
+ALONE = 0.9
+MILD = 7.0
 #: Share of the scatter of values that belong to one state each which a single wave may hold, if they are to be random.
 ONE_WAVE = 0.6
 #: An information about a parameter below this, in chi-square for its typical size, is none.
@@ -98,7 +102,15 @@ def _unname(problem: InstrumentProblem, search: Search, found: Found, after: Seq
     structure = any(value > LIMIT for r in after for value in r.tests.values())
     structure |= not problem.noise_known and bool(found.effects)
     left = max(found.after.excess - problem.noise_known * 2 * search.noise_of(found.after), 0.0)
-    small = [c for c in found.effects if structure and found.gain.get(c, np.inf) < left]
+    worst = max((r.worst[1] for r in after if r.tests), default=np.inf)
+    alone = {t.candidate: found.before.excess - t.out.excess for t in found.ranking}
+    small = []
+    if structure and worst > MILD:
+        # With much structure left, several effects together may imitate one that is not in the list: only what
+        # explains nearly everything by itself keeps its name.
+        small = [c for c in found.effects if alone.get(c, 0.0) < ALONE * found.before.excess]
+    elif structure:
+        small = [c for c in found.effects if found.gain.get(c, np.inf) < left]
     part = dict(zip(found.space.candidates, found.space.slices, strict=True))
     waves = [c for c in found.effects if c.effect.per_state and _one_wave(found.fit.values[part[c]]) > ONE_WAVE]
     for candidate in (*small, *waves):
@@ -136,8 +148,7 @@ def _verdict(problem: InstrumentProblem, search: Search, found: Found, after: Se
         return "explained"
     unexplained = max(found.after.excess - problem.noise_known * 2 * search.noise_of(found.after), 0.0)
     explained = 1 - unexplained / max(found.before.excess, 1e-300)
-    named = [c for c in found.effects if c not in found.nameless]
-    sure = bool(named) and all(found.chance.get(c, 1.0) < CHANCE for c in named)
+    sure = all(found.chance.get(c, 1.0) < CHANCE for c in found.effects)
     return "partly_explained" if explained >= SHARE and sure else "unexplained"
 
 

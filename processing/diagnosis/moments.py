@@ -43,7 +43,7 @@ DERIVATIVE_NOISE = {
 FOLDS_OF_TILES = 2
 FOLDS_OF_STATES = 5
 #: Tiles along each side of the image, for effects and structure that vary over it.
-TILES = 10
+TILES = 16
 #: Captures with more rows, or fewer pixels, than these hold out states, others hold out tiles of the image.
 MOST_ROWS_FOR_TILES = 100
 FEWEST_PIXELS_FOR_TILES = 64

@@ -11,12 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.changes import Changes
-from processing.diagnosis.candidate import Candidate
+from processing.diagnosis.candidate import Candidate, nominal_values, pool
 from processing.diagnosis.capture_data import CaptureData
 from processing.diagnosis.moments import (
     DERIVATIVES,
@@ -89,6 +90,38 @@ class Space:
         return np.concatenate([np.zeros(0), *(getattr(c, name) for c in self.candidates)])
 
 
+class Problem(Protocol):
+    """What the search needs of measured data and a model.
+
+    Attributes
+    ----------
+    folds : parts that are held out in turn; `holds_out_states` says that the parts are states.
+    noise_known : the excess is in units of a known noise.
+    spread : see `Moments`.
+    """
+
+    folds: int
+    noise_known: bool
+    holds_out_states: bool
+    spread: float
+
+    def sums(self, space: Space, values: Array, *, derivatives: bool = True) -> Sums:
+        """Excess, and with `derivatives` its half gradient and curvature, of every fold."""
+        ...
+
+    def pool(self) -> tuple[Candidate, ...]:
+        """Every effect at every place."""
+        ...
+
+    def nominal(self) -> tuple[Candidate, ...]:
+        """Values that are always fitted, because the model gives them as nominal only."""
+        ...
+
+    def powers(self) -> list[tuple[int, Array]]:
+        """Rows that the unknowns leave over, and the power of each component of the signal, for each capture."""
+        ...
+
+
 class InstrumentProblem:
     """All captures against one instrument model, resolved at their wavelength."""
 
@@ -98,6 +131,34 @@ class InstrumentProblem:
         self.folds = FOLDS_OF_STATES if any(holds_out_states(c) for c in captures) else FOLDS_OF_TILES
         self.moments: tuple[Moments, ...] = tuple(moments_of(c, self.folds) for c in captures)
         self.noise_known = all(c.noise_known for c in captures)
+        self.holds_out_states = any(m.tiles is None for m in self.moments)
+        self.spread = max(m.spread for m in self.moments)
+
+    def nominal(self) -> tuple[Candidate, ...]:
+        """Values that the instrument file calls nominal, if a known sample is there to fit them to."""
+        known = any(c.sample is not None for c in self.captures)
+        return nominal_values(self.model, self.captures[0].conditions) if known else ()
+
+    def pool(self) -> tuple[Candidate, ...]:
+        """Every effect at every place of the captures."""
+        return pool(self.model, [c.conditions for c in self.captures])
+
+    def powers(self) -> list[tuple[int, Array]]:
+        """Rows that the unknowns leave over, and the power of each component of the signal, for each capture."""
+        out, empty = [], Space(())
+        for k, moments in enumerate(self.moments):
+            a = self.columns(k, self.changes(k, empty, np.zeros(0)))
+            u, size, _ = np.linalg.svd(a, full_matrices=False)
+            q = u[:, size > RANK * size[0]]
+            z = np.concatenate(
+                [b.counts for b in moments.blocks[:: self.folds if moments.tiles is None else 1]], axis=1
+            )
+            part = q.T @ (z / moments.sigma[:, None])
+            power = np.maximum(np.linalg.eigvalsh(part @ part.T), 0.0)
+            # With a single state, structure can vary over the image only.
+            patches = moments.tiles.x.size if moments.tiles and self.captures[k].conditions.states == 1 else 1
+            out.append(((a.shape[0] - q.shape[1]) * patches, power + 1e-300))
+        return out
 
     def changes(self, capture: int, space: Space, values: Array) -> Changes:
         """Changes of one capture with the instrument's own effects and the active candidates."""

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from processing.diagnosis.candidate import Candidate, nominal_values, pool
+from processing.diagnosis.candidate import Candidate
 from processing.diagnosis.fit import Fit, HeldOut, held_out, minimize, prior, score
-from processing.diagnosis.problem import InstrumentProblem, Space
+from processing.diagnosis.problem import Problem, Space
 
 Array = NDArray[np.float64]
 #: Called with a line that says what is being done.
@@ -87,12 +87,10 @@ class Found:
 class Search:
     """The search over the effects in one problem."""
 
-    def __init__(self, problem: InstrumentProblem, say: Say) -> None:
+    def __init__(self, problem: Problem, say: Say) -> None:
         self.problem, self.say = problem, say
-        conditions = [c.conditions for c in problem.captures]
-        known = any(c.sample is not None for c in problem.captures)
-        self.base = Space(nominal_values(problem.model, conditions[0]) if known else ())
-        self.pool = pool(problem.model, conditions)
+        self.base = Space(problem.nominal())
+        self.pool = problem.pool()
         self.n0 = 1.0 if problem.noise_known else 0.0
         self._power: list[tuple[int, Array]] | None = None
 
@@ -142,23 +140,8 @@ class Search:
         return weighty, max(visible, weighty)
 
     def _powers(self) -> list[tuple[int, Array]]:
-        """Rows that the unknowns leave over, and the power of each component of the signal, for each capture."""
         if self._power is None:
-            self._power, empty = [], Space(())
-            for k, moments in enumerate(self.problem.moments):
-                a = self.problem.columns(k, self.problem.changes(k, empty, np.zeros(0)))
-                u, size, _ = np.linalg.svd(a, full_matrices=False)
-                q = u[:, size > 1e-8 * size[0]]
-                z = np.concatenate(
-                    [b.counts for b in moments.blocks[:: self.problem.folds if moments.tiles is None else 1]], axis=1
-                )
-                part = q.T @ (z / moments.sigma[:, None])
-                power = np.maximum(np.linalg.eigvalsh(part @ part.T), 0.0)
-                # With a single state, structure can vary over the image only.
-                patches = (
-                    moments.tiles.x.size if moments.tiles and self.problem.captures[k].conditions.states == 1 else 1
-                )
-                self._power.append(((a.shape[0] - q.shape[1]) * patches, power + 1e-300))
+            self._power = self.problem.powers()
         return self._power
 
     def _testable(self, candidate: Candidate, space: Space, excess: float) -> bool:
@@ -205,7 +188,9 @@ class Search:
         counts = [c for c in plain if c.effect.corrects_counts]
         groups = [counts, [c for c in plain if c not in counts]]
         if any(c in tiled for c in space.candidates):
-            groups = [[c] for c in plain]
+            # Every tile has its own matrix then: a few candidates at a time, and no slips at every state.
+            light = [c for c in plain if not c.effect.corrects_counts and "@" not in c.place]
+            groups = [light[k : k + 8] for k in range(0, len(light), 8)]
         groups += [[c] for c in offered if c.kind == "field_retardance"]
         for group in groups:
             both = Space((*space.candidates, *group))
@@ -253,7 +238,7 @@ class Search:
 
     def noise_of(self, out: HeldOut) -> float:
         """Standard deviation of the excess if there is nothing but noise."""
-        return float(np.sqrt(2 * out.freedom * max(m.spread for m in self.problem.moments)))
+        return float(np.sqrt(2 * out.freedom * self.problem.spread))
 
     def structure(self, after: HeldOut, parameters: int) -> float:
         """Chi-square for each direction of structure that is left beyond two standard deviations of the noise."""

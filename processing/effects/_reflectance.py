@@ -1,0 +1,27 @@
+"""What effects of the reflectance model share: they bend the dominant process and have no place in an instrument."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+
+from processing.changes import Changes, Conditions
+from processing.effects.base import Array, Effect, EffectError
+from processing.instrument import InstrumentModel
+from processing.reflectance_changes import ReflectanceChanges
+
+
+class ReflectanceEffect(Effect):
+    """An effect of the paper's model in place of the instrument's."""
+
+    group = "reflectance"
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        return ()
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        raise EffectError(f"effect {self.kind!r} belongs to a reflectance model, not to an instrument file")
+
+    @abstractmethod
+    def bend(self, changes: ReflectanceChanges, values: Array) -> None:
+        """Add the effect of `values` to the changes."""
