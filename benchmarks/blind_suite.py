@@ -22,8 +22,8 @@ def one(capture: str) -> tuple[str, dict]:
     """Diagnose one capture with the instrument model that it declares."""
     from processing.capture import Capture
     from processing.diagnosis.run import diagnose_captures
-    from processing.yaml_file import parse_yaml
     from processing.instrument import InstrumentModel
+    from processing.yaml_file import parse_yaml
 
     path = Path(capture)
     with Capture(path) as source:

@@ -31,6 +31,11 @@ class ReflectanceChanges:
     generator_rad : the generator's polarization is turned by this.
     twice : weight of light that met two facets, relative to the dominant process.
     volume : share of a dipole's amplitudes in the first-surface term.
+    index : added to the refractive index.
+
+    What only an object in front of a camera has (`processing.diagnosis.surface_view`):
+    centre_mm, scale : the sphere stands off its place by (x, y), and is larger by this part of its radius.
+    support : depolarized light from below, over the mean signal.
     """
 
     diffuse_a: float = 0.0
@@ -40,10 +45,15 @@ class ReflectanceChanges:
     generator_rad: float = 0.0
     twice: float = 0.0
     volume: float = 0.0
+    index: complex = 0j
+    centre_mm: tuple[float, float] = (0.0, 0.0)
+    scale: float = 0.0
+    support: float = 0.0
 
     def dominant(self, geometry: ScatteringGeometry, index: complex) -> Array:
         """Dominant process (N, 4, 4), element 00 equal to 1, in the axes that the geometry states."""
-        g = self._moved(geometry)
+        g, index = self._moved(geometry), index + self.index
+        index = complex(max(index.real, 0.05), max(index.imag, 0.0))
         jones = fresnel.jones(g, index)
         if self.volume:
             # Fresnel's ratio of amplitudes at an index near one is that of a dipole.

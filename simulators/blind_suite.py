@@ -107,12 +107,12 @@ def _case(folder: Path, name: str, group: str, chosen: list[str], random: np.ran
 
 def _angles(states: int, mosaic: bool, zigzag: bool) -> dict[str, Array]:
     step = 360.0 / states if not mosaic else 180.0 / states
-    psg = step * np.arange(states)
+    psg = np.asarray(step * np.arange(states), dtype=np.float64)
     order = np.arange(states)
     if zigzag:
         # Every third step goes back: states are reached from both sides.
         order = np.concatenate([g[::-1] for g in np.array_split(order, max(states // 3, 1))])
-    return {"psg": psg[order], "psa": 4.91 * psg[order]}
+    return {"psg": np.asarray(psg[order]), "psa": np.asarray(4.91 * psg[order])}
 
 
 def _excess(bench: Bench, scene: Scene, angles: dict[str, Array], air: bool, instrument: Path) -> float:

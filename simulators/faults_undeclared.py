@@ -282,7 +282,7 @@ def fly(bench: Bench, random: np.random.Generator, states: int) -> Truth:
     def shadow(k: int, e: Array) -> Array:
         on = first <= k < first + 5
         step = k - first
-        return e * (1 - 0.6 * on * (np.hypot(x - x0 - step, y - y0 + step) < radius))
+        return np.asarray(e * (1 - 0.6 * on * (np.hypot(x - x0 - step, y - y0 + step) < radius)))
 
     bench.light.append(shadow)
     return Truth("fly")

@@ -119,7 +119,7 @@ class Bench:
         for k in self.band:
             plate = retarder_jones(angles["psa"] + self.oa, d * k, *self.fast_slow_a)
             rows.append(_analyzer(polarizer_jones(self.lp, self.extinction_a) @ plate))
-        return np.mean(rows, axis=0)[None]
+        return np.asarray(np.mean(rows, axis=0)[None])
 
 
 def _analyzer(jones: Complex) -> Array:
@@ -197,7 +197,7 @@ def expose(bench: Bench, scene: Scene, angles_deg: dict[str, Array]) -> Array:
     for k in range(n):
         for change in bench.light:
             out[k] = change(k, out[k])
-    return out
+    return np.asarray(out)
 
 
 def _on_mosaic(light: Array) -> Array:
@@ -214,7 +214,8 @@ def digitize(bench: Bench, electrons: Array, random: np.random.Generator) -> NDA
     for curve in bench.transfer:
         found = curve(found)
     found = found + bench.read_noise * random.standard_normal(found.shape)
-    return np.clip(np.rint(found / bench.gain + BLACK), 0, 2**BITS - 1).astype(np.uint16)
+    counts = np.clip(np.rint(found / bench.gain + BLACK), 0, 2**BITS - 1)
+    return np.asarray(counts, dtype=np.uint16)
 
 
 def write_capture(

@@ -110,7 +110,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
         noise_source="not known: too few pixels and no detector constants; the residual itself is the measure",
         clipped=clipped,
         clipped_states=clipped_states,
-        usable=np.isfinite(raw).all(axis=(0, 1)),
+        usable=np.asarray(np.isfinite(raw).all(axis=(0, 1))),
         simulated=capture.simulated,
         wavelength_nm=capture.header.wavelength_nm,
     )
@@ -140,18 +140,18 @@ def _frames(
             over = (frame >= level).any(axis=0)
             clipped |= over
             clipped_states[n] = over.any()
-        frame -= np.float32(correction.black) if np.isscalar(correction.black) else np.asarray(correction.black)
+        frame -= np.asarray(correction.black, dtype=np.float32)
         frames.append(frame if correction.flat is None else frame / correction.flat)
     raw = np.stack(frames)
     if model.mosaic is None:
-        return raw, clipped, clipped_states
+        return raw, np.asarray(clipped), clipped_states
     rows, columns = len(model.mosaic), len(model.mosaic[0])
     height, width = raw.shape[2] // rows * rows, raw.shape[3] // columns * columns
     raw = raw[:, :, :height, :width]
     where = {name: (r, c) for r, line in enumerate(model.mosaic) for c, name in enumerate(line)}
     planes = [raw[:, 0, where[c.name][0] :: rows, where[c.name][1] :: columns] for c in model.channels]
     blocks = clipped[:height, :width].reshape(height // rows, rows, width // columns, columns)
-    return np.stack(planes, axis=1), blocks.any(axis=(1, 3)), clipped_states
+    return np.stack(planes, axis=1), np.asarray(blocks.any(axis=(1, 3))), clipped_states
 
 
 def _clip_level(capture: Capture, correction: Correction) -> float | None:

@@ -158,7 +158,7 @@ def _white(r: Residual) -> bool:
         return True
     centred = mean - mean.mean()
     lag = float(centred[1:] @ centred[:-1] / (centred @ centred))
-    return abs(lag) * np.sqrt(mean.size) < WHITE
+    return bool(abs(lag) * np.sqrt(mean.size) < WHITE)
 
 
 def _error(problem: InstrumentProblem, out: object) -> Error:

@@ -62,7 +62,8 @@ class Sums:
     def empty(cls, folds: int, parameters: int) -> Sums:
         """All zero."""
         f, k = folds, parameters
-        return cls(*(np.zeros(f) for _ in range(4)), np.zeros((f, k)), np.zeros((f, k, k)))
+        zero = np.zeros(f)
+        return cls(zero, zero.copy(), zero.copy(), zero.copy(), np.zeros((f, k)), np.zeros((f, k, k)))
 
 
 @dataclass
@@ -331,7 +332,7 @@ def add_response(counts: Array, coefficients: Array, a: Array) -> Array:
         q = u[:, size > RANK * size[0]]
         fitted = (q @ (q.T @ counts.reshape(counts.shape[0], -1))).reshape(counts.shape)
         z[-DERIVATIVES:] = image_derivatives(fitted)
-    return np.einsum("fl,flhw->lhw", coefficients, z)
+    return np.asarray(np.einsum("fl,flhw->lhw", coefficients, z))
 
 
 def _tiled(changes: Changes, count: int, states: int) -> Changes:

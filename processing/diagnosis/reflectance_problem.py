@@ -1,7 +1,7 @@
 """Measured reflectance against the paper's triply degenerate model with first-surface reflection.
 
 Each point has its own throughput and depolarization: intensities = W [m0 mID] alpha with two free coefficients, which
-are projected out; what is left depends on the dominant process m0 alone. The search over effects is that of instruments.
+are projected out; what is left depends on the dominant process m0 alone. The search is that of instruments.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class ReflectanceProblem:
         a = np.stack(
             [
                 m @ self.w.T,
-                np.broadcast_to(self.w @ mueller.IDEAL_DEPOLARIZER.reshape(16), m.shape[:1] + (len(self.w),)),
+                np.broadcast_to(self.w @ mueller.IDEAL_DEPOLARIZER.reshape(16), (*m.shape[:1], len(self.w))),
             ],
             axis=-1,
         )

@@ -75,7 +75,7 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
         free[:, mask] = (1 - np.sum(q * q, axis=1))[:, None]
     noise = variance / level[:, None, None] ** 2 / np.maximum(variance.mean(axis=0), 1e-300)
     expected = (free * noise).astype(np.float32)
-    good = np.isfinite(r).all(axis=0)
+    good = np.asarray(np.isfinite(r).all(axis=0))
     tests = _tests(r, signal, expected, good, a.shape[1], moments.spread, data.noise_known)
     n, channels = data.signal.shape[:2]
     mean = r[:, good].mean(axis=1) if good.any() else np.zeros(rows)

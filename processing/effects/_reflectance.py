@@ -22,6 +22,14 @@ class ReflectanceEffect(Effect):
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         raise EffectError(f"effect {self.kind!r} belongs to a reflectance model, not to an instrument file")
 
+    def places_on(self, shape: str) -> Sequence[str]:
+        """Where it can act on an object in front of a camera: `shape` is "sphere", "flat" or "mesh"."""
+        return ("",)
+
+    def bend_at(self, changes: ReflectanceChanges, place: str, values: Array) -> None:
+        """`bend`, for an effect that has more than one place."""
+        self.bend(changes, values)
+
     @abstractmethod
     def bend(self, changes: ReflectanceChanges, values: Array) -> None:
         """Add the effect of `values` to the changes."""

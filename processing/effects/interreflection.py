@@ -6,6 +6,8 @@ Mend: black cloth around the object, a thin pin as support; leave concave parts 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from processing.changes import Conditions
 from processing.effects._reflectance import ReflectanceEffect
 from processing.effects.base import Array, Parameter
@@ -14,10 +16,25 @@ from processing.reflectance_changes import ReflectanceChanges
 
 
 class This(ReflectanceEffect):
-    """Weight of light that met two facets over that which met one."""
+    """Weight of light that met two facets over that which met one; place "support": light from below.
+
+    The support's light arrives depolarized and leaves the surface polarized as a first surface does it; its weight is
+    the polarized part where it falls straight on the surface, over the mean signal.
+    """
+
+    def places_on(self, shape: str) -> Sequence[str]:
+        return ("", "support")
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        if place == "support":
+            return (Parameter("support", "1", -0.05, 2.0, 0.02),)
         return (Parameter("twice", "1", -0.05, 1.0, 0.05),)
 
     def bend(self, changes: ReflectanceChanges, values: Array) -> None:
         changes.twice += float(values[0])
+
+    def bend_at(self, changes: ReflectanceChanges, place: str, values: Array) -> None:
+        if place == "support":
+            changes.support += float(values[0])
+        else:
+            self.bend(changes, values)

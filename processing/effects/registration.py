@@ -6,6 +6,8 @@ Mend: register again on the outline (`process geometry`), put the object back on
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from processing.changes import Conditions
@@ -16,11 +18,28 @@ from processing.reflectance_changes import ReflectanceChanges
 
 
 class This(ReflectanceEffect):
-    """Turn of all normals in degrees; on a sphere of radius R pixels one pixel is 57.3/R degrees at its centre."""
+    """Offset in mm (x to the right, y up) and relative size of a sphere; of bare points, turn of all normals (degrees).
+
+    Size stands for the camera's scale as well: one image cannot tell the two apart.
+    """
+
+    def places_on(self, shape: str) -> Sequence[str]:
+        return ("sphere",) if shape == "sphere" else ("",)
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        if place == "sphere":
+            offsets = (Parameter(n, "mm", -2.0, 2.0, 0.2) for n in ("x", "y"))
+            return (*offsets, Parameter("scale", "1", -0.1, 0.1, 0.01))
         return (Parameter("about_y", "degree", -10, 10, 0.5), Parameter("about_x", "degree", -10, 10, 0.5))
 
     def bend(self, changes: ReflectanceChanges, values: Array) -> None:
         y, x = np.deg2rad(values)
         changes.tilt_rad = (changes.tilt_rad[0] + float(y), changes.tilt_rad[1] + float(x))
+
+    def bend_at(self, changes: ReflectanceChanges, place: str, values: Array) -> None:
+        if place != "sphere":
+            self.bend(changes, values)
+            return
+        x, y, scale = (float(v) for v in values)
+        changes.centre_mm = (changes.centre_mm[0] + x, changes.centre_mm[1] + y)
+        changes.scale += scale

@@ -1,7 +1,7 @@
 """Light that was scattered inside the volume behaves like a dipole's, not like a reflection at the surface.
 
-Cause: small scatterers near the surface of a white, porous or pigmented material (PTFE, plaster, paper). The ratio of the
-amplitudes across and along the plane of scattering is then cos(2 theta_d), which is Fresnel's for an index near one.
+Cause: small scatterers near the surface of a white, porous or pigmented material (PTFE, plaster, paper). The ratio
+of the amplitudes across and along the plane of scattering is then cos(2 theta_d), which is Fresnel's for an index near one.
 Mend: take the material's dominant process from measurement; a first-surface index near one imitates it.
 """
 
@@ -15,7 +15,7 @@ from processing.reflectance_changes import ReflectanceChanges
 
 
 class This(ReflectanceEffect):
-    """Share of the dipole's Jones matrix in the sum with the first surface's, both of unit strength; 1 is all dipole."""
+    """Share of the dipole's Jones matrix beside the first surface's, both of unit strength; 1 is all dipole."""
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         return (Parameter("share", "1", -1.0, 4.0, 0.2),)

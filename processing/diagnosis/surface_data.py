@@ -1,0 +1,170 @@
+"""Pixels of a capture that see the object, ready to be compared with the triply degenerate model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from processing.capture import Capture
+from processing.changes import Conditions
+from processing.diagnosis.capture_data import CaptureData, read_capture
+from processing.diagnosis.surface_view import SurfaceView
+from processing.errors import ProcessError
+from processing.geometry.pinhole import PinholeCamera
+from processing.geometry.viewing import ViewingGeometry
+from processing.instrument import InstrumentModel
+from processing.reflectance.base import ReflectanceModel
+
+Array = NDArray[np.float64]
+
+#: Pixels of a capture that are used, evenly spread.
+MOST_PIXELS = 4000
+FEWEST_PIXELS = 100
+#: Rim that is left out, as part of the object's radius and in pixels of the camera: an object off its place, and
+#: interpolation of a mosaic, would mix object and background there.
+RIM, RIM_PX = 0.06, 6
+#: Pixels darker than this part of the median are shadow or background.
+DARK = 0.1
+#: Tiles along each side of the object, half of them held out in turn.
+TILES = 8
+FOLDS = 2
+
+
+@dataclass(frozen=True)
+class SurfaceData:
+    """Pixels (P,) of one capture.
+
+    Attributes
+    ----------
+    y : (P, L) signals of all states and channels over full scale.
+    variance : (P, L) expected of their noise, from the signals themselves.
+    slope, floor : (L,) variance of a signal u is slope * u + floor.
+    exposure : (L,) relative exposure of each row.
+    fold, tile : (P,).
+    where : (P, 2) row and column of each pixel in an image of `shape`.
+    """
+
+    name: str
+    view: SurfaceView
+    y: Array
+    variance: Array
+    slope: Array
+    floor: Array
+    exposure: Array
+    conditions: Conditions
+    fold: NDArray[np.int64]
+    tile: NDArray[np.int64]
+    where: NDArray[np.int64]
+    shape: tuple[int, int]
+    noise: str
+    simulated: bool
+    wavelength_nm: float
+    omega_deg: float
+    clipped_fraction: float
+
+
+def read_surface(
+    capture: Capture, model: InstrumentModel, view: ViewingGeometry, material: ReflectanceModel
+) -> SurfaceData:
+    """Read the pixels of a capture that see the object.
+
+    Raises
+    ------
+    ProcessError : no arm angle, no noise, or too few pixels of the object.
+    """
+    data, omega = read_capture(capture, model), capture.header.omega_deg
+    if omega is None:
+        raise ProcessError(f"{capture.path}: the capture does not say its arm angle; import it with --omega-deg.")
+    if not data.noise_known:
+        raise ProcessError(
+            f"{capture.path}: its noise is not known, and without it no effect of the reflectance can be told from "
+            "chance. Give the detector's gain and read noise in the capture's header."
+        )
+    cell = 1 if model.mosaic is None else len(model.mosaic)
+    signal, share = _at_cell_centres(data, model) if cell > 1 else (data.signal, np.ones(data.signal.shape[1]))
+    height, width = signal.shape[2:]
+    rows, columns = capture.frame_shape
+    camera = _grid(view.camera.resized(rows, columns), cell * data.binned, height, width)
+    picked = _pick(data, signal, view.model_copy(update={"camera": camera}), omega, cell)
+    where = np.argwhere(picked)
+    if len(where) < FEWEST_PIXELS:
+        raise ProcessError(
+            f"{capture.path}: {len(where)} pixels see the lit object well within its outline; "
+            f"{FEWEST_PIXELS} are needed. Check the geometry file and the arm angle ({omega:g} degrees)."
+        )
+    y = signal[:, :, picked].astype(np.float64).reshape(-1, len(where)).T
+    channels = signal.shape[1]
+    share = np.tile(share, data.conditions.states)
+    slope, floor = np.repeat(data.slope, channels) * share, np.repeat(data.floor, channels) * share
+    low = where.min(axis=0)
+    tiles = (where - low) * TILES // (where.max(axis=0) - low + 1)
+    return SurfaceData(
+        name=data.name,
+        view=SurfaceView(view, camera, picked, omega, material, data.wavelength_nm),
+        y=y,
+        variance=slope * np.maximum(y, 0) + floor,
+        slope=slope,
+        floor=floor,
+        exposure=data.row_exposure,
+        conditions=data.conditions,
+        fold=tiles.sum(axis=1) % FOLDS,
+        tile=tiles[:, 0] * TILES + tiles[:, 1],
+        where=where,
+        shape=(height, width),
+        noise=data.noise_source,
+        simulated=data.simulated,
+        wavelength_nm=data.wavelength_nm,
+        omega_deg=omega,
+        clipped_fraction=float(np.mean(data.clipped)),
+    )
+
+
+def _pick(
+    data: CaptureData, signal: NDArray[np.float32], view: ViewingGeometry, omega: float, cell: int
+) -> NDArray[np.bool_]:
+    mask = view.at(omega).mask
+    if not mask.any():
+        raise ProcessError(f"{data.name}: no pixel sees a lit point of the object at Omega {omega:g} degrees.")
+    mean = signal.mean(axis=(0, 1), dtype=np.float64)
+    lit = mean > DARK * np.median(mean[mask])
+    rim = int(np.ceil(max(RIM * np.sqrt(mask.sum() / np.pi), RIM_PX / (cell * data.binned))))
+    inside = ndimage.binary_erosion(mask & lit, iterations=rim)
+    good = inside & data.usable & ~ndimage.binary_dilation(data.clipped, iterations=1)
+    # Neighbours of an interpolated mosaic share pixels; every second one does not.
+    step = max(int(np.ceil(np.sqrt(good.sum() / MOST_PIXELS))), 2 if cell > 1 else 1)
+    grid = np.zeros_like(good)
+    grid[::step, ::step] = True
+    return np.asarray(good & grid)
+
+
+def _at_cell_centres(data: CaptureData, model: InstrumentModel) -> tuple[NDArray[np.float32], Array]:
+    """Signals of all channels at the centres of the mosaic's cells, and the part of their variance that is left.
+
+    Each channel is interpolated linearly between its two neighbours along rows and columns; the curvature of the
+    image then changes all channels alike, so that no false polarization comes from it.
+    """
+    mosaic = model.mosaic or ()
+    if any(len(line) != 2 for line in mosaic) or len(mosaic) != 2:
+        raise ProcessError("effects of the reflectance are sought in mosaics of 2 x 2 pixels only.")
+    where = {name: (r, c) for r, line in enumerate(mosaic) for c, name in enumerate(line)}
+    far = 0.25 / data.binned
+    out = np.empty_like(data.signal)
+    for k, channel in enumerate(model.channels):
+        plane = data.signal[:, k]
+        for axis, offset in zip((1, 2), where[channel.name], strict=True):
+            # The rolled edge is outside of what is used.
+            plane = (1 - far) * plane + far * np.roll(plane, 1 if offset else -1, axis=axis)
+        out[:, k] = plane
+    return out, np.full(len(model.channels), ((1 - far) ** 2 + far**2) ** 2)
+
+
+def _grid(camera: PinholeCamera, side: int, height: int, width: int) -> PinholeCamera:
+    """The camera with pixels `side` times as large, counted from the same corner."""
+    row, column = camera.axis_px
+    centre = ((row + 0.5) / side - 0.5, (column + 0.5) / side - 0.5)
+    return camera.model_copy(
+        update={"rows": height, "columns": width, "pixel_mm": camera.pixel_mm * side, "centre_px": centre}
+    )

@@ -1,0 +1,23 @@
+"""The surface's refractive index is not the one of the material file.
+
+Cause: an index from a table for another batch, wavelength, paint or finish; an oxide or an oil film.
+Mend: fit it (`process fit-material`), or measure it on a polished piece with an ellipsometer.
+"""
+
+from __future__ import annotations
+
+from processing.changes import Conditions
+from processing.effects._reflectance import ReflectanceEffect
+from processing.effects.base import Array, Parameter
+from processing.instrument import InstrumentModel
+from processing.reflectance_changes import ReflectanceChanges
+
+
+class This(ReflectanceEffect):
+    """What has to be added to n and k."""
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return (Parameter("n", "1", -1.0, 3.0, 0.05), Parameter("k", "1", -1.0, 3.0, 0.05))
+
+    def bend(self, changes: ReflectanceChanges, values: Array) -> None:
+        changes.index += complex(*values)

@@ -1,0 +1,153 @@
+"""Every effect of the folder: nothing at zero, units and bounds that make sense, a derivative that is one, a cause."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from processing.changes import Changes, Conditions
+from processing.diagnosis.candidate import Candidate
+from processing.diagnosis.capture_data import CaptureData
+from processing.diagnosis.problem import InstrumentProblem, Space
+from processing.effects._reflectance import ReflectanceEffect
+from processing.effects.base import EffectError, all_effects, apply_to, changes_of
+from processing.instrument import AppliedEffect, EffectParameter, InstrumentModel
+from processing.reflectance_changes import ReflectanceChanges
+
+ISSUE = """psg_retardance psa_retardance psg_azimuth psa_azimuth analyzer_azimuth psg_extinction psa_extinction
+retarder_diattenuation retarder_transmission generator_ellipticity field_retardance stray_light rotation_eccentricity
+rotation_ratio rotation_backlash rotation_slip angle_per_state source_drift source_flicker detector_nonlinearity
+detector_offset saturation image_drift beam_wander channel_gain channel_azimuth channel_extinction pixel_crosstalk
+tone_curve polarized_diffuse registration arm_zero illumination_azimuth interreflection""".split()
+INSTRUMENT_KINDS = [k for k, e in all_effects().items() if e.group != "reflectance"]
+REFLECTANCE_KINDS = [k for k, e in all_effects().items() if e.group == "reflectance"]
+
+
+def test_the_list_is_complete():
+    assert set(ISSUE) <= set(all_effects())
+
+
+@pytest.mark.parametrize("kind", all_effects())
+def test_says_what_causes_and_what_mends_it(kind):
+    text = __import__(f"processing.effects.{kind}", fromlist=["x"]).__doc__ or ""
+    assert "Cause" in text
+    assert "Mend" in text
+
+
+def data(configs: Path, kind: str) -> tuple[InstrumentModel, CaptureData]:
+    """A small noisy capture of an instrument in which the effect has a place; states come from both sides."""
+    random = np.random.default_rng(1)
+    mosaic = kind.startswith(("channel", "pixel"))
+    file = {True: "mosaic_polarimeter", False: "rgb950"}[mosaic]
+    if kind == "analyzer_transmission":
+        file = "drr_imaging_630nm"
+    model = InstrumentModel.load(configs / f"instruments/{file}.yaml")
+    model = model.at((model.wavelengths_nm or (662,))[2 if file == "rgb950" else 0])
+    n = 24
+    angles = {axis: np.sort(random.uniform(0, 360, n))[np.arange(n) ^ 1] for axis in model.axes}
+    conditions = Conditions(angles, n, tuple(c.name for c in model.channels), np.linspace(-0.5, 0.5, n), 4000.0)
+    m = np.eye(4).reshape(16) + 0.1 * random.normal(size=(144, 16))
+    signal = np.einsum("ncj,pj->ncp", model.rows(angles), m).reshape(n, -1, 12, 12) + 0.2
+    signal += 0.003 * random.normal(size=signal.shape)
+    clipped = np.zeros((12, 12), dtype=bool)
+    clipped[4, 4] = True
+    capture = CaptureData(
+        name="test",
+        signal=signal.astype(np.float32),
+        conditions=conditions,
+        exposure=np.ones(n),
+        sample=np.eye(4).reshape(16),
+        slope=np.full(n, 1e-5),
+        floor=np.full(n, 1e-6),
+        noise_known=True,
+        noise_source="",
+        clipped=clipped,
+        clipped_states=np.arange(n) == 3,
+        usable=np.ones((12, 12), dtype=bool),
+        simulated=True,
+        wavelength_nm=662.0,
+    )
+    return model, capture
+
+
+@pytest.mark.parametrize("kind", INSTRUMENT_KINDS)
+def test_identity_at_zero_and_bounds(kind, configs):
+    effect = all_effects()[kind]
+    model, capture = data(configs, kind)
+    places = effect.places(model, capture.conditions)
+    assert places
+    changes = Changes(capture.conditions)
+    parameters = effect.parameters(model, capture.conditions, places[0])
+    effect.apply(changes, model, places[0], np.zeros(len(parameters)))
+    assert model.rows(capture.conditions.angles_deg, changes) == pytest.approx(
+        model.rows(capture.conditions.angles_deg), abs=1e-15
+    )
+    assert not any(np.any(v) for v in changes.response.values())
+    assert not np.any(changes.shift_px)
+    assert not changes.drop_clipped
+    assert not any(np.any(v) for v in changes.field_retardance_rad.values())
+    for p in parameters:
+        assert p.lower <= 0 < p.upper
+        assert 0 < p.typical <= p.upper
+        assert p.unit in ("1", "degree", "pixel", "count")
+
+
+@pytest.mark.parametrize("kind", [k for k in INSTRUMENT_KINDS if not all_effects()[k].switch])
+def test_derivative_is_the_slope_of_the_excess(kind, configs):
+    model, capture = data(configs, kind)
+    problem = InstrumentProblem(model, [capture])
+    effect = all_effects()[kind]
+    place = effect.places(model, capture.conditions)[-1]
+    parameters = effect.parameters(model, capture.conditions, place)
+    space = Space((Candidate(effect, place, parameters, 0 if effect.scope == "capture" else None),))
+    at = 0.3 * space.joined("typical") * np.random.default_rng(2).uniform(0.5, 1, space.size)
+    gradient = 2 * problem.sums(space, at).gradient.sum(axis=0)
+    for j in np.unique([0, space.size - 1]):
+        step = np.zeros(space.size)
+        step[j] = 1e-4 * space.joined("typical")[j]
+        up, down = (problem.sums(space, at + s, derivatives=False).excess.sum() for s in (step, -step))
+        slope = (up - down) / (2 * step[j])
+        scale = abs(gradient).max() + 1.0 / space.joined("typical")[j]
+        # The noise of second derivatives is left out of the slope of image shifts (a share of a percent).
+        assert gradient[j] == pytest.approx(slope, abs=0.02 * scale)
+
+
+@pytest.mark.parametrize("kind", REFLECTANCE_KINDS)
+def test_reflectance_effects_do_nothing_at_zero_and_something_elsewhere(kind, configs):
+    from simulators.scene import Scene
+
+    scene = Scene.load(configs / "scenes/red_sphere.yaml")
+    geometry = scene.truth(35, 662, 24, 24).geometry.points
+    effect = all_effects()[kind]
+    assert isinstance(effect, ReflectanceEffect)
+    plain = ReflectanceChanges().dominant(geometry, 1.3 + 0.08j)
+    model, capture = data(configs, "psg_azimuth")
+    parameters = effect.parameters(model, capture.conditions, "")
+    changes = ReflectanceChanges()
+    effect.bend(changes, np.zeros(len(parameters)))
+    assert changes.dominant(geometry, 1.3 + 0.08j) == pytest.approx(plain, abs=1e-12)
+    effect.bend(changes, np.array([p.typical for p in parameters]))
+    moved = changes.dominant(geometry, 1.3 + 0.08j)
+    # Registration acts through theta_h, which the first surface does not know (trap 1).
+    assert np.abs(moved - plain).max() > 1e-3 or kind == "registration"
+
+
+def test_an_effect_of_one_capture_holds_for_that_capture_only(configs):
+    model, capture = data(configs, "source_drift")
+    drift = AppliedEffect(
+        kind="source_drift",
+        scope="capture",
+        captures=("one",),
+        parameters={"fraction": EffectParameter(value=0.1, unit="1")},
+    )
+    changed = model.model_copy(update={"effects": (drift,)})
+    assert np.ptp(changes_of(changed, capture.conditions, "one").gain) == pytest.approx(0.1)
+    assert np.ptp(changes_of(changed, capture.conditions, "another").gain) == 0
+    assert changed.rows(capture.conditions.angles_deg) == pytest.approx(model.rows(capture.conditions.angles_deg))
+
+
+@pytest.mark.parametrize(("kind", "element"), [("gremlin", None), ("psg_azimuth", "lens"), ("psg_azimuth", None)])
+def test_unknown_effects_are_refused(kind, element, configs):
+    model, capture = data(configs, "psg_azimuth")
+    with pytest.raises(EffectError):
+        apply_to(Changes(capture.conditions), model, AppliedEffect(kind=kind, element=element, parameters={}))
