@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import logging
-import math
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
-
-import numpy as np
 
 from acquisition.cleanup import Step, run_all
 from acquisition.errors import AcquisitionError
@@ -24,14 +20,11 @@ from drivers.registry import open_axis
 from drivers.serial_link import LineRegistry
 from drivers.source import LightSource
 from drivers.sources.manual import Ask, ManualSource
-from processing.states import StateTable
 from simulators.rig import SimulatedRig
 from simulators.rig_model import SCHEME
 
 log = logging.getLogger(__name__)
 
-#: An endless axis unwinds once it has come this far: position counters are not endless.
-ENDLESS_UP_TO_DEG = 36_000.0
 #: Shortest pause between two looks at a moving axis.
 SHORTEST_LOOK_S = 0.002
 #: Longest wait for moves that were started and given up.
@@ -158,14 +151,12 @@ class Rig:
         """Names of the axes without a reference, in homing order."""
         return [name for name in self.homing_order() if not self.axes[name].is_homed()]
 
-    def home(self, names: list[str], wait: Callable[[Mapping[str, Motion]], None] | None = None) -> None:
+    def home(self, names: list[str]) -> None:
         """Home the axes one after another. Raises MotionFailed; every axis has been sent a stop by then."""
         for name in names:
-            self._wait({name: self.axes[name].home()}, wait)
+            self.wait({name: self.axes[name].home()})
 
-    def move(
-        self, targets_deg: Mapping[str, float], wait: Callable[[Mapping[str, Motion]], None] | None = None
-    ) -> dict[str, Position]:
+    def move(self, targets_deg: Mapping[str, float]) -> dict[str, Position]:
         """Move axes at the same time and wait; returns the positions read back at rest.
 
         An axis with backlash comes to its target from below, if its limits leave room for that.
@@ -175,8 +166,8 @@ class Rig:
             if name in targets_deg and targets_deg[name] < self.axes[name].read_position().deg - 1e-6:
                 below[name] = targets_deg[name] - slack
         if below and self._allowed(below):
-            self._wait(self.start_moves(dict(targets_deg) | below), wait)
-        return self._wait(self.start_moves(targets_deg), wait)
+            self.wait(self.start_moves(dict(targets_deg) | below))
+        return self.wait(self.start_moves(targets_deg))
 
     def _allowed(self, targets_deg: Mapping[str, float]) -> bool:
         try:
@@ -186,19 +177,6 @@ class Rig:
         except (LimitError, AcquisitionError):
             return False
         return True
-
-    def unwound(self, table: StateTable) -> StateTable:
-        """The table with endless axes moved on by whole turns, so that they need not unwind and never turn back."""
-        angles = dict(table.angles_deg)
-        for name in self.config.endless:
-            axis = self.axes[name]
-            free = axis.limits.min_deg is None and axis.limits.max_deg is None
-            if free and name in angles and np.ptp(angles[name]) > 0 and axis.is_homed():
-                here = axis.read_position().deg
-                turns = math.ceil((here - 1e-3 - float(angles[name].min())) / 360.0)
-                if turns > 0 and here < ENDLESS_UP_TO_DEG:
-                    angles[name] = angles[name] + 360.0 * turns
-        return replace(table, angles_deg=angles)
 
     def start_moves(self, targets_deg: Mapping[str, float]) -> dict[str, Motion]:
         """Start axes at the same time; those that stand within a count of their target are started too."""
@@ -233,11 +211,6 @@ class Rig:
         MotionFailed
             As the first axis that failed has it; every axis has been sent a stop.
         """
-        return self._wait(motions, None)
-
-    def _wait(
-        self, motions: Mapping[str, Motion], tick: Callable[[Mapping[str, Motion]], None] | None
-    ) -> dict[str, Position]:
         left = dict(motions)
         positions: dict[str, Position] = {}
         start_s = time.monotonic()
@@ -247,8 +220,6 @@ class Rig:
                     if motion.done():
                         positions[name] = motion.wait()
                         del left[name]
-                if tick is not None:
-                    tick(motions)
                 if left:
                     time.sleep(self._next_look_s(left, time.monotonic() - start_s))
         except MotionFailed as failure:
@@ -277,10 +248,6 @@ class Rig:
         off_s = abs(slowest.expected_s / self.time_scale - elapsed_s)
         longest_s = min(self.axes[name].config.poll_s for name in left)
         return min(max(off_s / 2, SHORTEST_LOOK_S), longest_s)
-
-    def positions(self) -> dict[str, Position]:
-        """Positions of all axes, read now."""
-        return {name: axis.read_position() for name, axis in self.axes.items()}
 
     def stop(self) -> Exception | None:
         """Send a stop to every axis, whatever the others answer; returns the first failure."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from acquisition.capture_writer import PARTIAL, CaptureWriter
 from acquisition.cleanup import run_all
+from acquisition.endless import unwound
 from acquisition.errors import AcquisitionError, Stopped
 from acquisition.header import capture_header, now, title_of
 from acquisition.job import Job, Result, frame_shape
@@ -45,7 +46,7 @@ def take(
     """
     _require_reference(rig, home)
     place_sample(job, rig)
-    job = replace(job, table=rig.unwound(job.table))
+    job = replace(job, table=unwound(job.table, rig))
     header = capture_header(job.plan, job.rig, job.instrument, rig, job.seed)
     writer = CaptureWriter.create(path, header, job.table, frame_shape(rig), now())
     if not job.exposure_known:
