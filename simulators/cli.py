@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -14,7 +15,7 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, help="Emulated har
 
 @app.callback()
 def _simulate() -> None:
-    """Keep `serve` a subcommand, although it is the only one."""
+    """Emulated hardware: one controller, or a whole rig."""
 
 
 @app.command()
@@ -73,6 +74,33 @@ def serve(
             pass
 
 
+@app.command()
+def rig(
+    rig_file: Annotated[Path, typer.Argument(help="rig file with a `simulator` section")],
+    out: Annotated[Path, typer.Option(help="rig file to write, with device paths in place of sim: ports")],
+    sample: Annotated[str, typer.Option(help="what stands at the centre")] = "red_sphere",
+    mode: Annotated[str, typer.Option(help="drr or stokes")] = "drr",
+    wavelength: Annotated[float, typer.Option(help="nm")] = 662,
+    omega: Annotated[float, typer.Option(help="arm angle to prepare for, degrees")] = 35,
+) -> None:
+    """Serve a whole simulated rig until SIGTERM; any program can open its ports with the rig file written."""
+    from drivers.errors import DeviceError
+    from processing.errors import ProcessError
+    from simulators import served_rig
+
+    ended = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: ended.set())
+    try:
+        with served_rig.serve(rig_file, out, sample, mode, wavelength, omega):
+            typer.echo(out)
+            sys.stdout.flush()
+            ended.wait()
+    except (ProcessError, DeviceError) as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(1) from None
+
+
 def _parse_limits(text: str | None) -> tuple[float, float] | None:
     if text is None:
         return None
@@ -88,3 +116,7 @@ def _parse_limits(text: str | None) -> tuple[float, float] | None:
 def main() -> None:
     """Run the command line."""
     app()
+
+
+if __name__ == "__main__":
+    main()

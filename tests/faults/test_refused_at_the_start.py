@@ -2,6 +2,8 @@
 
 import json
 import resource
+import subprocess
+import sys
 
 import pytest
 
@@ -39,6 +41,22 @@ def test_second_program_is_refused_with_the_name_of_the_first(spawn, partial_of,
         # The first one has not noticed.
         _, err = first.communicate(timeout=60)
         assert first.returncode == 0, err
+
+
+def test_a_rig_served_by_the_command_line_takes_a_capture(quick_rig, acquire, intact, tmp_path):
+    """Emulators in a program of their own: the drivers see ports and an address, nothing else."""
+    command = [sys.executable, "-m", "simulators.cli", "rig", quick_rig("behind.yaml"), "--out", tmp_path / "rig.yaml"]
+    server = subprocess.Popen([*map(str, command)], stdout=subprocess.PIPE, text=True)
+    try:
+        assert server.stdout.readline().strip() == str(tmp_path / "rig.yaml")
+        assert "sim:" not in (tmp_path / "rig.yaml").read_text()
+        code, out, err = acquire("--omega", 35, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "out")
+        assert code == 0, err
+        assert "SIMULATED" in out
+        assert intact(next((tmp_path / "out").glob("*.h5"))) == 44
+    finally:
+        server.terminate()
+        server.communicate(timeout=20)
 
 
 def test_a_capture_that_is_being_written_cannot_be_resumed(spawn, partial_of, quick_rig, acquire, tmp_path):
