@@ -142,3 +142,26 @@ def test_a_hot_camera_is_waited_for(run_with, intact):
     with Capture(path) as capture:
         (event,) = capture.closing["interlocks"]
     assert "61.5 C" in event["why"]
+
+
+def test_exposures_that_nobody_asked_for_never_enter_a_capture(run_with, intact):
+    """Stray pulses while the axes turn: their frames show other angles, and are thrown away."""
+
+    class Stray(Observer):
+        rig = None
+
+        def state_done(self, report):
+            # Told while the axes are on their way to the next state.
+            if self.rig is not None and report.state % 3 == 0:
+                self.rig.simulation.camera.fire()
+
+    stray = Stray()
+
+    def act(rig, state, retake):
+        stray.rig = rig
+
+    error, path = run_with(act, observers=(stray,), clock_speed=10)
+    assert error is None
+    assert intact(path) == 44
+    with Capture(path) as capture:
+        assert capture.closing["stream"]["stale_discarded"] >= 5
