@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 #: Longest side of a panel in pixels; larger images are thinned before drawing, which changes no file.
 PANEL_PIXELS = 600
 SIMULATED = "SIMULATED"
+#: A pixel is drawn normalized where m00 is this many standard errors above zero.
+LIT_ERRORS = 10.0
 
 
 def draw_product(path: Path, figure: Path) -> None:
@@ -38,8 +40,10 @@ def draw_product(path: Path, figure: Path) -> None:
 def product_figure(product: Product) -> Figure:
     """Matplotlib figure of a product; raises ProcessError for a kind without one."""
     if product.kind == "mueller":
-        elements = thin(product.get("mueller"))
-        return mueller_figure(elements, _title(product), product.simulated)
+        elements, error = thin(product.get("mueller")), thin(product.get("mueller_errors")[0, 0])
+        with np.errstate(invalid="ignore"):
+            lit = elements[0, 0] > LIT_ERRORS * np.nan_to_num(error)
+        return mueller_figure(elements, lit, _title(product), product.simulated)
     if product.kind == "stokes":
         maps = {name: thin(product.get(name)) for name in ("s0", "dolp", "aolp_deg")}
         return stokes_figure(maps, _title(product), product.simulated)
@@ -62,17 +66,18 @@ def product_figure(product: Product) -> Figure:
     raise ProcessError(f"{product.path}: no figure is defined for a {product.kind} image.")
 
 
-def mueller_figure(elements: NDArray[Any], title: str, simulated: bool) -> Figure:
+def mueller_figure(elements: NDArray[Any], lit: NDArray[np.bool_], title: str, simulated: bool) -> Figure:
     """4 x 4 panels of M / m00 (4, 4, rows, columns), one diverging scale symmetric about zero, one colour bar.
 
-    The scale is the largest magnitude apart from m00 (99.5 % of the pixels), at most 1; the m00 panel shows m00
-    over its own 99.5 % so that the object can be recognised, and is drawn in grey.
+    Pixels that are not `lit` (rows, columns) have no M / m00 to show and stay grey. The scale is the largest
+    magnitude apart from m00 (99.5 % of the pixels), at most 1; the m00 panel shows m00 over its own 99.5 % so that
+    the object can be recognised, and is drawn in grey.
     """
     from matplotlib.figure import Figure
 
     m00 = elements[0, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        normalized = np.where(m00 > 0, elements / m00, np.nan)
+        normalized = np.where(lit, elements / m00, np.nan)
     rest = np.abs(normalized.reshape(16, *m00.shape)[1:])
     limit = float(np.clip(_percentile(rest, 99.5), 1e-6, 1.0))
     figure = Figure(figsize=(9.5, 8.6 * max(0.45, m00.shape[0] / max(m00.shape[1], 1)) + 0.8), layout="constrained")
@@ -83,12 +88,13 @@ def mueller_figure(elements: NDArray[Any], title: str, simulated: bool) -> Figur
             panel = panels[i, j]
             panel.set_xticks([])
             panel.set_yticks([])
+            panel.set_facecolor("0.85")
             panel.set_title(f"$m_{{{i}{j}}}$", fontsize=9, pad=2)
             if i == j == 0:
                 panel.imshow(m00, cmap="gray", vmin=0, vmax=max(_percentile(m00, 99.5), 1e-30))
                 continue
             shown = panel.imshow(normalized[i, j], cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
-    figure.colorbar(shown, ax=panels, shrink=0.8, label="$m_{ij}/m_{00}$ (grey: $m_{00}$ alone)")
+    figure.colorbar(shown, ax=panels, shrink=0.8, label="$m_{ij}/m_{00}$ (first panel: $m_{00}$; plain grey: too dark)")
     _entitle(figure, title, simulated)
     return figure
 

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from processing.commands.drawing import FigureFile, NoFigure, draw
+
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
@@ -16,7 +18,8 @@ def register(app: typer.Typer) -> None:
 def camera_command(
     captures: Annotated[list[Path], typer.Argument(help="Captures with dark states and with repeated states.")],
     out: Annotated[Path | None, typer.Option(help="Product file; default: beside the first capture.")] = None,
-    figure: Annotated[Path | None, typer.Option(help="Also draw the photon-transfer line (PNG).")] = None,
+    figure: FigureFile = None,
+    no_figure: NoFigure = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
 ) -> None:
     """Photon transfer: gain and read noise from states that repeat each other, bad pixels from dark states."""
@@ -29,8 +32,4 @@ def camera_command(
     step = Step("camera", {"captures": [p.name for p in captures]}, identities)
     _, facts, simulated = write_camera(captures, product, step, overwrite)
     summary(product, facts, simulated)
-    if figure is not None:
-        from processing.figures import draw_product
-
-        draw_product(product, figure)
-        typer.echo(f"figure: {figure}")
+    draw(product, figure, no_figure)

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
+from processing.commands.drawing import FigureFile, NoFigure, draw
+
 if TYPE_CHECKING:
     from processing.quantities import State
 
@@ -28,7 +30,8 @@ def quantities_command(
     ] = None,
     instrument: Annotated[Path | None, typer.Option(help="Instrument file, where a capture is reduced here.")] = None,
     out: Annotated[Path | None, typer.Option(help="Product file; default: beside the source.")] = None,
-    figure: Annotated[Path | None, typer.Option(help="Also draw the maps (PNG).")] = None,
+    figure: FigureFile = None,
+    no_figure: NoFigure = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
 ) -> None:
     """Eigenvalues, depolarization, diattenuation, polarizance, retardance and their standard errors."""
@@ -49,11 +52,7 @@ def quantities_command(
 
     with Product(target) as opened:
         summary(target, facts, opened.simulated)
-    if figure is not None:
-        from processing.figures import draw_product
-
-        draw_product(target, figure)
-        typer.echo(f"figure: {figure}")
+    draw(target, figure, no_figure)
 
 
 def _pair(text: str) -> tuple[str, tuple[State, State]]:

@@ -10,6 +10,8 @@ from typing import Annotated, Any
 
 import typer
 
+from processing.commands.drawing import FigureFile, NoFigure, draw
+
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
@@ -36,18 +38,15 @@ def reduce_command(
     analyzers: Annotated[
         Path | None, typer.Option(help="Mosaic: analysis vectors of the pixels, from `process calibrate-mosaic`.")
     ] = None,
-    figure: Annotated[Path | None, typer.Option(help="Also draw the image (PNG).")] = None,
+    figure: FigureFile = None,
+    no_figure: NoFigure = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
 ) -> None:
     """Invert W per pixel: Mueller image, or Stokes image of a polarization mosaic, with standard errors."""
     options = ReduceOptions(instrument, weighted, covariance, physical, camera, dark, flat, demosaic, analyzers)
     product, facts, simulated = reduce_file(capture, out, options, overwrite)
     summary(product, facts, simulated)
-    if figure is not None:
-        from processing.figures import draw_product
-
-        draw_product(product, figure)
-        typer.echo(f"figure: {figure}")
+    draw(product, figure, no_figure)
 
 
 @dataclass(frozen=True)

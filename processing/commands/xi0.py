@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from processing.commands.drawing import FigureFile, NoFigure, draw
+
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
@@ -24,7 +26,8 @@ def xi0_command(
     ] = None,
     instrument: Annotated[Path | None, typer.Option(help="Instrument file, where the capture is reduced here.")] = None,
     out: Annotated[Path | None, typer.Option(help="Product file; default: beside the source.")] = None,
-    figure: Annotated[Path | None, typer.Option(help="Also draw the image (PNG).")] = None,
+    figure: FigureFile = None,
+    no_figure: NoFigure = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
 ) -> None:
     """xi0 from a Mueller capture (coherency eigenvalues) or a linear Stokes capture (two coefficients)."""
@@ -53,8 +56,4 @@ def xi0_command(
         with progress_bar("xi0", "rows") as tick:
             facts = xi0_of_mueller(product, target, step, overwrite, tick)
     summary(target, facts, simulated)
-    if figure is not None:
-        from processing.figures import draw_product
-
-        draw_product(target, figure)
-        typer.echo(f"figure: {figure}")
+    draw(target, figure, no_figure)
