@@ -7,11 +7,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.spatial.transform import Rotation
 
 from processing.geometry.errors import GeometryError
 from processing.threads import for_ranges
@@ -42,8 +40,7 @@ class Mesh(BaseModel):
 
     def to_world(self, points: FloatArray) -> FloatArray:
         """World coordinates in mm of points (..., 3) in the file's own."""
-        turn = Rotation.from_rotvec(np.deg2rad(self.rotation_deg)).as_matrix()
-        return np.asarray((points * self.scale_mm) @ turn.T + np.asarray(self.translation_mm))
+        return np.asarray((points * self.scale_mm) @ _turn(self.rotation_deg).T + np.asarray(self.translation_mm))
 
     def intersect(
         self, origin_mm: FloatArray, rays: FloatArray, omega_deg: float
@@ -53,6 +50,9 @@ class Mesh(BaseModel):
         Raises GeometryError when the file cannot be read or the mesh has holes.
         """
         del omega_deg
+        # Late: only meshes need compiled loops, and every `acquire` imports this module.
+        from processing.geometry.mesh_kernels import meet
+
         world = self._world()
         flat = np.ascontiguousarray(rays.reshape(-1, 3))
         origin = np.asarray(origin_mm, dtype=float)
@@ -63,7 +63,7 @@ class Mesh(BaseModel):
         corners = world.corner_normals if self.smooth_normals else world.flat_normals
         for_ranges(
             index.size,
-            lambda start, stop: _meet(
+            lambda start, stop: meet(
                 index, face, flat, origin, world.triangles, world.face_normals, corners, points, normal, start, stop
             ),
         )
@@ -122,7 +122,7 @@ def _load(
             "Close it in a mesh editor, or set allow_holes: true to take it as it is."
         )
     matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_rotvec(np.deg2rad(rotation_deg)).as_matrix() * scale_mm
+    matrix[:3, :3] = _turn(rotation_deg) * scale_mm
     matrix[:3, 3] = translation_mm
     mesh = mesh.copy()
     mesh.apply_transform(matrix)
@@ -147,32 +147,7 @@ def _first_hits(scene: Any, origin: FloatArray, rays: FloatArray) -> NDArray[np.
     return np.asarray(scene.run(origins, rays.astype(np.float32)), dtype=np.int64)
 
 
-@numba.njit(nogil=True, cache=True)
-def _meet(index, face, rays, origin, triangles, face_normals, corner_normals, points, normals, start, stop):  # type: ignore[no-untyped-def]
-    # Meet the plane of the triangle in double precision (embree's own distance is single), then weigh the normals
-    # of its corners with barycentric coordinates, which are ratios of areas.
-    for k in range(start, stop):
-        ray = index[k]
-        f = face[ray]
-        n0, n1, n2 = face_normals[f, 0], face_normals[f, 1], face_normals[f, 2]
-        a, b, c = triangles[f, 0], triangles[f, 1], triangles[f, 2]
-        up = (a[0] - origin[0]) * n0 + (a[1] - origin[1]) * n1 + (a[2] - origin[2]) * n2
-        t = up / (rays[ray, 0] * n0 + rays[ray, 1] * n1 + rays[ray, 2] * n2)
-        x, y, z = origin[0] + t * rays[ray, 0], origin[1] + t * rays[ray, 1], origin[2] + t * rays[ray, 2]
-        points[k, 0], points[k, 1], points[k, 2] = x, y, z
-        wa = _area(b[0] - x, b[1] - y, b[2] - z, c[0] - x, c[1] - y, c[2] - z, n0, n1, n2)
-        wb = _area(c[0] - x, c[1] - y, c[2] - z, a[0] - x, a[1] - y, a[2] - z, n0, n1, n2)
-        wc = _area(a[0] - x, a[1] - y, a[2] - z, b[0] - x, b[1] - y, b[2] - z, n0, n1, n2)
-        length = 0.0
-        for i in range(3):
-            v = wa * corner_normals[f, 0, i] + wb * corner_normals[f, 1, i] + wc * corner_normals[f, 2, i]
-            normals[k, i] = v
-            length += v * v
-        length = np.sqrt(length)
-        for i in range(3):
-            normals[k, i] /= length
+def _turn(rotation_deg: tuple[float, float, float]) -> FloatArray:
+    from scipy.spatial.transform import Rotation
 
-
-@numba.njit(inline="always")
-def _area(px, py, pz, qx, qy, qz, n0, n1, n2):  # type: ignore[no-untyped-def]
-    return (py * qz - pz * qy) * n0 + (pz * qx - px * qz) * n1 + (px * qy - py * qx) * n2
+    return np.asarray(Rotation.from_rotvec(np.deg2rad(rotation_deg)).as_matrix())

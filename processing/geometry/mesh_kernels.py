@@ -1,0 +1,38 @@
+"""The compiled loop of meshes: where a ray meets its triangle, and the normal there."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+
+@numba.njit(nogil=True, cache=True)
+def meet(index, face, rays, origin, triangles, face_normals, corner_normals, points, normals, start, stop):  # type: ignore[no-untyped-def]
+    """Points and unit normals where rays[index[start:stop]] meet their triangles; writes `points` and `normals`."""
+    # Meet the plane of the triangle in double precision (embree's own distance is single), then weigh the normals
+    # of its corners with barycentric coordinates, which are ratios of areas.
+    for k in range(start, stop):
+        ray = index[k]
+        f = face[ray]
+        n0, n1, n2 = face_normals[f, 0], face_normals[f, 1], face_normals[f, 2]
+        a, b, c = triangles[f, 0], triangles[f, 1], triangles[f, 2]
+        up = (a[0] - origin[0]) * n0 + (a[1] - origin[1]) * n1 + (a[2] - origin[2]) * n2
+        t = up / (rays[ray, 0] * n0 + rays[ray, 1] * n1 + rays[ray, 2] * n2)
+        x, y, z = origin[0] + t * rays[ray, 0], origin[1] + t * rays[ray, 1], origin[2] + t * rays[ray, 2]
+        points[k, 0], points[k, 1], points[k, 2] = x, y, z
+        wa = _area(b[0] - x, b[1] - y, b[2] - z, c[0] - x, c[1] - y, c[2] - z, n0, n1, n2)
+        wb = _area(c[0] - x, c[1] - y, c[2] - z, a[0] - x, a[1] - y, a[2] - z, n0, n1, n2)
+        wc = _area(a[0] - x, a[1] - y, a[2] - z, b[0] - x, b[1] - y, b[2] - z, n0, n1, n2)
+        length = 0.0
+        for i in range(3):
+            v = wa * corner_normals[f, 0, i] + wb * corner_normals[f, 1, i] + wc * corner_normals[f, 2, i]
+            normals[k, i] = v
+            length += v * v
+        length = np.sqrt(length)
+        for i in range(3):
+            normals[k, i] /= length
+
+
+@numba.njit(inline="always")
+def _area(px, py, pz, qx, qy, qz, n0, n1, n2):  # type: ignore[no-untyped-def]
+    return (py * qz - pz * qy) * n0 + (pz * qx - px * qz) * n1 + (px * qy - py * qx) * n2
