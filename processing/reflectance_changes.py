@@ -35,7 +35,7 @@ class ReflectanceChanges:
 
     What only an object in front of a camera has (`processing.diagnosis.surface_view`):
     centre_mm, scale : the sphere stands off its place by (x, y), and is larger by this part of its radius.
-    support : depolarized light from below, over the mean signal.
+    support : irradiance by depolarized light from below over that by the source.
     """
 
     diffuse_a: float = 0.0
@@ -54,6 +54,8 @@ class ReflectanceChanges:
         """Dominant process (N, 4, 4), element 00 equal to 1, in the axes that the geometry states."""
         g, index = self._moved(geometry), index + self.index
         index = complex(max(index.real, 0.05), max(index.imag, 0.0))
+        # At an index of one nothing is reflected; the ratio of the amplitudes has a limit there all the same.
+        index = DIPOLE if abs(index - 1) < abs(DIPOLE - 1) else index
         jones = fresnel.jones(g, index)
         if self.volume:
             # Fresnel's ratio of amplitudes at an index near one is that of a dipole.

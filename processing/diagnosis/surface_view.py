@@ -19,8 +19,10 @@ from processing.reflectance_changes import ReflectanceChanges
 
 Array = NDArray[np.float64]
 
-#: Direction from the object to its support.
-SUPPORT: Array = np.array([0.0, -1.0, 0.0])
+#: Direction from the object to its support; just off the vertical, where the axes of a beam have no direction.
+SUPPORT: Array = unit([0.0, -1.0, 1e-3])
+#: Steps of theta_h in which the polarized light of a surface is learnt from its own pixels.
+BINS = 16
 
 
 class SurfaceView:
@@ -28,10 +30,10 @@ class SurfaceView:
 
     Parameters
     ----------
-    view : geometry as its file states it, its camera resized to the grid of the pixels.
+    view : geometry as its file states it.
+    camera : with the grid of the pixels.
     pixels : (rows, columns) True where a pixel is used; all of them must see the object.
     omega_deg : arm angle as read.
-    index, a, b : constants of the material; a = 0 for a first surface alone.
     """
 
     def __init__(
@@ -49,6 +51,7 @@ class SurfaceView:
         self.rays = camera.rays()[pixels]
         # What is not a sphere stands as its file says; an error of the arm moves the source alone.
         _, self.points, self.normal = view.shape.intersect(self.eye, self.rays, omega_deg)
+        self._theta_h, self._alpha_0 = np.zeros(1), np.zeros(1)
 
     def geometry(self, changes: ReflectanceChanges) -> ScatteringGeometry:
         """Directions at the pixels, for the sphere and the source where the changes put them."""
@@ -77,13 +80,23 @@ class SurfaceView:
         # The arm's error is in the geometry already.
         return replace(changes, diffuse_a=changes.diffuse_a + self.a, diffuse_log_b=log_b, arm_rad=0.0)
 
+    def learn_polarized(self, alpha_0: Array, weight: Array) -> None:
+        """Take from the pixels how much polarized light (P,) the surface sends back, as a function of theta_h."""
+        theta = self.geometry(ReflectanceChanges()).angles.theta_h
+        edges = np.quantile(theta, np.linspace(0, 1, BINS + 1))
+        bins = np.clip(np.searchsorted(edges, theta, side="right") - 1, 0, BINS - 1)
+        total = np.maximum(np.bincount(bins, weight, BINS), 1e-300)
+        self._theta_h = np.bincount(bins, weight * theta, BINS) / total
+        self._alpha_0 = np.bincount(bins, weight * alpha_0, BINS) / total
+
     def extra(self, changes: ReflectanceChanges) -> Array | None:
-        """Mueller matrices (P, 4, 4) of light that came from the support, relative to the mean signal; or None."""
+        """Mueller matrices (P, 4, 4) of light that came from the support, in the units of alpha_0; None without it."""
         if not changes.support:
             return None
         g = self.geometry(changes)
         below = ScatteringGeometry(g.normal, np.broadcast_to(SUPPORT, g.normal.shape), g.to_camera)
         weight = changes.support * np.maximum(dot(g.normal, SUPPORT), 0.0)
+        weight = weight * np.interp(below.angles.theta_h, self._theta_h, self._alpha_0)
         m = self._complete(changes).dominant(below, self.index) @ mueller.IDEAL_DEPOLARIZER
         return np.asarray(weight[:, None, None] * m)
 

@@ -18,8 +18,8 @@ from processing.reflectance_changes import ReflectanceChanges
 class This(ReflectanceEffect):
     """Weight of light that met two facets over that which met one; place "support": light from below.
 
-    The support's light arrives depolarized and leaves the surface polarized as a first surface does it; its weight is
-    the polarized part where it falls straight on the surface, over the mean signal.
+    The support's light arrives depolarized and the surface polarizes it as it does the source's; the parameter is its
+    irradiance over the source's where both fall straight on the surface.
     """
 
     def places_on(self, shape: str) -> Sequence[str]:

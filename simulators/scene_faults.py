@@ -1,0 +1,102 @@
+"""What can be wrong with an object on its mount, the arm and the illumination: scenes and optics that do not say so.
+
+Each takes the scene (or the optics) that the processing believes in and returns the true one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing import triply_degenerate
+from processing.geometry.frames import ScatteringGeometry, dot
+from processing.geometry.sphere import Sphere
+from processing.instrument import InstrumentModel, Polarizer, Retarder
+from simulators.scene import Scene, Surface
+
+FloatArray = NDArray[np.float64]
+
+
+def moved_sphere(scene: Scene, x_mm: float = 0.0, y_mm: float = 0.0, scale: float = 0.0) -> Scene:
+    """The sphere stands off the centre of rotation, and is larger by this part of its radius."""
+    geometry = scene.object.geometry
+    if not isinstance(geometry.shape, Sphere):
+        raise ValueError("only a sphere can be moved")
+    sphere = Sphere(radius_mm=geometry.shape.radius_mm * (1 + scale), centre_mm=(x_mm, y_mm, 0.0))
+    spec = scene.object.model_copy(update={"geometry": geometry.model_copy(update={"shape": sphere})})
+    return Scene(spec, scene.material)
+
+
+class ArmZero:
+    """The arm stands `error_deg` further round than it reads."""
+
+    def __init__(self, scene: Scene, error_deg: float) -> None:
+        self.scene, self.error_deg = scene, error_deg
+
+    def mueller_image(self, omega_deg: float, wavelength_nm: float, rows: int, columns: int) -> NDArray[np.float32]:
+        """The scene at the true angle."""
+        return self.scene.mueller_image(omega_deg + self.error_deg, wavelength_nm, rows, columns)
+
+
+def turned_generator(instrument: InstrumentModel, error_deg: float) -> InstrumentModel:
+    """Every element of the generator stands turned about the beam, as one unit that was put in askew."""
+    turned = []
+    for element in instrument.generator:
+        if not isinstance(element, Polarizer | Retarder):
+            raise ValueError(f"a {element.kind} cannot be turned")
+        azimuth = element.azimuth_deg
+        new = {k: v + error_deg for k, v in azimuth.items()} if isinstance(azimuth, dict) else azimuth + error_deg
+        turned.append(element.model_copy(update={"azimuth_deg": new}))
+    return instrument.model_copy(update={"generator": tuple(turned)})
+
+
+class LitSupport:
+    """A white disc below the sphere, lit by the source, lights the sphere's lower side with depolarized light.
+
+    The disc is a Lambertian of albedo 1 in patches; each patch's light meets the same surface, whose triply degenerate
+    matrix then acts on unpolarized light. `strength` is the disc's irradiance over that on the sphere.
+    """
+
+    PATCHES = 24
+
+    def __init__(self, scene: Scene, strength: float = 1.0, radius_mm: float = 20.0, below_mm: float = 30.0) -> None:
+        self.scene, self.strength = scene, strength
+        rings = np.sqrt((np.arange(self.PATCHES) + 0.5) / self.PATCHES) * radius_mm
+        turns = np.pi * (3 - np.sqrt(5)) * np.arange(self.PATCHES)
+        height = np.full(self.PATCHES, -below_mm)
+        self.patches = np.stack([rings * np.cos(turns), height, rings * np.sin(turns)], axis=1)
+        self.area_mm2 = np.pi * radius_mm**2 / self.PATCHES
+
+    def mueller_image(self, omega_deg: float, wavelength_nm: float, rows: int, columns: int) -> NDArray[np.float32]:
+        """The scene, and the disc's light on it."""
+        out = self.scene.mueller_image(omega_deg, wavelength_nm, rows, columns)
+        spec = self.scene.object
+        image = spec.geometry.at(omega_deg, rows, columns)
+        surface = next(s for nm, s in spec.surface.items() if abs(nm - wavelength_nm) < 0.5)
+        g = image.points
+        centre = spec.geometry.shape.centre_mm if isinstance(spec.geometry.shape, Sphere) else (0.0, 0.0, 0.0)
+        radius = spec.geometry.shape.radius_mm if isinstance(spec.geometry.shape, Sphere) else 0.0
+        points = np.asarray(centre) + radius * g.normal
+        added = np.zeros((len(points), 4, 4))
+        for patch in self.patches:
+            towards = patch - points
+            square = dot(towards, towards)
+            direction = towards / np.sqrt(square)[:, None]
+            # The surface's own law holds the cosine of incidence on it.
+            seen = (dot(g.normal, direction) > 0) * np.maximum(-direction[:, 1], 0.0)
+            weight = self.strength * self.area_mm2 / np.pi * seen / square
+            from_patch = ScatteringGeometry(g.normal, direction, g.to_camera)
+            m = _triply_degenerate(self.scene, surface, from_patch, wavelength_nm)
+            m[..., 1:] = 0.0
+            added += weight[:, None, None] * m
+        out[image.mask] += added.astype(np.float32)
+        return out
+
+
+def _triply_degenerate(scene: Scene, surface: Surface, points: ScatteringGeometry, wavelength_nm: float) -> FloatArray:
+    material = scene.material
+    if material is None:
+        raise ValueError("an object scene needs its reflectance model")
+    m0 = material.mueller_jones(points, wavelength_nm)
+    xi0, m00 = surface.xi0(points), surface.m00(points)
+    return np.array(triply_degenerate.mueller_matrix(m0, xi0, m00), dtype=float)
