@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -51,7 +50,6 @@ class Rig:
         config: RigConfig,
         *,
         with_camera: bool = True,
-        transcripts: Path | None = None,
         ask: Ask | None = None,
     ) -> None:
         self.config = config
@@ -63,7 +61,7 @@ class Rig:
         self._read_back = CameraSettings()
         self._with_camera = with_camera
         self._ask = ask
-        self._lines = LineRegistry(transcripts)
+        self._lines = LineRegistry(config.wire_log)
 
     def __enter__(self) -> Self:
         try:

@@ -96,6 +96,7 @@ class RigConfig(_Part):
     settle_s: float = Field(default=0.02, ge=0, description="wait after the last axis is idle")
     exposure_s: tuple[float, float] = Field(default=(1e-5, 10.0), description="shortest and longest exposure")
     retakes: int = Field(default=3, ge=0, description="tries again for a state whose frame is incomplete")
+    wire_log: Path | None = Field(default=None, description="folder for a transcript of every byte on serial lines")
     forbidden: tuple[ForbiddenPose, ...] = ()
     interlocks: tuple[InterlockConfig, ...] = ()
     simulated: bool = Field(default=False, description="the devices at these ports are emulators (simulate rig)")
@@ -116,4 +117,5 @@ def load_rig(path: Path | str) -> RigConfig:
     folder = path.resolve().parent
     modes = {name: mode.model_copy(update={"instrument": folder / mode.instrument}) for name, mode in rig.modes.items()}
     simulator = rig.simulator.below(folder) if rig.simulator else None
-    return rig.model_copy(update={"modes": modes, "simulator": simulator})
+    wire_log = folder / rig.wire_log if rig.wire_log else None
+    return rig.model_copy(update={"modes": modes, "simulator": simulator, "wire_log": wire_log})

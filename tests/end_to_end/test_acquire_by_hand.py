@@ -114,3 +114,13 @@ def test_snap_writes_counts_and_leaves_the_light_as_it_was(acquire, served, tmp_
     assert frame.dtype == "uint16"
     assert frame.shape == (64, 80)
     assert not simulation.light()
+
+
+def test_a_wire_log_holds_every_byte_of_every_line(acquire, served, tmp_path):
+    _, rig = served
+    _change(rig, lambda tree: tree.update(wire_log="wire"))
+    code, out, err = acquire("home", "psg", "--rig", rig, "--yes")
+    assert code == 0, out + err
+    logs = [path.read_text() for path in (tmp_path / "wire").glob("*.log")]
+    assert len(logs) == 3  # rotators, arm, shutter
+    assert any(">> /1 1 " in log and " home:" in log and "<< @01 1 " in log for log in logs)
