@@ -94,7 +94,7 @@ def _case(folder: Path, name: str, group: str, chosen: list[str], random: np.ran
         alone = Bench(rows=size, columns=size, mosaic=mosaic, electrons=clean.electrons)
         fault(alone, np.random.default_rng(draw), states)
         parts.append(alone)
-    angles = _angles(states, mosaic, bench.zigzag)
+    angles = state_angles(states, mosaic, bench.zigzag)
     if mosaic:
         angles = {"psg": angles["psg"]}
     detectable = tuple(_excess(b, scene, angles, air, configs / "instruments" / instrument) for b in parts)
@@ -105,7 +105,8 @@ def _case(folder: Path, name: str, group: str, chosen: list[str], random: np.ran
     return Case(name, group, tuple(faults), sample.kind, instrument, detectable)
 
 
-def _angles(states: int, mosaic: bool, zigzag: bool) -> dict[str, Array]:
+def state_angles(states: int, mosaic: bool, zigzag: bool) -> dict[str, Array]:
+    """Angles of both axes in degrees; `zigzag` reaches states from both sides."""
     step = 360.0 / states if not mosaic else 180.0 / states
     psg = np.asarray(step * np.arange(states), dtype=np.float64)
     order = np.arange(states)

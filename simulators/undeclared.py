@@ -28,12 +28,12 @@ BLACK = 100.0
 
 
 def retarder_jones(azimuth_rad: float, retardance_rad: Any, t_fast: float = 1.0, t_slow: float = 1.0) -> Complex:
-    """Jones matrices (..., 2, 2) of a retarder; decreasing phase, so the fast axis leads by +retardance/2."""
+    """Jones matrices (..., 2, 2) of a retarder; phase so that S3 has the sign of conventions.md."""
     d = np.asarray(retardance_rad, dtype=float)[..., None, None]
     c, s = np.cos(azimuth_rad), np.sin(azimuth_rad)
     fast = np.array([[c * c, c * s], [c * s, s * s]])
     slow = np.eye(2) - fast
-    return np.asarray(np.sqrt(t_fast) * fast * np.exp(0.5j * d) + np.sqrt(t_slow) * slow * np.exp(-0.5j * d))
+    return np.asarray(np.sqrt(t_fast) * fast * np.exp(-0.5j * d) + np.sqrt(t_slow) * slow * np.exp(0.5j * d))
 
 
 def polarizer_jones(azimuth_rad: float, extinction: float = 0.0) -> Complex:

@@ -169,7 +169,8 @@ class InstrumentProblem:
             if applied.scope == "instrument" or data.name in applied.captures:
                 apply_to(changes, self.model, applied)
         for candidate, part in zip(space.candidates, space.slices, strict=True):
-            if candidate.capture in (None, capture):
+            # At zero an effect does nothing: there is no need to ask it.
+            if candidate.capture in (None, capture) and values[part].any():
                 candidate.effect.apply(changes, self.model, candidate.place, values[part])
         return changes
 
@@ -250,8 +251,10 @@ class InstrumentProblem:
                 step_j = STEP * candidate.typical[j]
                 moved[part.start + j] += step_j
                 changes = self.changes(k, space, moved)
-                da[part.start + j] = (self.columns(k, changes) - a) / step_j
-                dc[part.start + j] = (self.coefficients(k, changes) - c) / step_j
+                if candidate.effect.corrects_counts:
+                    dc[part.start + j] = (self.coefficients(k, changes) - c) / step_j
+                else:
+                    da[part.start + j] = (self.columns(k, changes) - a) / step_j
         return da, dc
 
     def _slope_of_axis(self, k: int, space: Space, values: Array, axis: str, a: Array) -> Array:

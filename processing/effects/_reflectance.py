@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from typing import ClassVar
 
 from processing.changes import Changes, Conditions
 from processing.effects.base import Array, Effect, EffectError
@@ -12,9 +13,16 @@ from processing.reflectance_changes import ReflectanceChanges
 
 
 class ReflectanceEffect(Effect):
-    """An effect of the paper's model in place of the instrument's."""
+    """An effect of the paper's model in place of the instrument's.
+
+    Attributes
+    ----------
+    rough : part of what it explains (chi-square) that its simple form may leave over; beside it no effect is named
+        that explains less.
+    """
 
     group = "reflectance"
+    rough: ClassVar[float] = 1e-3
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ()

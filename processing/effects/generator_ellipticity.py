@@ -30,4 +30,4 @@ class This(Effect):
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         polarizer = next(e for e in model.generator if e.name == place)
         azimuth = np.deg2rad(float(polarizer.azimuth_deg)) if not isinstance(polarizer.azimuth_deg, dict) else 0.0
-        changes.follow(place, mueller.retarder(azimuth + np.pi / 4, -2 * np.deg2rad(values[0])))
+        changes.follow(place, mueller.retarder(azimuth + np.pi / 4, 2 * np.deg2rad(values[0])))

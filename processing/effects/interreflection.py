@@ -22,6 +22,9 @@ class This(ReflectanceEffect):
     irradiance over the source's where both fall straight on the surface.
     """
 
+    # Where the support stands and how far it reaches is not known.
+    rough = 0.2
+
     def places_on(self, shape: str) -> Sequence[str]:
         return ("", "support")
 

@@ -1,0 +1,43 @@
+"""Thirty captures with undeclared faults, truth apart: the whole suite is `python benchmarks/blind_suite.py`."""
+
+import json
+import os
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+import pytest
+
+from processing.capture import Capture
+from processing.diagnosis.run import diagnose_captures
+from processing.instrument import InstrumentModel
+from processing.yaml_file import parse_yaml
+from simulators.blind_suite import judge, make, table
+
+COUNT, SEED = 30, 1000
+
+
+def diagnosed(path):
+    with Capture(path) as source:
+        model = parse_yaml(source.header.instrument_yaml, InstrumentModel)
+    judged, _ = diagnose_captures([path], model)
+    return path.stem, json.loads(judged.diagnosis.model_dump_json())
+
+
+@pytest.mark.timeout(600)
+def test_thirty_blind_captures(configs, tmp_path, monkeypatch):
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
+    cases = make(tmp_path, COUNT, SEED, configs)
+    truth = (tmp_path / "truth.json").rename(tmp_path / "away.json")
+    with ProcessPoolExecutor(min(2, os.cpu_count() or 1), mp_context=get_context("spawn")) as pool:
+        results = dict(pool.map(diagnosed, [tmp_path / f"{c.name}.h5" for c in cases]))
+    assert truth.exists()
+    score = judge(cases, results)
+    print(table(score))
+    numbers = score.numbers
+    # Of so few, one may be wrong where the whole suite allows 5 %; a false alarm may not.
+    assert numbers["single"] * numbers["single_count"] >= numbers["single_count"] - 1
+    assert numbers["two"] * numbers["two_count"] >= numbers["two_count"] - 1
+    assert numbers["none"] == 1.0
+    assert numbers["unlisted"] == 1.0
+    assert numbers["parameters"] >= 0.95
+    assert numbers["error"] == 1.0

@@ -1,0 +1,143 @@
+"""What `diagnose` must know and what it must know that it does not know, on captures made by Jones calculus."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from processing.capture_schema import Sample
+from processing.diagnosis import cli
+from processing.diagnosis.result import Diagnosis
+from processing.diagnosis.run import diagnose_captures
+from processing.instrument import InstrumentModel
+from simulators.blind_suite import state_angles
+from simulators.undeclared import Bench, Scene, digitize, expose, write_capture
+
+STATES = 40
+
+
+def capture(folder: Path, configs: Path, bench: Bench, air: bool, seed: int = 7) -> Path:
+    random = np.random.default_rng(seed)
+    scene = Scene(random, np.eye(4) if air else None)
+    angles = state_angles(STATES, bench.mosaic, bench.zigzag)
+    counts = digitize(bench, expose(bench, scene, angles), random)
+    path = folder / "capture.h5"
+    text = (configs / "instruments/rgb950.yaml").read_text()
+    write_capture(path, bench, counts, angles, Sample(kind="air" if air else "unknown"), text)
+    return path
+
+
+def diagnosed(path: Path, configs: Path) -> Diagnosis:
+    return diagnose_captures([path], InstrumentModel.load(configs / "instruments/rgb950.yaml"))[0].diagnosis
+
+
+def test_jones_bench_and_mueller_model_are_the_same_instrument(configs):
+    bench = Bench()
+    model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
+    angles = state_angles(STATES, False, False)
+    g = np.stack([bench.generated({k: float(np.deg2rad(v[n])) for k, v in angles.items()}, n) for n in range(STATES)])
+    a = np.stack([bench.analyzed({k: float(np.deg2rad(v[n])) for k, v in angles.items()}, n)[0] for n in range(STATES)])
+    assert g == pytest.approx(model.generator_states(angles), abs=1e-12)
+    assert a == pytest.approx(model.analyzer_states(angles)[:, 0], abs=1e-12)
+
+
+def test_a_retardance_error_is_invisible_with_an_unknown_sample_and_plain_with_air(configs, tmp_path):
+    """Trap 8 of the conventions."""
+    wrong = np.deg2rad(127.12 + 1.0)
+    unknown = diagnosed(capture(tmp_path, configs, Bench(dg=wrong), air=False), configs)
+    assert unknown.verdict == "consistent"
+    hidden = {"psg_retardance[psg_retarder]", "psa_retardance[psa_retarder]", "psg_extinction[psg_polarizer]"}
+    assert hidden | {"stray_light"} <= set(unknown.unobservable)
+    assert "air" in unknown.recommendation
+    (tmp_path / "capture.h5").unlink()
+    air = diagnosed(capture(tmp_path, configs, Bench(dg=wrong), air=True), configs)
+    assert air.verdict == "explained"
+    (effect,) = air.effects
+    assert (effect.kind, effect.element) == ("psg_retardance", "psg_retarder")
+    found = effect.parameters["retardance"]
+    assert found.value == pytest.approx(1.0, abs=3 * found.stderr)
+    assert found.stderr < 0.05
+
+
+def test_azimuths_of_analyzer_and_its_retarder_are_named_together(configs, tmp_path):
+    """Trap 8: with an unknown sample the two cannot be told apart, and air is what separates them."""
+    d = diagnosed(capture(tmp_path, configs, Bench(oa=np.deg2rad(13.41 + 0.4)), air=False), configs)
+    (effect,) = d.effects
+    both = {effect.kind, *(text.partition("[")[0] for text in effect.indistinguishable_from)}
+    assert both == {"psa_azimuth", "analyzer_azimuth"}
+    assert "air" in d.recommendation
+
+
+def test_nothing_wrong_is_consistent(configs, tmp_path):
+    for seed, air in ((1, True), (2, False)):
+        d = diagnosed(capture(tmp_path, configs, Bench(), air, seed), configs)
+        (tmp_path / "capture.h5").unlink()
+        assert d.verdict == "consistent"
+        assert d.effects == ()
+        assert d.error_after.rms_percent < 1.05 * d.noise_floor_percent
+
+
+def test_random_gains_in_air_are_not_given_a_name(configs, tmp_path):
+    """One known sample and one channel: a gain for each state explains anything, so it explains nothing."""
+    bench = Bench()
+    gains = 1 + 0.01 * np.random.default_rng(3).standard_normal(STATES)
+    bench.level.append(lambda k, a: float(gains[k]))
+    d = diagnosed(capture(tmp_path, configs, bench, air=True), configs)
+    assert d.verdict == "unexplained"
+    assert d.effects == ()
+    empirical = d.unexplained.empirical
+    assert empirical.kind in ("gain_per_state", "angle_per_state")
+    assert "source_flicker" in empirical.would_also_fit
+    assert "empirical" in empirical.note
+
+
+def test_what_is_written_is_used_and_nothing_is_overwritten(configs, tmp_path, capsys):
+    path = capture(tmp_path, configs, Bench(dg=np.deg2rad(129.0)), air=True)
+    instrument, new = configs / "instruments/rgb950.yaml", tmp_path / "new.yaml"
+    report, out = tmp_path / "report.html", tmp_path / "out.json"
+    call = [str(path), "--instrument", str(instrument), "--write", str(new)]
+    with pytest.raises(SystemExit) as ended:
+        cli.main([*call, "--json", str(out), "--report", str(report)])
+    assert ended.value.code == 0
+    assert "psg_retardance" in capsys.readouterr().out
+    keys = {"verdict", "error_before", "error_after", "noise_floor_percent", "effects", "unobservable"}
+    said = json.loads(out.read_text())
+    assert keys | {"recommendation"} <= set(said)
+    assert {"kind", "element", "parameters", "evidence", "indistinguishable_from"} <= set(said["effects"][0])
+    assert {"rms_percent", "chi2_reduced", "held_out"} <= set(said["error_after"])
+    page = report.read_text()
+    assert page.count("data:image/png;base64,") == 2
+    assert "src='http" not in page
+    model = InstrumentModel.load(new)
+    assert model.effects[0].kind == "psg_retardance"
+    assert path.name in model.effects[0].captures[0]
+    # Found at 662 nm: it is not carried over to another wavelength.
+    assert [len(model.at(nm).effects) for nm in (662, 451)] == [1, 0]
+    assert diagnose_captures([path], model)[0].diagnosis.verdict == "consistent"
+    with pytest.raises(SystemExit) as ended:
+        cli.main(call)
+    assert ended.value.code == 2
+    assert "exists" in capsys.readouterr().err
+
+
+def test_reduce_with_the_written_model_is_closer_to_the_truth(configs, tmp_path):
+    from processing.capture import Capture
+    from processing.diagnosis.write import write_instrument
+    from processing.images import MuellerImage
+    from processing.product import Step
+    from processing.reduce import reduce_mueller
+
+    path = capture(tmp_path, configs, Bench(dg=np.deg2rad(129.0)), air=True)
+    model = InstrumentModel.load(configs / "instruments/rgb950.yaml")
+    judged, _ = diagnose_captures([path], model)
+    write_instrument(tmp_path / "new.yaml", model, judged.diagnosis)
+    errors = []
+    for k, used in enumerate((model, InstrumentModel.load(tmp_path / "new.yaml"))):
+        with Capture(path) as source:
+            reduce_mueller(source, used.at(662), tmp_path / f"m{k}.h5", (Step("reduce", {}),))
+        m = np.nanmean(MuellerImage.load(tmp_path / f"m{k}.h5").values, axis=(2, 3), dtype=float)
+        mean = m / m[0, 0]
+        errors.append(np.abs(mean - np.eye(4)).max())
+    assert errors[0] > 0.02
+    assert errors[1] < 0.004
