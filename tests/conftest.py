@@ -19,12 +19,20 @@ SIOCSIFFLAGS = 0x8914
 IFF_UP = 1
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """`--rig FILE` names the rig that tests/hardware may move."""
+    parser.addoption("--rig", default=None, help="rig file of real hardware for tests/hardware")
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Give each test process a loopback interface of its own, where it may.
 
     The simulated camera occupies a fixed port of 127.0.0.1: with a network of their own, parallel test processes do
     not wait for each other's. Needs root; without it the tests run as they are, one process at a time (`./lab test`).
+    Real hardware is reached over the real network.
     """
+    if config.getoption("--rig") is not None:
+        return
     if os.geteuid() == 0 and ctypes.CDLL(None, use_errno=True).unshare(CLONE_NEWNET) == 0:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as control:
             fcntl.ioctl(control, SIOCSIFFLAGS, struct.pack("16sH14x", b"lo", IFF_UP))
