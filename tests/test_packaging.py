@@ -28,9 +28,7 @@ def test_no_other_distribution_installs_the_name(name: str) -> None:
 def test_every_subpackage_is_in_the_wheel() -> None:
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())
     packaged = set(find_packages(str(ROOT), include=settings["tool"]["setuptools"]["packages"]["find"]["include"]))
-    folders = {
-        ".".join(path.parent.relative_to(ROOT).parts) for name in NAMES for path in (ROOT / name).rglob("*.py")
-    }
+    folders = {".".join(path.parent.relative_to(ROOT).parts) for name in NAMES for path in (ROOT / name).rglob("*.py")}
     assert folders == packaged
 
 

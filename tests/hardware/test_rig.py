@@ -1,6 +1,7 @@
 """First contact with a real rig: `./lab test -n 0 tests/hardware --rig my_rig.yaml`.
 
-Home everything first, away from forbidden poses and with free way. Each axis moves one degree up and back. Nothing homes; an axis without reference is skipped and says so.
+Home everything first, away from forbidden poses and with free way. Each axis moves one degree up and back. Nothing
+homes; an axis without reference is skipped and says so.
 """
 
 from collections.abc import Iterator
