@@ -27,9 +27,15 @@ app = typer.Typer(
 def diagnose_command(
     captures: Annotated[list[Path], typer.Argument(help="Captures of one instrument at one wavelength.")],
     instrument: Annotated[Path, typer.Option(help="Instrument file that the intensities are compared with.")],
-    write: Annotated[Path | None, typer.Option(help="New instrument file with the effects found.")] = None,
+    write: Annotated[
+        Path | None, typer.Option(help="New file with the effects found: instrument, or material.")
+    ] = None,
     json: Annotated[Path | None, typer.Option(help="Result as JSON.")] = None,
     report: Annotated[Path | None, typer.Option(help="Report with figures (HTML, one file).")] = None,
+    reflectance: Annotated[
+        Path | None, typer.Option(help="Material file: the sample is triply degenerate with this dominant process.")
+    ] = None,
+    geometry: Annotated[Path | None, typer.Option(help="Geometry file of the object, with --reflectance.")] = None,
 ) -> None:
     """Trace the residual between intensities and model to the effects that explain it; say so if none does."""
     # The problems are many and small: BLAS threads would only wait for one another.
@@ -39,6 +45,11 @@ def diagnose_command(
             from processing.errors import ProcessError
 
             raise ProcessError(f"{target} exists and is not replaced. Give another name.")
+    if reflectance is not None or geometry is not None:
+        from processing.diagnosis.surface_cli import diagnose_reflectance
+
+        diagnose_reflectance(captures, instrument, reflectance, geometry, write, json, report)
+        return
     from processing.diagnosis.run import diagnose_captures
     from processing.instrument import InstrumentModel
 

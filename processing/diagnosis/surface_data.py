@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,10 +95,19 @@ def read_surface(
             f"{capture.path}: {len(where)} pixels see the lit object well within its outline; "
             f"{FEWEST_PIXELS} are needed. Check the geometry file and the arm angle ({omega:g} degrees)."
         )
-    y = signal[:, :, picked].astype(np.float64).reshape(-1, len(where)).T
+    states = signal[:, :, picked].astype(np.float64)
+    exposure, conditions, state_slope, state_floor = data.exposure, data.conditions, data.slope, data.floor
+    if not model.axes:
+        # Nothing turns, so all states are one: their mean is as good, and cheaper.
+        n, total = len(states), exposure.sum()
+        states = states.sum(axis=0, keepdims=True) / n
+        state_slope, state_floor = np.array([data.slope.mean() / n]), np.array([data.floor.mean() / n])
+        exposure = np.array([total / n])
+        conditions = replace(conditions, states=1, elapsed=np.zeros(1))
+    y = states.reshape(-1, len(where)).T
     channels = signal.shape[1]
-    share = np.tile(share, data.conditions.states)
-    slope, floor = np.repeat(data.slope, channels) * share, np.repeat(data.floor, channels) * share
+    share = np.tile(share, conditions.states)
+    slope, floor = np.repeat(state_slope, channels) * share, np.repeat(state_floor, channels) * share
     low = where.min(axis=0)
     tiles = (where - low) * TILES // (where.max(axis=0) - low + 1)
     return SurfaceData(
@@ -108,8 +117,8 @@ def read_surface(
         variance=slope * np.maximum(y, 0) + floor,
         slope=slope,
         floor=floor,
-        exposure=data.row_exposure,
-        conditions=data.conditions,
+        exposure=np.repeat(exposure, channels),
+        conditions=conditions,
         fold=tiles.sum(axis=1) % FOLDS,
         tile=tiles[:, 0] * TILES + tiles[:, 1],
         where=where,

@@ -22,13 +22,17 @@ Shape = Annotated[Sphere | Flat | Mesh, Field(discriminator="kind")]
 
 
 class ViewingGeometry(BaseModel):
-    """Where camera, source and object stand. The source's distance is from the centre of rotation."""
+    """Where camera, source and object stand. The source's distance is from the centre of rotation.
+
+    `arm_zero_deg` is what has to be added to the arm's reading (`diagnose --reflectance` finds it).
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     camera: PinholeCamera
     source_distance_mm: float = Field(gt=0)
     shape: Shape
+    arm_zero_deg: float = 0.0
 
     @classmethod
     def load(cls, path: Path | str) -> ViewingGeometry:
@@ -42,8 +46,8 @@ class ViewingGeometry(BaseModel):
         return self.model_copy(update={"shape": self.shape.relative_to(folder)})
 
     def source_position_mm(self, omega_deg: float) -> FloatArray:
-        """(sin W, 0, cos W) times the source's distance."""
-        w = np.deg2rad(omega_deg)
+        """(sin W, 0, cos W) times the source's distance, W being the arm's reading and its zero."""
+        w = np.deg2rad(omega_deg + self.arm_zero_deg)
         return self.source_distance_mm * np.array([np.sin(w), 0.0, np.cos(w)])
 
     def at(

@@ -1,0 +1,45 @@
+"""The search over effects of the reflectance: that of the instrument, more careful with what imitates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from processing.diagnosis.candidate import Candidate
+from processing.diagnosis.fit import Fit, HeldOut
+from processing.diagnosis.problem import Space
+from processing.diagnosis.search import Search, Trial
+from processing.effects._reflectance import ReflectanceEffect
+
+#: Every effect of the pool is fitted, not only those that promise most: the model is far from linear in them.
+LEADERS = 12
+#: Part of what is left over that an effect must explain to be added. Several that each take a little together imitate
+#: nearly any smooth pattern over an object.
+LEAST_SHARE = 0.3
+
+
+class SurfaceSearch(Search):
+    """The search in one `SurfaceProblem`."""
+
+    _start: float | None = None
+
+    def _trials(
+        self,
+        space: Space,
+        fit: Fit,
+        out: HeldOut,
+        without: Sequence[Candidate] = (),
+        leaders: int = LEADERS,
+        least: float = 0.0,
+    ) -> list[Trial]:
+        trials = super()._trials(space, fit, out, without, max(leaders, LEADERS), least)
+        if self._start is None:
+            self._start = out.excess
+        # Beside an effect whose form is rough, what its form leaves over must not get a name of its own.
+        rough = max((_roughness(c) for c in space.candidates), default=0.0)
+        needed = max(LEAST_SHARE * (out.excess - 2 * self.noise_of(out)), rough * max(self._start - out.excess, 0.0))
+        return [t for t in trials if out.excess - t.out.excess >= needed]
+
+
+def _roughness(candidate: Candidate) -> float:
+    effect = candidate.effect
+    return effect.rough if isinstance(effect, ReflectanceEffect) else 0.0
