@@ -177,7 +177,7 @@ class Search:
         chosen = [c for _, c in sorted(scored.values(), key=lambda item: item[0])[:leaders]]
         if _rms(fit) > FAR_OFF:
             chosen += [c for c in offered if c.starts and c not in chosen]
-        trials = [self._trial(space, fit, out, c, weighty) for c in chosen]
+        trials = [self.trial(space, fit, out, c, weighty) for c in chosen]
         return sorted(trials, key=lambda t: t.rank)
 
     def scores(self, space: Space, fit: Fit, offered: Sequence[Candidate]) -> dict[Candidate, tuple[float, Array]]:
@@ -211,7 +211,8 @@ class Search:
         without = self.problem.sums(both, np.append(fit.values, 1.0), derivatives=False).excess.sum()
         return float(with_all - without)
 
-    def _trial(self, space: Space, fit: Fit, out: HeldOut, candidate: Candidate, weighty: float) -> Trial:
+    def trial(self, space: Space, fit: Fit, out: HeldOut, candidate: Candidate, weighty: float) -> Trial:
+        """One candidate fitted with the active ones, from all its starts, and scored on held-out data."""
         both = Space((*space.candidates, candidate))
         best: Fit | None = None
         for start in (np.zeros(candidate.size), *candidate.starts):

@@ -1,7 +1,7 @@
 """Light that was scattered inside the volume behaves like a dipole's, not like a reflection at the surface.
 
 Cause: small scatterers near the surface of a white, porous or pigmented material (PTFE, plaster, paper). The ratio
-of the amplitudes across and along the plane of scattering is then cos(2 theta_d), which is Fresnel's for an index near one.
+of the amplitudes across and along the plane of scattering is then cos(2 theta_d), Fresnel's for an index near one.
 Mend: take the material's dominant process from measurement; a first-surface index near one imitates it.
 """
 

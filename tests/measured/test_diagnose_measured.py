@@ -48,7 +48,7 @@ def test_wollaston_the_source_is_the_cause(shared_data, configs, tmp_path):
     named = [e for e in d.effects if e.confident]
     assert [e.kind for e in named] == ["source_flicker"]
     assert d.verdict == "explained"
-    # Both channels saw it: the sum of the channels, which is modulated only as far as they differ, shows the same gains.
+    # Both channels saw it: their sum, which is modulated only as far as they differ, shows the same gains.
     gains = 1 + np.array(named[0].parameters["states"].value)
     total = (left + right)[np.argsort(theta)]
     assert np.corrcoef(gains, total)[0, 1] > 0.95
