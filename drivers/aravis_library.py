@@ -7,12 +7,12 @@ import ipaddress
 import socket
 import struct
 import warnings
-from pathlib import Path
 from typing import Any
 
 from drivers.errors import CameraBusy, CameraError, CameraNotFound
 
 _SIOCGIFADDR = 0x8915
+_SIOCGIFMTU = 0x8921
 # GigE Vision bootstrap register: address of the application that controls the camera (optional for cameras).
 _PRIMARY_APPLICATION_IP = 0x0A14
 
@@ -138,10 +138,11 @@ def interface_of(address: str) -> tuple[str, int] | None:
     """Name and MTU in bytes of the network interface that has an IPv4 address; None if none has it."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         for _, name in socket.if_nameindex():
+            request = struct.pack("256s", name.encode()[:15])
             try:
-                reply = fcntl.ioctl(probe, _SIOCGIFADDR, struct.pack("256s", name.encode()[:15]))
+                reply = fcntl.ioctl(probe, _SIOCGIFADDR, request)
             except OSError:
                 continue
             if socket.inet_ntoa(reply[20:24]) == address:
-                return name, int(Path(f"/sys/class/net/{name}/mtu").read_text())
+                return name, int(struct.unpack_from("i", fcntl.ioctl(probe, _SIOCGIFMTU, request), 16)[0])
     return None
