@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.errors import ProcessError
-from processing.product import Product
+from processing.product import LIT_ERRORS, Product
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 #: Longest side of a panel in pixels; larger images are thinned before drawing, which changes no file.
 PANEL_PIXELS = 600
 SIMULATED = "SIMULATED"
-#: A pixel is drawn normalized where m00 is this many standard errors above zero.
-LIT_ERRORS = 10.0
 
 
 def draw_product(path: Path, figure: Path) -> None:
@@ -40,12 +38,13 @@ def draw_product(path: Path, figure: Path) -> None:
 def product_figure(product: Product) -> Figure:
     """Matplotlib figure of a product; raises ProcessError for a kind without one."""
     if product.kind == "mueller":
-        elements, error = thin(product.get("mueller")), thin(product.get("mueller_errors")[0, 0])
-        with np.errstate(invalid="ignore"):
-            lit = elements[0, 0] > LIT_ERRORS * np.nan_to_num(error)
+        elements = thin(product.get("mueller"))
+        lit = _lit(elements[0, 0], thin(product.get("mueller_errors")[0, 0]))
         return mueller_figure(elements, lit, _title(product), product.simulated)
     if product.kind == "stokes":
         maps = {name: thin(product.get(name)) for name in ("s0", "dolp", "aolp_deg")}
+        dark = ~_lit(maps["s0"], thin(product.get("s0_errors")))
+        maps["dolp"][dark] = maps["aolp_deg"][dark] = np.nan
         return stokes_figure(maps, _title(product), product.simulated)
     if product.kind == "xi0":
         xi0, errors, valid = (thin(product.get(name)) for name in ("xi0", "xi0_errors", "valid"))
@@ -151,9 +150,16 @@ def thin(image: NDArray[Any]) -> NDArray[Any]:
     return image[..., ::step, ::step]
 
 
+def _lit(intensity: NDArray[Any], error: NDArray[Any]) -> NDArray[np.bool_]:
+    # Where the noise is not known the error is NaN, and any light counts.
+    with np.errstate(invalid="ignore"):
+        return np.asarray(intensity > LIT_ERRORS * np.nan_to_num(error))
+
+
 def _map(figure: Figure, axis: Any, values: NDArray[Any], label: str, **keywords: Any) -> None:
     shown = axis.imshow(values, interpolation="nearest", **keywords)
     axis.set_title(label, fontsize=10)
+    axis.set_facecolor("0.85")
     axis.set_xticks([])
     axis.set_yticks([])
     figure.colorbar(shown, ax=axis, shrink=0.85)

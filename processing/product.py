@@ -27,6 +27,9 @@ from processing.provenance import step_text as step_text
 
 PRODUCT_VERSION = 1
 
+#: A pixel has light where its intensity is this many standard errors above zero; figures and summaries count those.
+LIT_ERRORS = 10.0
+
 
 class ProductError(ProcessError):
     """A product file cannot be read or written."""

@@ -16,16 +16,13 @@ from processing.decompositions.lu_chipman import lu_chipman
 from processing.decompositions.symmetric import symmetric
 from processing.errors import ProcessError
 from processing.images import MuellerImage
-from processing.product import Plane, Product, ProductWriter, Step
+from processing.product import LIT_ERRORS, Plane, Product, ProductWriter, Step
 from processing.propagation import Derived
 from processing.quantities import PAPER_PAIRS, State
 from processing.reduce import Progress
 
 #: Pixels of a block: gradients take 128 bytes a pixel and quantity.
 BLOCK_PIXELS = 1 << 14
-
-#: A pixel holds light where m00 is this many standard errors.
-LIT = 10.0
 
 #: Decompositions that are computed only where asked for, because they take seconds for a megapixel.
 EXTRA = ("symmetric", "differential")
@@ -136,7 +133,7 @@ def _planes(extra: Sequence[str], pairs: Mapping[str, tuple[State, State]]) -> d
         found |= _DIFFERENTIAL
     for name in defined:
         found[f"{name}_defined"] = Plane((), "", f"1 = the {name.replace('_', '-')} decomposition exists", np.uint8)
-    found["lit"] = Plane((), "", f"1 = m00 is above {LIT:g} of its standard errors", np.uint8)
+    found["lit"] = Plane((), "", f"1 = m00 is above {LIT_ERRORS:g} of its standard errors", np.uint8)
     found["negative_determinant"] = Plane((), "", "1 = det M < 0: Lu-Chipman's depolarizer is negative there", np.uint8)
     return found
 
@@ -146,7 +143,7 @@ def _block(
 ) -> dict[str, NDArray[Any]]:
     m = image.matrices.astype(float)
     # Where there is no light an eigenvalue solver only works on noise, slowly.
-    lit = np.where((image.values[0, 0] > LIT * np.nan_to_num(image.errors[0, 0]))[..., None, None], m, np.nan)
+    lit = np.where((image.values[0, 0] > LIT_ERRORS * np.nan_to_num(image.errors[0, 0]))[..., None, None], m, np.nan)
     derived: dict[str, Derived] = {}
     with np.errstate(divide="ignore", invalid="ignore"):
         for group in _GROUPS:
@@ -178,7 +175,9 @@ def _facts(writer: ProductWriter, maps: Mapping[str, Plane]) -> dict[str, Any]:
     known = writer.get("lit") > 0
     facts: dict[str, Any] = {"pixels": int(known.size), "pixels_with_light": int(known.sum()), "warnings": []}
     if not known.any():
-        facts["warnings"].append(f"no pixel has m00 above {LIT:g} of its standard errors: there is nothing but noise")
+        facts["warnings"].append(
+            f"no pixel has m00 above {LIT_ERRORS:g} of its standard errors: there is nothing but noise"
+        )
         return facts
     names = ("depolarization_index", "entropy", "td_missed", "diattenuation_linear", "polarizance_linear")
     facts |= {f"median_{name}": _median(writer.get(name)[known]) for name in names}

@@ -19,7 +19,7 @@ from processing.mosaic.layout import MosaicLayout
 from processing.mosaic.methods import demosaic
 from processing.mosaic.noise import stokes_covariance
 from processing.noise import NoiseModel
-from processing.product import Plane, ProductWriter, Step
+from processing.product import LIT_ERRORS, Plane, ProductWriter, Step
 from processing.reduce import Progress, relative_exposure, sample_states
 from processing.reduce_facts import in_words
 
@@ -43,6 +43,9 @@ PLANES = {
     "closure": Plane((), "count", "what the model cannot explain of the four channels: I0 + I90 - I45 - I135 if ideal"),
     "pixel_mask": Plane((), "", f"0 = good; bits: {Mask.meaning()}", np.uint8),
 }
+
+#: Without light there is no degree and no angle of polarization; S itself is a measurement all the same.
+RATIOS = ("dolp", "dolp_errors", "aolp_deg", "aolp_deg_errors")
 
 
 def channel_rows(
@@ -144,11 +147,11 @@ def reduce_stokes(
     frames = float(capture.column("repeats")[states].sum())
     found = stokes(channels, analyzers, layout, method, noise, frames, correction.dark_frames, frame)
     found["pixel_mask"] = _spread(mask, channels.shape[1:])
-    lost = (found["pixel_mask"] != 0) | ~(found["s0"] > 0)
-    found["pixel_mask"][~(found["s0"] > 0) & (found["pixel_mask"] == 0)] = np.uint8(Mask.NOT_DETERMINED)
+    lost = found["pixel_mask"] != 0
+    dark = ~(found["s0"] > 0)
     for name, values in found.items():
         if name != "pixel_mask":
-            values[..., lost] = np.nan
+            values[..., lost | dark if name in RATIOS else lost] = np.nan
     rows, columns = channels.shape[1:]
     facts = _facts(found, analyzers, noise, correction, method, len(states))
     with ProductWriter(out, "stokes", capture.header, (rows, columns), PLANES, steps, overwrite) as product:
@@ -247,16 +250,19 @@ def _facts(
     if good[::3, ::3].sum() > 1000:
         some[:] = False
         some[::3, ::3] = good[::3, ::3]
+    lit = some & (found["s0"] > LIT_ERRORS * found["s0_errors"])
+    closure = found["closure"][lit] / found["s0"][lit]
     return {
         "states": states,
         "method": method,
         "condition_number": condition_number_linear(analyzers),
         "black": correction.source,
         "noise": noise.source if noise else "estimated from the closure",
-        "median_closure_over_s0": float(np.median(found["closure"][some] / found["s0"][some])),
-        "rms_closure_over_s0": float(np.sqrt(np.mean((found["closure"][some] / found["s0"][some]) ** 2))),
-        "median_dolp": float(np.median(found["dolp"][some])),
+        "median_closure_over_s0": float(np.median(closure)) if lit.any() else float("nan"),
+        "rms_closure_over_s0": float(np.sqrt(np.mean(closure**2))) if lit.any() else float("nan"),
+        "median_dolp": float(np.median(found["dolp"][lit])) if lit.any() else float("nan"),
         "pixels": mask.size,
+        "pixels_with_light": int(np.sum(found["s0"] > LIT_ERRORS * found["s0_errors"])),
         "masked": counts,
         "warnings": warnings,
     }
