@@ -5,11 +5,13 @@ Each takes the scene (or the optics) that the processing believes in and returns
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from processing import triply_degenerate
-from processing.geometry.frames import ScatteringGeometry, dot
+from processing import mueller, triply_degenerate
+from processing.geometry.frames import ScatteringGeometry, dot, unit
 from processing.geometry.sphere import Sphere
 from processing.instrument import InstrumentModel, Polarizer, Retarder
 from simulators.scene import Scene, Surface
@@ -40,14 +42,25 @@ class ArmZero:
 
 def turned_generator(instrument: InstrumentModel, error_deg: float) -> InstrumentModel:
     """Every element of the generator stands turned about the beam, as one unit that was put in askew."""
+    return instrument.model_copy(update={"generator": _turned(instrument.generator, error_deg)})
+
+
+def turned_analyzer(instrument: InstrumentModel, error_deg: float) -> InstrumentModel:
+    """The whole analyzer, with the polarizers of all channels, turned about the beam; the image stays upright."""
+    channels = tuple(c.model_copy(update={"elements": _turned(c.elements, error_deg)}) for c in instrument.channels)
+    analyzer = _turned(instrument.analyzer, error_deg)
+    return instrument.model_copy(update={"analyzer": analyzer, "channels": channels})
+
+
+def _turned(elements: tuple[Any, ...], error_deg: float) -> tuple[Any, ...]:
     turned = []
-    for element in instrument.generator:
+    for element in elements:
         if not isinstance(element, Polarizer | Retarder):
             raise ValueError(f"a {element.kind} cannot be turned")
         azimuth = element.azimuth_deg
         new = {k: v + error_deg for k, v in azimuth.items()} if isinstance(azimuth, dict) else azimuth + error_deg
         turned.append(element.model_copy(update={"azimuth_deg": new}))
-    return instrument.model_copy(update={"generator": tuple(turned)})
+    return tuple(turned)
 
 
 class LitSupport:
@@ -72,7 +85,7 @@ class LitSupport:
         out = self.scene.mueller_image(omega_deg, wavelength_nm, rows, columns)
         spec = self.scene.object
         image = spec.geometry.at(omega_deg, rows, columns)
-        surface = next(s for nm, s in spec.surface.items() if abs(nm - wavelength_nm) < 0.5)
+        surface = _surface(self.scene, wavelength_nm)
         g = image.points
         centre = spec.geometry.shape.centre_mm if isinstance(spec.geometry.shape, Sphere) else (0.0, 0.0, 0.0)
         radius = spec.geometry.shape.radius_mm if isinstance(spec.geometry.shape, Sphere) else 0.0
@@ -91,6 +104,55 @@ class LitSupport:
             added += weight[:, None, None] * m
         out[image.mask] += added.astype(np.float32)
         return out
+
+
+class Dented:
+    """A sphere whose normals wave by `amplitude_deg`, `waves` times over its width: no sphere for polarization."""
+
+    def __init__(self, scene: Scene, amplitude_deg: float, waves: float) -> None:
+        self.scene, self.amplitude_deg, self.waves = scene, amplitude_deg, waves
+
+    def mueller_image(self, omega_deg: float, wavelength_nm: float, rows: int, columns: int) -> NDArray[np.float32]:
+        """The scene with bent normals."""
+        image = self.scene.object.geometry.at(omega_deg, rows, columns)
+        g = image.points
+        tilt = np.deg2rad(self.amplitude_deg) * np.sin(np.pi * self.waves * (g.normal[:, 0] + 0.6 * g.normal[:, 1]))
+        bent = unit(g.normal + tilt[:, None] * np.array([0.5, 0.8, 0.0]))
+        points = ScatteringGeometry(bent, g.to_source, g.to_camera)
+        out = np.zeros((rows, columns, 4, 4), dtype=np.float32)
+        out[image.mask] = _triply_degenerate(self.scene, _surface(self.scene, wavelength_nm), points, wavelength_nm)
+        return out
+
+
+class SecondLamp:
+    """A second source at another arm angle, with the same polarization, `strength` times as bright."""
+
+    def __init__(self, scene: Scene, omega_deg: float, strength: float) -> None:
+        self.scene, self.omega_deg, self.strength = scene, omega_deg, strength
+
+    def mueller_image(self, omega_deg: float, wavelength_nm: float, rows: int, columns: int) -> NDArray[np.float32]:
+        """The scene lit from both."""
+        first = self.scene.mueller_image(omega_deg, wavelength_nm, rows, columns)
+        second = self.scene.mueller_image(self.omega_deg, wavelength_nm, rows, columns)
+        return np.asarray(first + np.float32(self.strength) * second)
+
+
+class SlowTurn:
+    """Strained glass before the sphere turns the illumination by an angle that waves over the image."""
+
+    def __init__(self, scene: Scene, amplitude_deg: float) -> None:
+        self.scene, self.amplitude_deg = scene, amplitude_deg
+
+    def mueller_image(self, omega_deg: float, wavelength_nm: float, rows: int, columns: int) -> NDArray[np.float32]:
+        """The scene behind the glass."""
+        m = self.scene.mueller_image(omega_deg, wavelength_nm, rows, columns)
+        y, x = np.mgrid[-1 : 1 : rows * 1j, -1 : 1 : columns * 1j]
+        turn = np.deg2rad(self.amplitude_deg) * np.sin(3 * x + 5 * y)
+        return np.asarray(m @ mueller.rotation(turn), dtype=np.float32)
+
+
+def _surface(scene: Scene, wavelength_nm: float) -> Surface:
+    return next(s for nm, s in scene.object.surface.items() if abs(nm - wavelength_nm) < 0.5)
 
 
 def _triply_degenerate(scene: Scene, surface: Surface, points: ScatteringGeometry, wavelength_nm: float) -> FloatArray:

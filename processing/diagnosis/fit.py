@@ -135,7 +135,10 @@ def held_out(problem: Problem, space: Space, full: Fit) -> HeldOut:
     total = np.zeros(4)
     for fold in range(problem.folds):
         others = [f for f in range(problem.folds) if f != fold]
-        values = _one_step(full, space, others)
+        if problem.far_from_linear:
+            values = minimize(problem, space, full.values, others, steps=6).values
+        else:
+            values = _one_step(full, space, others)
         if local.any():
             start = np.where(local, full.values, values)
             fit = minimize(problem, space, start, [fold], free=local, steps=3)

@@ -39,6 +39,7 @@ class ReflectanceProblem:
     """
 
     holds_out_states = False
+    far_from_linear = False
     spread = 1.0
     folds = FOLDS
 

@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from processing.capture import Capture
 from processing.changes import Conditions
+from processing.correction import Correction
 from processing.diagnosis.capture_data import CaptureData, read_capture
 from processing.diagnosis.surface_view import SurfaceView
 from processing.errors import ProcessError
@@ -101,7 +102,9 @@ def read_surface(
         # Nothing turns, so all states are one: their mean is as good, and cheaper.
         n, total = len(states), exposure.sum()
         states = states.sum(axis=0, keepdims=True) / n
-        state_slope, state_floor = np.array([data.slope.mean() / n]), np.array([data.floor.mean() / n])
+        # The dark that was taken away is the same in all of them and does not average out.
+        dark = 1 / frames if (frames := Correction.of(capture).dark_frames) else 0.0
+        state_slope, state_floor = np.array([data.slope.mean() / n]), np.array([data.floor.mean() * (1 / n + dark)])
         exposure = np.array([total / n])
         conditions = replace(conditions, states=1, elapsed=np.zeros(1))
     y = states.reshape(-1, len(where)).T

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 #: Standard deviations beyond which a test says "structure".
 LIMIT = 5.0
-#: Share of the excess that must be explained before anything is named while structure is left.
+#: Share of every test's excess that must be explained before anything is named while structure is left.
 SHARE = 0.97
 #: Information, in chi-square for a typical size, below which an effect cannot be seen.
 SEEN = 4.0
@@ -76,7 +76,7 @@ def diagnose_surface(problem: SurfaceProblem, material: str, say: Say) -> Surfac
     none = np.zeros(0)
     before = [structure(problem, k, found.base, none) for k in captures]
     after = [structure(problem, k, found.space, found.fit.values) for k in captures]
-    verdict = _verdict(search, found, after)
+    verdict = _verdict(found, before, after)
     tried: tuple[Candidate, ...] = ()
     if verdict == "unexplained":
         tried = found.effects or tuple(t.candidate for t in found.ranking[:5])
@@ -192,7 +192,7 @@ def noise_floor(problem: SurfaceProblem) -> float:
     return float(np.sqrt(np.mean(parts)))
 
 
-def _verdict(search: SurfaceSearch, found: Found, after: Sequence[dict[str, float]]) -> Verdict:
+def _verdict(found: Found, before: Sequence[dict[str, float]], after: Sequence[dict[str, float]]) -> Verdict:
     left = any(value > LIMIT for tests in after for value in tests.values())
     if not found.effects:
         return "unexplained" if left else "consistent"
@@ -200,11 +200,13 @@ def _verdict(search: SurfaceSearch, found: Found, after: Sequence[dict[str, floa
         return "unexplained"
     if not left:
         return "explained"
-    unexplained = max(found.after.excess - 2 * search.noise_of(found.after), 0.0)
-    share = 1 - unexplained / max(found.before.excess, 1e-300)
+    # Of what is smooth over the object, which noise is not.
+    share = max(
+        y[name] / max(x[name], LIMIT) for x, y in zip(before, after, strict=True) for name in x if y[name] > LIMIT
+    )
     rough = max(getattr(c.effect, "rough", 0.0) for c in found.effects)
     sure = all(found.chance.get(c, 1.0) < CHANCE for c in found.effects)
-    return "partly_explained" if share >= min(SHARE, 1 - rough) and sure else "unexplained"
+    return "partly_explained" if share <= max(1 - SHARE, rough) and sure else "unexplained"
 
 
 def _error(problem: SurfaceProblem, rms: float, chi2: float) -> Error:

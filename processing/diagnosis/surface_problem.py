@@ -8,7 +8,7 @@ is both coefficients, are free at every pixel and projected out, exactly as a fr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from processing.diagnosis.candidate import Candidate
 from processing.diagnosis.problem import Space, Sums
 from processing.diagnosis.surface_data import FOLDS, SurfaceData
 from processing.effects._reflectance import ReflectanceEffect
-from processing.effects.base import all_effects, apply_to
+from processing.effects.base import Parameter, all_effects, apply_to
 from processing.instrument import InstrumentModel
 from processing.reflectance_changes import ReflectanceChanges
 
@@ -67,6 +67,7 @@ class SurfaceProblem:
     """Captures of one object with one instrument against instrument and reflectance model."""
 
     holds_out_states = False
+    far_from_linear = True
     noise_known = True
     spread = 1.0
     folds = FOLDS
@@ -101,8 +102,16 @@ class SurfaceProblem:
             else:
                 continue
             for place in places:
-                out.append(Candidate(effect, place, effect.parameters(self.model, conditions, place)))
+                parameters = effect.parameters(self.model, conditions, place)
+                out.append(Candidate(effect, place, self._physical(effect.kind, parameters)))
         return tuple(out)
+
+    def _physical(self, kind: str, parameters: tuple[Parameter, ...]) -> tuple[Parameter, ...]:
+        """Bounds that keep k and a of the material from becoming negative."""
+        view = self.captures[0].view
+        lowest = {"polarized_diffuse": {"a": -view.a - 1e-9}, "refractive_index": {"k": -view.index.imag - 1e-9}}
+        mine = lowest.get(kind, {})
+        return tuple(replace(p, lower=max(p.lower, mine[p.name])) if p.name in mine else p for p in parameters)
 
     def powers(self) -> list[tuple[int, Array]]:
         """Rows that the unknowns leave over, and equal power of the smooth patterns that a misfit can have."""

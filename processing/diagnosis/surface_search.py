@@ -15,6 +15,9 @@ LEADERS = 12
 #: Part of what is left over that an effect must explain to be added. Several that each take a little together imitate
 #: nearly any smooth pattern over an object.
 LEAST_SHARE = 0.3
+PROMISE = 0.2
+#: Standard deviations of the noise up to which a total excess is no structure: the noise is known to some percent only.
+NO_STRUCTURE = 4.0
 
 
 class SurfaceSearch(Search):
@@ -31,13 +34,20 @@ class SurfaceSearch(Search):
         leaders: int = LEADERS,
         least: float = 0.0,
     ) -> list[Trial]:
-        trials = super()._trials(space, fit, out, without, max(leaders, LEADERS), least)
+        # What one step promises says little here, so nothing is left out for promising little.
+        trials = super()._trials(space, fit, out, without, max(leaders, LEADERS), PROMISE * least)
         if self._start is None:
             self._start = out.excess
         # Beside an effect whose form is rough, what its form leaves over must not get a name of its own.
         rough = max((_roughness(c) for c in space.candidates), default=0.0)
         needed = max(LEAST_SHARE * (out.excess - 2 * self.noise_of(out)), rough * max(self._start - out.excess, 0.0))
         return [t for t in trials if out.excess - t.out.excess >= needed]
+
+    def structure(self, after: HeldOut, parameters: int) -> float:
+        """Chi-square for each direction of structure that is left beyond what errors of the noise may cause."""
+        excess = after.excess - NO_STRUCTURE * self.noise_of(after)
+        weighty, _ = self.directions(excess)
+        return float(max(excess, 0.0) / max(weighty - parameters, 1.0))
 
 
 def _roughness(candidate: Candidate) -> float:
