@@ -1,0 +1,123 @@
+"""The paper's own story: a sphere at 662 nm, processed with first surface alone, then with what `diagnose` writes."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from processing.capture import Capture
+from processing.cli import main as process
+from processing.deviation import linear_diattenuation, magnitude, orientation_difference, rmsd
+from processing.diagnosis.cli import main as diagnose
+from processing.diagnosis.surface_judge import SurfaceDiagnosis
+from processing.diagnosis.surface_run import diagnose_object
+from processing.geometry.viewing import ViewingGeometry
+from processing.instrument import InstrumentModel
+from processing.product import Product
+from processing.reflectance.base import load_reflectance
+from simulators import scene_faults
+from simulators.scene import Scene
+from simulators.sphere_suite import SphereFault, drawn, take
+
+NM, OMEGA_DEG = 662.0, 35.0
+FIRST_SURFACE = "kind: first_surface\nname: red print, first surface alone\nconstants:\n  662: {n: 1.30, k: 0.08}\n"
+
+
+def run(main, *arguments) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main([str(a) for a in arguments])
+    return stop.value.code or 0
+
+
+@pytest.fixture(scope="module")
+def scene(configs: Path) -> Scene:
+    return Scene.load(configs / "scenes/red_sphere.yaml")
+
+
+def capture(folder: Path, configs: Path, scene: Scene, name: str, seed: int = 1) -> Path:
+    declared = InstrumentModel.load(configs / f"instruments/{name}.yaml")
+    fault = drawn("polarized_diffuse", np.random.default_rng(0), scene, declared)
+    path = folder / f"{name}.h5"
+    take(path, fault, declared, NM, OMEGA_DEG, seed)
+    return path
+
+
+def errors_of_m0(scene: Scene, material: Path) -> tuple[float, float]:
+    """RMS error of psi (degrees) and of |D| (percent) of a material's dominant process against the true one."""
+    points = scene.object.geometry.at(OMEGA_DEG, 120, 120).points
+    true, model = (
+        linear_diattenuation(m.mueller_jones(points, NM)) for m in (scene.material, load_reflectance(material))
+    )
+    psi = float(np.rad2deg(rmsd(orientation_difference(model, true))))
+    return psi, 100 * rmsd(magnitude(model) - magnitude(true))
+
+
+def error_of_xi0(scene: Scene, product: Path) -> float:
+    with Product(product) as opened:
+        xi0, valid = opened.get("xi0"), opened.get("valid") > 0
+    return rmsd((xi0 - scene.truth(OMEGA_DEG, NM, *xi0.shape).xi0)[valid])
+
+
+@pytest.mark.parametrize("name", ["rgb950", "linear_stokes"])
+def test_first_surface_lacks_polarized_diffuse(name, configs, scene, tmp_path, capsys):
+    path = capture(tmp_path, configs, scene, name)
+    stokes = path if name == "linear_stokes" else capture(tmp_path, configs, scene, "linear_stokes", seed=2)
+    plain, new = tmp_path / "plain.yaml", tmp_path / "new.yaml"
+    plain.write_text(FIRST_SURFACE)
+    geometry = configs / "geometries/one_inch_sphere.yaml"
+    given = [path, "--instrument", configs / f"instruments/{name}.yaml", "--reflectance", plain, "--geometry", geometry]
+    given += ["--write", new, "--json", tmp_path / "d.json", "--report", tmp_path / "d.html"]
+    assert run(diagnose, *given) == 0
+    said = capsys.readouterr().out
+    assert "SIMULATED" in said
+    assert "polarized_diffuse" in said
+    d = SurfaceDiagnosis.model_validate(json.loads((tmp_path / "d.json").read_text()))
+    assert d.verdict == "explained"
+    (effect,) = d.effects
+    assert effect.kind == "polarized_diffuse"
+    assert effect.evidence > 1000
+    assert d.constants == pytest.approx({"n": 1.30, "k": 0.08, "a": 0.17, "b": 2.0}, abs=0.05)
+    assert "<img" in (tmp_path / "d.html").read_text()
+
+    # xi0 of the Stokes camera: only the new material is right.
+    found = []
+    for material, out in ((plain, tmp_path / "before.h5"), (new, tmp_path / "after.h5")):
+        assert run(process, "xi0", stokes, "--geometry", geometry, "--material", material, "--out", out) == 0
+        found.append((*errors_of_m0(scene, material), error_of_xi0(scene, out)))
+    (psi, size, xi0), (psi_after, size_after, xi0_after) = found
+    assert (psi, size) == pytest.approx((41, 28), abs=6)
+    assert psi_after < 1.0
+    assert size_after < 1.0
+    assert xi0_after < 0.3 * xi0
+
+    assert run(diagnose, *given) == 2
+    assert "exists and is not replaced" in capsys.readouterr().err
+
+
+def test_geometry_and_instrument_that_were_found_end_the_error(configs, scene, tmp_path, capsys):
+    declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
+    moved = scene_faults.ArmZero(scene_faults.moved_sphere(scene, 0.5, -0.3, 0.02), 2.0)
+    fault = SphereFault("three", moved, scene_faults.turned_generator(declared, 1.5), scene.material)
+    path, new = tmp_path / "c.h5", tmp_path / "new.yaml"
+    take(path, fault, declared, NM, OMEGA_DEG, 3)
+    material = configs / "materials/red_print.yaml"
+    geometry = configs / "geometries/one_inch_sphere.yaml"
+    given = ["--instrument", configs / "instruments/rgb950.yaml", "--reflectance", material, "--geometry", geometry]
+    assert run(diagnose, path, *given, "--write", new) == 0
+    assert not new.exists()
+    corrected = ViewingGeometry.load(tmp_path / "new.geometry.yaml")
+    assert corrected.arm_zero_deg == pytest.approx(2.0, abs=0.4)
+    assert corrected.shape.centre_mm[:2] == pytest.approx((0.5, -0.3), abs=0.1)
+    instrument = InstrumentModel.load(tmp_path / "new.instrument.yaml")
+    with Capture(path) as opened:
+        assert opened.header.omega_deg == OMEGA_DEG
+    again = diagnose_object([path], instrument, load_reflectance(material), corrected)[0].diagnosis
+    assert again.verdict == "consistent"
+    assert run(diagnose, path, *given, "--write", new) == 2
+
+
+def test_both_files_are_needed(configs, tmp_path, capsys):
+    code = run(diagnose, tmp_path / "c.h5", "--instrument", "i.yaml", "--reflectance", "m.yaml")
+    assert code == 2
+    assert "needs both" in capsys.readouterr().err

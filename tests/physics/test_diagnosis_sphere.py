@@ -1,0 +1,141 @@
+"""What `diagnose --reflectance` finds on spheres with one thing wrong, and that it keeps silent where nothing is."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from processing.diagnosis.problem import Space
+from processing.diagnosis.surface_judge import SurfaceDiagnosis
+from processing.diagnosis.surface_problem import SurfaceProblem
+from processing.diagnosis.surface_run import diagnose_object
+from processing.errors import ProcessError
+from processing.instrument import InstrumentModel
+from simulators import scene_faults
+from simulators.scene import Scene
+from simulators.sphere_suite import SphereFault, drawn, take
+
+NM, OMEGA_DEG = 662.0, 35.0
+
+
+@pytest.fixture(scope="module")
+def scene(configs: Path) -> Scene:
+    return Scene.load(configs / "scenes/red_sphere.yaml")
+
+
+@pytest.fixture(scope="module", params=["rgb950", "linear_stokes"])
+def declared(configs: Path, request: pytest.FixtureRequest) -> InstrumentModel:
+    return InstrumentModel.load(configs / f"instruments/{request.param}.yaml")
+
+
+def diagnosed(
+    folder: Path, fault: SphereFault, declared: InstrumentModel, scene: Scene, seed: int = 1
+) -> tuple[SurfaceDiagnosis, SurfaceProblem]:
+    path = folder / "capture.h5"
+    path.unlink(missing_ok=True)
+    take(path, fault, declared, NM, OMEGA_DEG, seed)
+    judged, problem = diagnose_object([path], declared, fault.material, scene.object.geometry)
+    return judged.diagnosis, problem
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_true_model_is_left_in_peace(scene, declared, tmp_path, seed):
+    fault = drawn("none", np.random.default_rng(seed), scene, declared)
+    d, _ = diagnosed(tmp_path, fault, declared, scene, seed)
+    assert d.verdict == "consistent"
+    assert not d.effects
+    # Chi-square of some thousand degrees of freedom at least.
+    assert d.error_before.chi2_reduced == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("kind", ["polarized_diffuse", "registration", "illumination_azimuth"])
+def test_what_is_wrong_gets_its_name(scene, declared, tmp_path, kind):
+    fault = drawn(kind, np.random.default_rng(11), scene, declared)
+    d, _ = diagnosed(tmp_path, fault, declared, scene)
+    assert d.verdict == "explained"
+    (effect,) = d.effects
+    assert effect.kind == kind
+    assert not effect.indistinguishable_from
+    for name, truth in fault.parameters.items():
+        found = effect.parameters[name]
+        assert found.value == pytest.approx(truth, abs=3.5 * found.stderr)
+    assert d.error_after.rms_percent < 1.05 * d.noise_floor_percent
+    # A small fault is well under the noise of a pixel and plain over all of them.
+    assert d.error_after.rms_percent < d.error_before.rms_percent
+    assert effect.evidence > 50
+
+
+def test_arm_zero_and_registration_cannot_be_told_apart_by_linear_stokes(scene, configs, tmp_path):
+    declared = InstrumentModel.load(configs / "instruments/linear_stokes.yaml")
+    fault = SphereFault("arm_zero", scene_faults.ArmZero(scene, 2.0), declared, scene.material)
+    d, _ = diagnosed(tmp_path, fault, declared, scene)
+    (effect,) = d.effects
+    assert {effect.kind, *(i.partition("[")[0] for i in effect.indistinguishable_from)} == {"arm_zero", "registration"}
+    assert "outline" in d.recommendation
+    # A full Mueller capture with the same light sees the angle of incidence at each facet, and so the arm itself.
+    declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
+    fault = SphereFault("arm_zero", scene_faults.ArmZero(scene, 2.0), declared, scene.material)
+    d, _ = diagnosed(tmp_path, fault, declared, scene)
+    (effect,) = d.effects
+    assert (effect.kind, effect.indistinguishable_from) == ("arm_zero", ())
+
+
+def test_light_from_the_support_is_interreflection(scene, configs, tmp_path):
+    declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
+    fault = SphereFault("interreflection", scene_faults.LitSupport(scene, 0.3), declared, scene.material)
+    d, _ = diagnosed(tmp_path, fault, declared, scene)
+    (effect,) = d.effects
+    assert (effect.kind, effect.element) == ("interreflection", "support")
+    assert d.verdict in ("explained", "partly_explained")
+
+
+@pytest.mark.parametrize("kind", ["not_degenerate", "slow_turn"])
+def test_what_is_not_in_the_list_gets_no_name(scene, configs, tmp_path, kind):
+    declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
+    fault = drawn(kind, np.random.default_rng(4), scene, declared)
+    d, _ = diagnosed(tmp_path, fault, declared, scene)
+    assert d.verdict == "unexplained"
+    assert not d.effects
+    assert d.unexplained is not None
+    assert d.unexplained.description
+
+
+def test_two_effects_at_once(scene, configs, tmp_path):
+    declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
+    both = scene_faults.ArmZero(scene, 2.0)
+    fault = SphereFault("two", both, scene_faults.turned_generator(declared, 1.0), scene.material)
+    d, _ = diagnosed(tmp_path, fault, declared, scene)
+    found = {e.kind: next(iter(e.parameters.values())) for e in d.effects}
+    assert set(found) == {"arm_zero", "illumination_azimuth"}
+    assert found["arm_zero"].value == pytest.approx(2.0, abs=3.5 * found["arm_zero"].stderr)
+    assert found["illumination_azimuth"].value == pytest.approx(1.0, abs=3.5 * found["illumination_azimuth"].stderr)
+
+
+def test_derivatives_are_those_of_the_residual(scene, configs, tmp_path):
+    declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
+    fault = drawn("polarized_diffuse", np.random.default_rng(1), scene, declared)
+    _, problem = diagnosed(tmp_path, fault, declared, scene)
+    pool = [c for c in problem.pool() if c.effect.group == "reflectance"]
+    space = Space(tuple(pool))
+    values = 0.5 * np.minimum(space.joined("typical"), space.joined("upper"))
+    sums = problem.sums(space, values)
+    for j in range(space.size):
+        step = 1e-3 * space.joined("typical")[j]
+        moved = [values.copy(), values.copy()]
+        moved[0][j] -= step
+        moved[1][j] += step
+        low, high = (problem.sums(space, v, derivatives=False).excess.sum() for v in moved)
+        scale = np.sqrt(sums.curvature.sum(axis=0)[j, j] * abs(sums.excess.sum()))
+        # Kaufman's derivative leaves out a part that the gradient of the sum of squares does not have.
+        assert (high - low) / (4 * step) == pytest.approx(sums.gradient.sum(axis=0)[j], abs=2e-3 * scale)
+
+
+def test_an_object_out_of_view_is_refused(scene, configs, tmp_path):
+    declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
+    fault = drawn("none", np.random.default_rng(1), scene, declared)
+    path = tmp_path / "capture.h5"
+    take(path, fault, declared, NM, OMEGA_DEG, 1)
+    geometry = scene.object.geometry
+    far = geometry.shape.model_copy(update={"centre_mm": (400.0, 0.0, 0.0)})
+    with pytest.raises(ProcessError, match="no pixel sees a lit point"):
+        diagnose_object([path], declared, scene.material, geometry.model_copy(update={"shape": far}))
