@@ -56,6 +56,8 @@ def score(fault: SphereFault, d: SurfaceDiagnosis, seen: bool) -> str:
         right = all(right_names & {k, *others} for k, others in names.items())
         return d.verdict if not names else "right" if right else "wrong name"
     if fault.kind in UNLISTED:
+        if names and fault.kind == "not_degenerate" and all("not_triply_degenerate" in v for v in names.values()):
+            return "right"
         return "wrong name" if names else d.verdict
     if not names:
         return "missed" if seen else "not detectable"
@@ -69,7 +71,7 @@ def deviations(fault: SphereFault, d: SurfaceDiagnosis) -> list[float]:
     """Errors of the parameters in standard errors, where the effect itself is named."""
     out = []
     for e in d.effects:
-        if e.kind == fault.kind and not e.indistinguishable_from:
+        if e.kind == fault.kind and set(e.indistinguishable_from) <= {"not_triply_degenerate"}:
             for name, truth in fault.parameters.items():
                 p = e.parameters[name]
                 if isinstance(p.stderr, float) and not isinstance(p.value, tuple):

@@ -55,7 +55,9 @@ def test_what_is_wrong_gets_its_name(scene, declared, tmp_path, kind):
     assert d.verdict == "explained"
     (effect,) = d.effects
     assert effect.kind == kind
-    assert not effect.indistinguishable_from
+    # A linear Stokes camera cannot exclude that the small eigenvalues differ, unless the effect is a large one.
+    assert set(effect.indistinguishable_from) <= ({"not_triply_degenerate"} if declared.mosaic else set())
+    assert kind != "polarized_diffuse" or not effect.indistinguishable_from
     for name, truth in fault.parameters.items():
         found = effect.parameters[name]
         assert found.value == pytest.approx(truth, abs=3.5 * found.stderr)
@@ -70,7 +72,8 @@ def test_arm_zero_and_registration_cannot_be_told_apart_by_linear_stokes(scene, 
     fault = SphereFault("arm_zero", scene_faults.ArmZero(scene, 2.0), declared, scene.material)
     d, _ = diagnosed(tmp_path, fault, declared, scene)
     (effect,) = d.effects
-    assert {effect.kind, *(i.partition("[")[0] for i in effect.indistinguishable_from)} == {"arm_zero", "registration"}
+    named = {effect.kind, *(i.partition("[")[0] for i in effect.indistinguishable_from)}
+    assert named == {"arm_zero", "registration", "not_triply_degenerate"}
     assert "outline" in d.recommendation
     # A full Mueller capture with the same light sees the angle of incidence at each facet, and so the arm itself.
     declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
