@@ -86,6 +86,7 @@ class Correction:
             states = source_of_dark.states_with("dark")
             black, dark_frames = dark.astype(np.float32), int(source_of_dark.column("repeats")[states].sum())
             source = f"mean of {dark_frames} dark frame(s)" + (f" of {dark_from.path.name}" if dark_from else "")
+            warnings += _unmatched_dark_current(capture, source_of_dark)
         else:
             black, dark_frames = detector.black_level_counts, 0
             source = f"black level {black:g} counts from the header"
@@ -98,6 +99,29 @@ class Correction:
         saturation = _saturation(capture)
         flat = _flat(flat_from, black) if flat_from else _flat(capture, black)
         return cls(black, dark_frames, source, flat, bad, saturation, tuple(warnings))
+
+
+def _unmatched_dark_current(capture: Capture, source: Capture) -> list[str]:
+    """A warning where one mean dark stands for several exposures and the dark current shows in it."""
+    states = source.states_with("dark")
+    dark_s = source.column("exposure_s")[states].astype(float)
+    light_s = capture.column("exposure_s")[capture.states_with("sample")].astype(float)
+    away_s = float(np.max(np.abs(light_s - dark_s.mean()), initial=0.0))
+    if not away_s > 0.01 * dark_s.mean():  # also where exposures are not known
+        return []
+    lengths = np.unique(dark_s)
+    if lengths.size < 2:
+        return [
+            f"the dark states were exposed {lengths[0]:g} s, sample states differ from that by up to {away_s:g} s: "
+            "their dark current is not taken out. Take darks at the exposures of the sample."
+        ]
+    shortest, longest = (
+        np.mean([source.frames(int(k)).mean() for k in states[dark_s == length]]) for length in lengths[[0, -1]]
+    )
+    error = abs(longest - shortest) / (lengths[-1] - lengths[0]) * away_s
+    if error < 0.5:  # below the rounding of a count
+        return []
+    return [f"one mean dark for several exposures: the dark current leaves up to {error:.2g} counts in the signal"]
 
 
 def _saturation(capture: Capture) -> float | None:
