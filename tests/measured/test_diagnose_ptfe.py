@@ -1,5 +1,7 @@
 """PTFE: which effect helps the first-surface model, on directions of incidence that the fit has not seen."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,8 @@ pytestmark = pytest.mark.measured
 
 #: Residual of all Mueller elements over m00 in percent, before and after: found on these data, held-out directions.
 FOUND = {0.351: (1.87, 1.60), 0.532: (2.02, 1.38), 0.633: (2.24, 1.53), 1.064: (2.84, 2.08)}
+#: The same with the refractive index (and k) fitted in place of an effect, n down to 1.01.
+INDEX = {0.351: 1.57, 0.532: 1.48, 0.633: 1.67, 1.064: 2.29}
 
 
 def direction(theta_deg, phi_deg):
@@ -21,8 +25,7 @@ def direction(theta_deg, phi_deg):
     return np.stack([np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)], axis=-1)
 
 
-@pytest.mark.parametrize("wavelength_um", FOUND)
-def test_scattering_in_the_volume_helps_and_polarized_diffuse_does_not(shared_data, wavelength_um):
+def problem_of(shared_data, wavelength_um):
     rows = np.genfromtxt(shared_data / "ptfe-mueller-brdf/PTFE.data.csv", delimiter=",", skip_header=1)
     s = rows[rows[:, 0] == wavelength_um]
     # Axes of the file: docs/reflectance.md.
@@ -35,7 +38,12 @@ def test_scattering_in_the_volume_helps_and_polarized_diffuse_does_not(shared_da
     m = change_frames(m, surface, surface.s_axis)
     # Whole directions of incidence are held out together.
     _, incidence = np.unique(np.round(s[:, 1] / 5).astype(int), return_inverse=True)
-    problem = ReflectanceProblem(geometry, m.reshape(-1, 16), np.eye(16), 1.35 + 0j, folds=incidence % FOLDS)
+    return ReflectanceProblem(geometry, m.reshape(-1, 16), np.eye(16), 1.35 + 0j, folds=incidence % FOLDS)
+
+
+@pytest.mark.parametrize("wavelength_um", FOUND)
+def test_scattering_in_the_volume_helps_and_polarized_diffuse_does_not(shared_data, wavelength_um):
+    problem = problem_of(shared_data, wavelength_um)
     search = Search(problem, lambda line: None)
     nothing = Space(())
     fit = minimize(problem, nothing, np.zeros(0))
@@ -47,3 +55,20 @@ def test_scattering_in_the_volume_helps_and_polarized_diffuse_does_not(shared_da
     assert (100 * before.rms, 100 * alone["volume_scattering"]) == pytest.approx(FOUND[wavelength_um], abs=0.01)
     # The paper's diffuse term is not what PTFE does: it takes under a tenth of what volume scattering takes.
     assert before.rms - alone["polarized_diffuse"] < 0.1 * (before.rms - alone["volume_scattering"])
+
+
+@pytest.mark.parametrize("wavelength_um", FOUND)
+def test_a_fitted_index_runs_to_its_bound(shared_data, wavelength_um):
+    problem = problem_of(shared_data, wavelength_um)
+    (index,) = (c for c in problem.pool() if c.kind == "refractive_index")
+    free = replace(index, parameters=(replace(index.parameters[0], lower=-0.34), index.parameters[1]))
+    left = {}
+    for name, candidate in (("bounded", index), ("free", free)):
+        space = Space((candidate,))
+        fit = minimize(problem, space, np.zeros(2))
+        # PTFE's own index is 1.35; the fit asks for that of nothing at all (1.01), which is no surface.
+        assert fit.values[0] == pytest.approx(candidate.lower[0], abs=1e-3)
+        left[name] = 100 * held_out(problem, space, fit).rms
+    # It helps on directions that it has not seen, as a dipole's ratio of amplitudes does, which it imitates there.
+    assert left["free"] < left["bounded"] < FOUND[wavelength_um][0]
+    assert left["free"] == pytest.approx(INDEX[wavelength_um], abs=0.01)

@@ -38,10 +38,9 @@ def diagnosed(
     return judged.diagnosis, problem
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_true_model_is_left_in_peace(scene, declared, tmp_path, seed):
-    fault = drawn("none", np.random.default_rng(seed), scene, declared)
-    d, _ = diagnosed(tmp_path, fault, declared, scene, seed)
+def test_a_true_model_is_left_in_peace(scene, declared, tmp_path):
+    fault = drawn("none", np.random.default_rng(1), scene, declared)
+    d, _ = diagnosed(tmp_path, fault, declared, scene)
     assert d.verdict == "consistent"
     assert not d.effects
     # Chi-square of some thousand degrees of freedom at least.
