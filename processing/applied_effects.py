@@ -113,4 +113,4 @@ def _feature(name: str, u: NDArray[np.float32]) -> NDArray[np.float32] | np.floa
     if name in powers:
         return np.asarray(u ** powers[name])
     log = np.log(np.maximum(u, _TINY))
-    return np.asarray(u * log if name == "log" else u * log * log)
+    return np.asarray(u * log ** {"log": 1, "log_square": 2, "log_cube": 3}[name])

@@ -79,10 +79,17 @@ class Changes:
     response: defaultdict[str, Array] = field(default_factory=_zeros)
     shift_px: Array = field(init=False)
     drop_clipped: bool = False
+    #: Element matrices that were built before, for one model and capture; a fit changes one element at a time.
+    built: dict[tuple[str, bytes], Array] | None = None
 
     def __post_init__(self) -> None:
         self.gain = np.ones((self.conditions.states, len(self.conditions.channels)))
         self.shift_px = np.zeros((self.conditions.states, 2))
+
+    def key(self, element: str, azimuth_rad: Array) -> tuple[str, bytes]:
+        """What the Mueller matrices of an element depend on, its own values left out."""
+        parts = (azimuth_rad, self.retardance_rad[element], self.extinction[element], self.diattenuation[element])
+        return element, b"|".join(np.asarray(p, dtype=float).tobytes() for p in parts)
 
     def turn_axis(self, axis: str, error_deg: Array, elements: Mapping[str, float]) -> None:
         """The axis stands `error_deg` (N,) from where it says; `elements` are the ratios of those that it turns."""

@@ -257,7 +257,14 @@ def _matrices(element: Element, angles_deg: Mapping[str, ArrayLike], states: int
     azimuth = element.azimuth_rad(angles_deg, states)
     if changes is None:
         return element.mueller(azimuth)
-    matrix = element.mueller(azimuth + changes.azimuth_rad[element.name], changes)
+    azimuth = azimuth + changes.azimuth_rad[element.name]
+    key = changes.key(element.name, azimuth) if changes.built is not None else None
+    if changes.built is not None and key in changes.built:
+        matrix = changes.built[key]
+    else:
+        matrix = element.mueller(azimuth, changes)
+        if changes.built is not None and key is not None:
+            changes.built[key] = matrix
     return changes.after[element.name] @ matrix if element.name in changes.after else matrix
 
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.diagnosis.problem import Problem, Space, Sums
+from processing.diagnosis.problem import Problem
+from processing.diagnosis.space import Space, Sums
 
 Array = NDArray[np.float64]
 

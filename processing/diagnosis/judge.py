@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from processing.diagnosis.candidate import Candidate
 from processing.diagnosis.fit import covariance, minimize
-from processing.diagnosis.problem import InstrumentProblem, Space
+from processing.diagnosis.problem import InstrumentProblem
 from processing.diagnosis.recommend import recommended
 from processing.diagnosis.result import (
     CaptureReport,
@@ -23,6 +23,7 @@ from processing.diagnosis.result import (
     Verdict,
 )
 from processing.diagnosis.search import CHANCE, Found, Say, Search
+from processing.diagnosis.space import Space
 from processing.diagnosis.structure import LIMIT, Residual, description, residual
 from processing.instrument import EffectParameter
 
@@ -35,7 +36,7 @@ SHARE = 0.97
 ALONE = 0.9
 MILD = 7.0
 #: Share of the scatter of values that belong to one state each which a single wave may hold, if they are to be random.
-ONE_WAVE = 0.6
+ONE_WAVE = 0.85
 #: An information about a parameter below this, in chi-square for its typical size, is none.
 SEEN = 4.0
 #: Autocorrelation over the states, in standard deviations, from which on a residual of few pixels is not white.
@@ -112,25 +113,37 @@ def _unname(problem: InstrumentProblem, search: Search, found: Found, after: Seq
     elif structure:
         small = [c for c in found.effects if found.gain.get(c, np.inf) < left]
     part = dict(zip(found.space.candidates, found.space.slices, strict=True))
-    waves = [c for c in found.effects if c.effect.per_state and _one_wave(found.fit.values[part[c]]) > ONE_WAVE]
+    curvature = found.fit.sums.curvature.sum(axis=0)
+    waves = [
+        c
+        for c in found.effects
+        if c.effect.per_state and _one_wave(found.fit.values[part[c]], curvature[part[c], part[c]]) > ONE_WAVE
+    ]
     for candidate in (*small, *waves):
         found.nameless.append(candidate)
 
 
-def _one_wave(values: Array) -> float:
-    """Largest share of the scatter of values (N,) that one sine over the states holds."""
+def _one_wave(values: Array, information: Array) -> float:
+    """Largest share of what values (N,) explain that one sine over the states would explain as well.
+
+    `information` (N, N) is the curvature of the chi-square: patterns that the unknown sample takes up do not count.
+    """
     n = values.size
-    centred = values - values.mean()
-    total = float(centred @ centred)
-    if total == 0.0:
-        return 0.0
     k = np.arange(n)
+    power, vector = np.linalg.eigh(information)
+    root = (vector * np.sqrt(np.maximum(power, 0.0))).T
+    seen = root @ values
+    total = float(seen @ seen)
+    # N values fitted to noise alone explain N.
+    if total <= 2 * n:
+        return 0.0
     best = 0.0
     for rate in np.linspace(0.5 / n, 0.5, 8 * n):
         wave = np.stack([np.cos(2 * np.pi * rate * k), np.sin(2 * np.pi * rate * k)], axis=1)
-        q, _ = np.linalg.qr(wave - wave.mean(axis=0))
-        best = max(best, float(np.sum((q.T @ centred) ** 2)) / total)
-    return best
+        u, size, _ = np.linalg.svd(root @ wave, full_matrices=False)
+        along = u[:, size > 1e-6 * size[0]].T @ seen
+        best = max(best, float(along @ along))
+    return best / (total - n)
 
 
 def _verdict(problem: InstrumentProblem, search: Search, found: Found, after: Sequence[Residual]) -> Verdict:
@@ -147,6 +160,8 @@ def _verdict(problem: InstrumentProblem, search: Search, found: Found, after: Se
     if not structure:
         return "explained"
     unexplained = max(found.after.excess - problem.noise_known * 2 * search.noise_of(found.after), 0.0)
+    if problem.noise_known and all(c in found.nameless for c in found.effects):
+        return "unexplained"
     explained = 1 - unexplained / max(found.before.excess, 1e-300)
     sure = all(found.chance.get(c, 1.0) < CHANCE for c in found.effects)
     return "partly_explained" if explained >= SHARE and sure else "unexplained"

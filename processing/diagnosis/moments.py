@@ -19,7 +19,10 @@ from processing.diagnosis.capture_data import CaptureData
 Array = NDArray[np.float64]
 
 #: Features of a signal u (counts over full scale); corrected counts = u + sum of coefficient times feature.
-FEATURES = ("counts", "one", "square", "cube", "fourth", "log", "log_square", "dx", "dy", "dxx", "dxy", "dyy")
+FEATURES = (
+    *("counts", "one", "square", "cube", "fourth", "log", "log_square", "log_cube"),
+    *("dx", "dy", "dxx", "dxy", "dyy"),
+)
 #: The last of them are derivatives of the image by position.
 DERIVATIVES = 5
 TINY = 1e-6
@@ -256,6 +259,7 @@ def features(u: Array) -> tuple[Array, Array]:
     z[4], slope[4] = u**4, 4 * u**3
     z[5], slope[5] = u * log, log + 1
     z[6], slope[6] = u * log**2, log**2 + 2 * log
+    z[7], slope[7] = u * log**3, log**3 + 3 * log**2
     return z, slope
 
 

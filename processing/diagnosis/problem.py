@@ -10,7 +10,7 @@ of the counts.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -20,75 +20,24 @@ from processing.changes import Changes
 from processing.diagnosis.candidate import Candidate, nominal_values, pool
 from processing.diagnosis.capture_data import CaptureData
 from processing.diagnosis.moments import (
-    DERIVATIVES,
     FEATURES,
     FOLDS_OF_STATES,
     FOLDS_OF_TILES,
-    Block,
     Moments,
-    features,
     holds_out_states,
-    image_derivatives,
     moments_of,
 )
+from processing.diagnosis.projection import RANK, add_block
+from processing.diagnosis.space import Space as Space
+from processing.diagnosis.space import Sums as Sums
 from processing.effects.base import apply_to, turned_by
 from processing.effects.field_retardance import terms
 from processing.instrument import InstrumentModel
 
 Array = NDArray[np.float64]
 STEP = 1e-4
-RANK = 1e-8
-
-
-@dataclass
-class Sums:
-    """Sums over the data of each fold F.
-
-    Attributes
-    ----------
-    excess : (F,) sum of squares in units of the noise, minus what noise is expected to give (`freedom`, (F,)).
-    square : (F,) sum of squares relative to the mean signal; count : (F,) the degrees of freedom behind it.
-    gradient, curvature : (F, K), (F, K, K), half of the derivatives of the excess.
-    """
-
-    excess: Array
-    freedom: Array
-    square: Array
-    count: Array
-    gradient: Array
-    curvature: Array
-
-    @classmethod
-    def empty(cls, folds: int, parameters: int) -> Sums:
-        """All zero."""
-        f, k = folds, parameters
-        zero = np.zeros(f)
-        return cls(zero, zero.copy(), zero.copy(), zero.copy(), np.zeros((f, k)), np.zeros((f, k, k)))
-
-
-@dataclass
-class Space:
-    """Active candidates and where their values stand in the common vector."""
-
-    candidates: tuple[Candidate, ...]
-    slices: tuple[slice, ...] = field(init=False)
-    size: int = field(init=False)
-
-    def __post_init__(self) -> None:
-        start, slices = 0, []
-        for candidate in self.candidates:
-            slices.append(slice(start, start + candidate.size))
-            start += candidate.size
-        self.slices, self.size = tuple(slices), start
-
-    @property
-    def fixed(self) -> NDArray[np.bool_]:
-        """(K,) values that are on or off and not fitted."""
-        return np.array([c.effect.switch for c in self.candidates for _ in c.parameters], dtype=bool)
-
-    def joined(self, name: str) -> Array:
-        """A property of all candidates, end to end."""
-        return np.concatenate([np.zeros(0), *(getattr(c, name) for c in self.candidates)])
+#: Element matrices that are kept for use in another evaluation.
+MOST_BUILT = 64
 
 
 class Problem(Protocol):
@@ -135,6 +84,7 @@ class InstrumentProblem:
         self.captures = tuple(captures)
         self.folds = FOLDS_OF_STATES if any(holds_out_states(c) for c in captures) else FOLDS_OF_TILES
         self.moments: tuple[Moments, ...] = tuple(moments_of(c, self.folds) for c in captures)
+        self._built: list[dict[tuple[str, bytes], Array]] = [{} for _ in captures]
         self.noise_known = all(c.noise_known for c in captures)
         self.holds_out_states = any(m.tiles is None for m in self.moments)
         self.spread = max(m.spread for m in self.moments)
@@ -168,7 +118,10 @@ class InstrumentProblem:
     def changes(self, capture: int, space: Space, values: Array) -> Changes:
         """Changes of one capture with the instrument's own effects and the active candidates."""
         data = self.captures[capture]
-        changes = Changes(data.conditions)
+        built = self._built[capture]
+        if len(built) > MOST_BUILT:
+            built.clear()
+        changes = Changes(data.conditions, built=built)
         for applied in self.model.effects:
             if applied.scope == "instrument" or data.name in applied.captures:
                 apply_to(changes, self.model, applied)
@@ -223,7 +176,7 @@ class InstrumentProblem:
                     continue
                 block = replace(block, rows=block.sound)
             if block.rows.size:
-                _add_block(block, a, c, da, dc, self.moments[k], out)
+                add_block(block, a, c, da, dc, self.moments[k], out)
 
     def _derivatives(self, k: int, space: Space, values: Array, a: Array, c: Array) -> tuple[Array, Array]:
         da, dc = np.zeros((space.size, *a.shape)), np.zeros((space.size, *c.shape))
@@ -329,19 +282,6 @@ class InstrumentProblem:
         return np.asarray(a / self.moments[k].sigma[:, None])
 
 
-def add_response(counts: Array, coefficients: Array, a: Array) -> Array:
-    """Corrected counts (L, rows, columns) from the coefficients of the features (F, L); a (L, K) in units of noise."""
-    if not np.any(coefficients[1:]):
-        return counts
-    z, _ = features(counts)
-    if np.any(coefficients[-DERIVATIVES:]):
-        u, size, _ = np.linalg.svd(a, full_matrices=False)
-        q = u[:, size > RANK * size[0]]
-        fitted = (q @ (q.T @ counts.reshape(counts.shape[0], -1))).reshape(counts.shape)
-        z[-DERIVATIVES:] = image_derivatives(fitted)
-    return np.asarray(np.einsum("fl,flhw->lhw", coefficients, z))
-
-
 def _tiled(changes: Changes, count: int, states: int) -> Changes:
     conditions = replace(changes.conditions, states=states * count)
     out = Changes(conditions)
@@ -351,62 +291,3 @@ def _tiled(changes: Changes, count: int, states: int) -> Changes:
     out.after, out.stray, out.mixing = dict(changes.after), changes.stray, changes.mixing
     out.gain = np.tile(changes.gain, (count, 1))
     return out
-
-
-def _add_block(block: Block, a: Array, c: Array, da: Array, dc: Array | None, moments: Moments, out: Sums) -> None:
-    rows = block.rows
-    scale = 1 / moments.sigma[rows]
-    # Without corrections of the counts, as few pseudo-pixels as there are rows say the same.
-    plain = not np.any(c[1:]) and (dc is None or not np.any(dc))
-    z, noise = (block.counts[None, rows] if plain else block.z[:, rows]), block.noise[rows]
-    u, size, vt = np.linalg.svd(a[rows], full_matrices=False)
-    keep = size > RANK * size[0]
-    q = u[:, keep]
-    if not plain and (np.any(c[-DERIVATIVES:]) or (dc is not None and np.any(dc[:, -DERIVATIVES:]))):
-        z, noise = _smooth_derivatives(z, noise, q, scale)
-    y = _weighted_sum(c[:, rows], z) * scale[:, None]
-    cn = np.einsum("lfg,gl->lf", noise, c[:, rows])
-    n = np.einsum("fl,lf->l", c[:, rows], cn) * scale**2
-    pinv = (vt[keep].T / size[keep]) @ q.T
-    r = y - q @ (q.T @ y)
-    free = 1 - np.sum(q * q, axis=1)
-    f = block.fold
-    out.freedom[f] += free @ n
-    out.excess[f] += float(np.sum(r * r)) - free @ n
-    out.square[f] += float(np.sum((r / scale[:, None]) ** 2)) * moments.relative
-    out.count[f] += free.sum() * block.pixels
-    if dc is None or da.shape[0] == 0:
-        return
-    k = da.shape[0]
-    d = -(da[:, rows].reshape(-1, a.shape[1]) @ (pinv @ y)).reshape(k, rows.size, -1)
-    noise_term = np.zeros(k)
-    counted = np.flatnonzero(np.any(dc != 0, axis=(1, 2)))
-    for j in counted:
-        d[j] += _weighted_sum(dc[j][:, rows], z) * scale[:, None]
-        noise_term[j] += np.sum(free * np.einsum("fl,lf->l", dc[j][:, rows], cn) * scale**2)
-    d -= q @ (q.T @ d)
-    b = np.einsum("kli,il->kl", da[:, rows], pinv)
-    qb = np.einsum("lr,kri,il->kl", q, np.einsum("lr,kli->kri", q, da[:, rows], optimize=True), pinv, optimize=True)
-    noise_term -= np.einsum("kl,l->k", b - qb, n)
-    flat = d.reshape(k, -1)
-    out.gradient[f] += flat @ r.reshape(-1) - noise_term
-    out.curvature[f] += flat @ flat.T
-
-
-def _smooth_derivatives(z: Array, noise: Array, q: Array, scale: Array) -> tuple[Array, Array]:
-    """Derivatives of the fitted image in place of those of the noisy frames, and the noise that is left in them."""
-    z, noise = z.copy(), noise.copy()
-    hat = q @ q.T
-    relative = scale[None, :] / scale[:, None]
-    for f in range(-DERIVATIVES, 0):
-        z[f] = (hat @ (z[f] * scale[:, None])) / scale[:, None]
-        # The fitted image has the noise that the projection takes away: none is shared with what it leaves.
-        noise[:, :-DERIVATIVES, f] = noise[:, f, :-DERIVATIVES] = 0.0
-        for g in range(-DERIVATIVES, 0):
-            noise[:, f, g] = (hat * relative) ** 2 @ noise[:, f, g] if f <= g else noise[:, g, f]
-    return z, noise
-
-
-def _weighted_sum(c: Array, z: Array) -> Array:
-    used = np.flatnonzero(np.any(c != 0, axis=1))
-    return np.asarray(sum(c[f][:, None] * z[f] for f in used))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from processing import mueller
 from processing.changes import Conditions
 from processing.diagnosis.candidate import Candidate
-from processing.diagnosis.problem import Space, Sums
+from processing.diagnosis.space import Space, Sums
 from processing.effects._reflectance import ReflectanceEffect
 from processing.effects.base import all_effects
 from processing.geometry.frames import ScatteringGeometry

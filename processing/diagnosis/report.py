@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from processing.cloude import xi0_and_dominant
 from processing.diagnosis.fit import Fit
 from processing.diagnosis.judge import Judged
-from processing.diagnosis.problem import InstrumentProblem, Space
+from processing.diagnosis.problem import InstrumentProblem
+from processing.diagnosis.projection import add_response
+from processing.diagnosis.space import Space
 from processing.diagnosis.structure import HARMONICS, Residual
 from processing.errors import ProcessError
 
@@ -165,8 +167,6 @@ def _quantities(judged: Judged, problem: InstrumentProblem, k: int) -> str:
 
 
 def _mueller(problem: InstrumentProblem, k: int, space: Space, fit: Fit) -> Array | None:
-    from processing.diagnosis.problem import add_response
-
     data = problem.captures[k]
     changes = problem.changes(k, space, fit.values)
     w = problem.model.rows(data.conditions.angles_deg, changes).reshape(-1, 16) * data.row_exposure[:, None]

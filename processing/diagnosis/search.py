@@ -15,7 +15,8 @@ from scipy import stats
 
 from processing.diagnosis.candidate import Candidate
 from processing.diagnosis.fit import Fit, HeldOut, held_out, minimize, prior, score
-from processing.diagnosis.problem import Problem, Space
+from processing.diagnosis.problem import Problem
+from processing.diagnosis.space import Space
 
 Array = NDArray[np.float64]
 #: Called with a line that says what is being done.

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from processing.changes import Changes
 from processing.diagnosis.fit import Fit
 from processing.diagnosis.moments import inside
-from processing.diagnosis.problem import InstrumentProblem, Space, add_response
+from processing.diagnosis.problem import InstrumentProblem
+from processing.diagnosis.projection import add_response
+from processing.diagnosis.space import Space
 from processing.effects.field_retardance import terms
 
 Array = NDArray[np.float64]

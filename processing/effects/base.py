@@ -111,7 +111,10 @@ def apply_to(changes: Changes, model: InstrumentModel, applied: AppliedEffect) -
     if applied.kind not in effects:
         raise EffectError(f"effect {applied.kind!r} does not exist; there are: {', '.join(sorted(effects))}")
     effect, place = effects[applied.kind], applied.element or ""
-    if place not in effect.places(model, changes.conditions):
+    # An axis that stands still in this capture is no place to search, but what was found elsewhere holds there too.
+    turned = {axis: np.arange(8.0) ** 2 for axis in model.axes}
+    anywhere = effect.places(model, Conditions.of(turned, changes.conditions.channels)) if turned else ()
+    if place not in anywhere and place not in effect.places(model, changes.conditions):
         raise EffectError(f"effect {applied.kind!r} cannot act on {place!r} in instrument {model.name!r}")
     parameters = effect.parameters(model, changes.conditions, place)
     if effect.per_state:

@@ -28,5 +28,5 @@ class This(Effect):
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         e = values[0]
         # y^(1 + e) = y (1 + e ln y + e^2/2 ln^2 y + ...), y = counts over full scale.
-        for name, factor in (("log", e), ("log_square", e * e / 2)):
+        for name, factor in (("log", e), ("log_square", e * e / 2), ("log_cube", e**3 / 6)):
             changes.response[name] = changes.response[name] + factor

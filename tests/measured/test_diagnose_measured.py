@@ -54,6 +54,7 @@ def test_wollaston_the_source_is_the_cause(shared_data, configs, tmp_path):
     assert np.corrcoef(gains, total)[0, 1] > 0.95
 
 
+@pytest.mark.timeout(900)
 def test_mirror_frames_down_to_a_quarter_percent(shared_data, configs, tmp_path):
     instrument = configs / "instruments/drr_imaging_630nm.yaml"
     with (shared_data / "drr-imaging-630nm/roi_stats_630nm.csv").open() as file:
@@ -70,6 +71,7 @@ def test_mirror_frames_down_to_a_quarter_percent(shared_data, configs, tmp_path)
     assert {"path_retardance", "retarder_transmission", "analyzer_transmission", "rotation_eccentricity"} <= kinds
 
 
+@pytest.mark.timeout(900)
 def test_the_gain_learnt_on_one_picture_mends_another(shared_data, configs, tmp_path):
     instrument = configs / "instruments/linear_stokes.yaml"
     folder = shared_data / "dofp-imx250mzr"

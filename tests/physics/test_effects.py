@@ -8,50 +8,49 @@ import pytest
 from processing.changes import Changes, Conditions
 from processing.diagnosis.candidate import Candidate
 from processing.diagnosis.capture_data import CaptureData
-from processing.diagnosis.problem import InstrumentProblem, Space
+from processing.diagnosis.problem import InstrumentProblem
+from processing.diagnosis.space import Space
 from processing.effects._reflectance import ReflectanceEffect
 from processing.effects.base import EffectError, all_effects, apply_to, changes_of
 from processing.instrument import AppliedEffect, EffectParameter, InstrumentModel
 from processing.reflectance_changes import ReflectanceChanges
 
-ISSUE = set(
-    [
-        "psg_retardance",
-        "psa_retardance",
-        "psg_azimuth",
-        "psa_azimuth",
-        "analyzer_azimuth",
-        "psg_extinction",
-        "psa_extinction",
-        "retarder_diattenuation",
-        "retarder_transmission",
-        "generator_ellipticity",
-        "field_retardance",
-        "stray_light",
-        "rotation_eccentricity",
-        "rotation_ratio",
-        "rotation_backlash",
-        "rotation_slip",
-        "angle_per_state",
-        "source_drift",
-        "source_flicker",
-        "detector_nonlinearity",
-        "detector_offset",
-        "saturation",
-        "image_drift",
-        "beam_wander",
-        "channel_gain",
-        "channel_azimuth",
-        "channel_extinction",
-        "pixel_crosstalk",
-        "tone_curve",
-        "polarized_diffuse",
-        "registration",
-        "arm_zero",
-        "illumination_azimuth",
-        "interreflection",
-    ]
-)
+ISSUE = {
+    "psg_retardance",
+    "psa_retardance",
+    "psg_azimuth",
+    "psa_azimuth",
+    "analyzer_azimuth",
+    "psg_extinction",
+    "psa_extinction",
+    "retarder_diattenuation",
+    "retarder_transmission",
+    "generator_ellipticity",
+    "field_retardance",
+    "stray_light",
+    "rotation_eccentricity",
+    "rotation_ratio",
+    "rotation_backlash",
+    "rotation_slip",
+    "angle_per_state",
+    "source_drift",
+    "source_flicker",
+    "detector_nonlinearity",
+    "detector_offset",
+    "saturation",
+    "image_drift",
+    "beam_wander",
+    "channel_gain",
+    "channel_azimuth",
+    "channel_extinction",
+    "pixel_crosstalk",
+    "tone_curve",
+    "polarized_diffuse",
+    "registration",
+    "arm_zero",
+    "illumination_azimuth",
+    "interreflection",
+}
 INSTRUMENT_KINDS = [k for k, e in all_effects().items() if e.group != "reflectance"]
 REFLECTANCE_KINDS = [k for k, e in all_effects().items() if e.group == "reflectance"]
 
