@@ -299,12 +299,12 @@ def _capture(problem: InstrumentProblem, k: int, found: Found, before: Residual,
         clipped_fraction=float(np.mean(data.clipped)),
         tests_before=before.tests,
         tests_after=after.tests,
-        closure_before_percent=_closure(problem, k, found.base, found.before_fit.values),
-        closure_after_percent=_closure(problem, k, found.space, found.fit.values),
+        closure_before_percent=closure(problem, k, found.base, found.before_fit.values),
+        closure_after_percent=closure(problem, k, found.space, found.fit.values),
     )
 
 
-def _closure(problem: InstrumentProblem, k: int, space: Space, values: Array) -> float | None:
+def closure(problem: InstrumentProblem, k: int, space: Space, values: Array) -> float | None:
     """Mean of I0 + I90 - I45 - I135 over mean S0, percent, after dividing by the gains of the channels."""
     model, data = problem.model, problem.captures[k]
     if model.mosaic is None or {c.name for c in model.channels} != {"0", "45", "90", "135"}:
