@@ -1,4 +1,4 @@
-"""Time of `diagnose` on 40 states of 600 x 600 pixels with all effects and all pixels: `python benchmarks/diagnose_speed.py`."""
+"""Time of `diagnose` on 40 states of 600 x 600 pixels: all effects, all pixels."""
 
 from __future__ import annotations
 
