@@ -76,6 +76,11 @@ def read_surface(
     ------
     ProcessError : no arm angle, no noise, or too few pixels of the object.
     """
+    if capture.header.mode == "drr" and model.mosaic is not None:
+        raise ProcessError(
+            f"{capture.path}: a capture without mosaic, and the instrument {model.name!r} has one. Captures of two "
+            "instruments are diagnosed one after the other, each with its own instrument file."
+        )
     data, omega = read_capture(capture, model), capture.header.omega_deg
     if omega is None:
         raise ProcessError(f"{capture.path}: the capture does not say its arm angle; import it with --omega-deg.")
@@ -106,7 +111,8 @@ def read_surface(
         dark = 1 / frames if (frames := Correction.of(capture).dark_frames) else 0.0
         state_slope, state_floor = np.array([data.slope.mean() / n]), np.array([data.floor.mean() * (1 / n + dark)])
         exposure = np.array([total / n])
-        conditions = replace(conditions, states=1, elapsed=np.zeros(1))
+        # A rig records the angles of its axes all the same.
+        conditions = replace(conditions, angles_deg={}, states=1, elapsed=np.zeros(1))
     y = states.reshape(-1, len(where)).T
     channels = signal.shape[1]
     share = np.tile(share, conditions.states)
