@@ -17,6 +17,7 @@ from processing.geometry.viewing import ViewingGeometry
 from processing.reflectance.base import ReflectanceModel, load_reflectance
 from processing.yaml_file import ConfigError, load_yaml
 from simulators.laws import M00Law, Xi0Law, split_eigenvalues
+from simulators.traced_surface import traced
 
 FloatArray = NDArray[np.floating]
 
@@ -105,6 +106,8 @@ class Scene:
             raise ValueError("an object scene needs its reflectance model")
         self.spec = spec
         self.material = material
+        #: What light meets: the material's physics by another way than the one that the processing takes.
+        self.optics = None if material is None else traced(material)
 
     @classmethod
     def load(cls, path: Path | str) -> Scene:
@@ -178,19 +181,19 @@ class Scene:
         raise ConfigError(f"scene {spec.name!r} is given at {known} nm, not at {wavelength_nm:g} nm")
 
     def _points(self, surface: Surface, image: GeometryImage, wavelength_nm: float) -> FloatArray:
-        material = self.material
-        if material is None:
+        optics = self.optics
+        if optics is None:
             raise ValueError("an object scene needs its reflectance model")
         points = image.points
         xi0 = surface.xi0(points)
-        m = triply_degenerate.mueller_matrix(material.mueller_jones(points, wavelength_nm), xi0, surface.m00(points))
+        m = triply_degenerate.mueller_matrix(optics.mueller_jones(points, wavelength_nm), xi0, surface.m00(points))
         if surface.eigenvalue_deviation == 0:
             return m
         small = (1 - xi0) / 3
         # Stays a physical matrix whose largest eigenvalue is still xi0.
         limit = 0.9 * np.minimum(small, np.abs(xi0 - small))
         shift = np.minimum(surface.eigenvalue_deviation * np.sin(points.angles.theta_h), limit)
-        return split_eigenvalues(np.asarray(m, dtype=float), material.jones(points, wavelength_nm), shift)
+        return split_eigenvalues(np.asarray(m, dtype=float), optics.jones(points, wavelength_nm), shift)
 
 
 def _check_angle(spec: AirScene | MirrorScene, omega_deg: float) -> None:

@@ -156,9 +156,8 @@ def _surface(scene: Scene, wavelength_nm: float) -> Surface:
 
 
 def _triply_degenerate(scene: Scene, surface: Surface, points: ScatteringGeometry, wavelength_nm: float) -> FloatArray:
-    material = scene.material
-    if material is None:
+    if scene.optics is None:
         raise ValueError("an object scene needs its reflectance model")
-    m0 = material.mueller_jones(points, wavelength_nm)
+    m0 = scene.optics.mueller_jones(points, wavelength_nm)
     xi0, m00 = surface.xi0(points), surface.m00(points)
     return np.array(triply_degenerate.mueller_matrix(m0, xi0, m00), dtype=float)
