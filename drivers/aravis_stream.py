@@ -30,16 +30,14 @@ class Arrival:
     camera_time_ns: int
     first_packet_s: float
 
-    def is_stale(self, sent_unix_s: float, last_id: int | None) -> bool:
-        """True if this frame began before a trigger was sent, or does not follow the last frame seen.
+    def follows(self, last_id: int | None) -> bool:
+        """False if this frame's number does not come after the last one seen.
 
         16-bit frame ids go from 65535 to 1; they are compared on that circle.
         """
-        if 0 < self.first_packet_s < sent_unix_s:
-            return True
         if last_id is None or self.frame_id == 0:
-            return False
-        return not 0 < (self.frame_id - last_id) % 65535 < 65535 // 2
+            return True
+        return 0 < (self.frame_id - last_id) % 65535 < 65535 // 2
 
     def image_layout(self) -> tuple[int, int, int]:
         """Pixel format code, width and height as the camera announced them with this frame."""

@@ -111,6 +111,8 @@ class GigeCamera:
         self._lost_ratio = lost_ratio
         self._description = description
         self._wait_s = wait_s
+        # Holds frames back after their exposure, as a busy host or a full link does.
+        self.delivery_delay_s = 0.0
         self._error: BaseException | None = None
         self._gone = threading.Event()
         self._camera: Any = None
@@ -266,7 +268,7 @@ class GigeCamera:
                 camera.set_property("gvsp-lost-ratio", 1.0)
         del camera
         # The frame is sent when this returns, and no frame leaves a camera before its exposure has ended.
-        self._gone.wait(max(0.0, start_s + exposure_us * 1e-6 - time.monotonic()))
+        self._gone.wait(max(0.0, start_s + exposure_us * 1e-6 + self.delivery_delay_s - time.monotonic()))
 
     def _info(self, buffer: int, exposure_us: int, gain_raw: int) -> ExposureInfo:
         sfnc = self._description == "sfnc"

@@ -20,6 +20,7 @@ from drivers.aravis_library import load_aravis, open_camera
 from drivers.aravis_setup import Config, Setup
 from drivers.aravis_stream import Arrival, FrameStream
 from drivers.camera import Camera, CameraIdentity, CameraSettings, Frame, StreamStatistics
+from drivers.camera_clock import CameraClock
 from drivers.errors import CameraError, FrameLost, UnknownPixelFormat
 from drivers.genicam import Features
 from drivers.pixel_formats import PixelFormat
@@ -33,6 +34,8 @@ _SLICE_S = 0.1
 # The slowest link that still makes sense for a camera, 100 Mbit/s, and a margin on top.
 _SLOWEST_BYTES_S = 10e6
 _TRANSFER_MARGIN_S = 1.0
+# How much shorter than it reads back an exposure may be.
+_EARLY, _EARLY_S = 0.02, 1e-3
 
 
 def open(name: str, config: Config) -> AravisCamera:
@@ -58,6 +61,7 @@ class AravisCamera(Camera):
         self._features = Features(name, aravis, glib_error, camera)
         self._setup = Setup(name, config, aravis, camera, self._features)
         self._stream: FrameStream | None = None
+        self._clock = CameraClock(name)
         self._counted: dict[str, int] = {}
         self._stale = 0
         self._asked_structure: tuple[object, ...] | None = None
@@ -147,6 +151,7 @@ class AravisCamera(Camera):
             )
             self._camera.start_acquisition()
         self._last_id = None
+        self._clock.forget()
 
     def _stop(self) -> None:
         if self._stream is None:
@@ -170,6 +175,7 @@ class AravisCamera(Camera):
             self._drain()
             self._camera.start_acquisition()
         self._last_id = None
+        self._clock.forget()
 
     def _live_stream(self) -> FrameStream:
         if self._stream is None:
@@ -207,10 +213,9 @@ class AravisCamera(Camera):
             self._wait_for_hardware_trigger(stream)
             return
         end_s = self._sent_s + self._setup.exposure_s
-        self._sleep_until(end_s - max(0.02 * self._setup.exposure_s, 0.001))
-        # A frame that is complete before the exposure can have ended is not ours.
+        self._sleep_until(end_s - max(_EARLY * self._setup.exposure_s, _EARLY_S))
         while (arrival := stream.take(0)) is not None:
-            if time.monotonic() > end_s:
+            if self._is_ours(arrival):
                 stream.unread(arrival)
                 break
             self._throw_away(stream, arrival)
@@ -253,7 +258,7 @@ class AravisCamera(Camera):
                     self._restart()
                     raise self._frame_lost(f"no frame within {time.monotonic() - self._sent_s:.2f} s of the trigger")
                 continue
-            if arrival.is_stale(self._sent_unix_s, self._last_id):
+            if not self._is_ours(arrival):
                 self._throw_away(stream, arrival)
                 continue
             if not arrival.whole:
@@ -264,6 +269,14 @@ class AravisCamera(Camera):
                 return self._make_frame(arrival)
             finally:
                 stream.give_back(arrival)
+
+    def _is_ours(self, arrival: Arrival) -> bool:
+        """True unless the frame left the camera before the exposure under way can have ended, or has an old number."""
+        exposure_s = self._setup.exposure_s
+        came_s = self._clock.came_s(arrival.camera_time_ns, arrival.first_packet_s, exposure_s)
+        ended_s = self._sent_unix_s + exposure_s - max(_EARLY * exposure_s, _EARLY_S)
+        # Without its first packet a frame has no time; it is not whole either.
+        return arrival.follows(self._last_id) and (arrival.first_packet_s <= 0 or came_s >= ended_s)
 
     def _give_up(self, stream: FrameStream, arrival: Arrival) -> NoReturn:
         stream.give_back(arrival)
@@ -318,7 +331,7 @@ class AravisCamera(Camera):
             if arrival is None:
                 self._check_control("wait for an abandoned exposure")
                 continue
-            ours = not arrival.is_stale(self._sent_unix_s, self._last_id)
+            ours = self._is_ours(arrival)
             self._throw_away(stream, arrival)
             if ours:
                 self._outstanding = False

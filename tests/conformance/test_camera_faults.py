@@ -163,6 +163,26 @@ def test_a_stray_exposure_before_the_trigger_is_not_taken_for_its_own(
     assert camera.statistics().stale_discarded == 1
 
 
+def test_a_stray_frame_that_arrives_after_the_trigger_is_not_taken_for_its_own(
+    scene: Scene, simulated: GigeCamera, camera: aravis.AravisCamera
+) -> None:
+    # Exposed 0.1 s before the trigger and delivered 0.2 s after it, when the frame asked for could be there: only the
+    # camera's clock tells them apart.
+    camera.configure(CameraSettings(exposure_s=0.02))
+    camera.capture(2)
+    for number in range(3):
+        scene.angle_deg = 1.0
+        simulated.delivery_delay_s = 0.3
+        simulated.fire()
+        time.sleep(0.1)
+        scene.angle_deg = 2.0
+        simulated.delivery_delay_s = 0.0 if number else 0.05
+        frame = camera.capture()[0]
+        assert read_stamp(frame.pixels)[0] == 2.0
+    assert camera.statistics().stale_discarded == 3
+    assert camera.statistics().retakes == 0
+
+
 def test_a_camera_that_vanishes_is_noticed_and_can_be_opened_again(
     scene: Scene, simulated: GigeCamera, camera: aravis.AravisCamera
 ) -> None:
