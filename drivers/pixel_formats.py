@@ -83,6 +83,19 @@ class PixelFormat:
             pixels >>= np.uint16(shift)
         return pixels.reshape(height, width)
 
+    def misalignment(self, memory: NDArray[np.uint8], pixels: NDArray[np.uint16], bits: int, shift: int) -> str:
+        """Say how an image contradicts `bits` real bits above `shift` empty ones; empty text if it does not.
+
+        `memory` is the whole image as it came, `pixels` what `decode` made of it.
+        """
+        if bits < self.bits - shift and int(pixels.max()) >> bits:
+            return f"a count of {int(pixels.max())} needs more than {bits} bits"
+        if shift and self.layout == "plain" and self.bits_in_memory == 16:
+            size = self.payload_bytes(pixels.shape[1], pixels.shape[0])
+            if int(np.bitwise_or.reduce(memory[:size].view("<u2"))) & ((1 << shift) - 1):
+                return f"the {shift} low bits are not empty"
+        return ""
+
     def encode(self, pixels: NDArray[np.uint16]) -> NDArray[np.uint8]:
         """Lay out an image as a camera would send it: the inverse of `decode` with no shift.
 

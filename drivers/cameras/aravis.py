@@ -12,9 +12,6 @@ import threading
 import time
 from typing import Any, NoReturn
 
-import numpy as np
-from numpy.typing import NDArray
-
 from drivers import genicam
 from drivers.aravis_library import load_aravis, open_camera
 from drivers.aravis_setup import Config, Setup
@@ -297,27 +294,16 @@ class AravisCamera(Camera):
                 f" but 0x{fmt.code:08x}, {self._setup.size[0]} x {self._setup.size[1]} was set"
             )
         pixels = fmt.decode(arrival.memory, *self._setup.size, shift=self._config.shift)
-        self._check_alignment(fmt, arrival.memory, pixels)
-        pixels.flags.writeable = False
-        host_time_s = arrival.first_packet_s if self._setup.hardware else self._sent_unix_s
-        return Frame(pixels, arrival.frame_id, arrival.camera_time_ns, host_time_s)
-
-    def _check_alignment(self, fmt: PixelFormat, memory: NDArray[np.uint8], pixels: NDArray[np.uint16]) -> None:
-        """A wrong `bits` or `shift` in the rig file shows in the counts: refuse to hand out such a frame."""
-        shift, bits = self._config.shift, self.bits
-        found = ""
-        if shift and fmt.layout == "plain" and fmt.bits_in_memory == 16:
-            below = int(np.bitwise_or.reduce(memory[: fmt.payload_bytes(*self._setup.size)].view("<u2")))
-            if below & ((1 << shift) - 1):
-                found = f"the {shift} low bits are not empty"
-        if bits < fmt.bits - shift and int(pixels.max()) >> bits:
-            found = f"a count of {int(pixels.max())} needs more than {bits} bits"
-        if found:
+        # A wrong `bits` or `shift` in the rig file shows in the counts.
+        if found := fmt.misalignment(arrival.memory, pixels, self.bits, self._config.shift):
             raise UnknownPixelFormat(
-                f"camera {self.name}, {fmt.name} with bits {bits} and shift {shift}",
+                f"camera {self.name}, {fmt.name} with bits {self.bits} and shift {self._config.shift}",
                 found,
                 "Correct `bits` and `shift` in the rig file; the camera's manual says how it aligns its data",
             )
+        pixels.flags.writeable = False
+        host_time_s = arrival.first_packet_s if self._setup.hardware else self._sent_unix_s
+        return Frame(pixels, arrival.frame_id, arrival.camera_time_ns, host_time_s)
 
     def _discard_outstanding(self) -> None:
         """Wait for an exposure that nobody collected, and throw its frame away."""
