@@ -28,7 +28,7 @@ class ReflectanceChanges:
     diffuse_a, diffuse_log_b : weight a sin^b(theta_h) of polarized diffuse reflection, b = exp(diffuse_log_b).
     tilt_rad : turn of all normals about y and about x (a sphere or flat object that is registered off its place).
     arm_rad : the source stands this much further round than the arm says.
-    generator_rad : the generator's polarization is turned by this.
+    generator_rad, analyzer_rad : the generator's polarization, and the whole analyzer, are turned by this.
     twice : weight of light that met two facets, relative to the dominant process.
     volume : share of a dipole's amplitudes in the first-surface term.
     index : added to the refractive index.
@@ -43,6 +43,7 @@ class ReflectanceChanges:
     tilt_rad: tuple[float, float] = (0.0, 0.0)
     arm_rad: float = 0.0
     generator_rad: float = 0.0
+    analyzer_rad: float = 0.0
     twice: float = 0.0
     volume: float = 0.0
     index: complex = 0j
@@ -69,6 +70,8 @@ class ReflectanceChanges:
             m = (m + self.twice * again / again[..., :1, :1]) / (1 + self.twice)
         if self.generator_rad:
             m = m @ mueller.rotation(self.generator_rad)
+        if self.analyzer_rad:
+            m = mueller.rotation(-self.analyzer_rad) @ m
         return np.asarray(m)
 
     def _moved(self, g: ScatteringGeometry) -> ScatteringGeometry:

@@ -14,6 +14,8 @@ from processing import mueller, triply_degenerate
 from processing.geometry.frames import ScatteringGeometry, dot, unit
 from processing.geometry.sphere import Sphere
 from processing.instrument import InstrumentModel, Polarizer, Retarder
+from processing.reflectance import first_surface
+from simulators.bench import SceneImage
 from simulators.scene import Scene, Surface
 
 FloatArray = NDArray[np.float64]
@@ -32,7 +34,7 @@ def moved_sphere(scene: Scene, x_mm: float = 0.0, y_mm: float = 0.0, scale: floa
 class ArmZero:
     """The arm stands `error_deg` further round than it reads."""
 
-    def __init__(self, scene: Scene, error_deg: float) -> None:
+    def __init__(self, scene: SceneImage, error_deg: float) -> None:
         self.scene, self.error_deg = scene, error_deg
 
     def mueller_image(self, omega_deg: float, wavelength_nm: float, rows: int, columns: int) -> NDArray[np.float32]:
@@ -149,6 +151,42 @@ class SlowTurn:
         y, x = np.mgrid[-1 : 1 : rows * 1j, -1 : 1 : columns * 1j]
         turn = np.deg2rad(self.amplitude_deg) * np.sin(3 * x + 5 * y)
         return np.asarray(m @ mueller.rotation(turn), dtype=np.float32)
+
+
+class WetPatch:
+    """A round patch of the sphere carries water: first-surface reflection at its index, without the diffuse term."""
+
+    WATER = 1.33
+
+    def __init__(self, scene: Scene, right_deg: float, up_deg: float, radius_deg: float) -> None:
+        constants = {nm: first_surface.Constants(n=self.WATER) for nm in scene.object.surface}
+        self.dry, self.wet = scene, Scene(scene.spec, first_surface.Model(name="water", constants=constants))
+        x, y = np.deg2rad(right_deg), np.deg2rad(up_deg)
+        self.axis = np.array([np.sin(x) * np.cos(y), np.sin(y), np.cos(x) * np.cos(y)])
+        self.radius_deg = radius_deg
+
+    def mueller_image(self, omega_deg: float, wavelength_nm: float, rows: int, columns: int) -> NDArray[np.float32]:
+        """The scene, wet where the patch is."""
+        image = self.dry.object.geometry.at(omega_deg, rows, columns)
+        patch = np.zeros((rows, columns), dtype=bool)
+        patch[image.mask] = image.points.normal @ self.axis > np.cos(np.deg2rad(self.radius_deg))
+        dry, wet = (s.mueller_image(omega_deg, wavelength_nm, rows, columns) for s in (self.dry, self.wet))
+        return np.where(patch[..., None, None], wet, dry)
+
+
+class BroadSource:
+    """The source is a bar `width_deg` wide as seen from the object, where a point is meant."""
+
+    PARTS = 5
+
+    def __init__(self, scene: Scene, width_deg: float) -> None:
+        self.scene, self.width_deg = scene, width_deg
+
+    def mueller_image(self, omega_deg: float, wavelength_nm: float, rows: int, columns: int) -> NDArray[np.float32]:
+        """Mean of the scene over the source."""
+        places = omega_deg + self.width_deg * ((np.arange(self.PARTS) + 0.5) / self.PARTS - 0.5)
+        parts = [self.scene.mueller_image(float(w), wavelength_nm, rows, columns) for w in places]
+        return np.asarray(np.mean(parts, axis=0, dtype=np.float32))
 
 
 def _surface(scene: Scene, wavelength_nm: float) -> Surface:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,67 +18,92 @@ from simulators.virtual_capture import write_virtual_capture
 EXPOSURE_S = 0.02
 #: Image size and number of states of a full Mueller and of a linear Stokes capture.
 MUELLER, STOKES = (120, 40), (240, 8)
+#: In this order one can be put on top of another.
 LISTED = (
     "polarized_diffuse",
+    "refractive_index",
     "registration",
+    "interreflection",
     "arm_zero",
     "illumination_azimuth",
-    "interreflection",
-    "refractive_index",
+    "analyzer_roll",
 )
-UNLISTED = ("not_degenerate", "camera_roll", "dented", "second_lamp", "slow_turn")
+UNLISTED = ("not_degenerate", "dented", "second_lamp", "slow_turn", "wet_patch", "broad_source")
 
 
 @dataclass(frozen=True)
 class SphereFault:
-    """What is wrong: kind, true parameters in the units of the effect, and what makes it so."""
+    """What is wrong, and what makes it so.
+
+    Attributes
+    ----------
+    kind : name of the case; parts of two at once are joined with "+".
+    scene, instrument : what is true; material : what the processing believes.
+    parameters : true values by kind of effect, in the units of the effect; empty where it has no counterpart.
+    """
 
     kind: str
     scene: SceneImage
     instrument: InstrumentModel
-    material: object
-    parameters: dict[str, float] = field(default_factory=dict)
+    material: Any
+    parameters: dict[str, dict[str, float]] = field(default_factory=dict)
 
 
 def drawn(kind: str, random: np.random.Generator, scene: Scene, instrument: InstrumentModel) -> SphereFault:
-    """A fault of a kind, its size drawn; `material` is what the processing believes, the rest is what is true.
+    """A fault of a kind, its size drawn. "none" is a true model, "two" two of `LISTED` at once.
 
-    "none" is a true model. Of the kinds in `UNLISTED` no effect is known to `diagnose`.
+    Of the kinds in `UNLISTED` no effect is known to `diagnose`.
     """
-    material = scene.material
+    nothing = SphereFault("none", scene, instrument, scene.material)
     if kind == "none":
-        return SphereFault(kind, scene, instrument, material)
-    if kind in ("polarized_diffuse", "refractive_index"):
-        return _of_material(kind, random, scene, instrument)
-    if kind == "registration":
-        x, y, scale = random.uniform(-1, 1, 3) * (0.8, 0.8, 0.03)
-        moved = scene_faults.moved_sphere(scene, x, y, scale)
-        return SphereFault(kind, moved, instrument, material, {"x": x, "y": y, "scale": scale})
+        return nothing
+    if kind == "two":
+        first, second = sorted(random.choice(len(LISTED), 2, replace=False))
+        both = _with(LISTED[second], random, _with(LISTED[first], random, nothing))
+        return replace(both, kind=f"{LISTED[first]}+{LISTED[second]}")
+    if kind in LISTED:
+        return replace(_with(kind, random, nothing), kind=kind)
+    return replace(nothing, kind=kind, scene=_unlisted_scene(kind, random, scene))
+
+
+def _with(kind: str, random: np.random.Generator, so_far: SphereFault) -> SphereFault:
+    scene, instrument, truth = so_far.scene, so_far.instrument, dict[str, float]()
     if kind == "arm_zero":
-        error = _signed(random, 0.7, 4.0)
-        return SphereFault(kind, scene_faults.ArmZero(scene, error), instrument, material, {"arm": error})
-    if kind == "illumination_azimuth":
-        error = _signed(random, 0.4, 5.0)
-        turned = scene_faults.turned_generator(instrument, error)
-        return SphereFault(kind, scene, turned, material, {"azimuth": error})
+        truth = {"arm": _signed(random, 0.7, 4.0)}
+        return _added(so_far, kind, truth, scene=scene_faults.ArmZero(scene, truth["arm"]))
+    if kind in ("illumination_azimuth", "analyzer_roll"):
+        turn = scene_faults.turned_generator if kind == "illumination_azimuth" else scene_faults.turned_analyzer
+        truth = {"azimuth": _signed(random, 0.4, 5.0)}
+        return _added(so_far, kind, truth, instrument=turn(instrument, truth["azimuth"]))
+    if not isinstance(scene, Scene):
+        raise ValueError(f"{kind} has to be put in before what stands in front of the scene")
+    if kind == "registration":
+        truth = {n: random.uniform(-s, s) for n, s in (("x", 0.8), ("y", 0.8), ("scale", 0.03))}
+        moved = scene_faults.moved_sphere(scene, truth["x"], truth["y"], truth["scale"])
+        return _added(so_far, kind, truth, scene=moved)
     if kind == "interreflection":
-        lit = scene_faults.LitSupport(scene, random.uniform(0.15, 0.6))
-        return SphereFault(kind, lit, instrument, material)
-    if kind == "camera_roll":
-        return SphereFault(kind, scene, scene_faults.turned_analyzer(instrument, _signed(random, 1, 5)), material)
-    return SphereFault(kind, _unlisted_scene(kind, random, scene), instrument, material)
-
-
-def _of_material(kind: str, random: np.random.Generator, scene: Scene, instrument: InstrumentModel) -> SphereFault:
-    constants = getattr(scene.material, "constants", {})
+        return _added(so_far, kind, {}, scene=scene_faults.LitSupport(scene, random.uniform(0.15, 0.6)))
     if kind == "polarized_diffuse":
+        a, b = float(np.exp(random.uniform(np.log(0.02), np.log(0.3)))), random.uniform(1.5, 3.0)
+        constants = so_far.material.constants
+        true = {nm: c.model_copy(update={"a": a, "b": b}) for nm, c in constants.items()}
         plain = {nm: first_surface.Constants(n=c.n, k=c.k) for nm, c in constants.items()}
         believed = first_surface.Model(name="first surface alone", constants=plain)
-        return SphereFault(kind, scene, instrument, believed)
-    dn, dk = random.uniform(-0.2, 0.2), random.uniform(-0.06, 0.1)
-    wrong = {nm: c.model_copy(update={"n": c.n - dn, "k": max(c.k - dk, 0.0)}) for nm, c in constants.items()}
-    material = scene.material.model_copy(update={"constants": wrong})  # type: ignore[union-attr]
-    return SphereFault(kind, scene, instrument, material, {"n": dn})
+        surface = Scene(scene.spec, so_far.material.model_copy(update={"constants": true}))
+        # Without a diffuse term the model's exponent stands at 2.
+        return _added(so_far, kind, {"a": a, "log_b": float(np.log(b / 2))}, scene=surface, material=believed)
+    if kind == "refractive_index":
+        truth = {"n": random.uniform(-0.2, 0.2), "k": random.uniform(-0.06, 0.07)}
+        wrong = {
+            nm: c.model_copy(update={"n": c.n - truth["n"], "k": c.k - truth["k"]})
+            for nm, c in so_far.material.constants.items()
+        }
+        return _added(so_far, kind, truth, material=so_far.material.model_copy(update={"constants": wrong}))
+    raise ValueError(f"no fault {kind!r}; there are none, two, {', '.join((*LISTED, *UNLISTED))}")
+
+
+def _added(so_far: SphereFault, kind: str, truth: dict[str, float], **changed: Any) -> SphereFault:
+    return replace(so_far, parameters={**so_far.parameters, kind: truth}, **changed)
 
 
 def _unlisted_scene(kind: str, random: np.random.Generator, scene: Scene) -> SceneImage:
@@ -91,7 +117,11 @@ def _unlisted_scene(kind: str, random: np.random.Generator, scene: Scene) -> Sce
         return scene_faults.SecondLamp(scene, random.uniform(-120, -40), random.uniform(0.05, 0.4))
     if kind == "slow_turn":
         return scene_faults.SlowTurn(scene, random.uniform(2, 8))
-    raise ValueError(f"no fault {kind!r}; there are none, {', '.join((*LISTED, *UNLISTED))}")
+    if kind == "wet_patch":
+        return scene_faults.WetPatch(scene, random.uniform(-40, 60), random.uniform(-40, 40), random.uniform(10, 30))
+    if kind == "broad_source":
+        return scene_faults.BroadSource(scene, random.uniform(4, 12))
+    raise ValueError(f"no fault {kind!r}; there are none, two, {', '.join((*LISTED, *UNLISTED))}")
 
 
 def take(

@@ -46,7 +46,7 @@ class TracedSurface:
         g, facet = geometry, geometry.to_source + geometry.to_camera
         facet = facet / np.sqrt(_dot(facet, facet))[..., None]
         # Two beams at once, polarized along x and y of the generator.
-        fields = np.stack(_axes(-g.to_source))
+        fields = np.stack(_axes(-g.to_source)).astype(complex)
         seen = _mirrored(fields, g.to_source, facet, complex(c.n, c.k))
         out = np.stack([_dot(seen, axis) for axis in _axes(g.to_camera)])
         if a := getattr(c, "a", 0.0):
@@ -67,8 +67,9 @@ class TracedSurface:
 
 def traced(material: ReflectanceModel) -> ReflectanceModel:
     """The traced surface of a material; one of another kind as it is."""
-    known = isinstance(material, first_surface.Model | polarized_diffuse.Model)
-    return TracedSurface(material) if known else material
+    if isinstance(material, first_surface.Model | polarized_diffuse.Model):
+        return TracedSurface(material)
+    return material
 
 
 def _outwards(g: ScatteringGeometry, facet: Real) -> tuple[Real, Real]:
