@@ -19,6 +19,9 @@ Array = NDArray[np.float64]
 
 #: Values of a capture that are kept; a larger one is averaged over squares of pixels first.
 MOST_VALUES = 40_000_000
+#: Pixels whose mean signal is less than this many standard deviations of one intensity are left out: logarithms and
+#: powers of such counts do not scatter in proportion to the noise, and they say nothing about polarization.
+FAINTEST = 5.0
 #: Below this number of pixels their scatter says nothing about the noise.
 FEWEST_PIXELS = 30
 
@@ -39,7 +42,8 @@ class CaptureData:
     noise_source : in words.
     clipped : (rows, columns) True where some state is at the top of the range.
     clipped_states : (N,) True for states in which some pixel is.
-    usable : (rows, columns) True where every state has a number.
+    usable : (rows, columns) True where every state has a number and the pixel is not dark.
+    dark_fraction : part of the pixels that are too dark to be used.
     binned : side of the squares over which pixels were averaged.
     """
 
@@ -58,6 +62,7 @@ class CaptureData:
     simulated: bool
     wavelength_nm: float
     binned: int = 1
+    dark_fraction: float = 0.0
 
     @property
     def values_per_pixel(self) -> int:
@@ -70,9 +75,12 @@ class CaptureData:
         return np.repeat(self.exposure, self.signal.shape[1])
 
     def variance(self, u: NDArray[np.floating]) -> Array:
-        """Variance (N, ...) of signals u (N, ...), in full scale squared."""
+        """Variance (N, ...) of signals u (N, ...), in full scale squared; right on average over noisy signals.
+
+        Cutting it off at zero signal would make it too large in dark states, so a single one may be negative.
+        """
         shape = (-1,) + (1,) * (u.ndim - 1)
-        return np.asarray(self.slope.reshape(shape) * np.maximum(u, 0) + self.floor.reshape(shape))
+        return np.asarray(self.slope.reshape(shape) * u + self.floor.reshape(shape))
 
 
 def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
@@ -118,14 +126,32 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     repeats = np.maximum(capture.column("repeats")[states].astype(float), 1)
     noise = NoiseModel.of(detector, integer)
     if noise is not None:
-        slope, floor = noise.slope / repeats / top, noise.averaged_floor(repeats) / top**2
+        excess = correction.black.excess(noise, capture.column("exposure_s")[states])
+        slope, floor = noise.slope / repeats / top, noise.averaged_floor(repeats, excess) / top**2
         data = replace(data, slope=slope, floor=floor, noise_known=True, noise_source=noise.source)
     data = _binned(data)
     if noise is None and data.usable.sum() >= FEWEST_PIXELS:
         from processing.diagnosis.noise_estimate import estimated_noise
 
         data = estimated_noise(data)
-    return data
+    return without_dark_pixels(data) if data.noise_known else data
+
+
+def without_dark_pixels(data: CaptureData) -> CaptureData:
+    """The capture without pixels that show nothing but noise.
+
+    Raises
+    ------
+    CaptureError : nothing else is there.
+    """
+    mean = data.signal.mean(axis=(0, 1), dtype=np.float64)
+    dark = mean < FAINTEST * np.sqrt(np.maximum(data.slope.mean() * mean + data.floor.mean(), 0))
+    if dark.all():
+        raise CaptureError(
+            f"{data.name}: no pixel has a mean signal above {FAINTEST:g} standard deviations of its noise. "
+            "Expose longer, or look whether the light was on."
+        )
+    return replace(data, usable=data.usable & ~dark, dark_fraction=float(dark.mean()))
 
 
 def _frames(
@@ -134,14 +160,15 @@ def _frames(
     level = _clip_level(capture, correction)
     frames, clipped = [], np.zeros(capture.frame_shape, dtype=bool)
     clipped_states = np.zeros(len(states), dtype=bool)
+    exposure = capture.column("exposure_s")[states].astype(float)
     for n, k in enumerate(states):
         frame = capture.frames(int(k)).astype(np.float32)
         if level is not None:
             over = (frame >= level).any(axis=0)
             clipped |= over
             clipped_states[n] = over.any()
-        frame -= np.asarray(correction.black, dtype=np.float32)
-        frames.append(frame if correction.flat is None else frame / correction.flat)
+        frame -= correction.black.at(exposure[n])
+        frames.append(frame if correction.flat is None else frame / correction.flat.response)
     raw = np.stack(frames)
     if model.mosaic is None:
         return raw, np.asarray(clipped), clipped_states

@@ -76,6 +76,7 @@ class CaptureReport(_Part):
     noise: str
     binned: int
     clipped_fraction: float
+    dark_fraction: float = 0.0
     tests_before: dict[str, float]
     tests_after: dict[str, float]
     closure_before_percent: float | None = None
