@@ -7,10 +7,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.black import Black
 from processing.capture import Capture
 
 #: Longest side of the maps in the figure, pixels; a larger frame is thinned out.
 LARGEST = 600
+#: Saturated part of a frame that the figure can bear.
+HARDLY = 0.01
 
 
 def draw(path: Path) -> Path:
@@ -53,17 +56,15 @@ def draw(path: Path) -> Path:
 def _maps(
     capture: Capture,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], list[float], tuple[str, NDArray[np.float64]]]:
-    light = [k for k, role in enumerate(capture.role) if role != "dark"]
+    light = _best_exposure(capture)
     mosaic = capture.header.mosaic is not None
     step = max(1, -(-max(capture.frame_shape) // LARGEST))
-    dark = capture.dark
-    black = np.float32(capture.header.detector.black_level_counts) if dark is None else dark[0].astype(np.float32)
+    darks = Black.of(capture) or Black.level(capture.header.detector.black_level_counts)
+    black = darks.at(float(capture.column("exposure_s")[light[0]]))[0] if light else np.zeros(())
     total = low = high = None
     levels = []
-    exposure_s = capture.column("exposure_s")
     for k in light:
-        scale = np.float32(exposure_s[light[0]] / exposure_s[k])
-        frame = (capture.frames(k)[0].astype(np.float32) - black) * scale
+        frame = capture.frames(k)[0].astype(np.float32) - black
         levels.append(float(frame.mean()))
         for image in _super_pixels(frame) if mosaic else [frame]:
             thin = image[::step, ::step]
@@ -81,6 +82,14 @@ def _maps(
     turning = [(name, column[light]) for name, column in capture.angles_deg.items() if np.ptp(column[light]) > 1]
     angles = (f"{turning[0][0]}, degrees", turning[0][1]) if turning else ("frame", np.arange(len(light), dtype=float))
     return mean.astype(np.float32), modulation.astype(np.float32), levels, angles
+
+
+def _best_exposure(capture: Capture) -> list[int]:
+    """States with light, of a bracket those of the longest exposure at which hardly anything is saturated."""
+    light = np.flatnonzero([role != "dark" for role in capture.role])
+    exposure_s, saturated = capture.column("exposure_s")[light], capture.column("saturated_fraction")[light]
+    lengths = [length for length in np.unique(exposure_s) if saturated[exposure_s == length].max(initial=0) < HARDLY]
+    return [int(k) for k in light[exposure_s == (lengths[-1] if lengths else exposure_s.min(initial=np.inf))]]
 
 
 def _super_pixels(frame: NDArray[np.float32]) -> list[NDArray[np.float32]]:

@@ -87,13 +87,14 @@ def known_mueller(sample: Sample) -> NDArray[np.float64]:
 
 def region_means(capture: Capture, rows: slice, columns: slice) -> NDArray[np.float64]:
     """Mean signal (N, channels) of a region in every state of the sample, black subtracted."""
-    correction = Correction.of(capture)
-    black = correction.black
-    offset = np.asarray(black)[:, rows, columns].mean(axis=(1, 2)) if isinstance(black, np.ndarray) else black
-    means = [capture.frames(int(k), rows)[:, :, columns].mean(axis=(1, 2)) for k in sample_states(capture)]
+    black = Correction.of(capture).black
+    means_of_dark = black.means if black.means.shape[2] == 1 else black.means[:, :, rows, columns]
+    states = sample_states(capture)
+    share = black.weights(capture.column("exposure_s")[states].astype(float))
+    means = [capture.frames(int(k), rows)[:, :, columns].mean(axis=(1, 2)) for k in states]
     if not means or means[0].size == 0 or not np.all(np.isfinite(means)):
         raise CalibrationError(f"{capture.path}: the region holds no pixels, or no numbers; choose another one.")
-    return np.asarray(means) - offset
+    return np.asarray(np.asarray(means) - share @ means_of_dark.mean(axis=(2, 3)))
 
 
 def fit_train(

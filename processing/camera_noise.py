@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.black import Black
 from processing.capture import Capture
 from processing.correction import Mask
 from processing.errors import NotDetermined, ProcessError
@@ -32,7 +33,7 @@ OUTLIER = 8.0
 CLIPPING = 0.97
 
 PLANES = {
-    "dark_mean": Plane((), "count", "mean of the dark frames"),
+    "dark_mean": Plane((), "count", "mean of the dark frames of the shortest exposure"),
     "pixel_mask": Plane((), "", f"0 = good; bits: {Mask.meaning()}", np.uint8),
 }
 
@@ -47,7 +48,7 @@ class PhotonTransfer:
     covariance : (2, 2) of (slope, floor).
     signal, variance, stderr : (levels,), counts above black, counts^2.
     chi_square : reduced, of the line; well above 1: not linear, or the light flickered.
-    black_counts : mean of the dark frames.
+    black_counts : mean of the dark frames of the shortest exposure.
     """
 
     slope: float
@@ -94,11 +95,11 @@ def photon_transfer(captures: Sequence[Capture]) -> PhotonTransfer:
     ProcessError : no dark states, or no repeated states.
     NotDetermined : the light spans too small a range.
     """
-    dark = [np.mean(c.dark) for c in captures if c.dark is not None]
-    if not dark:
+    darks = [dark for c in captures if (dark := Black.of(c)) is not None]
+    if not darks:
         raise ProcessError("no dark states in these captures: the black level is needed. Take some (plan key `darks`).")
-    black = float(np.mean(dark))
-    pairs = list(_pairs(captures, black))
+    black = float(np.mean([d.means[0].mean() for d in darks]))
+    pairs = list(_pairs(captures, darks[0]))
     if not pairs:
         raise ProcessError(
             "no two states of these captures repeat each other, so noise cannot be told from signal. "
@@ -140,13 +141,15 @@ def photon_transfer(captures: Sequence[Capture]) -> PhotonTransfer:
     )
 
 
-def _pairs(captures: Sequence[Capture], black: float) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
+def _pairs(captures: Sequence[Capture], other: Black) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
     """Signal and difference of pairs of repeated frames, scaled to single frames; clipped pixels are left out."""
     for capture in captures:
         bits = capture.header.detector.bits
         ceiling = CLIPPING * (2**bits - 1) if bits and capture.integer_counts else np.inf
-        averaged = capture.column("repeats")
+        averaged, exposure_s = capture.column("repeats"), capture.column("exposure_s").astype(float)
+        darks = Black.of(capture) or other
         for group in repeats(capture):
+            black = float(darks.at(exposure_s[group[0]]).mean())
             # Each frame serves in one pair, so that pairs are independent.
             for first, second in zip(group[0::2], group[1::2], strict=False):
                 a, b = (capture.frames(int(k)).astype(np.float64).reshape(-1) for k in (first, second))
@@ -157,11 +160,10 @@ def _pairs(captures: Sequence[Capture], black: float) -> Iterator[tuple[NDArray[
 
 def bad_pixels(capture: Capture) -> NDArray[np.bool_]:
     """Pixels (rows, columns) whose dark signal lies far from the others'; none without dark states."""
-    dark = capture.dark
-    if dark is None:
-        return np.zeros(capture.frame_shape, dtype=bool)
+    black = Black.of(capture)
     out = np.zeros(capture.frame_shape, dtype=bool)
-    for channel in dark:
+    # Hot pixels show best in the longest darks.
+    for channel in () if black is None else black.means[-1]:
         centre = np.median(channel)
         spread = 1.4826 * np.median(np.abs(channel - centre))
         # Whole counts can make the spread vanish; a count is the least that means anything.
@@ -182,7 +184,7 @@ def write_camera(
         line = photon_transfer(captures)
         first = captures[0]
         bad = np.any([bad_pixels(c) for c in captures], axis=0)
-        darks = [c.dark for c in captures if c.dark is not None]
+        darks = [dark.means[0] for c in captures if (dark := Black.of(c)) is not None]
         facts: dict[str, Any] = {
             "gain_e_per_count": line.gain_e_per_count,
             "gain_stderr": line.gain_stderr,

@@ -128,14 +128,6 @@ class Capture:
             yield slice(start, min(start + step, height))
 
     @cached_property
-    def dark(self) -> NDArray[np.float64] | None:
-        """Mean of the dark states (channels, rows, columns) in counts; None without dark states."""
-        dark = self.states_with("dark")
-        if dark.size == 0:
-            return None
-        return np.asarray(sum(self.frames(int(k)).astype(np.float64) for k in dark) / dark.size)
-
-    @cached_property
     def instrument(self) -> InstrumentModel | None:
         """The instrument model stored with the capture, resolved at its wavelength."""
         if not self.header.instrument_yaml:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntFlag
 
@@ -10,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.applied_effects import CountsCorrection
+from processing.black import Black
 from processing.capture import Capture, CaptureError
-from processing.noise import NoiseModel
+from processing.flat import Flat
 
 
 class Mask(IntFlag):
@@ -34,19 +36,17 @@ class Correction:
 
     Attributes
     ----------
-    black : counts; a number, or (channels, rows, columns) from dark states.
-    dark_frames : how many dark frames `black` is the mean of; 0 for a number.
-    flat : relative response (channels, rows, columns), mean 1; None for none.
+    black : of every exposure, from dark states or the header.
+    flat : relative response; None for none.
     bad : (rows, columns) bool; None for none.
     saturation : counts from which on a pixel is saturated; None if the range is not known.
     source : in words, for the facts and the console.
     warnings : what the user should know.
     """
 
-    black: float | NDArray[np.float32]
-    dark_frames: int
+    black: Black
     source: str
-    flat: NDArray[np.float32] | None = None
+    flat: Flat | None = None
     bad: NDArray[np.bool_] | None = None
     saturation: float | None = None
     warnings: tuple[str, ...] = ()
@@ -57,74 +57,46 @@ class Correction:
         capture: Capture,
         bad: NDArray[np.bool_] | None = None,
         dark_from: Capture | None = None,
-        flat_from: Capture | None = None,
+        flat_from: Sequence[Capture] = (),
     ) -> Correction:
         """What the capture offers: dark states, else the header's black level, else nothing (and says so).
 
         Parameters
         ----------
         bad : (rows, columns), pixels to leave out.
-        dark_from, flat_from : other captures of the same camera whose dark and flat states are used instead.
+        dark_from : another capture of the same camera whose dark states are used instead.
+        flat_from : other captures of the same camera whose flat states, all together, are used instead.
 
         Raises
         ------
         CaptureError : another capture does not fit, is simulated where this one is measured, or lacks such states.
         """
-        for other, name in ((dark_from, "dark"), (flat_from, "flat")):
+        for other, name in ((dark_from, "dark"), *((c, "flat") for c in flat_from)):
             if other is not None:
                 _check_partner(capture, other, name)
         if bad is not None and bad.shape != capture.frame_shape:
             raise CaptureError(
                 f"the bad-pixel map is {bad.shape}, the frames of {capture.path} are {capture.frame_shape}."
             )
-        source_of_dark = dark_from or capture
-        detector = capture.header.detector
-        warnings: list[str] = []
-        dark = source_of_dark.dark
-        black: float | NDArray[np.float32]
-        if dark is not None:
-            states = source_of_dark.states_with("dark")
-            black, dark_frames = dark.astype(np.float32), int(source_of_dark.column("repeats")[states].sum())
-            source = f"mean of {dark_frames} dark frame(s)" + (f" of {dark_from.path.name}" if dark_from else "")
-            warnings += _unmatched_dark_current(capture, source_of_dark)
-        else:
-            black, dark_frames = detector.black_level_counts, 0
-            source = f"black level {black:g} counts from the header"
-            if black == 0.0:
-                source = "no black was subtracted"
-                warnings.append(
-                    "no dark states and no black level in the capture: nothing was subtracted, and a pedestal would "
-                    "show as depolarization. Take dark states, or import with --black-level."
-                )
-        saturation = _saturation(capture)
-        flat = _flat(flat_from, black) if flat_from else _flat(capture, black)
-        return cls(black, dark_frames, source, flat, bad, saturation, tuple(warnings))
+        light = capture.column("exposure_s")[_light(capture)].astype(float)
+        black = Black.of(dark_from or capture) or Black.level(capture.header.detector.black_level_counts)
+        source = black.in_words(light) + (f" of {dark_from.path.name}" if dark_from else "")
+        warnings = black.warnings(light)
+        if not black.measured and not black.means.any():
+            warnings.append(
+                "no dark states and no black level in the capture: nothing was subtracted, and a pedestal would "
+                "show as depolarization. Take dark states, or import with --black-level."
+            )
+        top = saturation(capture)
+        flat = Flat.of(list(flat_from) or [capture], black, top)
+        return cls(black, source, flat, bad, top, tuple(warnings))
 
 
-def _unmatched_dark_current(capture: Capture, source: Capture) -> list[str]:
-    """A warning where one mean dark stands for several exposures and the dark current shows in it."""
-    states = source.states_with("dark")
-    dark_s = source.column("exposure_s")[states].astype(float)
-    light_s = capture.column("exposure_s")[capture.states_with("sample")].astype(float)
-    away_s = float(np.max(np.abs(light_s - dark_s.mean()), initial=0.0))
-    if not away_s > 0.01 * dark_s.mean():  # also where exposures are not known
-        return []
-    lengths = np.unique(dark_s)
-    if lengths.size < 2:
-        return [
-            f"the dark states were exposed {lengths[0]:g} s, sample states differ from that by up to {away_s:g} s: "
-            "their dark current is not taken out. Take darks at the exposures of the sample."
-        ]
-    shortest, longest = (
-        np.mean([source.frames(int(k)).mean() for k in states[dark_s == length]]) for length in lengths[[0, -1]]
-    )
-    error = abs(longest - shortest) / (lengths[-1] - lengths[0]) * away_s
-    if error < 0.5:  # below the rounding of a count
-        return []
-    return [f"one mean dark for several exposures: the dark current leaves up to {error:.2g} counts in the signal"]
+def _light(capture: Capture) -> NDArray[np.int64]:
+    return np.flatnonzero([role != "dark" for role in capture.role])
 
 
-def _saturation(capture: Capture) -> float | None:
+def saturation(capture: Capture) -> float | None:
     """Counts from which on a pixel is saturated: the end of the range, or the full well where that comes first."""
     detector = capture.header.detector
     if detector.bits is None or not capture.integer_counts:
@@ -153,23 +125,6 @@ def _check_partner(capture: Capture, other: Capture, role: str) -> None:
         raise CaptureError(f"{other.path} has no {role} states that are done.")
 
 
-def _flat(capture: Capture, black: float | NDArray[np.float32]) -> NDArray[np.float32] | None:
-    states = capture.states_with("flat")
-    if states.size == 0:
-        return None
-    total = np.zeros((capture.channels, *capture.frame_shape))
-    for k in states:
-        total += capture.frames(int(k))
-    response = total / states.size - black
-    with np.errstate(invalid="ignore", divide="ignore"):
-        response /= np.nanmean(response, axis=(1, 2), keepdims=True)
-    if not np.all(np.isfinite(response)) or np.mean(response <= 0) > 0.01:
-        raise CaptureError(
-            f"{capture.path}: the flat states are no brighter than the black; retake them or leave them out."
-        )
-    return np.maximum(response, 1e-3).astype(np.float32)
-
-
 class BlockReader:
     """Corrected signal of the sample states, tile by tile, with the mask filled in passing."""
 
@@ -182,10 +137,16 @@ class BlockReader:
     ) -> None:
         self.capture, self.states, self.correction, self.counts = capture, states, correction, counts
         self.repeats = capture.column("repeats")[states].astype(float)
+        exposure = capture.column("exposure_s")[states].astype(float)
+        #: Black of each state as a weighted sum of the means of dark states (states, D).
+        self.black_weights = correction.black.weights(exposure)
+        self._levels, level = np.unique(self.black_weights, axis=0, return_inverse=True)
+        self._level = level.reshape(-1)
+        self.exposure_s = exposure
         self._buffer: NDArray[np.generic] | None = None
         #: First row of the block that was read last.
         self.first_row = 0
-        self._black: NDArray[np.float32] | np.float32 = np.float32(0)
+        self._black = np.zeros((1, 1, 1), np.float32)
         self._gain: NDArray[np.float32] | None = None
         self._bad: NDArray[np.bool_] | None = None
 
@@ -203,12 +164,12 @@ class BlockReader:
             self._read_moved(rows, block, self.counts.shift_px)
         else:
             self.capture.read_block(self.states, rows, block)
-        black, flat, bad = self.correction.black, self.correction.flat, self.correction.bad
-        if isinstance(black, np.ndarray):
-            self._black = np.ascontiguousarray(black[:, rows].reshape(channels, -1))
-        else:
-            self._black = np.float32(black)
-        self._gain = None if flat is None else 1.0 / flat[:, rows].reshape(channels, -1)
+        means, flat, bad = self.correction.black.means, self.correction.flat, self.correction.bad
+        means = means[:, :, rows] if means.shape[2] > 1 else means
+        # (levels, channels, pixels), or (1, 1, 1) for a declared black level.
+        black = np.tensordot(self._levels, means.reshape(*means.shape[:2], -1), axes=1)
+        self._black = np.ascontiguousarray(black, dtype=np.float32)
+        self._gain = None if flat is None else 1.0 / flat.response[:, rows].reshape(channels, -1)
         self._bad = None if bad is None else bad[rows].reshape(-1)
         return block.reshape(len(self.states), channels, -1)
 
@@ -256,18 +217,11 @@ class BlockReader:
     ) -> NDArray[np.float32] | None:
         """Fill `out` with counts minus black over flat; returns 1 / flat (channels, pixels), None without one."""
         np.copyto(out, raw, casting="unsafe")
-        if isinstance(self._black, np.ndarray):
-            out -= self._black[:, pixels]
-        elif self._black:
-            out -= self._black
+        black = self._black[..., pixels] if self._black.shape[2] > 1 else self._black
+        out -= black if len(black) == 1 else black[self._level]
         gain = None if self._gain is None else self._gain[:, pixels]
         if gain is not None:
             out *= gain
         if self.counts is not None:
             self.counts.apply(out)
         return gain
-
-    def black_variance(self, noise: NoiseModel) -> float:
-        """Variance, counts^2, of the black that is subtracted from every state alike."""
-        frames = self.correction.dark_frames
-        return noise.floor / frames if frames else 0.0

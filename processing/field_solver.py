@@ -59,7 +59,7 @@ class FieldSolver:
 
     def __init__(self, plain: MuellerSolver, field: Field) -> None:
         self.plain, self.reader, self.inversion = plain, plain.reader, plain.inversion
-        self.noise, self.repeats = plain.noise, plain.repeats
+        self.noise, self.repeats, self.intensity_floor = plain.noise, plain.repeats, plain.intensity_floor
         self.field = field
         y, x = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 41), np.linspace(-1, 1, 41), indexing="ij"))
         extra = field.extra(x, y)

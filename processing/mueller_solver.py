@@ -35,12 +35,16 @@ class MuellerSolver:
         stack = [inversion.pinv, inversion.null, *([squares / self.repeats] if noise else [])]
         self.stack = np.concatenate(stack).astype(np.float32)
         self.first_square = inversion.w.shape[0]
-        # The black is one number for all states of a channel, so its error is common to them.
-        floor = noise.averaged_floor(self.repeats) if noise else np.zeros(inversion.w.shape[0])
-        self.floor = (squares * floor).reshape(17, -1, channels).sum(axis=1).astype(np.float32)
-        by_channel = inversion.pinv.reshape(16, -1, channels).sum(axis=1) ** 2
-        null_channel = np.sum(inversion.null.reshape(len(inversion.null), -1, channels).sum(axis=1) ** 2, axis=0)
-        self.black_unit = np.concatenate([by_channel, null_channel[None]]).astype(np.float32)
+        black = reader.correction.black
+        excess = np.repeat(black.excess(noise, reader.exposure_s), channels)
+        #: Variance without light of each intensity (N,), counts^2.
+        self.intensity_floor = noise.averaged_floor(self.repeats, excess) if noise else np.zeros(inversion.w.shape[0])
+        self.floor = (squares * self.intensity_floor).reshape(17, -1, channels).sum(axis=1).astype(np.float32)
+        # The black is the same in all states of one exposure of a channel, so its error is common to them.
+        self.black_variance = black.mean_variance(noise)
+        seen = np.concatenate([inversion.pinv, inversion.null]).reshape(-1, len(reader.repeats), channels)
+        drive = np.einsum("knc,nd->kcd", seen, reader.black_weights) ** 2 @ self.black_variance
+        self.black = np.concatenate([drive[:16], drive[16:].sum(axis=0, keepdims=True)]).astype(np.float32)
         self.unit_sigma = np.sqrt(np.diag(inversion.unit_covariance)).astype(np.float32)
 
     def solve(self, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
@@ -93,7 +97,7 @@ class MuellerSolver:
         noise: NoiseModel,
     ) -> NDArray[np.float32]:
         """Variances (17, pixels), counts^2: of the 16 elements, and of the whole residual."""
-        constant = self.floor + self.reader.black_variance(noise) * self.black_unit
+        constant = self.floor + self.black
         if gain is None:
             shot *= np.float32(noise.slope)
             shot += constant.sum(axis=1, keepdims=True)
@@ -129,17 +133,50 @@ def solve_without_saturated(
         residual = (y - m @ w.T) * keep
         free = np.maximum(keep.sum(axis=1) - dof, 0)
         rss = np.sum(residual**2, axis=1)
-        unit = np.ones((frames.shape[1], len(part)), np.float32) if gain is None else gain
-        per_state = np.asarray(np.broadcast_to(unit[None], raw.shape).reshape(n, -1).T, dtype=float)
         with np.errstate(divide="ignore", invalid="ignore"):
             if solver.noise is None:
-                variance = np.broadcast_to((rss / free)[:, None], y.shape)
+                found["mueller_errors"][:, part] = np.sqrt(np.einsum("pin,pin->ip", solve, solve) * (rss / free))
             else:
-                dark = solver.noise.averaged_floor(solver.repeats) * per_state
-                shot = solver.noise.slope / solver.repeats * y
-                variance = np.maximum(shot + dark, LEAST * dark) * per_state
-            found["mueller_errors"][:, part] = np.sqrt(np.einsum("pin,pn->ip", solve**2, variance))
-            found["reduced_chi_square"][part] = np.sum(residual**2 / variance, axis=1) / free
+                unit = np.ones((frames.shape[1], len(part)), np.float32) if gain is None else gain
+                scale = np.asarray(np.broadcast_to(unit[None], raw.shape).reshape(n, -1).T, dtype=float)
+                errors, expected = _expected(solver, solve, keep, y, scale)
+                found["mueller_errors"][:, part] = errors
+                found["reduced_chi_square"][part] = np.where(free > 0, rss / expected, np.nan)
         found["mueller"][:, part] = m.T
         found["residual_rms"][part] = np.sqrt(rss / keep.sum(axis=1))
         found["pixel_mask"][part[ill]] |= np.uint8(Mask.NOT_DETERMINED)
+
+
+def _expected(
+    solver: MuellerSolver,
+    solve: NDArray[np.float64],
+    keep: NDArray[np.float64],
+    y: NDArray[np.float64],
+    scale: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Standard errors (16, pixels) and expected sum of squared residuals (pixels,) of fits to the states kept.
+
+    solve (pixels, 16, N) is each pixel's least-squares matrix, 0 where a state is left out; y and keep (pixels, N);
+    scale (pixels, N) is 1 / flat. The residual of least squares is a projection, so noise of variance v leaves the
+    sum over the states of v times its diagonal.
+    """
+    w, n = solver.inversion.w, solver.inversion.w.shape[0]
+    slope = solver.noise.slope / solver.repeats if solver.noise else np.zeros(n)
+    dark = solver.intensity_floor * scale**2
+    diagonal = keep - np.einsum("ni,pin->pn", w, solve)
+
+    def total(variance: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.stack([*np.einsum("pin,pn->ip", solve**2, variance), np.einsum("pn,pn->p", diagonal, variance)])
+
+    least = total(dark)
+    channels = solver.black.shape[1]
+    for channel in range(channels):
+        for weight, variance in zip(solver.reader.black_weights.T, solver.black_variance, strict=True):
+            common = np.zeros(n)
+            common[channel::channels] = weight
+            pushed = common * scale * keep
+            moved = np.einsum("pin,pn->pi", solve, pushed)
+            left = (pushed - moved @ w.T) * keep
+            least += variance * np.stack([*moved.T**2, np.sum(left**2, axis=1)])
+    found = np.maximum(total(slope * y * scale) + least, LEAST * least)
+    return np.sqrt(found[:16]), found[16]

@@ -51,9 +51,9 @@ class NoiseModel:
         """Variance without light, counts^2."""
         return self.read + self.rounding
 
-    def averaged_floor(self, repeats: ArrayLike) -> NDArray[np.float64]:
-        """Variance without light of means of `repeats` frames, counts^2."""
-        return np.asarray(self.read / np.asarray(repeats, dtype=float) + self.rounding)
+    def averaged_floor(self, repeats: ArrayLike, excess: ArrayLike = 0.0) -> NDArray[np.float64]:
+        """Variance without light of means of `repeats` frames, counts^2; `excess` is what a frame has above `read`."""
+        return np.asarray((self.read + np.asarray(excess, dtype=float)) / np.asarray(repeats, float) + self.rounding)
 
     def variance(self, signal: ArrayLike) -> NDArray[np.float64]:
         """Variance, counts^2, at a signal in counts above black; a negative signal has the floor's."""

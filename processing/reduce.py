@@ -232,7 +232,7 @@ def _store_noise(product: ProductWriter, noise: NoiseModel | None, solver: Solve
     nothing = np.full(len(solver.repeats), np.nan)
     slope = noise.slope / solver.repeats if noise else nothing
     product.array("noise_slope", slope, "count", "shot noise: variance a signal count, for each row of W")
-    floor = noise.averaged_floor(solver.repeats) if noise else nothing
+    floor = solver.intensity_floor if noise else nothing
     product.array("noise_floor", floor, "count2", "variance without light, for each row of W")
 
 

@@ -51,6 +51,7 @@ def mueller_facts(
         "condition_number": inversion.condition_number,
         "degrees_of_freedom": inversion.degrees_of_freedom,
         "black": correction.source,
+        "flat": correction.flat.source if correction.flat else "none",
         "noise": noise.source if noise else "estimated from each pixel's residual, because the gain is not known",
         "weighted": weighted,
         "median_residual_rms_count": _median(residual),

@@ -16,11 +16,12 @@ from processing.errors import NotDetermined
 from processing.instrument import InstrumentModel
 from processing.mosaic.calibration import correct
 from processing.mosaic.layout import MosaicLayout
+from processing.mosaic.merge import MergedFrame, merge
 from processing.mosaic.methods import demosaic
 from processing.mosaic.noise import stokes_covariance
 from processing.noise import NoiseModel
 from processing.product import LIT_ERRORS, Plane, ProductWriter, Step
-from processing.reduce import Progress, relative_exposure, sample_states
+from processing.reduce import Progress, sample_states
 from processing.reduce_facts import in_words
 
 #: The method that docs/mosaic.md found best.
@@ -79,31 +80,6 @@ def channel_rows(
     return mean, np.asarray(analyzers)
 
 
-def mean_frame(
-    capture: Capture, states: NDArray[np.int64], correction: Correction, progress: Progress | None = None
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Mean signal (rows, columns) of alike states, black subtracted and flat divided, and the mask of raw pixels."""
-    total = np.zeros(capture.frame_shape)
-    mask = np.zeros(capture.frame_shape, np.uint8)
-    weight = relative_exposure(capture, states)
-    for count, state in enumerate(states, 1):
-        frame = capture.frames(int(state))[0]
-        if correction.saturation is not None:
-            mask[frame >= correction.saturation] |= np.uint8(Mask.SATURATED)
-        if frame.dtype.kind == "f":
-            mask[~np.isfinite(frame)] |= np.uint8(Mask.NOT_FINITE)
-        total += frame
-        if progress:
-            progress(count, len(states))
-    black = correction.black[0] if isinstance(correction.black, np.ndarray) else correction.black
-    total = (total / len(states) - black) / float(np.mean(weight))
-    if correction.flat is not None:
-        total /= correction.flat[0]
-    if correction.bad is not None:
-        mask[correction.bad] |= np.uint8(Mask.BAD)
-    return total.astype(np.float32), mask
-
-
 def reduce_stokes(
     capture: Capture,
     model: InstrumentModel,
@@ -135,19 +111,14 @@ def reduce_stokes(
     model_rows, analyzers = channel_rows(capture, model, states, changes)
     correction = correction or Correction.of(capture)
     noise = noise or NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
-    frame, mask = mean_frame(capture, states, correction, progress)
-    counts = counts_correction(changes)
-    if counts is not None:
-        signal = frame.reshape(1, 1, -1)
-        counts.apply(signal)
-        frame = signal.reshape(frame.shape)
+    merged = merge(capture, states, correction, noise, counts_correction(changes), progress)
+    frame = merged.signal
     if response is not None:
         frame = correct(frame, response, layout, analyzers)
     channels = demosaic(frame, layout, method)
-    frames = float(capture.column("repeats")[states].sum())
-    found = stokes(channels, analyzers, layout, method, noise, frames, correction.dark_frames, frame)
-    found["pixel_mask"] = _spread(mask, channels.shape[1:])
-    lost = found["pixel_mask"] != 0
+    found = stokes(channels, analyzers, layout, method, merged, frame)
+    found["pixel_mask"] = _spread(merged.mask, channels.shape[1:])
+    lost = (found["pixel_mask"] & ~np.uint8(Mask.SATURATED)) != 0
     dark = ~(found["s0"] > 0)
     for name, values in found.items():
         if name != "pixel_mask":
@@ -167,14 +138,13 @@ def stokes(
     analyzers: NDArray[np.float64],
     layout: MosaicLayout,
     method: str,
-    noise: NoiseModel | None,
-    frames: float = 1,
-    dark_frames: int = 0,
+    merged: MergedFrame,
     frame: NDArray[np.float32] | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Stokes planes and their errors from demosaiced channels (4, rows, columns); names as in PLANES.
 
-    Without a noise model the variance of a raw pixel is estimated from the closure, one number for the whole image.
+    `frame` is the mosaic frame that they come from. Without a noise model the variance of a raw pixel is estimated
+    from the closure, one number for the whole image.
     """
     solve = np.asarray(np.linalg.pinv(analyzers), dtype=float)
     null = np.linalg.svd(analyzers)[0][:, LINEAR]
@@ -182,12 +152,15 @@ def stokes(
     null = null / np.abs(null).max() * np.sign(null[0])
     s0, s1, s2 = np.tensordot(solve.astype(np.float32), channels, axes=1)
     closure = np.tensordot(null.astype(np.float32), channels, axes=1)
-    if noise is None:
+    if merged.shot is None or merged.floor is None:
         spread = 1.4826 * np.nanmedian(np.abs(closure - np.nanmedian(closure))) / np.linalg.norm(null)
         variance = np.full_like(channels, spread**2)
     else:
-        floor = noise.floor / frames + (noise.floor / dark_frames if dark_frames else 0.0)
-        variance = (noise.slope / frames * np.maximum(channels, 0.0) + floor).astype(np.float32)
+        shot, floor = _by_channel(merged.shot, layout, channels), _by_channel(merged.floor, layout, channels)
+        light = np.maximum(channels, 0.0)
+        variance = shot * light + floor
+        if merged.relative is not None:
+            variance += _by_channel(merged.relative, layout, channels) * light**2
     covariance = stokes_covariance(variance, layout, method, solve, frame)
     with np.errstate(divide="ignore", invalid="ignore"):
         linear = np.hypot(s1, s2)
@@ -211,6 +184,13 @@ def stokes(
     found |= {"stokes_covariance": covariance, "dolp": dolp, "dolp_errors": dolp_errors, "closure": closure}
     found |= {"aolp_deg": np.rad2deg(aolp), "aolp_deg_errors": np.rad2deg(aolp_errors)}
     return {name: np.asarray(values, dtype=np.float32) for name, values in found.items()}
+
+
+def _by_channel(raw: NDArray[np.float32], layout: MosaicLayout, channels: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Values of raw pixels (rows, columns) for each channel's image: those of its own pixel in the super-pixel."""
+    cell = np.stack([layout.samples(raw, k) for k in range(len(layout.channels))])
+    step = channels.shape[1] // cell.shape[1]
+    return np.asarray(cell if step == 1 else cell.repeat(step, axis=1).repeat(step, axis=2), dtype=np.float32)
 
 
 def _spread(mask: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.uint8]:
@@ -238,7 +218,7 @@ def _facts(
 ) -> dict[str, Any]:
     mask, warnings = found["pixel_mask"], list(correction.warnings)
     counts = {flag.name.lower(): int(np.sum((mask & np.uint8(flag)) != 0)) for flag in Mask if flag.name}
-    good = mask == 0
+    good = (mask & ~np.uint8(Mask.SATURATED)) == 0
     if not good.any():
         raise CaptureError(f"no pixel could be reduced: {in_words(counts)} of {mask.size} pixels. Nothing was written.")
     if any(counts.values()):
@@ -257,6 +237,7 @@ def _facts(
         "method": method,
         "condition_number": condition_number_linear(analyzers),
         "black": correction.source,
+        "flat": correction.flat.source if correction.flat else "none",
         "noise": noise.source if noise else "estimated from the closure",
         "median_closure_over_s0": float(np.median(closure)) if lit.any() else float("nan"),
         "rms_closure_over_s0": float(np.sqrt(np.mean(closure**2))) if lit.any() else float("nan"),

@@ -1,7 +1,7 @@
 """Noise-weighted inversion: every intensity counts as much as its noise allows, with the full covariance of a pixel.
 
 The weights come from the plain fit, not from the noisy counts (those would bias the estimate): variance =
-slope * fitted signal + floor. Saturated intensities have weight 0.
+slope * fitted signal + floor. Saturated intensities have weight 0, in the fit that the weights come from as well.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ class WeightedSolver:
         w = plain.inversion.w.astype(np.float32)
         self._w, self._wt = w, np.ascontiguousarray(w.T)
         self._pairs = np.ascontiguousarray((w[:, PACKED_ROW] * w[:, PACKED_COLUMN]).T)
-        self._floor = self.noise.averaged_floor(self.repeats).astype(np.float32)[:, None]
+        self.intensity_floor = plain.intensity_floor
+        self._floor = self.intensity_floor.astype(np.float32)[:, None]
         self._slope = (self.noise.slope / self.repeats).astype(np.float32)[:, None]
 
     def solve(self, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
@@ -74,6 +75,7 @@ class WeightedSolver:
             raw = frames[:, :, a:b]
             signal = np.empty(raw.shape, np.float32)
             gain = self.reader.signal(raw, slice(a, b), signal)
+            self._refit_saturated(raw, signal, found, slice(a, b))
             weight = self._weights(raw, found["mueller"][:, a:b], gain)
             residual = signal.reshape(n, b - a) - self._w @ found["mueller"][:, a:b]
             normal = self._pairs @ weight
@@ -84,11 +86,11 @@ class WeightedSolver:
             kept = (weight > 0).sum(axis=0)
             chi_square = np.einsum("np,np->p", weight, residual**2)
             squares = np.einsum("np,np->p", weight > 0, residual**2)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                found["reduced_chi_square"][a:b] = np.where(kept > ELEMENTS, chi_square / (kept - ELEMENTS), np.nan)
-                found["residual_rms"][a:b] = np.sqrt(squares / kept)
             found["mueller"][:, a:b] += step
-            self._add_black(covariance, weight.reshape(-1, channels, b - a), gain)
+            expected = kept - ELEMENTS + self._add_black(covariance, weight.reshape(-1, channels, b - a), gain)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                found["reduced_chi_square"][a:b] = np.where(kept > ELEMENTS, chi_square / expected, np.nan)
+                found["residual_rms"][a:b] = np.sqrt(squares / kept)
             found["mueller_errors"][:, a:b] = np.sqrt(covariance[_DIAGONAL])
             lost = np.isnan(step[0]) & ((found["pixel_mask"][a:b] & np.uint8(Mask.SATURATED)) != 0)
             found["pixel_mask"][a:b][lost] |= np.uint8(Mask.NOT_DETERMINED)
@@ -114,21 +116,43 @@ class WeightedSolver:
             weight[raw.reshape(weight.shape) >= level] = 0.0
         return np.asarray(weight, dtype=np.float32)
 
+    def _refit_saturated(
+        self, raw: NDArray[Any], signal: NDArray[np.float32], found: dict[str, NDArray[Any]], pixels: slice
+    ) -> None:
+        """Put the plain fit without saturated intensities into `found`, for the pixels that have any."""
+        level = self.reader.correction.saturation
+        some = np.flatnonzero(found["pixel_mask"][pixels] & np.uint8(Mask.SATURATED))
+        if level is None or not some.size:
+            return
+        n = self._w.shape[0]
+        keep = (raw[:, :, some] < level).reshape(n, -1).astype(np.float32)
+        right = self._wt @ (keep * signal[:, :, some].reshape(n, -1))
+        fit, covariance = np.empty((ELEMENTS, some.size), np.float32), np.empty((PACKED, some.size), np.float32)
+        solve_range(self._pairs @ keep, right, fit, covariance, 0, some.size)
+        found["mueller"][:, pixels.start + some] = np.where(np.isnan(fit), 0.0, fit)
+
     def _add_black(
         self, covariance: NDArray[np.float32], weight: NDArray[np.float32], gain: NDArray[np.float32] | None
-    ) -> None:
-        """Add what the error of the dark frames, common to all states of a channel, does to M."""
-        variance = self.reader.black_variance(self.noise)
-        if variance == 0.0:
-            return
+    ) -> NDArray[np.float32] | float:
+        """Add what the error of the darks, common to all states of an exposure of a channel, does to M.
+
+        Returns what it adds to the expected weighted sum of squared residuals (pixels,).
+        """
+        if not self.plain.black_variance.any():
+            return 0.0
         states, channels, pixels = weight.shape
         w = self._w.reshape(states, channels, ELEMENTS)
         full = np.empty((ELEMENTS, ELEMENTS, pixels), np.float32)
         full[PACKED_ROW, PACKED_COLUMN] = covariance
         full[PACKED_COLUMN, PACKED_ROW] = covariance
+        left = np.zeros(pixels, np.float32)
         for channel in range(channels):
-            drive = w[:, channel].T @ weight[:, channel]
-            moved = np.einsum("ijp,jp->ip", full, drive)
-            if gain is not None:
-                moved *= gain[channel]
-            covariance += np.float32(variance) * moved[PACKED_ROW] * moved[PACKED_COLUMN]
+            scale = 1.0 if gain is None else gain[channel]
+            for share, variance in zip(self.reader.black_weights.T, self.plain.black_variance, strict=True):
+                pushed = share.astype(np.float32)[:, None] * weight[:, channel]
+                drive = w[:, channel].T @ pushed
+                moved = np.einsum("ijp,jp->ip", full, drive)
+                unit = np.float32(variance) * scale**2
+                covariance += unit * moved[PACKED_ROW] * moved[PACKED_COLUMN]
+                left += unit * (share.astype(np.float32) @ pushed - np.einsum("ip,ip->p", drive, moved))
+        return left

@@ -83,7 +83,7 @@ def reduce_file(path: Path, out: Path | None, options: ReduceOptions, overwrite:
         if capture is None:
             raise ProcessError("no capture was given")
         noise, bad = read_camera(options.camera) if options.camera else (None, None)
-        correction = Correction.of(capture, bad, dark, flat)
+        correction = Correction.of(capture, bad, dark, [flat] if flat else [])
         kind = "stokes" if capture.header.mosaic else "mueller"
         product = out or path.with_suffix(f".{kind}.h5")
         given = (path, options.instrument, options.camera, options.dark, options.flat, options.analyzers)

@@ -17,6 +17,8 @@ from processing.errors import ProcessError
 from processing.geometry.pinhole import PinholeCamera
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument import InstrumentModel
+from processing.noise import NoiseModel
+from processing.reduce import sample_states
 from processing.reflectance.base import ReflectanceModel
 
 Array = NDArray[np.float64]
@@ -108,8 +110,8 @@ def read_surface(
         n, total = len(states), exposure.sum()
         states = states.sum(axis=0, keepdims=True) / n
         # The dark that was taken away is the same in all of them and does not average out.
-        dark = 1 / frames if (frames := Correction.of(capture).dark_frames) else 0.0
-        state_slope, state_floor = np.array([data.slope.mean() / n]), np.array([data.floor.mean() * (1 / n + dark)])
+        dark = _black_variance(capture) / data.conditions.full_scale**2
+        state_slope, state_floor = np.array([data.slope.mean() / n]), np.array([data.floor.mean() / n + dark])
         exposure = np.array([total / n])
         # A rig records the angles of its axes all the same.
         conditions = replace(conditions, angles_deg={}, states=1, elapsed=np.zeros(1))
@@ -138,6 +140,14 @@ def read_surface(
         omega_deg=omega,
         clipped_fraction=float(np.mean(data.clipped)),
     )
+
+
+def _black_variance(capture: Capture) -> float:
+    """Variance, counts^2, of what is subtracted from the mean of all sample states."""
+    black = Correction.of(capture).black
+    noise = NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
+    share = black.weights(capture.column("exposure_s")[sample_states(capture)].astype(float)).mean(axis=0)
+    return float(share**2 @ black.mean_variance(noise))
 
 
 def _pick(

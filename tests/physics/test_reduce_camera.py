@@ -112,8 +112,8 @@ def test_dark_and_flat_of_another_capture(synthetic_capture) -> None:
     other = synthetic_capture(ones[..., :10] * 100, {}, role=("dark",), name="small.h5")
     real = synthetic_capture(ones * 100, {}, role=("dark",), name="real.h5", simulated=False)
     with Capture(sample) as s, Capture(dark) as d, Capture(flat) as f, Capture(other) as o, Capture(real) as r:
-        correction = Correction.of(s, dark_from=d, flat_from=f)
-        signal = (s.frames(0) - correction.black) / correction.flat
+        correction = Correction.of(s, dark_from=d, flat_from=[f])
+        signal = (s.frames(0) - correction.black.at(0.01)) / correction.flat.response
         np.testing.assert_allclose(signal, 500, rtol=1e-5)
         assert "dark.h5" in correction.source
         with pytest.raises(CaptureError, match="same camera and size"):
@@ -121,7 +121,7 @@ def test_dark_and_flat_of_another_capture(synthetic_capture) -> None:
         with pytest.raises(CaptureError, match="never mixed"):
             Correction.of(s, dark_from=r)
         with pytest.raises(CaptureError, match="has no flat states"):
-            Correction.of(s, flat_from=d)
+            Correction.of(s, flat_from=[d])
         with pytest.raises(CaptureError, match="bad-pixel map"):
             Correction.of(s, bad=np.zeros((3, 3), bool))
         assert not bad_pixels(d).any()

@@ -1,13 +1,30 @@
-"""Darks that do not fit the exposures of the sample are told, with the counts that it may cost."""
+"""The black of each exposure: matched darks, offset plus dark current through others, and what is told."""
 
 import numpy as np
 import pytest
 
+from processing.black import Black
 from processing.capture import Capture
 from processing.correction import Correction
+from processing.images import MuellerImage
+from processing.instrument import InstrumentModel
+from processing.mosaic.layout import MosaicLayout
+from processing.mosaic.merge import merge
+from processing.noise import NoiseModel
+from processing.product import Product, Step
+from processing.reduce import Choice, reduce_mueller, sample_states
+from processing.reduce_stokes import reduce_stokes
+from processing.states import rotating_retarders
+from processing.yaml_file import dump_yaml
+from simulators.bench import DETECTOR, FixedScene, SimulatedBench
 
 ANGLES = {"psg": np.arange(6.0)}
 ROLE = ("dark", "dark", "sample", "sample", "sample", "sample")
+STEP = (Step("reduce", {}),)
+SHAPE = (48, 60)
+SHORT_S, LONG_S = 0.005, 0.04
+MUELLER = np.diag([1.0, 0.3, -0.25, 0.2])
+MUELLER[0, 1] = MUELLER[1, 0] = 0.15
 
 
 @pytest.mark.parametrize(
@@ -15,13 +32,109 @@ ROLE = ("dark", "dark", "sample", "sample", "sample", "sample")
     [
         ([0.1, 0.1, 0.1, 0.1, 0.1, 0.1], 500.0, None),
         ([0.1, 0.1, 0.1, 0.4, 0.4, 0.4], 500.0, "Take darks at the exposures of the sample"),
-        ([0.1, 0.4, 0.1, 0.4, 0.1, 0.4], 500.0, "leaves up to 75 counts"),
-        ([0.1, 0.4, 0.1, 0.4, 0.1, 0.4], 1.0, None),
+        ([0.1, 0.4, 0.1, 0.4, 0.2, 0.4], 500.0, None),
+        ([0.1, 0.4, 0.1, 0.4, 0.1, 0.8], 500.0, "0.8 s is extrapolated from darks of 0.1 to 0.4 s, by 2e+02 counts"),
+        ([0.1, 0.4, 0.1, 0.4, 0.1, 0.8], 1.0, None),
     ],
 )
-def test_dark_current_of_other_exposures(synthetic_capture, exposure_s, rate, told) -> None:
+def test_what_is_told_of_the_darks(synthetic_capture, exposure_s, rate, told) -> None:
     exposure = np.array(exposure_s)
     frames = np.broadcast_to((64 + rate * exposure)[:, None, None, None], (6, 1, 4, 6)).astype(np.uint16)
     with Capture(synthetic_capture(frames, ANGLES, role=ROLE, exposure_s=exposure)) as capture:
-        warnings = " ".join(Correction.of(capture).warnings)
+        correction = Correction.of(capture)
+        if told is None:
+            for k in range(2, 6):
+                np.testing.assert_allclose(correction.black.at(exposure[k]), capture.frames(k), atol=1)
+    warnings = " ".join(correction.warnings)
     assert (told in warnings) if told else not warnings
+
+
+def test_line_through_other_exposures_and_its_error() -> None:
+    """Many draws of noisy darks at two exposures: bias and variance of the black between them."""
+    rng = np.random.default_rng(1)
+    noise = NoiseModel(0.4, 2.0, 0.0, "")
+    exposure, frames = np.array([0.1, 0.4]), np.array([2.0, 6.0])
+    truth = 60 + 300 * exposure
+    means = truth[:, None, None, None] + rng.normal(size=(2, 1, 200, 200)) * np.sqrt(2.0 / frames)[:, None, None, None]
+    black = Black(means.astype(np.float32), exposure, frames, frames, np.full(2, 2.0), np.full(2, 0.01))
+    for t in (0.02, 0.2, 0.4, 0.6):
+        found = black.at(t) - (60 + 300 * t)
+        expected = black.weights(t)[0] ** 2 @ black.mean_variance(noise)
+        assert abs(found.mean()) < 4 * np.sqrt(expected / found.size)
+        assert found.var() == pytest.approx(expected, rel=0.03)
+
+
+def bench(instrument: InstrumentModel, level: np.ndarray, flux: float, dark_current: float, mueller: np.ndarray):
+    scene = FixedScene(np.broadcast_to(level[None, :, None, None] * mueller, (*SHAPE, 4, 4)))
+    return SimulatedBench(scene, instrument, 662, *SHAPE, DETECTOR, flux, dark_current, seed=3)
+
+
+def bracketed(synthetic_capture, model: InstrumentModel, stand: SimulatedBench, dark_s: list[float], angles: dict):
+    """A capture of both exposures in each pose, with darks of the exposures `dark_s`, from the bench."""
+    n, d = len(next(iter(angles.values()))), len(dark_s)
+    turned = {axis: np.concatenate([np.zeros(d), np.repeat(values, 2)]) for axis, values in angles.items()}
+    exposure = np.concatenate([dark_s, np.tile([SHORT_S, LONG_S], n)])
+    frames = np.stack(
+        [
+            stand.expose({axis: v[k] for axis, v in turned.items()}, exposure[k], k, light=float(k >= d))
+            for k in range(d + 2 * n)
+        ]
+    )
+    role = ("dark",) * d + ("sample",) * (2 * n)
+    header = {"detector": DETECTOR, "instrument_yaml": dump_yaml(model), "mosaic": model.mosaic}
+    return synthetic_capture(frames[:, None], turned, role=role, exposure_s=exposure, **header)
+
+
+@pytest.mark.parametrize("weighted", [False, True], ids=["plain", "weighted"])
+@pytest.mark.parametrize(
+    "dark_s", [[SHORT_S, LONG_S] * 4, [0.004] * 4 + [0.08] * 4], ids=["matched darks", "interpolated"]
+)
+def test_bracket_with_dark_current_has_unit_pulls(synthetic_capture, configs, tmp_path, dark_s, weighted) -> None:
+    """Dark current of 500 e/s, from hardly any light to saturation at the long exposure: reduced chi-square 1."""
+    model = InstrumentModel.load(configs / "instruments" / "rgb950.yaml")
+    flux, level = 4e6, np.geomspace(0.005, 1, SHAPE[1])
+    stand = bench(model.at(662), level, flux, 500.0, MUELLER)
+    path = bracketed(synthetic_capture, model, stand, dark_s, dict(rotating_retarders(1.0).angles_deg))
+    with Capture(path) as capture:
+        facts = reduce_mueller(capture, model.at(662), tmp_path / "m.h5", STEP, choice=Choice(weighted=weighted))
+    assert [w for w in facts["warnings"] if "saturated" not in w] == []
+    image = MuellerImage.load(tmp_path / "m.h5")
+    truth = flux * LONG_S / DETECTOR.gain_e_per_count * MUELLER[:, :, None, None] * level
+    pull = (image.values - truth) / image.errors
+    saturated = (image.mask & 1) != 0
+    assert 0.2 < saturated.mean() < 0.6
+    with Product(tmp_path / "m.h5") as product:
+        chi_square = product.get("reduced_chi_square")
+    for part in (saturated, ~saturated & (level > 0.03), ~saturated & (level <= 0.03)):
+        assert chi_square[part].mean() == pytest.approx(1, abs=0.03)
+        assert np.std(pull[..., part]) == pytest.approx(1, abs=0.03)
+        # Leaving out what saturates favours low counts at the edge by a tenth of a standard error.
+        assert abs(pull[..., part].mean(axis=-1)).max() < 0.2
+
+
+def test_bracketed_mosaic_uses_the_long_exposure_where_it_can(synthetic_capture, configs, tmp_path) -> None:
+    model = InstrumentModel.load(configs / "instruments" / "linear_stokes.yaml")
+    rows, light = model.at(662).rows({})[0], model.at(662).generator_states({})[0]
+    flux, level = 4e6, np.repeat(np.geomspace(0.005, 1, SHAPE[1] // 2), 2)
+    stand = bench(model.at(662), level, flux, 500.0, MUELLER)
+    path = bracketed(synthetic_capture, model, stand, [SHORT_S, LONG_S] * 4, {"psg": np.zeros(4)})
+    noise = NoiseModel.of(DETECTOR, integer=True)
+    with Capture(path) as capture:
+        merged = merge(capture, sample_states(capture), Correction.of(capture), noise)
+        reduce_stokes(capture, model.at(662), tmp_path / "s.h5", STEP, "superpixel")
+    layout = MosaicLayout.of(model.mosaic, [c.name for c in model.channels])
+    truth = np.zeros(SHAPE)
+    for k, (r, c) in enumerate(layout.offsets):
+        truth[r::2, c::2] = flux * LONG_S / DETECTOR.gain_e_per_count * (rows[k] @ MUELLER.ravel()) * level[c::2]
+    saturated = (merged.mask & 1) != 0
+    assert 0.1 < saturated.mean() < 0.6
+    assert not (merged.mask & 8).any()
+    pull = (merged.signal - truth) / np.sqrt(merged.shot * truth + merged.floor)
+    for part in (saturated, ~saturated & (level > 0.03), ~saturated & (level <= 0.03)):
+        assert pull[part].std() == pytest.approx(1, abs=0.07)
+        assert abs(pull[part].mean()) < 0.15
+    with Product(tmp_path / "s.h5") as product:
+        s0, error = product.get("s0"), product.get("s0_errors")
+        assert np.isfinite(s0).all()
+    expected = flux * LONG_S / DETECTOR.gain_e_per_count * level[::2] * (MUELLER[0] @ light)
+    assert ((s0 - expected) / error).std() == pytest.approx(1, abs=0.08)

@@ -1,0 +1,79 @@
+"""The flat field: relative response of each pixel and unevenness of the light, from flat states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.black import Black
+from processing.capture import Capture, CaptureError
+from processing.noise import NoiseModel
+
+#: A response below this is a dead pixel; dividing by less would blow its noise up without end.
+LEAST_RESPONSE = 1e-3
+
+
+@dataclass(frozen=True)
+class Flat:
+    """Relative response.
+
+    Attributes
+    ----------
+    response : (channels, rows, columns) float32, mean 1 in each channel.
+    frames : how many frames it is the mean of.
+    level : (channels,), counts above black of one frame.
+    source : in words.
+    """
+
+    response: NDArray[np.float32]
+    frames: int
+    level: NDArray[np.float64]
+    source: str
+
+    @classmethod
+    def of(cls, captures: list[Capture], black: Black | None = None, saturation: float | None = None) -> Flat | None:
+        """From all flat states of some captures of one camera; None without any.
+
+        Parameters
+        ----------
+        black : for captures without dark states of their own.
+        saturation : counts from which on a pixel is saturated; a flat state with such a pixel is left out.
+
+        Raises
+        ------
+        CaptureError : every flat state is saturated, or they are no brighter than the black.
+        """
+        captures = [c for c in captures if c.states_with("flat").size]
+        if not captures:
+            return None
+        total = np.zeros((captures[0].channels, *captures[0].frame_shape))
+        used = frames = 0
+        for capture in captures:
+            own = Black.of(capture) or black or Black.level(capture.header.detector.black_level_counts)
+            exposure, repeats = capture.column("exposure_s").astype(float), capture.column("repeats")
+            for k in capture.states_with("flat"):
+                frame = capture.frames(int(k))
+                # In a bracket the long exposures saturate; the others hold the same response.
+                if saturation is None or not (frame >= saturation).any():
+                    total += frame - own.at(exposure[k])
+                    used += 1
+                    frames += int(repeats[k])
+        names = ", ".join(c.path.name for c in captures)
+        if not used:
+            raise CaptureError(f"{names}: every flat state has saturated pixels; retake them with less exposure.")
+        with np.errstate(invalid="ignore", divide="ignore"):
+            level = np.nanmean(total, axis=(1, 2)) / used
+            response = total / used / level[:, None, None]
+        if not np.all(np.isfinite(response)) or np.mean(response <= 0) > 0.01:
+            raise CaptureError(
+                f"{names}: the flat states are no brighter than the black; retake them or leave them out."
+            )
+        response = np.maximum(response, LEAST_RESPONSE).astype(np.float32)
+        return cls(response, frames, level, f"mean of {frames} flat frame(s) of {names}")
+
+    def relative_variance(self, noise: NoiseModel) -> NDArray[np.float32]:
+        """Variance (channels, rows, columns) of the response over its square."""
+        light = self.level[:, None, None] * self.response
+        return np.asarray((noise.slope * light + noise.floor) / (self.frames * light**2), dtype=np.float32)
