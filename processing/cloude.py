@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing import coherency_kernels as kernels
-from processing.threads import for_chunks
+from processing.chunks import for_chunks
 
 Floats = NDArray[np.floating]
 

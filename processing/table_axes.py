@@ -43,10 +43,14 @@ class TableAxes:
         """(361,), degrees."""
         return np.arange(-180.0, 181.0)
 
-    def bins(self, angles: Angles) -> NDArray[np.int32]:
-        """Bin (...) of each direction, counted in C order over (theta_h, theta_d, phi_d); -1 for NaN."""
+    def bins(self, angles: Angles, out: NDArray[np.int32] | None = None) -> NDArray[np.int32]:
+        """Bin (...) of each direction, counted in C order over (theta_h, theta_d, phi_d); -1 for NaN.
+
+        `out` (N,) is filled and returned in the shape of the angles where it has their size.
+        """
         th, td, pd = (np.ascontiguousarray(v, dtype=np.float64).reshape(-1) for v in angles)
-        out = np.empty(th.size, dtype=np.int32)
+        if out is None or out.size != th.size:
+            out = np.empty(th.size, dtype=np.int32)
         renderer = self.layout == "renderer"
         for_ranges(th.size, lambda start, stop: _bins(th, td, pd, renderer, out, start, stop))
         return out.reshape(np.shape(angles.theta_h))

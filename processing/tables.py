@@ -55,6 +55,8 @@ class ScatteringTable:
         self._row = np.full(SHAPE[0] * SHAPE[1] * SHAPE[2], -1, dtype=np.int32)
         self.bins = np.empty(0, dtype=np.int32)
         self.count = np.empty(0, dtype=np.int64)
+        # Bins of the pixels of the last image, filled again by the next: the first touch of new memory is slow.
+        self._scratch: NDArray[np.int32] | None = None
         # Sums and sums of squares, (quantities, bins): double, so that a variance keeps its digits.
         self._sum = np.empty((len(quantities), 0))
         self._square = np.empty((len(quantities), 0))
@@ -79,7 +81,7 @@ class ScatteringTable:
         v = np.ascontiguousarray(v.reshape(len(v), -1))
         if v.dtype not in (np.float32, np.float64):
             v = v.astype(np.float64)
-        rows = np.ascontiguousarray(self.axes.bins(angles).reshape(-1))
+        rows = self._scratch = self.axes.bins(angles, self._scratch).reshape(-1)
         sums = np.empty(len(v))
         for_ranges(len(v), lambda start, stop: _plane_sums(v, sums, start, stop), align=1, smallest=1)
         if not np.all(np.isfinite(sums)):
@@ -226,7 +228,7 @@ def _claim_rows(bins, row_of_bin, used, found):  # type: ignore[no-untyped-def]
     return new
 
 
-@numba.njit(nogil=True, cache=True)
+@numba.njit(nogil=True, cache=True, fastmath={"contract"})
 def _accumulate(rows, values, total, square, count, start, stop):  # type: ignore[no-untyped-def]
     # Four quantities a thread: no two threads write to one place, and the eight sums do not wait for each
     # other. A run of pixels in one bin, the rule in an image, stays in registers.

@@ -9,16 +9,9 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 #: Environment variable that limits the threads of one process (a campaign's workers set it to 1).
 THREADS_VARIABLE = "UMOV_THREADS"
-
-#: Pixels that a compiled loop gets at a time in `for_chunks`: small enough for the second-level cache.
-CHUNK = 2048
 
 
 def thread_count() -> int:
@@ -50,29 +43,3 @@ def for_ranges(items: int, loop: Callable[[int, int], object], align: int = 256,
         loop(*ranges[0])
         for future in others:
             future.result()
-
-
-def for_chunks(kernel: Callable[..., object], source: NDArray[Any], *outputs: NDArray[Any]) -> None:
-    """Call `kernel(chunk, count, *results)` for chunks of a planar image and store what it writes.
-
-    Chunk and results are float64, C-ordered, whatever the arrays are, because each further type and layout costs
-    seconds of compilation.
-
-    Parameters
-    ----------
-    kernel : compiled function; reads chunk (rows, CHUNK), of which `count` pixels are valid, and fills the results.
-    source : (rows, pixels).
-    outputs : (..., pixels) each; the kernel gets one (..., CHUNK) for each.
-    """
-
-    def loop(start: int, stop: int) -> None:
-        chunk = np.zeros((source.shape[0], CHUNK))
-        results = [np.zeros((*out.shape[:-1], CHUNK)) for out in outputs]
-        for a in range(start, stop, CHUNK):
-            b = min(a + CHUNK, stop)
-            chunk[:, : b - a] = source[:, a:b]
-            kernel(chunk, b - a, *results)
-            for out, result in zip(outputs, results, strict=True):
-                out[..., a:b] = result[..., : b - a]
-
-    for_ranges(source.shape[1], loop)
