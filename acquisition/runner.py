@@ -50,6 +50,7 @@ class _Exposed:
     exposure: Exposure
     positions: dict[str, Position]
     retake: int
+    exposure_s: float
 
 
 @dataclass
@@ -180,6 +181,8 @@ class CaptureRunner:
     def _take(self, state: int, before: _Exposed | None) -> _Exposed | None:
         targets = {axis: float(column[state]) for axis, column in self.table.angles_deg.items()}
         changed = {axis: target for axis, target in targets.items() if self._here.get(axis) != target}
+        # The longest move first: the others start while it is under way.
+        changed = dict(sorted(changed.items(), key=lambda item: -self._move_s(*item)))
         motions = self.rig.start_moves(changed)
         longest_s = max((motion.expected_s for motion in motions.values()), default=0.0) / self.rig.time_scale
         if before is not None:
@@ -194,13 +197,20 @@ class CaptureRunner:
         self.ledger.unavoidable_s += longest_s + settle_s
         return self._expose(state, targets, positions)
 
+    def _move_s(self, axis: str, target_deg: float) -> float:
+        here_deg = self._here.get(axis)
+        return 0.0 if here_deg is None else self.rig.axes[axis].move_time_s(target_deg - here_deg)
+
     def _expose(self, state: int, targets: Mapping[str, float], moved: dict[str, Position]) -> _Exposed | None:
         retake = self._retakes.get(state, 0)
         for observer in self.observers:
             observer.exposing(state, retake)
         camera = self.rig.require_camera()
         with self.ledger.time("setting"):
-            self.rig.set_exposure(float(self.table.exposure_s[state]), int(self.table.repeats[state]))
+            asked_s = float(self.table.exposure_s[state])
+            settings = self.rig.set_exposure(asked_s, int(self.table.repeats[state]))
+        # Cameras set exposures in steps; what counts is the exposure that was.
+        exposure_s = settings.exposure_s or asked_s
         start_s = time.monotonic()
         with self.ledger.time("exposure"):
             try:
@@ -211,8 +221,9 @@ class CaptureRunner:
             except FrameLost as error:
                 self._again(state, error)
                 return None
-        light_s = float(self.table.exposure_s[state] * self.table.repeats[state])
-        # The camera's own delay from trigger to the end of the exposure, beyond the exposure itself.
+        light_s = exposure_s * float(self.table.repeats[state])
+        # The camera's own: until it says that the exposure has ended, beyond the exposure itself. The pause between
+        # two questions, a millisecond, is in it.
         readout_s = max(0.0, time.monotonic() - start_s - light_s)
         self.ledger.readout_s += readout_s
         self.ledger.unavoidable_s += light_s + readout_s
@@ -223,7 +234,7 @@ class CaptureRunner:
         if blocked is not None:
             self._discard(state, f"{blocked} in state {state}")
             return None
-        return _Exposed(state, exposure, {axis: positions[axis] for axis in targets}, retake)
+        return _Exposed(state, exposure, {axis: positions[axis] for axis in targets}, retake, exposure_s)
 
     def _collect(self, exposed: _Exposed) -> None:
         with self.ledger.time("transfer"):
@@ -234,7 +245,7 @@ class CaptureRunner:
                 return
         report = self._report(exposed, frame)
         # In a bracket the longer exposures are meant to saturate.
-        shortest = report.exposure_s <= 1.001 * float(self.table.exposure_s.min())
+        shortest = self.table.exposure_s[exposed.state] <= 1.001 * self.table.exposure_s.min()
         if self._saturation_limit is not None and shortest and report.saturated_fraction > self._saturation_limit:
             raise TooBright(
                 f"state {exposed.state}: {100 * report.saturated_fraction:.2f} % of the pixels are saturated"
@@ -244,6 +255,7 @@ class CaptureRunner:
             self._discard(exposed.state, blocked)
             return
         columns = {
+            "exposure_s": exposed.exposure_s,
             "host_time_s": frame.host_time_s,
             "camera_time_ns": frame.camera_time_ns,
             "frame_id": frame.frame_id,
@@ -260,16 +272,15 @@ class CaptureRunner:
 
     def _report(self, exposed: _Exposed, frame: Frame) -> StateReport:
         state, black = exposed.state, self.detector.black_level_counts
-        exposure_s = float(self.table.exposure_s[state])
         dim = black + NEAR_BLACK * (self._full_scale - black)
         return StateReport(
             state=state,
             role=self.table.role[state],
             positions=exposed.positions,
-            exposure_s=exposure_s,
+            exposure_s=exposed.exposure_s,
             saturated_fraction=float(np.count_nonzero(frame.pixels >= self._full_scale)) / frame.pixels.size,
             near_black_fraction=float(np.count_nonzero(frame.pixels < dim)) / frame.pixels.size,
-            monitor=(float(frame.pixels.mean()) - black) / exposure_s,
+            monitor=(float(frame.pixels.mean()) - black) / exposed.exposure_s,
             pixels=frame.pixels,
         )
 

@@ -156,6 +156,7 @@ def summarize(job: Job, result: Result) -> None:
         ("angles", f"read back at every state, at most {result.worst_angle_deg:.4f} deg from the target"),
         ("saturation", f"worst state {100 * result.saturated_fraction:.3f} % of pixels"),
         ("seconds", ", ".join(parts)),
+        *(("overhead", text) for text in _overhead(ledger)),
         *(("note", message) for message in result.messages[-5:]),
         ("figure", str(figure)),
         ("capture", str(result.path)),
@@ -163,6 +164,16 @@ def summarize(job: Job, result: Result) -> None:
     ]
     for label, text in lines:
         typer.echo(f"{label:<11} {text}")
+
+
+def _overhead(ledger: dict[str, float]) -> list[str]:
+    if "excess" not in ledger:
+        return []
+    readout_ms = 1e3 * ledger["of_it_readout_s"] / max(ledger["states"], 1)
+    return [
+        f"{100 * ledger['excess']:.1f} % beyond the unavoidable {ledger['unavoidable_s']:.1f} s of moves, settling, "
+        f"exposure and the camera's own {readout_ms:.0f} ms a state"
+    ]
 
 
 def next_command(job: Job, result: Result) -> str:

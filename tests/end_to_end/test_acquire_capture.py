@@ -56,6 +56,9 @@ def test_the_capture_says_what_it_is(acquire, small_rig, tmp_path):
             if k.endswith("_s") and k not in ("total_s", "unavoidable_s", "of_it_readout_s")
         ]
         assert sum(parts) == pytest.approx(ledger["total_s"], abs=0.01)
+        assert 0 < ledger["of_it_readout_s"] < ledger["unavoidable_s"]
+        assert ledger["excess_with_readout"] > ledger["excess"] > 0
+        assert "beyond the unavoidable" in out
         assert capture.closing["stream"]["completed"] >= 44
         dark = capture.frames(0)
         light = capture.frames(20)
