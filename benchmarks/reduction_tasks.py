@@ -1,0 +1,192 @@
+"""Tasks of `process reduce` and `diagnose` on captures: W of each pixel, weights, file to file, writing, start-up."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from measuring import LARGE, SMALL, Program, Spent, Task, seconds
+
+from acquisition.capture_writer import CaptureWriter, StateRecord
+from drivers.motion import Position
+from processing.applied_effects import capture_changes
+from processing.capture import Capture
+from processing.capture_schema import CaptureHeader, Detector, Sample
+from processing.correction import BlockReader, Correction
+from processing.diagnosis.run import diagnose_captures
+from processing.field_solver import FieldSolver
+from processing.instrument import AppliedEffect, EffectParameter, InstrumentModel
+from processing.inversion import Inversion
+from processing.mueller_solver import MuellerSolver
+from processing.noise import NoiseModel
+from processing.reduce import BLOCK_PIXELS, field_of, measurement_matrix, sample_states
+from processing.states import rotating_retarders
+from processing.threads import for_ranges
+from processing.weighted import WeightedSolver
+from simulators.blind_suite import state_angles
+from simulators.undeclared import Bench, Scene, digitize, expose, write_capture
+
+ROOT = Path(__file__).resolve().parents[1]
+INSTRUMENT = ROOT / "configs/instruments/rgb950.yaml"
+#: A retardance map of 16 degrees from end to end, on both retarders; terms x, y, x^2, x y, y^2, degrees.
+FIELD_DEG = {"x": 4.0, "y": -2.0, "x2": 3.0, "xy": 1.0, "y2": 0.0}
+
+
+def write_frames(path: Path, shape: tuple[int, int]) -> tuple[float, float]:
+    """A capture of 40 states of random counts through the writer of `acquire`; seconds to create it and to fill it."""
+    table = rotating_retarders(0.01)
+    header = CaptureHeader(
+        title="speed",
+        simulated=True,
+        mode="drr",
+        wavelength_nm=662,
+        sample=Sample(kind="unknown"),
+        detector=Detector(black_level_counts=50, gain_e_per_count=2.6, read_noise_e=2.3, full_well_e=1e6, bits=16),
+        instrument_yaml=INSTRUMENT.read_text(encoding="utf-8"),
+    )
+    frame = np.random.default_rng(1).integers(800, 3000, (1, *shape), dtype=np.uint16)
+    frames = [frame + np.uint16(n) for n in range(len(table))]
+    begin = time.perf_counter()
+    writer = CaptureWriter.create(path, header, table, shape, "2026-01-01T00:00:00+00:00")
+    created = time.perf_counter()
+    for n, pixels in enumerate(frames):
+        turned = {axis: float(values[n]) for axis, values in table.angles_deg.items()}
+        writer.put(StateRecord(n, pixels, {axis: Position(deg, deg) for axis, deg in turned.items()}))
+    writer.seal("complete", {})
+    return created - begin, time.perf_counter() - created
+
+
+class OpenCapture:
+    """What `process reduce` holds while it works on a capture, for tasks that measure its solvers alone."""
+
+    def __init__(self, path: Path, field_retardance: bool = False) -> None:
+        self.capture = Capture(path)
+        model = InstrumentModel.load(INSTRUMENT).at(662)
+        if field_retardance:
+            values = {k: EffectParameter(value=v, unit="degree") for k, v in FIELD_DEG.items()}
+            effects = [
+                AppliedEffect(kind="field_retardance", element=e, parameters=values, scope="instrument")
+                for e in ("psg_retarder", "psa_retarder")
+            ]
+            model = model.model_copy(update={"effects": tuple(effects)})
+        states = sample_states(self.capture)
+        changes = capture_changes(self.capture, model, states)
+        self.w = measurement_matrix(self.capture, model, states, changes).reshape(-1, 16)
+        self.field = field_of(self.capture, model, states, changes)
+        reader = BlockReader(self.capture, states, Correction.of(self.capture))
+        noise = NoiseModel.of(self.capture.header.detector, integer=True)
+        self.solver = MuellerSolver(Inversion.of(self.w), reader, noise)
+
+
+def varying_w(path: Path, target_ms: float) -> Task:
+    """uint16 frames to M, W of each pixel; peer: the pseudo-inverse of each pixel's W, built and applied."""
+    opened = OpenCapture(path, field_retardance=True)
+    if opened.field is None:
+        raise SystemExit("the instrument has no retardance map")
+    field, (height, width) = opened.field, opened.capture.frame_shape
+    solver = FieldSolver(opened.solver, field)
+    frames = np.array(solver.reader.read(slice(0, height))[:, 0])
+    out, few = np.empty((16, height * width), np.float32), 400
+
+    def rows(start: int, stop: int) -> None:
+        for row in range(start, stop, 3):
+            last = min(row + 3, stop)
+            pixels = slice(row * width, last * width)
+            out[:, pixels] = solver.mueller(frames[:, pixels].astype(np.float32), row, last)
+
+    def pixel_by_pixel() -> None:
+        places = np.linspace(-1, 1, few)
+        for k, extra in enumerate(field.extra(places, places).T):
+            np.linalg.pinv(field.matrix(extra)) @ frames[:, k]
+
+    name = f"40 x {height} x {width} uint16 to M, W of each pixel"
+    task = Task(name, target_ms, lambda: for_ranges(height, rows, align=1, smallest=16))
+    task.peers[f"numpy pinv of each pixel (scaled from {few})"] = lambda: seconds(pixel_by_pixel) * height * width / few
+    return task
+
+
+def weighted(path: Path, target_ms: float) -> Task:
+    """Weighted fit with the 16 x 16 covariance of each pixel; peer: the same in numpy, batched."""
+    opened = OpenCapture(path)
+    solver, (height, width), few = WeightedSolver(opened.solver, covariance=True), opened.capture.frame_shape, 4000
+    rows = max(1, BLOCK_PIXELS // width)
+    w, counts = opened.w, np.random.default_rng(2).uniform(500, 3000, (few, 40))
+
+    def ours() -> None:
+        for first in range(0, height, rows):
+            solver.solve(solver.reader.read(slice(first, min(first + rows, height))))
+
+    def batched() -> None:
+        normal = np.einsum("ni,pn,nj->pij", w, 1 / counts, w, optimize=True)
+        np.einsum("pij,pj->pi", np.linalg.inv(normal), (counts / counts) @ w)
+
+    name = f"40 x {height} x {width}, noise-weighted, 16 x 16 covariance of each pixel"
+    task = Task(name, target_ms, ours, rounds=None if height * width < 1e6 else 2)
+    task.peers[f"numpy inv, batched (scaled from {few})"] = lambda: seconds(batched) * height * width / few
+    return task
+
+
+def capture_to_disc(folder: Path) -> Task:
+    """40 states of 2048 x 2448 through the writer of `acquire`, to the disc; peer: the same bytes in one plain file."""
+    frame = np.random.default_rng(3).integers(0, 60_000, LARGE, dtype=np.uint16)
+
+    def ours() -> Spent:
+        path, begin = folder / "written.h5", time.process_time()
+        created, filled = write_frames(path, LARGE)
+        path.unlink()
+        return Spent(created + filled, time.process_time() - begin)
+
+    def raw() -> None:
+        with (folder / "raw").open("wb", buffering=0) as file:
+            for _ in range(40):
+                file.write(frame.tobytes())
+            os.fsync(file.fileno())
+        (folder / "raw").unlink()
+
+    task = Task("capture of 400 MB to disc, with sync", None, ours, rounds=5)
+    task.peers["raw write with sync"] = lambda: seconds(raw)
+    task.at_most = ("raw write with sync", 1.3)
+    return task
+
+
+def reduce_file(folder: Path, target_ms: float) -> Task:
+    """`process reduce` as a whole program, file to file, without a figure."""
+    path = folder / "large.h5"
+    write_frames(path, LARGE)
+    argv = [sys.executable, "-m", "processing.cli", "reduce", path, "--out", folder / "large.m.h5"]
+    program = Program([*argv, "--no-figure", "--overwrite"])
+    task = Task("process reduce, 40 x 2048 x 2448, file to file", target_ms, program, rounds=5)
+    task.also = lambda: [("peak memory", program.peak_mib, 1024, "MiB")]
+    return task
+
+
+def acquire(folder: Path) -> Task:
+    """A capture on the simulated rig, its motors at their true speed; what the states take beyond the unavoidable."""
+    out = folder / "acquired"
+    program = Program([ROOT / "lab", "acquire", "--omega", "35", "--exposure", "0.1", "--out", out])
+
+    def beyond() -> list[tuple[str, float, float, str]]:
+        with Capture(sorted(out.glob("*.h5"))[-1]) as capture:
+            return [("beyond moves, settling, exposure, readout", 100 * capture.closing["ledger"]["excess"], 5, "%")]
+
+    return Task("acquire, 40 states, 0.1 s exposure, simulated rig", None, program, rounds=2, also=beyond)
+
+
+def start_up(target_ms: float) -> Task:
+    return Task("acquire --help", target_ms, Program([ROOT / "lab", "acquire", "--help"]), rounds=7)
+
+
+def diagnose(folder: Path, target_ms: float, air: bool) -> Task:
+    """All effects, all pixels of 40 states of 600 x 600, the analyzer's retarder 0.05 degrees off."""
+    bench, random = Bench(rows=SMALL[0], columns=SMALL[1], oa=np.deg2rad(13.41 + 0.05)), np.random.default_rng(1)
+    angles = state_angles(40, False, False)
+    counts = digitize(bench, expose(bench, Scene(random, np.eye(4) if air else None), angles), random)
+    sample = Sample(kind="air" if air else "unknown")
+    path = folder / f"diagnose_{sample.kind}.h5"
+    write_capture(path, bench, counts, angles, sample, INSTRUMENT.read_text(encoding="utf-8"))
+    model = InstrumentModel.load(INSTRUMENT)
+    name = f"diagnose, 40 x 600 x 600, all effects, all pixels, sample {sample.kind}"
+    return Task(name, target_ms, lambda: diagnose_captures([path], model), rounds=1)
