@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from processing.calibrate import known_mueller
 from processing.capture import Capture, CaptureError
@@ -22,6 +23,9 @@ MOST_VALUES = 40_000_000
 #: Pixels whose mean signal is less than this many standard deviations of one intensity are left out: logarithms and
 #: powers of such counts do not scatter in proportion to the noise, and they say nothing about polarization.
 FAINTEST = 5.0
+#: Pixels around dark ones that are left out too: at an edge, image derivatives (over 7 pixels) do not tell what a shift
+#: of the image does.
+RIM = 4
 #: Below this number of pixels their scatter says nothing about the noise.
 FEWEST_PIXELS = 30
 
@@ -43,7 +47,7 @@ class CaptureData:
     clipped : (rows, columns) True where some state is at the top of the range.
     clipped_states : (N,) True for states in which some pixel is.
     usable : (rows, columns) True where every state has a number and the pixel is not dark.
-    dark_fraction : part of the pixels that are too dark to be used.
+    dark_fraction : part of the pixels that are too dark, or too close to dark ones, to be used.
     binned : side of the squares over which pixels were averaged.
     """
 
@@ -138,7 +142,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
 
 
 def without_dark_pixels(data: CaptureData) -> CaptureData:
-    """The capture without pixels that show nothing but noise.
+    """The capture without pixels that show nothing but noise, and without the rim around them.
 
     Raises
     ------
@@ -151,6 +155,8 @@ def without_dark_pixels(data: CaptureData) -> CaptureData:
             f"{data.name}: no pixel has a mean signal above {FAINTEST:g} standard deviations of its noise. "
             "Expose longer, or look whether the light was on."
         )
+    wide = ndimage.binary_dilation(dark, structure=np.ones((3, 3)), iterations=RIM)
+    dark = dark if wide.all() else wide
     return replace(data, usable=data.usable & ~dark, dark_fraction=float(dark.mean()))
 
 

@@ -87,7 +87,7 @@ def show(d: Diagnosis) -> None:
     typer.echo(f"  held out: {before.held_out}")
     for c in d.captures:
         if c.dark_fraction > 0:
-            typer.echo(f"  left out as too dark: {c.dark_fraction:.1%} of the pixels of {c.name}")
+            typer.echo(f"  left out as too dark, with their rim: {c.dark_fraction:.1%} of the pixels of {c.name}")
         if c.closure_before_percent is not None and c.closure_after_percent is not None:
             typer.echo(f"  closure of {c.name}: {c.closure_before_percent:.3f} % -> {c.closure_after_percent:.3f} %")
     for effect in d.effects:
