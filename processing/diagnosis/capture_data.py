@@ -155,7 +155,7 @@ def without_dark_pixels(data: CaptureData) -> CaptureData:
             f"{data.name}: no pixel has a mean signal above {FAINTEST:g} standard deviations of its noise. "
             "Expose longer, or look whether the light was on."
         )
-    wide = ndimage.binary_dilation(dark, structure=np.ones((3, 3)), iterations=RIM)
+    wide = ndimage.binary_dilation(dark, structure=np.ones((3, 3), dtype=bool), iterations=RIM)
     dark = dark if wide.all() else wide
     return replace(data, usable=data.usable & ~dark, dark_fraction=float(dark.mean()))
 
