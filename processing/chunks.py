@@ -10,9 +10,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from processing.compiling import njit
 from processing.threads import for_ranges
 
 #: Pixels that a compiled loop gets at a time: small enough for the second-level cache.

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from processing.compiling import njit
 
 T = 256  # pixels in a tile
 SWEEPS = 8

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.compiling import njit
 from processing.geometry.rusinkiewicz import Angles
 from processing.threads import for_ranges
 
@@ -61,7 +61,7 @@ class TableAxes:
         return Angles(*(np.deg2rad(v) for v in (self.theta_h_deg[i], self.theta_d_deg[j], self.phi_d_deg[k])))
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
 def _bins(th, td, pd, renderer, out, start, stop):  # type: ignore[no-untyped-def]
     degree = 180.0 / np.pi
     for n in range(start, stop):

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from processing.compiling import njit
 from processing.errors import ProcessError
 from processing.geometry.rusinkiewicz import Angles
 from processing.table_axes import SHAPE, Layout, TableAxes
@@ -190,7 +190,7 @@ def _kind(simulated: bool) -> str:
     return "simulated" if simulated else "measured"
 
 
-@numba.njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
+@njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
 def _plane_sums(values, out, start, stop):  # type: ignore[no-untyped-def]
     # Finite when every value is: far quicker than to look at each pixel.
     for c in range(start, stop):
@@ -200,7 +200,7 @@ def _plane_sums(values, out, start, stop):  # type: ignore[no-untyped-def]
         out[c] = total
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
 def _drop_unknown(rows, values):  # type: ignore[no-untyped-def]
     for n in range(rows.size):
         total = 0.0
@@ -210,7 +210,7 @@ def _drop_unknown(rows, values):  # type: ignore[no-untyped-def]
             rows[n] = -1
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _claim_rows(bins, row_of_bin, used, found):  # type: ignore[no-untyped-def]
     # Replaces each bin by its row in the sparse arrays; new bins get the next rows.
     new = 0
@@ -228,7 +228,7 @@ def _claim_rows(bins, row_of_bin, used, found):  # type: ignore[no-untyped-def]
     return new
 
 
-@numba.njit(nogil=True, cache=True, fastmath={"contract"})
+@njit(nogil=True, cache=True, fastmath={"contract"})
 def _accumulate(rows, values, total, square, count, start, stop):  # type: ignore[no-untyped-def]
     # Four quantities a thread: no two threads write to one place, and the eight sums do not wait for each
     # other. A run of pixels in one bin, the rule in an image, stays in registers.

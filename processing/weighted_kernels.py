@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from processing.compiling import njit
 
 ELEMENTS = 16
 PACKED = ELEMENTS * (ELEMENTS + 1) // 2

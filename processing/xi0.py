@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from processing.compiling import njit
 from processing.threads import for_ranges
 
 FloatArray = NDArray[np.float64]
@@ -191,7 +191,7 @@ def xi0_and_m00(
     return xi0, m00
 
 
-@numba.njit(nogil=True, fastmath={"contract", "reassoc", "arcp", "nsz"}, error_model="numpy", cache=True)
+@njit(nogil=True, fastmath={"contract", "reassoc", "arcp", "nsz"}, error_model="numpy", cache=True)
 def _four(i4, q4, pid, xi0, m00, start, stop):  # type: ignore[no-untyped-def]
     # Slices, a loop from 0 and division without exceptions: only then are eight pixels taken at a time.
     one = np.float32(1.0)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from processing.compiling import njit
 
-@numba.njit(nogil=True, cache=True)
+
+@njit(nogil=True, cache=True)
 def meet(index, face, rays, origin, triangles, face_normals, corner_normals, points, normals, start, stop):  # type: ignore[no-untyped-def]
     """Points and unit normals where rays[index[start:stop]] meet their triangles; writes `points` and `normals`."""
     # Meet the plane of the triangle in double precision (embree's own distance is single), then weigh the normals
@@ -33,6 +34,6 @@ def meet(index, face, rays, origin, triangles, face_normals, corner_normals, poi
             normals[k, i] /= length
 
 
-@numba.njit(inline="always")
+@njit(inline="always")
 def _area(px, py, pz, qx, qy, qz, n0, n1, n2):  # type: ignore[no-untyped-def]
     return (py * qz - pz * qy) * n0 + (pz * qx - px * qz) * n1 + (px * qy - py * qx) * n2

@@ -8,9 +8,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from processing.compiling import njit
 from processing.mosaic.layout import MosaicLayout
 from processing.threads import for_ranges
 

@@ -13,10 +13,10 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from processing.compiling import njit
 from processing.mosaic.layout import Frame, MosaicLayout
 from processing.threads import for_ranges
 
