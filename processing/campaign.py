@@ -20,6 +20,7 @@ from processing.campaign_tasks import CaptureMeasure, CaptureTask, locate, measu
 from processing.capture import Capture, CaptureError
 from processing.deviation import rmsd
 from processing.errors import NotDetermined, ProcessError
+from processing.flat import FlatCapture, flat_captures, nearest_flat
 from processing.geometry.viewing import ViewingGeometry
 from processing.reduce import Progress
 from processing.tables import ScatteringTable
@@ -61,11 +62,12 @@ class Row:
 
 @dataclass(frozen=True)
 class CampaignResult:
-    """All rows, in order of wavelength and angle, and what was left out."""
+    """All rows, in order of wavelength and angle, what was left out, and the flat of each capture that has one."""
 
     rows: tuple[Row, ...]
     simulated: bool
     left_out: tuple[str, ...] = ()
+    flats: dict[str, str] = field(default_factory=dict)
     tables: dict[tuple[str, float], Path] = field(default_factory=dict)
 
     def average(self, wavelength_nm: float, quantity: str) -> float:
@@ -78,6 +80,8 @@ class CampaignResult:
 def find_captures(folder: Path) -> tuple[list[tuple[Path, str, float, float]], bool, list[str]]:
     """Captures under a folder as (path, "mueller" or "stokes", nm, omega), whether simulated, and files left out.
 
+    Flat fields are in neither list.
+
     Raises
     ------
     ProcessError : no capture, or simulated and measured ones together.
@@ -86,9 +90,11 @@ def find_captures(folder: Path) -> tuple[list[tuple[Path, str, float, float]], b
     for path in sorted(folder.rglob("*.h5")):
         try:
             with Capture(path) as capture:
-                header, simulated = capture.header, capture.simulated
+                header, simulated, flat = capture.header, capture.simulated, FlatCapture.of(capture)
         except CaptureError as error:
             left_out.append(f"{path}: {error}")
+            continue
+        if flat is not None:
             continue
         if header.omega_deg is None or header.sample.kind in ("air", "mirror"):
             left_out.append(f"{path}: no arm angle" if header.omega_deg is None else f"{path}: {header.sample.kind}")
@@ -121,6 +127,9 @@ def run_campaign(
 ) -> CampaignResult:
     """Reduce every capture of a folder and compare the two instruments and the model.
 
+    Each capture is divided by the flat field of its camera and wavelength that was taken nearest in time, if the
+    folder has one.
+
     Parameters
     ----------
     out : folder for products and tables.
@@ -142,8 +151,17 @@ def run_campaign(
         if twin != path:
             raise ProcessError(f"{twin.name} and {path.name} are both {kind} captures at {nm:g} nm, {omega:g} degrees.")
     other = stokes_geometry or geometry
+    flats = _flats(folder, [path for path, *_ in captures])
     tasks = [
-        CaptureTask(str(p), kind, str(out), str(geometry if kind == "mueller" else other), str(material), border_px)
+        CaptureTask(
+            str(p),
+            kind,
+            str(out),
+            str(geometry if kind == "mueller" else other),
+            str(material),
+            border_px,
+            flat=str(flats.get(p, "")),
+        )
         for p, kind, _, _ in captures
     ]
     if register:
@@ -156,7 +174,19 @@ def run_campaign(
         if progress:
             progress(done, len(futures))
     tables = _merged_tables(measures, out)
-    return CampaignResult(tuple(_rows(measures, tables, views)), simulated, tuple(left_out), tables)
+    rows = tuple(_rows(measures, tables, views))
+    names = {path.name: flat.name for path, flat in flats.items()}
+    return CampaignResult(rows, simulated, tuple(left_out), names, tables)
+
+
+def _flats(folder: Path, paths: Sequence[Path]) -> dict[Path, Path]:
+    known = flat_captures(folder)
+    found = {}
+    for path in paths if known else ():
+        with Capture(path) as capture:
+            if (flat := nearest_flat(known, capture)) is not None:
+                found[path] = flat
+    return found
 
 
 def _registered(tasks: Sequence[CaptureTask], pool: Executor) -> list[CaptureTask]:

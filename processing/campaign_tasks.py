@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,13 +12,14 @@ from scipy.ndimage import binary_erosion
 
 from processing.capture import Capture
 from processing.cloude import coherency_eigenvalues, xi0_and_dominant
+from processing.correction import Correction
 from processing.deviation import linear_diattenuation, magnitude, orientation_difference, rmsd
 from processing.geometry.errors import OutlineNotFound
 from processing.geometry.frames import GeometryImage
 from processing.geometry.outline import find_sphere, registered
 from processing.geometry.viewing import ViewingGeometry
 from processing.images import MuellerImage, StokesImage
-from processing.product import Step, file_identity
+from processing.product import Product, Step, file_identity
 from processing.reduce import choose_model, reduce_mueller
 from processing.reduce_stokes import DEFAULT_METHOD, reduce_stokes
 from processing.reflectance.base import load_reflectance
@@ -41,6 +43,8 @@ class CaptureTask:
     border_px: int
     #: Geometry found in the images; empty: the one of the file.
     view_json: str = ""
+    #: Capture of the flat field; empty: none.
+    flat: str = ""
 
 
 @dataclass(frozen=True)
@@ -60,14 +64,14 @@ class CaptureMeasure:
 
 def measure(task: CaptureTask) -> CaptureMeasure:
     """Reduce a capture (unless its product is newer) and measure it."""
-    product = reduced_product(Path(task.capture), Path(task.out), task.kind)
+    product = reduced_product(task)
     view = task_view(task)
     return (_measure_mueller if task.kind == "mueller" else _measure_stokes)(task, product, view)
 
 
 def locate(task: CaptureTask) -> tuple[float, str] | None:
     """Find the sphere in a capture's image: relative error of its radius and geometry as text; None if not found."""
-    product = reduced_product(Path(task.capture), Path(task.out), task.kind)
+    product = reduced_product(task)
     if task.kind == "mueller":
         intensity: NDArray[np.floating] = MuellerImage.load(product).values[0, 0]
     else:
@@ -87,19 +91,29 @@ def task_view(task: CaptureTask) -> ViewingGeometry:
     return ViewingGeometry.load(task.geometry)
 
 
-def reduced_product(path: Path, out: Path, kind: str) -> Path:
-    """The product of a capture in the folder `out`, made now unless it is there and newer."""
-    product = out / f"{path.stem}.{kind}.h5"
-    if product.exists() and product.stat().st_mtime > path.stat().st_mtime:
-        return product
-    step = Step("campaign", {"capture": path.name}, (file_identity(path),))
-    with Capture(path) as capture:
+def reduced_product(task: CaptureTask) -> Path:
+    """The product of a capture in the task's folder, made now unless it is there, newer, and with the same flat."""
+    path, flat = Path(task.capture), Path(task.flat) if task.flat else None
+    target = Path(task.out) / f"{path.stem}.{task.kind}.h5"
+    if target.exists() and target.stat().st_mtime > path.stat().st_mtime and _flat_of(target) == task.flat:
+        return target
+    files = tuple(file_identity(p) for p in (path, flat) if p is not None)
+    step = Step("campaign", {"capture": path.name, "flat": task.flat}, files)
+    with ExitStack() as stack:
+        capture = stack.enter_context(Capture(path))
+        flats = [stack.enter_context(Capture(flat))] if flat else []
+        correction = Correction.of(capture, flat_from=flats)
         model = choose_model(capture, None)
-        if kind == "stokes":
-            reduce_stokes(capture, model, product, (step,), DEFAULT_METHOD, overwrite=True)
+        if task.kind == "stokes":
+            reduce_stokes(capture, model, target, (step,), DEFAULT_METHOD, correction, overwrite=True)
         else:
-            reduce_mueller(capture, model, product, (step,), overwrite=True)
-    return product
+            reduce_mueller(capture, model, target, (step,), correction, overwrite=True)
+    return target
+
+
+def _flat_of(product: Path) -> str:
+    with Product(product) as there:
+        return str(there.steps[-1].arguments.get("flat", ""))
 
 
 def _measure_mueller(task: CaptureTask, product: Path, view: ViewingGeometry) -> CaptureMeasure:

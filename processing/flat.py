@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,8 @@ from processing.noise import NoiseModel
 
 #: A response below this is a dead pixel; dividing by less would blow its noise up without end.
 LEAST_RESPONSE = 1e-3
+#: Wavelengths nearer than this are one filter.
+SAME_NM = 0.5
 
 
 @dataclass(frozen=True)
@@ -77,3 +81,62 @@ class Flat:
         """Variance (channels, rows, columns) of the response over its square."""
         light = self.level[:, None, None] * self.response
         return np.asarray((noise.slope * light + noise.floor) / (self.frames * light**2), dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class FlatCapture:
+    """A capture of the flat field, and what says to which other captures it belongs."""
+
+    path: Path
+    simulated: bool
+    mosaic: bool
+    wavelength_nm: float
+    frame_shape: tuple[int, int]
+    time_s: float
+
+    @classmethod
+    def of(cls, capture: Capture) -> FlatCapture | None:
+        """None unless every state with light is a flat state."""
+        if not capture.states_with("flat").size or set(capture.role) - {"flat", "dark"}:
+            return None
+        header = capture.header
+        return cls(
+            capture.path,
+            capture.simulated,
+            bool(header.mosaic),
+            header.wavelength_nm,
+            capture.frame_shape,
+            _time_s(capture),
+        )
+
+
+def flat_captures(folder: Path) -> list[FlatCapture]:
+    """All captures of the flat field under a folder."""
+    found = []
+    for path in sorted(folder.rglob("*.h5")):
+        try:
+            with Capture(path) as capture:
+                flat = FlatCapture.of(capture)
+        except CaptureError:
+            continue
+        if flat is not None:
+            found.append(flat)
+    return found
+
+
+def nearest_flat(flats: Sequence[FlatCapture], capture: Capture) -> Path | None:
+    """The flat of the same camera and wavelength that was taken nearest in time; None without any."""
+    kind = (capture.simulated, bool(capture.header.mosaic), capture.frame_shape)
+    same = [
+        flat
+        for flat in flats
+        if (flat.simulated, flat.mosaic, flat.frame_shape) == kind
+        and abs(flat.wavelength_nm - capture.header.wavelength_nm) < SAME_NM
+    ]
+    time_s = _time_s(capture)
+    return min(same, key=lambda flat: abs(flat.time_s - time_s)).path if same else None
+
+
+def _time_s(capture: Capture) -> float:
+    times = capture.column("host_time_s").astype(float)
+    return float(np.nanmean(times)) if np.isfinite(times).any() else 0.0

@@ -59,6 +59,9 @@ def mueller_facts(
         "pixels": mask.size,
         "masked": counts,
     }
+    if correction.flat and noise:
+        # One factor for all elements of a pixel; normalized quantities do not have it.
+        facts["flat_error_percent"] = 100 * float(np.sqrt(np.median(correction.flat.relative_variance(noise))))
     if noise is None and inversion.degrees_of_freedom == 0:
         warnings.append("as many unknowns as intensities and no gain: there are no standard errors")
     if noise is not None and inversion.degrees_of_freedom:

@@ -256,6 +256,19 @@ class PixelResponse(BenchEffect):
         return np.asarray(electrons * (1 + self.sigma * pattern.standard_normal(electrons.shape, dtype=np.float32)))
 
 
+class UnevenLight(BenchEffect):
+    """Uneven light on the field: it loses `corner_loss` towards the corners and grows by `gradient` over the rows."""
+
+    kind: Literal["uneven_light"] = "uneven_light"
+    corner_loss: float = Field(default=0.0, ge=0, lt=1)
+    gradient: float = Field(default=0.0, gt=-1, lt=1)
+
+    def optics(self, electrons: Image, shot: Shot) -> Image:
+        y, x = (np.linspace(-1, 1, n, dtype=np.float32) for n in electrons.shape[-2:])
+        loss = self.corner_loss * (x**2 + y[:, None] ** 2) / 2
+        return np.asarray(electrons * (1 - loss + self.gradient * y[:, None] / 2), dtype=np.float32)
+
+
 class BlackDrift(BenchEffect):
     """The black level moves by electrons an hour."""
 
@@ -281,6 +294,7 @@ AnyBenchEffect = Annotated[
     | MosaicCrosstalk
     | Nonlinearity
     | PixelResponse
+    | UnevenLight
     | BlackDrift,
     Field(discriminator="kind"),
 ]

@@ -1,4 +1,4 @@
-"""What stands at the centre of the simulated rig: an object, air or a mirror, as a true Mueller image."""
+"""What stands at the centre of the simulated rig: an object, air, a mirror or a diffuser, as a true Mueller image."""
 
 from __future__ import annotations
 
@@ -22,6 +22,9 @@ from simulators.traced_surface import traced
 FloatArray = NDArray[np.floating]
 
 BLOCK_PIXELS = 1 << 17
+
+#: Mueller matrix of what fills the whole frame, up to its throughput.
+IDEAL = {"air": np.eye(4), "mirror": mueller.IDEAL_MIRROR, "flat": mueller.IDEAL_DEPOLARIZER}
 
 
 class SceneError(ConfigError):
@@ -74,7 +77,15 @@ class MirrorScene(_Part):
     throughput: float = Field(default=1.0, gt=0, le=1)
 
 
-AnyScene = Annotated[ObjectScene | AirScene | MirrorScene, Field(discriminator="kind")]
+class FlatScene(_Part):
+    """An even white diffuser that fills the frame, for flat fields: it depolarizes perfectly, M = diag(1, 0, 0, 0)."""
+
+    kind: Literal["flat"] = "flat"
+    name: str = "white_diffuser"
+    throughput: float = Field(default=0.5, gt=0, le=1)
+
+
+AnyScene = Annotated[ObjectScene | AirScene | MirrorScene | FlatScene, Field(discriminator="kind")]
 
 
 class _SceneFile(RootModel[AnyScene]):
@@ -89,7 +100,7 @@ class SceneTruth:
     ----------
     xi0, m00 : (rows, columns), NaN outside the mask.
     mask : (rows, columns), pixels that see a lit point of the sample.
-    geometry : of those pixels; None for air and mirror.
+    geometry : of those pixels; None for what is no object.
     """
 
     xi0: FloatArray
@@ -127,7 +138,7 @@ class Scene:
 
     @property
     def object(self) -> ObjectScene:
-        """The object's description. Raises SceneError for air and mirror."""
+        """The object's description. Raises SceneError for air, mirror and flat."""
         if not isinstance(self.spec, ObjectScene):
             raise SceneError(f"scene {self.name!r} is {self.spec.kind} and has no object")
         return self.spec
@@ -145,7 +156,7 @@ class Scene:
         spec = self.spec
         if not isinstance(spec, ObjectScene):
             _check_angle(spec, omega_deg)
-            ideal = np.eye(4) if isinstance(spec, AirScene) else mueller.IDEAL_MIRROR
+            ideal = IDEAL[spec.kind]
             return np.tile((spec.throughput * ideal).astype(np.float32), (rows, columns, 1, 1))
         out = np.zeros((rows, columns, 4, 4), dtype=np.float32)
         out[..., 0, 0] = spec.background_m00
@@ -163,7 +174,8 @@ class Scene:
         if not isinstance(spec, ObjectScene):
             _check_angle(spec, omega_deg)
             full = np.ones((rows, columns))
-            return SceneTruth(full, spec.throughput * full, full > 0, None)
+            xi0 = 0.25 if isinstance(spec, FlatScene) else 1.0
+            return SceneTruth(xi0 * full, spec.throughput * full, full > 0, None)
         surface = self._surface(spec, wavelength_nm)
         image = spec.geometry.at(omega_deg, rows, columns)
         return SceneTruth(
@@ -196,15 +208,15 @@ class Scene:
         return split_eigenvalues(np.asarray(m, dtype=float), optics.jones(points, wavelength_nm), shift)
 
 
-def _check_angle(spec: AirScene | MirrorScene, omega_deg: float) -> None:
+def _check_angle(spec: AirScene | MirrorScene | FlatScene, omega_deg: float) -> None:
     if isinstance(spec, AirScene) and abs(abs(omega_deg) - 180) > 0.5:
         raise SceneError(
             f"air sends no light to the camera at omega {omega_deg:g} degrees. "
             "Go to 180 degrees, or choose another scene."
         )
-    if isinstance(spec, MirrorScene) and abs(omega_deg) > 170:
+    if not isinstance(spec, AirScene) and abs(omega_deg) > 170:
         raise SceneError(
-            f"the mirror cannot send light to the camera at omega {omega_deg:g} degrees: it would stand edge-on. "
+            f"the {spec.kind} cannot send light to the camera at omega {omega_deg:g} degrees: it would stand edge-on. "
             "Stay within 170 degrees."
         )
 

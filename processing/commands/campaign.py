@@ -54,6 +54,8 @@ def campaign_command(
     if result.simulated:
         typer.echo("SIMULATED data")
     typer.echo("\n".join(lines(result)))
+    used = len(set(result.flats.values()))
+    typer.echo(f"flat fields: {used}, used by {len(result.flats)} captures" if used else "flat fields: none")
     for text in result.left_out:
         typer.echo(f"left out: {text}", err=True)
     typer.echo(str(target / "campaign.csv"))

@@ -33,7 +33,10 @@ def reduce_command(
     ] = None,
     camera: Annotated[Path | None, typer.Option(help="Noise and bad pixels, from `process camera`.")] = None,
     dark: Annotated[Path | None, typer.Option(help="Other capture whose dark states are subtracted.")] = None,
-    flat: Annotated[Path | None, typer.Option(help="Other capture whose flat states are divided out.")] = None,
+    flat: Annotated[
+        list[Path] | None,
+        typer.Option(help="Capture of the flat field to divide by, several times for a mean; or a campaign's folder."),
+    ] = None,
     demosaic: Annotated[str | None, typer.Option(help="Mosaic method; default: the best of docs/mosaic.md.")] = None,
     analyzers: Annotated[
         Path | None, typer.Option(help="Mosaic: analysis vectors of the pixels, from `process calibrate-mosaic`.")
@@ -43,7 +46,9 @@ def reduce_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
 ) -> None:
     """Invert W per pixel: Mueller image, or Stokes image of a polarization mosaic, with standard errors."""
-    options = ReduceOptions(instrument, weighted, covariance, physical, camera, dark, flat, demosaic, analyzers)
+    options = ReduceOptions(
+        instrument, weighted, covariance, physical, camera, dark, tuple(flat or ()), demosaic, analyzers
+    )
     product, facts, simulated = reduce_file(capture, out, options, overwrite)
     summary(product, facts, simulated)
     draw(product, figure, no_figure)
@@ -59,7 +64,7 @@ class ReduceOptions:
     physical: str | None = None
     camera: Path | None = None
     dark: Path | None = None
-    flat: Path | None = None
+    flat: tuple[Path, ...] = ()
     demosaic: str | None = None
     analyzers: Path | None = None
 
@@ -77,18 +82,18 @@ def reduce_file(path: Path, out: Path | None, options: ReduceOptions, overwrite:
     from processing.reduce import Choice, choose_model, reduce_mueller
 
     with ExitStack() as stack:
-        capture, dark, flat = (
-            stack.enter_context(Capture(p)) if p else None for p in (path, options.dark, options.flat)
-        )
-        if capture is None:
-            raise ProcessError("no capture was given")
+        capture = stack.enter_context(Capture(path))
+        dark = stack.enter_context(Capture(options.dark)) if options.dark else None
+        flat_files = [_flat_file(p, capture) for p in options.flat]
+        flats = [stack.enter_context(Capture(p)) for p in flat_files]
         noise, bad = read_camera(options.camera) if options.camera else (None, None)
-        correction = Correction.of(capture, bad, dark, [flat] if flat else [])
+        correction = Correction.of(capture, bad, dark, flats)
         kind = "stokes" if capture.header.mosaic else "mueller"
         product = out or path.with_suffix(f".{kind}.h5")
-        given = (path, options.instrument, options.camera, options.dark, options.flat, options.analyzers)
+        given = (path, options.instrument, options.camera, options.dark, *flat_files, options.analyzers)
         files = [p for p in given if p is not None]
         arguments = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(options).items()}
+        arguments["flat"] = ", ".join(str(p) for p in flat_files) or None
         steps = (Step("reduce", {"capture": path.name} | arguments, tuple(file_identity(p) for p in files)),)
         model = choose_model(capture, options.instrument)
         tick = stack.enter_context(progress_bar("reducing", "rows" if kind == "mueller" else "states"))
@@ -111,6 +116,22 @@ def reduce_file(path: Path, out: Path | None, options: ReduceOptions, overwrite:
             response = read_response(options.analyzers, capture.frame_shape) if options.analyzers else None
             facts = reduce_stokes(capture, model, product, steps, method, correction, noise, response, overwrite, tick)
         return product, facts, capture.simulated
+
+
+def _flat_file(path: Path, capture: Any) -> Path:
+    """The flat capture itself, or the one of a folder that belongs to the capture."""
+    from processing.errors import ProcessError
+    from processing.flat import flat_captures, nearest_flat
+
+    if not path.is_dir():
+        return path
+    found = nearest_flat(flat_captures(path), capture)
+    if found is None:
+        raise ProcessError(
+            f"{path} holds no flat field of the camera and wavelength of {capture.path.name}. "
+            "Take one (plan key `role: flat`), or leave --flat away."
+        )
+    return found
 
 
 def reduced(source: Path, instrument: Path | None) -> Path:

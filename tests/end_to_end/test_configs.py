@@ -53,7 +53,12 @@ def test_red_sphere_campaign_is_what_the_issue_asks_for():
     assert len(taken) == 2 * 2 * 15
     assert [capture.plan.omega_deg for capture in taken[:15]] == [20 + 5 * k for k in range(15)]
     references = [capture for capture in captures(campaign) if capture.reference]
-    assert all(capture.plan.sample.kind == "air" and capture.plan.omega_deg == 180 for capture in references)
+    flats = [capture for capture in references if capture.plan.role == "flat"]
+    assert {capture.plan.mode for capture in flats} == {"drr", "stokes"}
+    airs = [capture for capture in references if capture not in flats]
+    assert all(capture.plan.sample.kind == "air" and capture.plan.omega_deg == 180 for capture in airs)
+    # Before the first and after the eighth of fifteen, for each wavelength.
+    assert (len(airs), len(flats)) == (4, 8)
     # What needs a person changes once.
     wavelengths = [capture.plan.wavelength_nm for capture in taken]
     assert sum(a != b for a, b in itertools.pairwise(wavelengths)) == 1
