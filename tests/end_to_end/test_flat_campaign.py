@@ -1,6 +1,7 @@
-"""A campaign with darks, flats and air references on the emulators: the products are rid of what the rig does not declare.
+"""A campaign with darks, flats and air references on the emulators, down to the products.
 
-Every pixel of the bench responds differently and the light of the field is uneven; nothing of the rig says so.
+Every pixel of the bench responds differently and the light of the field is uneven; nothing of the rig says so, and the
+products are rid of it.
 """
 
 import json
@@ -41,12 +42,9 @@ def campaign(tmp_path_factory, configs) -> Path:
     samples.update({name: str((source.parent / path).resolve()) for name, path in samples.items()})
     with (folder / "rig.yaml").open("w") as file:
         yaml.dump(rig, file)
-    (folder / "drr.yaml").write_text(
-        "kind: plan\nmode: drr\nexposure_s: 0.01\ndarks: 4\nstates: {kind: rotating_retarders, states: 30, step_deg: 12}\n"
-    )
-    (folder / "stokes.yaml").write_text(
-        "kind: plan\nmode: stokes\nexposure_s: 0.01\ndarks: 4\nstates: {kind: fixed, states: 10}\n"
-    )
+    states = {"drr": "{kind: rotating_retarders, states: 30, step_deg: 12}", "stokes": "{kind: fixed, states: 10}"}
+    for mode, table in states.items():
+        (folder / f"{mode}.yaml").write_text(f"kind: plan\nmode: {mode}\ndarks: 4\nstates: {table}\n")
     (folder / "campaign.yaml").write_text(
         f"kind: campaign\nname: flats\nplans: {{drr: drr.yaml, stokes: stokes.yaml}}\nsamples: [{{name: red_sphere}}]\n"
         f"wavelengths_nm: [662]\nomega_deg: {list(OMEGAS)}\nexposure_s: {{kind: auto}}\nreferences:\n"
