@@ -15,6 +15,13 @@ import pytest
 TIMES = {"host_time_s", "camera_time_ns", "frame_id", "start_time", "closing/json"}
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """A promise run in full takes its time: no limit for a single test then."""
+    if "UMOV_FAULT_RUNS" in os.environ or "UMOV_FAULTS" in os.environ:
+        for item in items:
+            item.add_marker(pytest.mark.timeout(0))
+
+
 @pytest.fixture
 def runs() -> int:
     """Repetitions of a random fault: few in CI; UMOV_FAULT_RUNS=50 for the full promise."""
