@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
-from acquisition.plan import AutoExposure, MeasurementPlan
+from acquisition.plan import Auto, AutoExposure, MeasurementPlan, Seconds, exposure_kind
 from processing.capture_schema import Sample
 from processing.yaml_file import load_yaml
 
@@ -68,7 +68,10 @@ class Campaign(_Part):
     samples: tuple[Sample, ...] = Field(min_length=1)
     wavelengths_nm: tuple[Annotated[float, Field(gt=0)], ...] = Field(min_length=1)
     omega_deg: AngleSteps | tuple[Angle, ...]
-    exposure_s: float | dict[float, float] | AutoExposure | None = None
+    exposure_s: (
+        Annotated[Seconds | Annotated[dict[float, float], Tag("by wavelength")] | Auto, Discriminator(exposure_kind)]
+        | None
+    ) = None
     references: tuple[Reference, ...] = ()
     retries: int = Field(default=0, ge=0, le=100)
     retry_wait_s: float = Field(default=5.0, ge=0)

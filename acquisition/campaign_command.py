@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -50,9 +51,23 @@ def run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Obs
         held.close()
     typer.echo(f"{complete} of {len(jobs)} captures complete in {folder}")
     typer.echo(f"index {folder / 'index.json'}, log {folder / 'log.jsonl'}")
-    if not done:
-        typer.echo("next: the same command goes on where it stopped")
+    door = os.environ.get("UMOV_DOOR", "")
+    after = f"{door} process campaign {folder} --geometry FILE --material FILE".lstrip()
+    typer.echo(f"next: {after}" if done else "next: the same command goes on where it stopped")
     return 0 if done else INTERRUPTED
+
+
+def _grouped(checks: Sequence[Check]) -> tuple[Check, ...]:
+    """What failed, and one line for each thing that passed, with its first and last finding."""
+    passed: dict[str, list[str]] = {}
+    for check in checks:
+        if check.passed:
+            passed.setdefault(check.what, []).append(check.found)
+    lines = [
+        Check(what, True, found[0] if len(found) == 1 else f"{found[0]} ... {found[-1]} ({len(found)} different)")
+        for what, found in passed.items()
+    ]
+    return (*(check for check in checks if not check.passed), *lines)
 
 
 def _show(planned: Sequence[Planned], checks: Sequence[Check], folder: Path) -> None:
@@ -71,7 +86,7 @@ def _show(planned: Sequence[Planned], checks: Sequence[Check], folder: Path) -> 
             "there already" if there else "reference" if entry.capture.reference else "",
         )
     console.print(table)
-    show_checks(console, tuple(checks))
+    show_checks(console, _grouped(checks))
     seconds, size = sum(p.seconds for p in planned), sum(p.size for p in planned)
     typer.echo(
         f"{len(planned)} captures, about {seconds / 60:.0f} min without homing and operator, {size / 1e9:.2f} GB; "

@@ -12,7 +12,7 @@ from acquisition.campaign import Campaign, CampaignCapture, captures
 from acquisition.campaign_log import CampaignFolder
 from acquisition.capture_writer import PARTIAL, bytes_needed, check_space
 from acquisition.checks import Check, refuse_failed
-from acquisition.errors import AcquisitionError, PlanRefused, Stopped
+from acquisition.errors import AcquisitionError, InterlockOpened, PlanRefused, Stopped
 from acquisition.estimate import capture_seconds, last_pose_deg
 from acquisition.job import Job, Result, check_with_devices, existing, job_of
 from acquisition.job import prepare as prepare_job
@@ -146,7 +146,8 @@ class CampaignRun:
                 failures = failures + 1 if self._states_done(capture) <= done else 1
                 self.folder.log("capture failed", capture=capture.name, error=str(error), tries=failures)
                 self.folder.record(capture.name, status="failed", error=str(error))
-                if failures > self.campaign.retries:
+                # An interlock is nothing to try again: whether the run goes on by itself is for the plan to say.
+                if failures > self.campaign.retries or isinstance(error, InterlockOpened):
                     raise
                 self._close_rig()
                 for observer in self.observers:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -57,7 +57,13 @@ def capture(
     if context.invoked_subcommand is not None:
         return
     if omega is None and plan is None and resume is None and campaign is None:
-        typer.echo(context.get_help())
+        sources = (context.get_parameter_source(name) for name in context.params)
+        if any(source is not None and source.name == "COMMANDLINE" for source in sources):
+            typer.echo(
+                "error: nothing to measure: give --omega, --plan, --campaign or --resume (-h for help)", err=True
+            )
+        else:
+            typer.echo(context.get_help())
         raise typer.Exit(2)
     from acquisition import single
 
@@ -78,7 +84,11 @@ def _stoppable(action: Callable[[StopRequest], int]) -> int:
     from acquisition.stop_request import StopRequest
 
     with StopRequest() as stop:
-        return action(stop)
+        try:
+            return action(stop)
+        except KeyboardInterrupt as error:
+            # Typer would end the program without a word.
+            _report(error, INTERRUPTED, "stopped at once; every axis was sent a stop")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -102,7 +112,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         _report(error, INTERRUPTED, "stopped at once; every axis was sent a stop")
 
 
-def _report(error: BaseException, code: int, text: str | None = None) -> None:
+def _report(error: BaseException, code: int, text: str | None = None) -> NoReturn:
     typer.echo(f"error: {text or error}", err=True)
     for note in getattr(error, "__notes__", []):
         typer.echo(note, err=True)

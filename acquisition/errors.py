@@ -19,5 +19,9 @@ class RunFailed(AcquisitionError):
     """A run ended early; the partial file holds every state that was done."""
 
 
+class InterlockOpened(RunFailed):
+    """An interlock ended the run: somebody has to look before it goes on."""
+
+
 class Stopped(AcquisitionError):
     """The person at the bench asked for the end (Ctrl-C or the stop button)."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from acquisition.errors import RunFailed
+from acquisition.errors import InterlockOpened
 from acquisition.observer import StateReport
 from acquisition.rig import Rig
 from acquisition.stop_request import StopRequest
@@ -45,8 +45,10 @@ class Interlocks:
                 return f"the camera has {warm:.1f} C, more than {entry.limit:g} C"
         return None
 
-    def judge(self, report: StateReport) -> str | None:
-        """Why this state cannot count, or None."""
+    def judge(self, report: StateReport, meant_to_saturate: bool = False) -> str | None:
+        """Why this state cannot count, or None; the long exposures of a bracket are meant to saturate."""
+        if meant_to_saturate:
+            return None
         entry = self._entries.get("saturation")
         if entry is not None and report.saturated_fraction > entry.limit:
             return f"{100 * report.saturated_fraction:.2f} % of the pixels are saturated"
@@ -69,7 +71,7 @@ class Interlocks:
 
         Raises
         ------
-        RunFailed
+        InterlockOpened
             The plan does not go on by itself, or waiting cannot help.
         """
         start_s = time.monotonic()
@@ -80,7 +82,7 @@ class Interlocks:
         # A door may be shut again by now; light that was wrong does not come right by waiting.
         waiting_helps = self.open_now() is not None or why.startswith(WAITABLE)
         if not (self.go_on and waiting_helps):
-            raise RunFailed(
+            raise InterlockOpened(
                 f"interlock: {why}. State {state} was discarded and the axes stopped. "
                 "Remove the cause, then go on with --resume."
             )

@@ -8,11 +8,11 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
 
 from processing.capture_schema import Sample
 from processing.states import RGB950_RATIO, RGB950_STATES, RGB950_STEP_DEG, Role, StateTable, rotating_retarders
-from processing.yaml_file import ConfigError, load_yaml
+from processing.yaml_file import ConfigError, load_yaml, message_of
 
 Mode = Literal["drr", "stokes"]
 
@@ -87,6 +87,17 @@ class AutoExposure(_Part):
     longest_s: float = Field(default=10.0, gt=0)
 
 
+def exposure_kind(value: Any) -> str:
+    """Which kind of exposure is meant, so that an error speaks of that one alone."""
+    if isinstance(value, AutoExposure) or (isinstance(value, dict) and "kind" in value):
+        return "auto"
+    return "by wavelength" if isinstance(value, dict) else "seconds"
+
+
+Seconds = Annotated[float, Tag("seconds")]
+Auto = Annotated[AutoExposure, Tag("auto")]
+
+
 class MeasurementPlan(_Part):
     """One capture.
 
@@ -103,7 +114,7 @@ class MeasurementPlan(_Part):
     sample: Sample = Sample(name="red_sphere")
     illumination: Literal["horizontal", "vertical"] = "horizontal"
     states: States = RotatingRetarders()
-    exposure_s: float | AutoExposure = Field(default=0.02)
+    exposure_s: Annotated[Seconds | Auto, Discriminator(exposure_kind)] = 0.02
     repeats: int = Field(default=1, ge=1, le=1000)
     darks: int = Field(default=4, ge=0, le=1000)
     repeat_first: bool = Field(default=False, description="take the first light state again at the end: a drift check")
@@ -130,7 +141,7 @@ class MeasurementPlan(_Part):
         try:
             return MeasurementPlan.model_validate(self.model_dump() | chosen)
         except ValidationError as error:
-            lines = [f"{'.'.join(str(part) for part in e['loc'])}: {e['msg']}" for e in error.errors()]
+            lines = [": ".join(filter(None, (".".join(map(str, e["loc"])), message_of(e)))) for e in error.errors()]
             raise ConfigError("\n".join(lines)) from error
 
     def state_table(self, pose_deg: Mapping[str, float], exposure_s: float) -> StateTable:

@@ -48,7 +48,7 @@ class ConsoleProgress(Observer):
         if self._bar is not None:
             self._bar.update(self._task, description=text)
         else:
-            self._console.print(text, markup=False)
+            self._console.print(text, markup=False, soft_wrap=True)
 
     def state_done(self, report: StateReport) -> None:
         self._done += 1
@@ -65,7 +65,9 @@ class ConsoleProgress(Observer):
         elif time.monotonic() - self._line_s > LINE_EVERY_S:
             self._line_s = time.monotonic()
             left_s = (self._line_s - self._start_s) / self._done * (self._pending - self._done)
-            self._console.print(f"{text}  {self._done}/{self._pending}, {left_s:.0f} s left", markup=False)
+            self._console.print(
+                f"{text}  {self._done}/{self._pending}, {left_s:.0f} s left", markup=False, soft_wrap=True
+            )
 
     def warning(self, text: str) -> None:
         self._print(f"warning: {text}")
@@ -77,4 +79,4 @@ class ConsoleProgress(Observer):
 
     def _print(self, text: str) -> None:
         console = self._console if self._bar is None else self._bar.console
-        console.print(text, markup=False, highlight=False)
+        console.print(text, markup=False, highlight=False, soft_wrap=True)

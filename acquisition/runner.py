@@ -250,7 +250,7 @@ class CaptureRunner:
             raise TooBright(
                 f"state {exposed.state}: {100 * report.saturated_fraction:.2f} % of the pixels are saturated"
             )
-        blocked = self.interlocks.judge(report)
+        blocked = self.interlocks.judge(report, meant_to_saturate=not shortest)
         if blocked is not None:
             self._discard(exposed.state, blocked)
             return

@@ -84,10 +84,14 @@ def _plain(node: Any) -> Any:
 def _describe(source: str, tree: CommentedMap, entry: Any) -> str:
     location: Sequence[int | str] = entry["loc"]
     where = ".".join(str(part) for part in location)
-    message = entry["msg"]
+    return ": ".join(filter(None, (f"{source}:{_line(tree, location)}", where, message_of(entry))))
+
+
+def message_of(entry: Any) -> str:
+    """What one entry of a ValidationError says, without the library's own words before it."""
     if entry["type"] == "extra_forbidden":
-        message = "unknown key"
-    return f"{source}:{_line(tree, location)}: {where}: {message}"
+        return "unknown key"
+    return str(entry["msg"]).removeprefix("Value error, ")
 
 
 def _line(tree: Any, location: Sequence[int | str]) -> int:

@@ -101,6 +101,27 @@ def test_stopped_campaign_goes_on_with_the_state_it_stopped_at(acquire, small_ri
         assert len(capture.done) == 19
 
 
+def test_an_open_door_is_not_tried_again_unattended(acquire, small_rig, campaign, tmp_path, monkeypatch):
+    """Retries are for devices: whether a run goes on by itself after an interlock is for the plan to say."""
+    from acquisition.interlocks import Interlocks
+
+    looked = []
+
+    def open_once(self):
+        looked.append(self)
+        return "the door is open" if len(looked) == 30 else None
+
+    monkeypatch.setattr(Interlocks, "open_now", open_once)
+    file = campaign(retries="3", retry_wait_s="0.05")
+    code, _, err = acquire("--campaign", file, "--rig", small_rig(), "--out", tmp_path)
+    assert code == 1
+    assert "the door is open" in err
+    log = [json.loads(line) for line in (tmp_path / "small" / "log.jsonl").read_text().splitlines()]
+    assert [entry["event"] for entry in log].count("capture failed") == 1
+    code, _, err = acquire("--campaign", file, "--rig", small_rig(), "--out", tmp_path)
+    assert code == 0, err
+
+
 def test_dry_run_lists_captures_time_space_and_checks(acquire, small_rig, campaign, tmp_path):
     code, out, err = acquire("--campaign", campaign(), "--rig", small_rig(), "--out", tmp_path, "--dry-run")
     assert code == 0, err

@@ -114,10 +114,13 @@ def test_averaged_frames_say_so(acquire, small_rig, tmp_path):
 
 
 def test_bracketed_capture_sees_dark_and_bright_pixels(acquire, small_rig, tmp_path):
-    """Eight times the exposure saturates the bright pixels; the reduction takes those from the short one."""
+    """Eight times the exposure saturates the bright pixels; the reduction takes those from the short one.
+
+    The interlock on saturation looks at the short one alone.
+    """
     plan = tmp_path / "plan.yaml"
     plan.write_text("kind: plan\nexposure_s: 0.005\nbracket: [1, 8]\ndarks: 2\n")
-    rig = small_rig(flux_e_per_s=3.2e6)
+    rig = small_rig(flux_e_per_s=3.2e6, top={"interlocks": [{"kind": "saturation", "limit": 0.001}]})
     code, out, err = acquire("--plan", plan, "--rig", rig, "--out", tmp_path)
     assert code == 0, err
     path = _path(out)

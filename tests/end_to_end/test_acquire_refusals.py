@@ -41,6 +41,14 @@ def test_unknown_key_is_named_with_its_line(refused, small_rig):
     assert f"rig.yaml:{line}: home_at_strat: unknown key" in err
 
 
+def test_wrong_key_of_an_exposure_speaks_of_that_kind_alone(refused, tmp_path):
+    plan = tmp_path / "plan.yaml"
+    plan.write_text("kind: plan\nexposure_s: {kind: auto, taget: 0.5}\n")
+    code, err = refused("--plan", plan)
+    assert code == 2
+    assert err.strip() == f"error: {plan}:2: exposure_s.auto.taget: unknown key"
+
+
 def test_unknown_key_of_an_axis_is_named_with_its_line(refused, small_rig):
     rig = _changed(small_rig(), lambda r: r["axes"]["psa"].update(adress=2))
     code, err = refused("--omega", 35, "--rig", rig)
@@ -52,6 +60,8 @@ def test_unknown_key_of_an_axis_is_named_with_its_line(refused, small_rig):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        (("--sample", "mirror"), ("nothing to measure", "--omega")),
+        (("--omega", 35, "--exposure", -1), ("error: exposure_s must be a positive number",)),
         (("--omega", 181), ("181", "0 to 180")),
         (("--omega", 3), ("forbidden pose", "arm")),
         (("--omega", 35, "--wavelength", 500), ("500", "662")),
