@@ -5,6 +5,8 @@ from __future__ import annotations
 import datetime
 import json
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +46,8 @@ class CampaignFolder:
                 f"{folder} holds another campaign: {plan} differs from the file given. "
                 "Give the same file, or another folder with --out."
             )
-        plan.write_text(text, encoding="utf-8")
+        if not plan.exists():
+            self._write_whole(plan, text)
         self.index: dict[str, dict[str, Any]] = {}
         if (folder / INDEX).exists():
             self.index = json.loads((folder / INDEX).read_text(encoding="utf-8"))
@@ -52,20 +55,40 @@ class CampaignFolder:
     def log(self, event: str, **details: Any) -> None:
         """Add a line to the log; it is on the disc when this returns."""
         line = {"time": datetime.datetime.now().astimezone().isoformat(timespec="milliseconds"), "event": event}
-        with (self.folder / LOG).open("a", encoding="utf-8") as file:
-            file.write(json.dumps(line | details, default=str) + "\n")
+        text = json.dumps(line | details, default=str) + "\n"
+        path = self.folder / LOG
+        with self._room_for(path), path.open("ab+") as file:
+            # A line that was cut off by a full disc must not spoil the next.
+            end = file.seek(0, os.SEEK_END)
+            if end and file.seek(end - 1) is not None and file.read(1) != b"\n":
+                text = "\n" + text
+            file.write(text.encode())
             file.flush()
             os.fsync(file.fileno())
 
     def record(self, capture: str, **details: Any) -> None:
         """Write what became of a capture into the index, which is whole at any instant."""
         self.index[capture] = self.index.get(capture, {}) | details
-        new = self.folder / (INDEX + ".new")
-        with new.open("w", encoding="utf-8") as file:
-            json.dump(self.index, file, indent=1, default=str)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(new, self.folder / INDEX)
+        self._write_whole(self.folder / INDEX, json.dumps(self.index, indent=1, default=str))
+
+    def _write_whole(self, path: Path, text: str) -> None:
+        new = path.with_name(path.name + ".new")
+        with self._room_for(path):
+            with new.open("w", encoding="utf-8") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(new, path)
+
+    @contextmanager
+    def _room_for(self, path: Path) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise AcquisitionError(
+                f"{path} cannot be written ({error.strerror}). The captures taken so far are whole. Make room, then "
+                "the same command goes on."
+            ) from error
 
     def close(self) -> None:
         """Let another program run the campaign."""

@@ -24,6 +24,9 @@ from acquisition.stop_request import StopRequest
 from drivers.errors import DeviceError
 from processing.capture import Capture, CaptureError
 
+#: Room for log and index, bytes.
+BOOKS = 4 << 20
+
 
 @dataclass(frozen=True)
 class Planned:
@@ -65,7 +68,7 @@ def check_all(jobs: Sequence[tuple[CampaignCapture, Job]], rig: Rig, folder: Pat
     checks = list(seen.values())
     missing = sum(p.size for p in planned if not (folder / p.capture.name).exists())
     try:
-        check_space(existing(folder), missing)
+        check_space(existing(folder), missing + BOOKS)
         checks.append(Check("disc for the campaign", True, f"{missing / 1e9:.2f} GB in {folder}"))
     except AcquisitionError as error:
         checks.append(Check("disc for the campaign", False, str(error)))
@@ -113,6 +116,7 @@ class CampaignRun:
                 for observer in self.observers:
                     observer.campaign_progress(number, len(jobs), capture.name)
                 if self._complete(capture):
+                    self._catch_up(capture)
                     continue
                 result = self._take(capture, job)
                 if result is None or result.status == "aborted":
@@ -158,11 +162,7 @@ class CampaignRun:
                 "capture ended", capture=capture.name, status=result.status, states=result.states_done,
                 saturated_fraction=result.saturated_fraction, ledger=result.ledger, messages=result.messages,
             )  # fmt: skip
-            self.folder.record(
-                capture.name, status=result.status, states=result.states_done, file=result.path.name,
-                omega_deg=capture.plan.omega_deg, wavelength_nm=capture.plan.wavelength_nm, mode=capture.plan.mode,
-                sample=capture.plan.sample.name, saturated_fraction=result.saturated_fraction, error=None,
-            )  # fmt: skip
+            self._record_end(capture, result.status, result.states_done, result.path.name, result.saturated_fraction)
             return result
 
     def _take_once(self, capture: CampaignCapture, job: Job, rig: Rig) -> Result:
@@ -184,6 +184,22 @@ class CampaignRun:
             return False
         with Capture(path) as there:
             return there.status == "complete"
+
+    def _catch_up(self, capture: CampaignCapture) -> None:
+        """Put a complete capture into the index, where a kill or a full disc has kept it out."""
+        if self.folder.index.get(capture.name, {}).get("status") == "complete":
+            return
+        with Capture(self.folder.folder / capture.name) as there:
+            saturated = float(there.column("saturated_fraction").max())
+            self._record_end(capture, "complete", len(there.done), capture.name, saturated)
+
+    def _record_end(self, capture: CampaignCapture, status: str, states: int, file: str, saturated: float) -> None:
+        plan = capture.plan
+        self.folder.record(
+            capture.name, status=status, states=states, file=file, reference=capture.reference, role=plan.role,
+            omega_deg=plan.omega_deg, wavelength_nm=plan.wavelength_nm, mode=plan.mode, sample=plan.sample.name,
+            saturated_fraction=saturated, error=None,
+        )  # fmt: skip
 
     def _states_done(self, capture: CampaignCapture) -> int:
         final = self.folder.folder / capture.name

@@ -122,6 +122,21 @@ def test_an_open_door_is_not_tried_again_unattended(acquire, small_rig, campaign
     assert code == 0, err
 
 
+def test_books_that_a_full_disc_cut_off_are_caught_up(acquire, small_rig, campaign, tmp_path):
+    file = campaign(plans="{stokes: stokes.yaml}", references="[]")
+    arguments = ("--campaign", file, "--rig", small_rig(), "--out", tmp_path)
+    assert acquire(*arguments)[0] == 0
+    index, log = tmp_path / "small" / "index.json", tmp_path / "small" / "log.jsonl"
+    whole = json.loads(index.read_text())
+    index.write_text(json.dumps({name: {"status": "running"} for name in list(whole)[:1]}))
+    log.write_text(log.read_text()[:-30])
+    code, out, err = acquire(*arguments)
+    assert code == 0, err
+    assert "2 of 2 captures complete" in out
+    assert json.loads(index.read_text()) == whole
+    assert json.loads(log.read_text().splitlines()[-1])["event"] == "campaign complete"
+
+
 def test_dry_run_lists_captures_time_space_and_checks(acquire, small_rig, campaign, tmp_path):
     code, out, err = acquire("--campaign", campaign(), "--rig", small_rig(), "--out", tmp_path, "--dry-run")
     assert code == 0, err
