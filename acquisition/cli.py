@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -83,7 +84,8 @@ hand_commands.register(app)
 def _stoppable(action: Callable[[StopRequest], int]) -> int:
     from acquisition.stop_request import StopRequest
 
-    with StopRequest() as stop:
+    # Straight to the descriptor: the signal may come in the middle of a buffered write.
+    with StopRequest(tell=lambda text: os.write(2, f"\n{text}\n".encode())) as stop:
         try:
             return action(stop)
         except KeyboardInterrupt as error:

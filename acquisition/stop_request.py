@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from collections.abc import Callable
 from types import FrameType, TracebackType
 from typing import Any, Self
 
@@ -17,10 +18,12 @@ class StopRequest:
     Parameters
     ----------
     patience : which request interrupts at once; 1 where there is no state to finish.
+    tell : told by the signal handler what a request that does not interrupt will do; must not use buffered output.
     """
 
-    def __init__(self, patience: int = 2) -> None:
+    def __init__(self, patience: int = 2, tell: Callable[[str], object] | None = None) -> None:
         self._patience = patience
+        self._tell = tell
         self._count = 0
         self._previous: dict[int, Any] = {}
         self._lock = threading.Lock()
@@ -43,8 +46,11 @@ class StopRequest:
             return self._count
 
     def _heard(self, number: int, frame: FrameType | None) -> None:
-        if self._add() == self._patience:
+        count = self._add()
+        if count == self._patience:
             raise KeyboardInterrupt
+        if count < self._patience and self._tell is not None:
+            self._tell("stopping after this state; once more stops at once")
 
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():

@@ -28,6 +28,7 @@ def test_once_finishes_the_state_parks_and_seals_and_the_capture_goes_on(spawn, 
     child.send_signal(signal.SIGINT)
     out, err = child.communicate(timeout=30)
     assert child.returncode == 130, err
+    assert "stopping after this state" in err
     (final,) = (tmp_path / "out").glob("*.h5")
     with Capture(final) as capture:
         assert capture.status == "aborted"
