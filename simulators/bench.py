@@ -161,8 +161,16 @@ class SimulatedBench:
         image = np.zeros(shape or (len(model.channels), self.rows, self.columns), dtype=np.float32)
         if light:
             axes = {name: [angles[name]] for name in model.axes} or {"none": [0.0]}
-            weights = model.rows(axes)[0] * (level * self.flux_e_per_s * exposure_s)
-            self._render(image, weights.astype(np.float32), model, float(angles.get("arm", omega_deg)))
+
+            def seen(optics: InstrumentModel) -> Image:
+                weights = optics.rows(axes)[0] * (level * self.flux_e_per_s * exposure_s)
+                through = np.zeros_like(image)
+                self._render(through, weights.astype(np.float32), optics, float(angles.get("arm", omega_deg)))
+                return through
+
+            image = seen(model)
+            for effect in self.effects:
+                image = effect.field(image, model, seen)
         for effect in self.effects:
             # Stray light comes from the source too: with the shutter closed it is dark everywhere.
             image = effect.optics(image, shot) if light else image

@@ -8,7 +8,7 @@ its size in physical units, and does nothing at size zero.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
@@ -52,6 +52,10 @@ class BenchEffect(BaseModel):
     def train(self, model: InstrumentModel, shot: Shot) -> InstrumentModel:
         """Stage `train`: the optics as they are in this exposure."""
         return model
+
+    def field(self, image: Image, model: InstrumentModel, seen: Callable[[InstrumentModel], Image]) -> Image:
+        """Stage `train`, for optics that differ over the image: `seen` gives the image through other optics."""
+        return image
 
     def source(self, level: float, shot: Shot) -> float:
         """Stage `source`: light level, 1 = nominal."""

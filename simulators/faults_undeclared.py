@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from simulators.undeclared import Bench
 
@@ -82,8 +83,21 @@ def field_retardance(bench: Bench, random: np.random.Generator, states: int) -> 
     size, x0, y0 = _signed(random, 0.3, 4.0), *random.uniform(-0.7, 0.7, 2)
     y, x = np.mgrid[-1 : 1 : bench.rows * 1j, -1 : 1 : bench.columns * 1j]
     tilt = (x - x0) ** 2 + (y - y0) ** 2
-    bench.field_retardance = np.deg2rad(size * (tilt - tilt.mean()))
-    return Truth("field_retardance", "psg_retarder", {"x2": size, "y2": size})
+    bench.field_retardance = np.deg2rad(size * (tilt - (2 / 3 + x0**2 + y0**2)))
+    values = {"x": -2 * size * x0, "y": -2 * size * y0, "x2": size, "xy": 0.0, "y2": size}
+    return Truth("field_retardance", "psg_retarder", values)
+
+
+def retardance_drift(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+    # A plate that warms up comes to rest like an exponential.
+    axis, size, rate = _axis(bench, random), np.deg2rad(_signed(random, 0.3, 4.0)), random.uniform(1, 3)
+
+    def warm(k: int) -> tuple[float, float]:
+        change = float(size * (1 - np.exp(-rate * k / (states - 1))))
+        return (change, 0.0) if axis == "psg" else (0.0, change)
+
+    bench.retardance.append(warm)
+    return Truth("retardance_drift", f"{axis}_retarder")
 
 
 def stray_light(bench: Bench, random: np.random.Generator, states: int) -> Truth:
@@ -101,11 +115,27 @@ def path_retardance(bench: Bench, random: np.random.Generator, states: int) -> T
 
 
 def rotation_eccentricity(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-    # A scale of radius 1 centred a little beside the shaft is read at one point.
-    axis, size, phase = _axis(bench, random), np.deg2rad(_size(random, 0.04, 1.0)), random.uniform(0, 2 * np.pi)
-    bench.angles.append(lambda k, a: a | {axis: a[axis] + np.arcsin(size * np.cos(a[axis] - phase))})
-    d = np.rad2deg(size)
-    return Truth("rotation_eccentricity", axis, {"cos_1": d * np.cos(phase), "sin_1": d * np.sin(phase)})
+    axis, d, phase = _axis(bench, random), _size(random, 0.04, 1.0), random.uniform(0, 2 * np.pi)
+    names = ("cos_1", "sin_1", "cos_2", "sin_2")
+    if random.random() < 0.5:
+        size = np.deg2rad(d)
+        # A scale of radius 1 centred a little beside the shaft is read at one point.
+        bench.angles.append(lambda k, a: a | {axis: a[axis] + np.arcsin(size * np.cos(a[axis] - phase))})
+        values = (d * np.cos(phase), d * np.sin(phase), 0.0, 0.0)
+    else:
+        # A joint whose shafts meet at an angle (8 degrees at most) leads and lags twice a turn, by tan^2(angle / 2).
+        d *= 0.3
+        size = np.deg2rad(d)
+        bend = (1 - size) / (1 + size)
+
+        def joint(k: int, a: dict[str, float]) -> dict[str, float]:
+            t = a[axis] - phase
+            return a | {axis: a[axis] + np.arctan2(np.sin(t) * bend, np.cos(t)) - np.arctan2(np.sin(t), np.cos(t))}
+
+        bench.angles.append(joint)
+        # atan(b tan t) - t = -size sin 2t + size^2/2 sin 4t - ..., with b = (1 - size)/(1 + size).
+        values = (0.0, 0.0, d * np.sin(2 * phase), -d * np.cos(2 * phase))
+    return Truth("rotation_eccentricity", axis, dict(zip(names, map(float, values), strict=True)))
 
 
 def rotation_ratio(bench: Bench, random: np.random.Generator, states: int) -> Truth:
@@ -232,6 +262,7 @@ LISTED: dict[str, Fault] = {
     "retarder_diattenuation": retarder_diattenuation,
     "retarder_transmission": retarder_transmission,
     "field_retardance": field_retardance,
+    "retardance_drift": retardance_drift,
     "stray_light": stray_light,
     "path_retardance": path_retardance,
     "rotation_eccentricity": rotation_eccentricity,
@@ -308,11 +339,22 @@ def broad_source(bench: Bench, random: np.random.Generator, states: int) -> Trut
     return Truth("broad_source")
 
 
-def warming_retarder(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-    """Both plates warm up during the capture, and their retardance with them."""
-    a, b = np.deg2rad([_signed(random, 0.5, 4.0), _signed(random, 0.5, 4.0)])
-    bench.retardance.append(lambda k: (float(a) * np.exp(-4 * k / states), float(b) * np.exp(-2 * k / states)))
-    return Truth("warming_retarder")
+def drying_sample(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+    """One of the sample's materials gets brighter or darker while it is measured."""
+    size, which = _signed(random, 0.02, 0.2), int(random.integers(4))
+    bench.material_level.append((which, lambda k: 1 + size * (1 - np.exp(-3 * k / states))))
+    return Truth("drying_sample")
+
+
+def defocus(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+    """The lens creeps out of focus during the capture."""
+    size = random.uniform(0.6, 2.0)
+
+    def blur(k: int, e: Array) -> Array:
+        return np.asarray(gaussian_filter(e, size * k / states, mode="nearest"))
+
+    bench.light.append(blur)
+    return Truth("defocus")
 
 
 def lamp_beat(bench: Bench, random: np.random.Generator, states: int) -> Truth:
@@ -332,5 +374,5 @@ def banding(bench: Bench, random: np.random.Generator, states: int) -> Truth:
 
 UNLISTED: dict[str, Fault] = {
     f.__name__: f
-    for f in (etalon, swapped_frames, fly, pressure_wave, broad_source, warming_retarder, lamp_beat, banding)
+    for f in (etalon, swapped_frames, fly, pressure_wave, broad_source, lamp_beat, banding, drying_sample, defocus)
 }

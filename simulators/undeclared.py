@@ -52,6 +52,7 @@ class Bench:
 
     rows: int = 32
     columns: int = 32
+    wavelength_nm: float = 662.0
     dg: float = np.deg2rad(127.12)
     og: float = np.deg2rad(-17.02)
     da: float = np.deg2rad(94.78)
@@ -80,6 +81,8 @@ class Bench:
     light: list[Callable[[int, Array], Array]] = field(default_factory=list)
     transfer: list[Callable[[Array], Array]] = field(default_factory=list)
     retardance: list[Callable[[int], tuple[float, float]]] = field(default_factory=list)
+    #: Number of a material of the scene, and (state) -> its level.
+    material_level: list[tuple[int, Callable[[int], float]]] = field(default_factory=list)
     order: NDArray[np.int64] | None = None
     shared_light: float = 0.0
     zigzag: bool = False
@@ -145,8 +148,8 @@ class Scene:
         keep = random.uniform(0.1, 0.9)
         return np.asarray(pure / pure[0, 0] * np.where(np.arange(16).reshape(4, 4) == 0, 1.0, keep))
 
-    def at(self, x: Array, y: Array) -> Array:
-        """Mueller matrices (..., 4, 4) at positions in image widths."""
+    def at(self, x: Array, y: Array, levels: Array | None = None) -> Array:
+        """Mueller matrices (..., 4, 4) at positions in image widths; `levels` (4,) of the materials, default 1."""
         k = self.waves
         # Up to about three periods over the image, weaker the faster.
         sums = [
@@ -159,9 +162,14 @@ class Scene:
         shade = np.exp(self.brightness * 0.4 * np.asarray(sums[4]))
         shade = shade / (1 + shade)
         if self.mueller is not None:
+            if levels is not None:
+                # In air it is a window that gets dirty, or clean, in places.
+                shade = shade * (1 + (np.prod(levels) - 1) / (1 + np.exp(-np.asarray(sums[0]))))
             return np.asarray((0.35 + 0.65 * shade)[..., None, None] * self.mueller)
         weights = np.exp(1.5 * np.stack(sums[:4], axis=-1))
         weights /= weights.sum(axis=-1, keepdims=True)
+        if levels is not None:
+            weights = weights * levels
         mixed = np.einsum("...m,mij->...ij", weights, self.materials)
         return np.asarray(shade[..., None, None] * mixed)
 
@@ -174,23 +182,26 @@ def expose(bench: Bench, scene: Scene, angles_deg: dict[str, Array]) -> Array:
     if bench.mosaic:
         # The lens is assumed to blur over a super-pixel: its four pixels see the same spot of the scene.
         ys, xs = ys // 2 * 2, xs // 2 * 2
-    still = None if bench.shift else scene.at(xs / bench.columns, ys / bench.rows)
+    still = None if bench.shift or bench.material_level else scene.at(xs / bench.columns, ys / bench.rows)
     for k in range(n):
         angles = {axis: float(np.deg2rad(v[k])) for axis, v in angles_deg.items()}
         for hook in bench.angles:
             angles = hook(k, angles)
         m = still
         if m is None:
-            dx, dy = (sum(parts) for parts in zip(*(s(k, angles) for s in bench.shift), strict=True))
-            m = scene.at((xs - dx) / bench.columns, (ys - dy) / bench.rows)
+            moved = [(0.0, 0.0), *(s(k, angles) for s in bench.shift)]
+            dx, dy = (sum(parts) for parts in zip(*moved, strict=True))
+            levels = np.ones(4)
+            for which, course in bench.material_level:
+                levels[which] *= course(k)
+            m = scene.at((xs - dx) / bench.columns, (ys - dy) / bench.rows, levels)
         g, a = bench.generated(angles, k), bench.analyzed(angles, k)
         light = np.einsum("ci,hwij,...j->chw", a, m, g) if g.ndim == 1 else np.einsum("ci,hwij,hwj->chw", a, m, g)
         out[k] = _on_mosaic(light) if bench.mosaic else light[0]
         for factor in bench.level:
             out[k] *= factor(k, angles)
-    if bench.shared_light and still is not None:
         # What would pass without any polarization: a quarter of m00, whatever the state.
-        out += bench.shared_light * 0.25 * still[..., 0, 0]
+        out[k] += bench.shared_light * 0.25 * m[..., 0, 0]
     if bench.order is not None:
         out = out[bench.order]
     out *= bench.electrons / out.max()
@@ -234,7 +245,7 @@ def write_capture(
         title=path.stem,
         simulated=True,
         mode="blind",
-        wavelength_nm=662.0,
+        wavelength_nm=bench.wavelength_nm,
         sample=sample,
         detector=detector,
         mosaic=layout,

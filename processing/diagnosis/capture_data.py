@@ -46,6 +46,8 @@ class CaptureData:
     noise_source : in words.
     clipped : (rows, columns) True where some state is at the top of the range.
     clipped_states : (N,) True for states in which some pixel is.
+    noise_estimated : slope and floor describe the scatter of these very counts, not the photons and the read-out.
+    true_variance : (N, channels, rows, columns) where the variance is not a line in the counts any more.
     usable : (rows, columns) True where every state has a number and the pixel is not dark.
     dark_fraction : part of the pixels that are too dark, or too close to dark ones, to be used.
     binned : side of the squares over which pixels were averaged.
@@ -67,6 +69,8 @@ class CaptureData:
     wavelength_nm: float
     binned: int = 1
     dark_fraction: float = 0.0
+    noise_estimated: bool = False
+    true_variance: NDArray[np.float32] | None = None
 
     @property
     def values_per_pixel(self) -> int:
@@ -78,13 +82,26 @@ class CaptureData:
         """Exposure (values_per_pixel,) of each row of W."""
         return np.repeat(self.exposure, self.signal.shape[1])
 
-    def variance(self, u: NDArray[np.floating]) -> Array:
-        """Variance (N, ...) of signals u (N, ...), in full scale squared; right on average over noisy signals.
+    def variance(self) -> Array:
+        """Variance (N, channels, rows, columns) in full scale squared; right on average over noisy signals.
 
         Cutting it off at zero signal would make it too large in dark states, so a single one may be negative.
         """
-        shape = (-1,) + (1,) * (u.ndim - 1)
-        return np.asarray(self.slope.reshape(shape) * u + self.floor.reshape(shape))
+        if self.true_variance is not None:
+            return np.asarray(self.true_variance, dtype=float)
+        shape = (-1, 1, 1, 1)
+        return np.asarray(self.slope.reshape(shape) * self.signal + self.floor.reshape(shape))
+
+    def undone(self, signal: Array, slope: Array) -> CaptureData:
+        """The capture with corrected counts, of the given slope over the old ones: the noise is stretched with them."""
+        variance = slope**2 * self.variance()
+        return replace(self, signal=signal.astype(np.float32), true_variance=variance.astype(np.float32))
+
+    def with_noise_of(self, signal: Array, slope: Array) -> CaptureData:
+        """The same counts with the noise that corrected counts tell: photon noise follows the light, not the counts."""
+        shape = (-1, 1, 1, 1)
+        variance = self.slope.reshape(shape) * signal / slope**2 + self.floor.reshape(shape)
+        return replace(self, true_variance=variance.astype(np.float32))
 
 
 def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:

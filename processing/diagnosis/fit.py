@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 #: The prior that keeps unseen parameters still is this many times wider than a typical size.
 PRIOR_WIDTH = 10.0
 STEPS = 15
+#: Times that corrections of counts are expanded anew about where a fit ended.
+EXPANSIONS = 2
 #: The fit ends when a step promises less than this in chi-square, or this fraction of the excess.
 LEAST_GAIN = 0.01
 LEAST_RELATIVE = 1e-7
@@ -44,6 +46,23 @@ def minimize(
     steps: int = STEPS,
 ) -> Fit:
     """Least squares by Levenberg-Marquardt with bounds, on the data of the folds given; `free` (K,) may hold some."""
+    fit = _descend(problem, space, start, folds, free, steps)
+    if folds is None:
+        for _ in range(EXPANSIONS):
+            if not problem.relinearize(space, fit.values):
+                break
+            fit = _descend(problem, space, fit.values, folds, free, steps)
+    return fit
+
+
+def _descend(
+    problem: Problem,
+    space: Space,
+    start: Array,
+    folds: Sequence[int] | None,
+    free: NDArray[np.bool_] | None,
+    steps: int,
+) -> Fit:
     use = list(range(problem.folds) if folds is None else folds)
     weak = prior(space)
     lower, upper = space.joined("lower"), space.joined("upper")

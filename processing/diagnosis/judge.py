@@ -34,7 +34,12 @@ SHARE = 0.97
 #: Share of the excess that one effect explains by itself, if it is to be named beside much that is unexplained; and
 #: standard deviations of the worst test that are not yet much.
 ALONE = 0.9
+#: An effect that explains so many times what is left, or what the weak ones besides it explain, keeps its name too: no
+#: effect's model is exact to a few per cent.
+TIMES = 20.0
 MILD = 7.0
+#: More effects at once than these are less likely than one cause that is not in the list.
+MOST_AT_ONCE = 2
 #: Share of the scatter of values that belong to one state each which a single wave may hold, if they are to be random.
 ONE_WAVE = 0.85
 #: An information about a parameter below this, in chi-square for its typical size, is none.
@@ -73,7 +78,7 @@ def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
     rivals = [c for e in found.effects for c in (e, *found.sets.get(e, ())) if found.sets.get(e)]
     unexplained = None
     if verdict in ("unexplained", "partly_explained"):
-        empirical = _empirical(problem, search, found) if verdict == "unexplained" else None
+        empirical = _empirical(problem, search, found)
         lines = tuple(line for r in after for line in description(r))
         unexplained = Unexplained(description=lines, tried=tuple(c.label for c in tried), empirical=empirical)
     diagnosis = Diagnosis(
@@ -104,14 +109,20 @@ def _unname(problem: InstrumentProblem, search: Search, found: Found, after: Seq
     structure |= not problem.noise_known and bool(found.effects)
     left = max(found.after.excess - problem.noise_known * 2 * search.noise_of(found.after), 0.0)
     worst = max((r.worst[1] for r in after if r.tests), default=np.inf)
-    alone = {t.candidate: found.before.excess - t.out.excess for t in found.ranking}
     small = []
     if structure and worst > MILD:
         # With much structure left, several effects together may imitate one that is not in the list: only what
-        # explains nearly everything by itself keeps its name.
-        small = [c for c in found.effects if alone.get(c, 0.0) < ALONE * found.before.excess]
+        # explains nearly everything by itself, or far more than is left, keeps its name.
+        remains = TIMES * sum(r.left if r.tests else np.inf for r in after)
+        small = [c for c in found.effects if found.alone.get(c, 0.0) < ALONE and found.gain.get(c, 0.0) < remains]
     elif structure:
         small = [c for c in found.effects if found.gain.get(c, np.inf) < left]
+    weak = sorted(found.effects, key=lambda c: -found.gain.get(c, 0.0))[MOST_AT_ONCE:]
+    rest = TIMES * sum(found.gain.get(c, 0.0) for c in weak)
+    small += [c for c in found.effects if weak and found.alone.get(c, 0.0) < ALONE and found.gain.get(c, 0.0) < rest]
+    # An effect has to beat chance to be named; values for each state leave too few directions to ask that.
+    if not any(c.effect.per_state for c in found.effects):
+        small += [c for c in found.effects if found.chance.get(c, 1.0) > CHANCE]
     part = dict(zip(found.space.candidates, found.space.slices, strict=True))
     curvature = found.fit.sums.curvature.sum(axis=0)
     waves = [
@@ -119,8 +130,7 @@ def _unname(problem: InstrumentProblem, search: Search, found: Found, after: Seq
         for c in found.effects
         if c.effect.per_state and _one_wave(found.fit.values[part[c]], curvature[part[c], part[c]]) > ONE_WAVE
     ]
-    for candidate in (*small, *waves):
-        found.nameless.append(candidate)
+    found.nameless += dict.fromkeys((*small, *waves))
 
 
 def _one_wave(values: Array, information: Array) -> float:
@@ -158,7 +168,8 @@ def _verdict(problem: InstrumentProblem, search: Search, found: Found, after: Se
         # A pattern over the states that is regular is not what this name means, and no other name fits.
         return "unexplained"
     if not structure:
-        return "explained"
+        # Nothing is left, but what took it away may stand for something else.
+        return "explained" if any(c not in found.nameless for c in found.effects) else "partly_explained"
     unexplained = max(found.after.excess - problem.noise_known * 2 * search.noise_of(found.after), 0.0)
     if problem.noise_known and all(c in found.nameless for c in found.effects):
         return "unexplained"
@@ -265,7 +276,8 @@ def _empirical(problem: InstrumentProblem, search: Search, found: Found) -> Empi
     best: tuple[float, Candidate, Array, float] | None = None
     fits = []
     for candidate in search.pool:
-        if not (candidate.effect.per_state or candidate.kind == "detector_nonlinearity"):
+        general = candidate.effect.per_state or candidate.kind == "detector_nonlinearity"
+        if not general or candidate in found.space.candidates:
             continue
         space = Space((*found.space.candidates, candidate))
         fit = minimize(problem, space, np.concatenate([found.fit.values, np.zeros(candidate.size)]))
@@ -314,5 +326,7 @@ def closure(problem: InstrumentProblem, k: int, space: Space, values: Array) -> 
     names = [c.name for c in model.channels]
     sign = np.array([1.0 if n in ("0", "90") else -1.0 for n in names])
     good = data.usable & ~data.clipped
+    if not good.any():
+        return None
     means = data.signal[:, :, good].mean(axis=(0, 2), dtype=np.float64) / changes.gain.mean(axis=0)
     return float(100 * (sign @ means) / (means.sum() / 2))

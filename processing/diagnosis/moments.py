@@ -127,7 +127,7 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
     n, c, height, width = data.signal.shape
     rows = n * c
     u = data.signal.reshape(rows, height, width)
-    variance = data.variance(data.signal).reshape(rows, height, width)
+    variance = data.variance().reshape(rows, height, width)
     scale = variance.mean(axis=0)
     good = data.usable & (scale > 0) & inside(height, width)
     sigma = np.sqrt(np.mean(variance[:, good] / scale[good], axis=1))

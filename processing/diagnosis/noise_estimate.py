@@ -54,5 +54,6 @@ def estimated_noise(data: CaptureData) -> CaptureData:
         slope=np.full(n, slope),
         floor=np.full(n, max(floor, 1e-12)),
         noise_known=True,
+        noise_estimated=True,
         noise_source="estimated from the scatter over pixels that is left after the leading components of the states",
     )

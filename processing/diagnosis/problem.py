@@ -9,7 +9,7 @@ of the counts.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Protocol
 
@@ -36,6 +36,8 @@ from processing.instrument import InstrumentModel
 
 Array = NDArray[np.float64]
 STEP = 1e-4
+#: Distance, in typical sizes, from the point of expansion up to which a correction of counts is exact enough.
+EXACT = 0.3
 #: Element matrices that are kept for use in another evaluation.
 MOST_BUILT = 64
 
@@ -73,13 +75,31 @@ class Problem(Protocol):
         """Rows that the unknowns leave over, and the power of each component of the signal, for each capture."""
         ...
 
+    def relinearize(self, space: Space, values: Array) -> bool:
+        """Take these values as the point that corrections are expanded about; False if one as close is known."""
+        ...
+
+    def adopt_noise(self, space: Space, values: Array) -> bool:
+        """Take the noise from the light that these values tell, for all that follows; False if that is as before."""
+        ...
+
 
 class InstrumentProblem:
-    """All captures against one instrument model, resolved at their wavelength."""
+    """All captures against one instrument model, resolved at their wavelength.
+
+    Corrections of the counts are expanded in features of the counts. Far from the point of expansion that is not exact,
+    and what it leaves of a large effect hides a small one; so the counts are corrected exactly at other points too
+    (`relinearize`), each a problem of its own, and the nearest one is asked (`near`).
+    """
 
     far_from_linear = False
 
-    def __init__(self, model: InstrumentModel, captures: Sequence[CaptureData]) -> None:
+    def __init__(
+        self, model: InstrumentModel, captures: Sequence[CaptureData], undone: Mapping[Candidate, Array] | None = None
+    ) -> None:
+        self.undone = dict(undone or {})
+        self._others: list[InstrumentProblem] = []
+        self._noise_at: dict[Candidate, Array] = {}
         self.model = model
         self.captures = tuple(captures)
         self.folds = FOLDS_OF_STATES if any(holds_out_states(c) for c in captures) else FOLDS_OF_TILES
@@ -114,6 +134,44 @@ class InstrumentProblem:
             patches = moments.tiles.x.size if moments.tiles and self.captures[k].conditions.states == 1 else 1
             out.append(((a.shape[0] - q.shape[1]) * patches, power + 1e-300))
         return out
+
+    def near(self, space: Space, values: Array) -> tuple[InstrumentProblem, Array]:
+        """The problem expanded nearest to these values, and what is left of the values there."""
+        best, least = self, _distance({}, space, values)
+        for other in self._others:
+            distance = _distance(other.undone, space, values)
+            if set(other.undone) <= set(space.candidates) and distance < least:
+                best, least = other, distance
+        local = values.copy()
+        for candidate, part in zip(space.candidates, space.slices, strict=True):
+            if candidate in best.undone:
+                local[part] -= best.undone[candidate]
+        return best, local
+
+    def relinearize(self, space: Space, values: Array) -> bool:
+        """Expand about these values from now on, unless a point as close is known."""
+        known, _ = self.near(space, values)
+        if _distance(known.undone, space, values) < EXACT:
+            return False
+        undone = _pointwise(space, values)
+        captures = [c.undone(*_undone(c, undone)) for c in self.captures]
+        self._others.append(InstrumentProblem(self.model, captures, undone))
+        return True
+
+    def adopt_noise(self, space: Space, values: Array) -> bool:
+        """Take the noise from the light that these values tell, for all that follows; False if that is as before.
+
+        The evidence for an effect is always taken with one and the same noise; else a correction could gain by the
+        noise that it pretends.
+        """
+        if _distance(self._noise_at, space, values) < EXACT or any(c.noise_estimated for c in self.captures):
+            return False
+        self._noise_at = _pointwise(space, values)
+        self.captures = tuple(c.with_noise_of(*_undone(c, self._noise_at)) for c in self.captures)
+        self.moments = tuple(moments_of(c, self.folds) for c in self.captures)
+        self.spread = max(m.spread for m in self.moments)
+        self._others.clear()
+        return True
 
     def changes(self, capture: int, space: Space, values: Array) -> Changes:
         """Changes of one capture with the instrument's own effects and the active candidates."""
@@ -154,6 +212,9 @@ class InstrumentProblem:
 
     def sums(self, space: Space, values: Array, *, derivatives: bool = True) -> Sums:
         """Excess, and with `derivatives` its half gradient and curvature, of every fold."""
+        other, local = self.near(space, values)
+        if other is not self:
+            return other.sums(space, local, derivatives=derivatives)
         out = Sums.empty(self.folds, space.size if derivatives else 0)
         for k in range(len(self.captures)):
             changes = self.changes(k, space, values)
@@ -280,6 +341,28 @@ class InstrumentProblem:
         w = self.model.rows(angles, tiled).reshape(count, -1, 16) * data.row_exposure[:, None]
         a = w if data.sample is None else (w @ data.sample)[..., None]
         return np.asarray(a / self.moments[k].sigma[:, None])
+
+
+def _distance(undone: Mapping[Candidate, Array], space: Space, values: Array) -> float:
+    """Largest distance of a pointwise correction from where it was undone, in typical sizes."""
+    away = [0.0]
+    for candidate, part in zip(space.candidates, space.slices, strict=True):
+        if candidate.effect.pointwise:
+            away.append(float(np.max(np.abs(values[part] - undone.get(candidate, 0.0)) / candidate.typical)))
+    return max(away)
+
+
+def _pointwise(space: Space, values: Array) -> dict[Candidate, Array]:
+    return {c: values[p] for c, p in zip(space.candidates, space.slices, strict=True) if c.effect.pointwise}
+
+
+def _undone(data: CaptureData, undone: Mapping[Candidate, Array]) -> tuple[Array, Array]:
+    """Signal with the effects undone exactly, and its slope over the old one."""
+    signal, slope = data.signal.astype(float), np.ones(())
+    for candidate, values in undone.items():
+        signal, step = candidate.effect.undo(signal, data.conditions, values)
+        slope = slope * step
+    return signal, slope
 
 
 def _tiled(changes: Changes, count: int, states: int) -> Changes:

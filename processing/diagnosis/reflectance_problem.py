@@ -104,6 +104,14 @@ class ReflectanceProblem:
         )
         return np.asarray(np.nan_to_num(a) / self.sigma[..., None])
 
+    def relinearize(self, space: Space, values: Array) -> bool:
+        """Nothing is expanded here."""
+        return False
+
+    def adopt_noise(self, space: Space, values: Array) -> bool:
+        """The noise does not depend on the effects."""
+        return False
+
     def sums(self, space: Space, values: Array, *, derivatives: bool = True) -> Sums:
         """Excess, and with `derivatives` its half gradient and curvature, of every fold."""
         k = space.size if derivatives else 0

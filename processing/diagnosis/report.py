@@ -167,8 +167,9 @@ def _quantities(judged: Judged, problem: InstrumentProblem, k: int) -> str:
 
 
 def _mueller(problem: InstrumentProblem, k: int, space: Space, fit: Fit) -> Array | None:
+    problem, values = problem.near(space, fit.values)
     data = problem.captures[k]
-    changes = problem.changes(k, space, fit.values)
+    changes = problem.changes(k, space, values)
     w = problem.model.rows(data.conditions.angles_deg, changes).reshape(-1, 16) * data.row_exposure[:, None]
     if np.linalg.matrix_rank(w, rtol=1e-8) < 16:
         return None

@@ -59,6 +59,14 @@ class Trial:
             near[part] &= not candidate.effect.switch
         return bool(near.any())
 
+    def sound(self, before: HeldOut) -> bool:
+        """No value runs to its bound, and the residual itself does not grow.
+
+        What fits better only where the weights are large is not an explanation. A bend of the response changes the
+        scale in which the residual is told, so it is not asked.
+        """
+        return not self.at_bound and (self.candidate.effect.pointwise or self.out.rms <= WORSE * before.rms)
+
 
 @dataclass
 class Found:
@@ -75,6 +83,7 @@ class Found:
     gain: dict[Candidate, float] = field(default_factory=dict)
     sets: dict[Candidate, tuple[Candidate, ...]] = field(default_factory=dict)
     ranking: list[Trial] = field(default_factory=list)
+    alone: dict[Candidate, float] = field(default_factory=dict)  # share of the excess that each explains by itself
     information: dict[Candidate, Array] = field(default_factory=dict)  # with no effect active
     untestable: tuple[Candidate, ...] = ()
     nameless: list[Candidate] = field(default_factory=list)
@@ -98,23 +107,55 @@ class Search:
     def run(self) -> Found:
         """Search; see the module."""
         base_fit = self._calibrated()
+        found = self._greedy(base_fit, self.pool)
+        if any(c.effect.per_state for c in found.effects):
+            found = self._plainer(base_fit, found)
+        self._sets(found)
+        self._observability(found)
+        return found
+
+    def _greedy(self, base_fit: Fit, pool: Sequence[Candidate]) -> Found:
+        """Add the best candidate of the pool while one is decisive, then take away what is not needed."""
         before = held_out(self.problem, self.base, base_fit)
         space, fit, out = self.base, base_fit, before
         ranking: list[Trial] = []
+        alone: dict[Candidate, float] = {}
         for _ in range(MOST_EFFECTS):
-            trials = self._trials(space, fit, out)
-            ranking = ranking or trials
-            # What fits better only where the weights are large makes the residual itself grow: not an explanation.
-            trials = [t for t in trials if t.evidence >= DECISIVE and t.out.rms <= WORSE * out.rms and not t.at_bound]
+            trials = self._trials(space, fit, out, pool)
+            if not ranking:
+                ranking = trials
+                alone = {t.candidate: (out.excess - t.out.excess) / max(out.excess, 1e-300) for t in trials}
+            trials = [t for t in trials if t.evidence >= DECISIVE and t.sound(out)]
             if not trials:
                 break
             best = trials[0]
             self.say(f"{best.candidate.label}: {100 * out.rms:.4g} % -> {100 * best.out.rms:.4g} % on held-out data")
             space, fit, out = best.space, best.fit, best.out
-        found = Found(self.base, before, base_fit, space, fit, out, ranking=ranking)
+            if self.problem.adopt_noise(space, fit.values):
+                fit = minimize(self.problem, space, fit.values)
+                out = held_out(self.problem, space, fit)
+                base_fit = minimize(self.problem, self.base, base_fit.values)
+                before = held_out(self.problem, self.base, base_fit)
+        found = Found(self.base, before, base_fit, space, fit, out, ranking=ranking, alone=alone)
         self._prune(found)
-        self._sets(found)
-        self._observability(found)
+        return found
+
+    def _plainer(self, base_fit: Fit, found: Found) -> Found:
+        """The search without values for each state, if these add nothing to what it finds.
+
+        So many values can imitate several plain effects at once, and are then the first to be added.
+        """
+        plain = [c for c in self.pool if not c.effect.per_state]
+        self.say("the same without values for each state")
+        other = self._greedy(base_fit, plain)
+        # Each must beat chance by itself: a few unrelated effects could also nibble at random values.
+        if other.effects and all(other.chance[c] < CHANCE for c in other.effects):
+            rest = self._trials(other.space, other.fit, other.after, self.pool)
+            if all(t.evidence < DECISIVE for t in rest if t.candidate.effect.per_state):
+                other.ranking, other.alone = found.ranking, found.alone
+                return other
+        found.fit = minimize(self.problem, found.space, found.fit.values)
+        found.after = held_out(self.problem, found.space, found.fit)
         return found
 
     def _calibrated(self) -> Fit:
@@ -156,7 +197,7 @@ class Search:
         space: Space,
         fit: Fit,
         out: HeldOut,
-        without: Sequence[Candidate] = (),
+        pool: Sequence[Candidate],
         leaders: int = LEADERS,
         least: float = 0.0,
     ) -> list[Trial]:
@@ -164,18 +205,19 @@ class Search:
         scored: dict[str, tuple[float, Candidate]] = {}
         weighty, _ = self.directions(out.excess)
         taken = {c.family for c in space.candidates}
-        offered = [c for c in self.pool if c not in without and c.family not in taken]
+        offered = [c for c in pool if c.family not in taken]
         offered = [c for c in offered if self._testable(c, space, out.excess)]
         for candidate, (gain, _) in self.scores(space, fit, offered).items():
             if gain < max(least, 0.5 * DECISIVE * self.n0):
                 continue
             # Rank as a Bayesian information criterion over the directions of structure, not over the pixels.
             rank = _rank(fit.excess - gain, fit.excess, weighty, candidate.cost, self.n0)
-            if candidate.effect.per_state:
-                rank -= 1e6  # one step promises too little where there are many parameters: always fitted
             if candidate.family not in scored or rank < scored[candidate.family][0]:
                 scored[candidate.family] = (rank, candidate)
-        chosen = [c for _, c in sorted(scored.values(), key=lambda item: item[0])[:leaders]]
+        order = [c for _, c in sorted(scored.values(), key=lambda item: item[0])]
+        chosen = [c for c in order if not c.effect.per_state][:leaders]
+        # One step promises too little where there are many parameters: these are always fitted.
+        chosen += [c for c in order if c.effect.per_state]
         if _rms(fit) > FAR_OFF:
             chosen += [c for c in offered if c.starts and c not in chosen]
         trials = [self.trial(space, fit, out, c, weighty) for c in chosen]
@@ -285,18 +327,22 @@ class Search:
                 fit = minimize(self.problem, rest, _without(found.space, found.fit.values, candidate))
                 out = held_out(self.problem, rest, fit)
                 needed = 0.7 * max(fit.excess - found.fit.excess, 0.0)
-                trials = self._trials(rest, fit, out, without=(candidate,), leaders=6, least=needed)
+                others = [c for c in self.pool if c != candidate]
+                trials = self._trials(rest, fit, out, others, leaders=6, least=needed)
                 unit = self.n0 + self.structure(found.after, found.space.size)
                 weighty, _ = self.directions(found.after.excess)
                 close = []
                 for trial in trials:
-                    worse = (trial.out.excess - found.after.excess) / unit
+                    worse = self._worse(trial, candidate, found) / unit
                     simpler = (candidate.cost - trial.candidate.cost) * float(np.log(weighty))
                     alike = max(CLOSE, ALIKE * (out.excess - found.after.excess) / unit)
                     if worse < alike and trial.candidate.family != candidate.family:
                         close.append(trial.candidate)
-                    sound = not trial.at_bound and trial.out.rms <= WORSE * found.after.rms
-                    if sound and worse < simpler - 2 and (better is None or worse - simpler < better[0]):
+                    if (
+                        trial.sound(found.after)
+                        and worse < simpler - 2
+                        and (better is None or worse - simpler < better[0])
+                    ):
                         better = (worse - simpler, candidate, trial)
                 found.sets[candidate] = tuple(close)
             if better is None:
@@ -306,6 +352,15 @@ class Search:
             found.space, found.fit, found.after = trial.space, trial.fit, trial.out
             found.sets.clear()
             self._prune(found)
+
+    def _worse(self, trial: Trial, candidate: Candidate, found: Found) -> float:
+        """By how much another candidate does worse in the place of one that was found, in chi-square.
+
+        On held-out data; or on all data, each further value at a cost of 2 (what it costs on the other half), if that
+        is less: values that the data do not determine can run away on one half without being wrong.
+        """
+        more = max(trial.candidate.size - candidate.size, 0)
+        return min(trial.out.excess - found.after.excess, trial.fit.excess - found.fit.excess + 2.0 * more)
 
     def _observability(self, found: Found) -> None:
         """Information about every candidate that the nominal values leave."""

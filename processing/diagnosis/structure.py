@@ -34,6 +34,7 @@ class Residual:
     harmonics : axis to amplitudes (HARMONICS,) of the state means, in units of the noise of one intensity.
     correlates : name to correlation of the rms map or of the residual with it.
     leading : (L,) leading component over the states, with its share of the sum of squares.
+    left : chi-square of the structure, as the test that finds most of it beyond two standard deviations has it.
     """
 
     image: NDArray[np.float32]
@@ -44,6 +45,7 @@ class Residual:
     correlates: dict[str, float]
     leading: Array
     leading_share: float
+    left: float = 0.0
 
     @property
     def worst(self) -> tuple[str, float]:
@@ -54,15 +56,16 @@ class Residual:
 
 def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -> Residual:
     """Residual of a capture at the values of a fit, pixel by pixel, and its tests."""
+    problem, values = problem.near(space, fit.values)
     data, moments = problem.captures[capture], problem.moments[capture]
-    changes = problem.changes(capture, space, fit.values)
+    changes = problem.changes(capture, space, values)
     a = problem.columns(capture, changes) * moments.sigma[:, None]
     rows = a.shape[0]
     height, width = data.signal.shape[2:]
     used = (data.usable & ~data.clipped if changes.drop_clipped else data.usable) & inside(height, width)
     counts = data.signal.reshape(rows, height, width).astype(np.float64)
     y = add_response(counts, problem.coefficients(capture, changes), problem.columns(capture, changes))
-    variance = data.variance(data.signal).reshape(rows, height, width)
+    variance = data.variance().reshape(rows, height, width)
     level = np.sqrt(moments.sigma**2)
     r = np.full((rows, height, width), np.nan, dtype=np.float32)
     free = np.zeros((rows, height, width), dtype=np.float32)
@@ -78,7 +81,7 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     noise = variance / level[:, None, None] ** 2 / np.maximum(variance.mean(axis=0), 1e-300)
     expected = (free * noise).astype(np.float32)
     good = np.asarray(np.isfinite(r).all(axis=0))
-    tests = _tests(r, signal, expected, good, a.shape[1], moments.spread, data.noise_known)
+    tests, left = _tests(r, signal, expected, good, a.shape[1], moments.spread, data.noise_known)
     n, channels = data.signal.shape[:2]
     mean = r[:, good].mean(axis=1) if good.any() else np.zeros(rows)
     states = mean.reshape(n, channels).mean(axis=1)
@@ -98,6 +101,7 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
         correlates=_correlates(r, signal, good),
         leading=vector[:, -1],
         leading_share=float(value[-1] / max(value.sum(), 1e-300)),
+        left=left,
     )
 
 
@@ -124,13 +128,14 @@ def _tests(
     columns: int,
     spread: float,
     noise_known: bool,
-) -> dict[str, float]:
+) -> tuple[dict[str, float], float]:
     count = int(good.sum())
     if count < 30 or not noise_known:
-        return {}
+        return {}, 0.0
     flat, wanted = r[:, good].astype(np.float64), expected[:, good].astype(np.float64)
     freedom = wanted.sum()
-    out = {"sum of squares": (np.sum(flat**2) - freedom) / np.sqrt(2 * freedom * spread)}
+    # Name to chi-square beyond noise, and its standard deviation with nothing but noise.
+    found = {"sum of squares": (np.sum(flat**2) - freedom, np.sqrt(2 * freedom * spread))}
     # Linear in the signal: every pixel's residual against the leading components of the fitted signal.
     s = signal[:, good].astype(np.float64)
     _, size, vt = np.linalg.svd(s @ s.T)
@@ -138,14 +143,17 @@ def _tests(
     weights = (vt[:keep] @ s) / np.sqrt(np.maximum(size[:keep], 1e-300))[:, None]
     linear = flat @ weights.T
     null = wanted @ (weights.T**2)
-    out["linear in the signal"] = (np.sum(linear**2) - null.sum()) / np.sqrt(2 * null.sum() * spread)
+    found["linear in the signal"] = (np.sum(linear**2) - null.sum(), np.sqrt(2 * null.sum() * spread))
     # Brightness: against the square of the signal, its linear part taken away.
     square = s**2
     square -= (square @ weights.T) @ weights
     norm = np.sqrt(np.sum(square**2, axis=1, keepdims=True)) + 1e-300
     along = np.sum(flat * square / norm, axis=1)
     expectation = np.sum(wanted * (square / norm) ** 2, axis=1)
-    out["brightness"] = (np.sum(along**2) - expectation.sum()) / np.sqrt(2 * np.sum(expectation**2) * spread + 1e-300)
+    found["brightness"] = (
+        np.sum(along**2) - expectation.sum(),
+        np.sqrt(2 * np.sum(expectation**2) * spread + 1e-300),
+    )
     # Neighbours: noise of two pixels is independent.
     for name, axis in (("neighbours, rows", 1), ("neighbours, columns", 2)):
         if r.shape[axis] > 2:
@@ -153,19 +161,22 @@ def _tests(
             both = np.isfinite(first) & np.isfinite(second)
             product = (first * second)[both].astype(np.float64)
             if product.size > 100:
-                out[name] = float(product.sum() / np.sqrt(np.sum(product**2)))
+                found[name] = (product.sum(), np.sqrt(np.sum(product**2)))
     # Tiles: mean residual of every row over patches of the image.
-    out["patches"] = _patches(r, expected, spread)
-    return {k: float(v) for k, v in out.items()}
+    found["patches"] = _patches(r, expected, spread)
+    left = max(chi2 - 2 * deviation for chi2, deviation in found.values())
+    return {k: float(chi2 / deviation) for k, (chi2, deviation) in found.items()}, max(float(left), 0.0)
 
 
-def _patches(r: NDArray[np.float32], expected: NDArray[np.float32], spread: float) -> float:
+def _patches(r: NDArray[np.float32], expected: NDArray[np.float32], spread: float) -> tuple[float, float]:
     side = max(r.shape[1] // 8, 1)
     h, w = r.shape[1] // side * side, r.shape[2] // side * side
     shape = (r.shape[0], h // side, side, w // side, side)
     total = np.nansum(r[:, :h, :w].reshape(shape), axis=(2, 4), dtype=np.float64)
     null = np.where(np.isfinite(r[:, :h, :w]), expected[:, :h, :w], 0).reshape(shape).sum(axis=(2, 4), dtype=np.float64)
-    return float((np.sum(total**2) - null.sum()) / np.sqrt(2 * np.sum(null**2) * spread + 1e-300))
+    pixels = side**2
+    deviation = np.sqrt(2 * np.sum(null**2) * spread + 1e-300)
+    return float((np.sum(total**2) - null.sum()) / pixels), float(deviation / pixels)
 
 
 def _correlates(r: NDArray[np.float32], signal: NDArray[np.float32], good: NDArray[np.bool_]) -> dict[str, float]:

@@ -166,6 +166,14 @@ class SurfaceProblem:
         residual = y - e * level[:, None] - f * modulation[:, None]
         return Pixels(e, f, residual, alpha_0, alpha_id, strength[:, 0], columns, flat, light)
 
+    def relinearize(self, space: Space, values: Array) -> bool:
+        """Nothing is expanded here."""
+        return False
+
+    def adopt_noise(self, space: Space, values: Array) -> bool:
+        """The noise does not depend on the effects."""
+        return False
+
     def sums(self, space: Space, values: Array, *, derivatives: bool = True) -> Sums:
         """Excess, and with `derivatives` its half gradient and curvature, of every fold."""
         out = Sums.empty(self.folds, space.size if derivatives else 0)

@@ -56,6 +56,7 @@ class Effect(ABC):
     scope : "capture" if another capture of the same instrument would have other values.
     per_state : parameter k acts on state k alone (which also makes its derivative cheap).
     corrects_counts : it is undone in the counts, not put into the rows of W.
+    pointwise : it is undone in each pixel by itself, by `undo`.
     switch : it is on or off; its parameter is not fitted.
     """
 
@@ -64,11 +65,16 @@ class Effect(ABC):
     scope: ClassVar[Scope] = "instrument"
     per_state: ClassVar[bool] = False
     corrects_counts: ClassVar[bool] = False
+    pointwise: ClassVar[bool] = False
     switch: ClassVar[bool] = False
 
     def first_state(self, place: str) -> int:
         """State from which on an axis error of one parameter acts; 0 for every other effect."""
         return 0
+
+    def undo(self, signal: Array, conditions: Conditions, values: Array) -> tuple[Array, Array]:
+        """Signal (counts over full scale) without the effect, exactly, and its slope; of `pointwise` effects only."""
+        return signal, np.ones_like(signal)
 
     @abstractmethod
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:

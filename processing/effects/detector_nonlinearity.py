@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from processing.changes import Changes, Conditions
 from processing.effects.base import Array, Effect, Parameter
 from processing.instrument import InstrumentModel
@@ -19,6 +21,7 @@ class This(Effect):
 
     group = "detector"
     corrects_counts = True
+    pointwise = True
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",)
@@ -31,3 +34,8 @@ class This(Effect):
         # Series of the exact inverse (1 - sqrt(1 - 4 c y)) / (2 c) = y + c y^2 + 2 c^2 y^3 + 5 c^3 y^4 + ...
         for name, factor in (("square", c), ("cube", 2 * c**2), ("fourth", 5 * c**3)):
             changes.response[name] = changes.response[name] + factor
+
+    def undo(self, signal: Array, conditions: Conditions, values: Array) -> tuple[Array, Array]:
+        # y = x - c x^2 has its top at y = 1 / (4 c), beyond the range for the bounds of c.
+        root = np.sqrt(np.maximum(1 - 4 * values[0] * signal, 0.01))
+        return 2 * signal / (1 + root), 1 / root

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from processing.changes import Changes, Conditions
 from processing.effects.base import Array, Effect, Parameter
 from processing.instrument import InstrumentModel
@@ -19,6 +21,7 @@ class This(Effect):
 
     group = "detector"
     corrects_counts = True
+    pointwise = True
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",)
@@ -30,3 +33,6 @@ class This(Effect):
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         full_scale = changes.conditions.full_scale
         changes.response["one"] = changes.response["one"] - values[0] / full_scale
+
+    def undo(self, signal: Array, conditions: Conditions, values: Array) -> tuple[Array, Array]:
+        return signal - values[0] / conditions.full_scale, np.ones_like(signal)

@@ -8,9 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from processing.changes import Changes, Conditions
 from processing.effects.base import Array, Effect, Parameter
 from processing.instrument import InstrumentModel
+
+#: Signal over full scale below which the curve is taken as straight.
+TINY = 1e-6
 
 
 class This(Effect):
@@ -18,6 +23,7 @@ class This(Effect):
 
     group = "mosaic"
     corrects_counts = True
+    pointwise = True
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",)
@@ -30,3 +36,8 @@ class This(Effect):
         # y^(1 + e) = y (1 + e ln y + e^2/2 ln^2 y + ...), y = counts over full scale.
         for name, factor in (("log", e), ("log_square", e * e / 2), ("log_cube", e**3 / 6)):
             changes.response[name] = changes.response[name] + factor
+
+    def undo(self, signal: Array, conditions: Conditions, values: Array) -> tuple[Array, Array]:
+        # Noise takes dark pixels below zero, where a power is not defined: straight there.
+        power = np.maximum(signal, TINY) ** values[0]
+        return signal * power, (1 + values[0]) * power
