@@ -186,9 +186,14 @@ def _mean_of(capture: Capture, states: NDArray[np.int64]) -> tuple[NDArray[np.fl
         return mean.astype(np.float32), float("nan"), float("nan")
     each = []
     for k in states:
-        left = capture.frames(int(k)) - mean
+        # In blocks of rows: the whole image in floating numbers would be the largest thing in memory.
+        sums = np.zeros(3)
+        for rows in capture.row_blocks():
+            left = (capture.frames(int(k), rows) - mean[:, rows]).ravel()
+            left = left[np.isfinite(left)]
+            sums += [left.size, left.sum(), left @ left]
         # A black level that moves as a whole is not noise of the pixels.
-        each.append(float(np.nanvar(left)))
+        each.append((sums[2] - sums[1] ** 2 / sums[0]) / sums[0] if sums[0] else float("nan"))
     scatter = float(np.mean(each)) * n / (n - 1)
     return mean.astype(np.float32), scatter, scatter * float(np.sqrt(2 / ((n - 1) * mean.size)))
 

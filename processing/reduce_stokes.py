@@ -188,6 +188,8 @@ def stokes(
 
 def _by_channel(raw: NDArray[np.float32], layout: MosaicLayout, channels: NDArray[np.float32]) -> NDArray[np.float32]:
     """Values of raw pixels (rows, columns) for each channel's image: those of its own pixel in the super-pixel."""
+    if raw.size == 1:
+        return raw[None]
     cell = np.stack([layout.samples(raw, k) for k in range(len(layout.channels))])
     step = channels.shape[1] // cell.shape[1]
     return np.asarray(cell if step == 1 else cell.repeat(step, axis=1).repeat(step, axis=2), dtype=np.float32)
@@ -242,6 +244,7 @@ def _facts(
         "median_closure_over_s0": float(np.median(closure)) if lit.any() else float("nan"),
         "rms_closure_over_s0": float(np.sqrt(np.mean(closure**2))) if lit.any() else float("nan"),
         "median_dolp": float(np.median(found["dolp"][lit])) if lit.any() else float("nan"),
+        "median_dolp_error": float(np.median(found["dolp_errors"][lit])) if lit.any() else float("nan"),
         "pixels": mask.size,
         "pixels_with_light": int(np.sum(found["s0"] > LIT_ERRORS * found["s0_errors"])),
         "masked": counts,

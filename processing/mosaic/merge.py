@@ -12,6 +12,7 @@ from processing.applied_effects import CountsCorrection
 from processing.capture import Capture
 from processing.correction import Correction, Mask
 from processing.noise import NoiseModel
+from processing.reduce import relative_exposure
 
 FloatArray = NDArray[np.float32]
 
@@ -25,8 +26,8 @@ class MergedFrame:
     signal : (rows, columns), counts above black at the longest exposure, flat divided.
     mask : (rows, columns), bits of Mask. A pixel is left out of every state of an exposure in one of which it
         saturates (choosing state by state would favour low counts); NOT_DETERMINED where no exposure is left.
-    shot, floor, relative : (rows, columns) or a number: variance of a raw pixel is shot * signal + floor +
-        relative * signal^2, the last part being the error of the flat. None: no noise model, no flat.
+    shot, floor, relative : variance of a raw pixel is shot * signal + floor + relative * signal^2, the last part being
+        the error of the flat; each (rows, columns), or (1, 1) where all are alike. None: no noise model, no flat.
     """
 
     signal: FloatArray
@@ -54,13 +55,15 @@ def merge(
     shape = capture.frame_shape
     exposure = capture.column("exposure_s")[states].astype(float)
     repeats = np.maximum(capture.column("repeats")[states].astype(float), 1)
-    relative = np.ones(len(states)) if np.isnan(exposure).all() else exposure / exposure.max()
+    relative = relative_exposure(capture, states)
     weights = correction.black.weights(exposure)
     excess = correction.black.excess(noise, exposure)
     flat = None if correction.flat is None else correction.flat.response[0]
-    total, weight, shot, floor = (np.zeros(shape, np.float32) for _ in range(4))
-    share = np.zeros((weights.shape[1], *shape), np.float32)
-    mask = np.zeros(shape, np.uint8)
+    total, mask = np.zeros(shape), np.zeros(shape, np.uint8)
+    # One number each while nothing saturates; images as soon as pixels differ.
+    zero: NDArray[np.floating] = np.zeros((1, 1), np.float32)
+    weight = shot = floor = zero
+    share: NDArray[np.floating] = np.zeros((weights.shape[1], 1, 1), np.float32)
     count = 0
     for value in np.unique(relative):
         group = np.flatnonzero(relative == value)
@@ -81,19 +84,20 @@ def merge(
         if value == relative.min():
             mask[clipped] |= np.uint8(Mask.NOT_DETERMINED)
             clipped[:] = False
-        keep = ~clipped
-        total += light * keep
-        weight += np.float32(value * len(group)) * keep
-        shot += np.float32(np.sum(value / repeats[group])) * keep
+        keep = ~clipped if clipped.any() else np.ones((1, 1), bool)
+        light *= keep
+        total += light
+        weight = weight + np.float32(value * len(group)) * keep
+        shot = shot + np.float32(np.sum(value / repeats[group])) * keep
         if noise is not None:
-            floor += np.float32(noise.averaged_floor(repeats[group], excess[group]).sum()) * keep
-        share += weights[group].sum(axis=0).astype(np.float32)[:, None, None] * keep
+            floor = floor + np.float32(noise.averaged_floor(repeats[group], excess[group]).sum()) * keep
+        share = share + weights[group].sum(axis=0).astype(np.float32)[:, None, None] * keep
     if correction.bad is not None:
         mask[correction.bad] |= np.uint8(Mask.BAD)
-    signal = total / weight
+    signal = (total / weight).astype(np.float32)
     if noise is None:
         return MergedFrame(signal, mask)
-    floor += np.tensordot(correction.black.mean_variance(noise).astype(np.float32), share**2, axes=1)
+    floor = floor + np.tensordot(correction.black.mean_variance(noise).astype(np.float32), share**2, axes=1)
     scale = np.float32(1) if flat is None else 1 / flat
     return MergedFrame(
         signal,
