@@ -75,6 +75,15 @@ class PhotonTransfer:
         """Read noise in electrons, rounding to whole counts taken out."""
         return float(np.sqrt(max(self.floor - QUANTIZATION, 0.0)) / self.slope)
 
+    @property
+    def read_noise_stderr(self) -> float:
+        """Standard error of the read noise, first order; NaN where none was found above the rounding."""
+        level = self.floor - QUANTIZATION
+        if level <= 0:
+            return float("nan")
+        gradient = self.read_noise_e * np.array([-1 / self.slope, 0.5 / level])
+        return float(np.sqrt(gradient @ self.covariance @ gradient))
+
 
 def repeats(capture: Capture) -> list[NDArray[np.int64]]:
     """Groups of states that repeat each other: same role, exposure and angles; at least two each."""
@@ -189,6 +198,7 @@ def write_camera(
             "gain_e_per_count": line.gain_e_per_count,
             "gain_stderr": line.gain_stderr,
             "read_noise_e": line.read_noise_e,
+            "read_noise_stderr": line.read_noise_stderr,
             "black_counts": line.black_counts,
             "slope": line.slope,
             "floor": line.floor,

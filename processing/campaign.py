@@ -22,6 +22,7 @@ from processing.deviation import rmsd
 from processing.errors import NotDetermined, ProcessError
 from processing.flat import FlatCapture, flat_captures, nearest_flat
 from processing.geometry.viewing import ViewingGeometry
+from processing.product import is_product
 from processing.reduce import Progress
 from processing.tables import ScatteringTable
 
@@ -45,9 +46,9 @@ PAPER = {451: PaperAverages(7.49, 4.96, 11.11), 662: PaperAverages(14.29, 11.73,
 class Row:
     """Deviations at one wavelength and arm angle; NaN where a capture is missing.
 
-    `xi0_noise_percent` is what the noise of both instruments alone makes of the xi0 deviation, `common` the
-    fraction of the virtual sphere where both have a value, `eigenvalue_deviation` the 99th percentile of the
-    largest deviation of xi1..xi3 from their mean.
+    `psi_noise_deg`, `magnitude_noise_percent` and `xi0_noise_percent` are what the noise alone, first order, makes of
+    the deviation (xi0: of both instruments), `common` the fraction of the virtual sphere where both have a value,
+    `eigenvalue_deviation` the 99th percentile of the largest deviation of xi1..xi3 from their mean.
     """
 
     wavelength_nm: float
@@ -55,6 +56,8 @@ class Row:
     psi_deg: float = np.nan
     magnitude_percent: float = np.nan
     xi0_percent: float = np.nan
+    psi_noise_deg: float = np.nan
+    magnitude_noise_percent: float = np.nan
     xi0_noise_percent: float = np.nan
     common: float = np.nan
     eigenvalue_deviation: float = np.nan
@@ -77,10 +80,12 @@ class CampaignResult:
         return float(np.mean(finite)) if finite else float("nan")
 
 
-def find_captures(folder: Path) -> tuple[list[tuple[Path, str, float, float]], bool, list[str]]:
+def find_captures(
+    folder: Path, out: Path | None = None
+) -> tuple[list[tuple[Path, str, float, float]], bool, list[str]]:
     """Captures under a folder as (path, "mueller" or "stokes", nm, omega), whether simulated, and files left out.
 
-    Flat fields are in neither list.
+    Flat fields are in neither list, nor is anything in `out`, the campaign's own results.
 
     Raises
     ------
@@ -88,6 +93,8 @@ def find_captures(folder: Path) -> tuple[list[tuple[Path, str, float, float]], b
     """
     found, kinds, left_out = [], {}, []
     for path in sorted(folder.rglob("*.h5")):
+        if (out is not None and path.is_relative_to(out)) or is_product(path):
+            continue
         try:
             with Capture(path) as capture:
                 header, simulated, flat = capture.header, capture.simulated, FlatCapture.of(capture)
@@ -143,7 +150,7 @@ def run_campaign(
     ------
     ProcessError : see `find_captures`; two captures of the same kind, wavelength and angle.
     """
-    captures, simulated, left_out = find_captures(folder)
+    captures, simulated, left_out = find_captures(folder, out)
     out.mkdir(parents=True, exist_ok=True)
     seen: dict[tuple[str, float, float], Path] = {}
     for path, kind, nm, omega in captures:
@@ -232,6 +239,7 @@ def _rows(
             if "mueller" in here:
                 m = here["mueller"]
                 values |= {"psi_deg": m.psi_deg, "magnitude_percent": m.magnitude_percent}
+                values |= {"psi_noise_deg": m.psi_noise_deg, "magnitude_noise_percent": m.magnitude_noise_percent}
                 values["eigenvalue_deviation"] = m.eigenvalue_deviation
             if "stokes" in here and len(loaded) == 2:
                 values |= compare_on_sphere(

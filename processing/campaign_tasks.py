@@ -18,6 +18,7 @@ from processing.geometry.errors import OutlineNotFound
 from processing.geometry.frames import GeometryImage
 from processing.geometry.outline import find_sphere, registered
 from processing.geometry.viewing import ViewingGeometry
+from processing.gradients import dominant
 from processing.images import MuellerImage, StokesImage
 from processing.product import Product, Step, file_identity
 from processing.reduce import choose_model, reduce_mueller
@@ -29,6 +30,10 @@ from processing.xi0_image import estimate_from_stokes
 #: Standard error of the Mueller image's xi0 above which a pixel does not count: beyond it the largest eigenvalue is
 #: noise's choice, and biased upwards.
 MAX_STDERR = 0.1
+#: Pixels whose noise in psi and |D| is worked out: gradients of m0 take 2 kB a pixel.
+NOISE_PIXELS = 4000
+#: Standard deviation of an orientation that may be anything from 0 to 180 degrees.
+RANDOM_PSI_DEG = 180 / np.sqrt(12)
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,9 @@ class CaptureMeasure:
     magnitude_percent: float
     eigenvalue_deviation: float
     pixels: int
+    #: What the noise alone makes of psi_deg and magnitude_percent.
+    psi_noise_deg: float = np.nan
+    magnitude_noise_percent: float = np.nan
 
 
 def measure(task: CaptureTask) -> CaptureMeasure:
@@ -133,6 +141,7 @@ def _measure_mueller(task: CaptureTask, product: Path, view: ViewingGeometry) ->
     good = np.isfinite(xi0) & ~(stderr > MAX_STDERR) & _inner(geometry, task.border_px)
     measured, modelled = linear_diattenuation(m0), linear_diattenuation(model)
     psi = orientation_difference(modelled, measured)[good]
+    psi_noise, magnitude_noise = _noise_of_dominant(image, np.flatnonzero(geometry.mask)[good])
     small = eigenvalues[:, 1:]
     deviation = np.abs(small - small.mean(axis=-1, keepdims=True)).max(axis=-1)[good]
     return CaptureMeasure(
@@ -145,7 +154,24 @@ def _measure_mueller(task: CaptureTask, product: Path, view: ViewingGeometry) ->
         magnitude_percent=100 * rmsd((magnitude(modelled) - magnitude(measured))[good]),
         eigenvalue_deviation=float(np.percentile(deviation, 99)) if good.any() else float("nan"),
         pixels=int(good.sum()),
+        psi_noise_deg=psi_noise,
+        magnitude_noise_percent=100 * magnitude_noise,
     )
+
+
+def _noise_of_dominant(image: MuellerImage, pixels: NDArray[np.int64]) -> tuple[float, float]:
+    """Root mean square of the standard errors of psi (degrees) and |D| of the dominant process, over some pixels.
+
+    First order; an orientation that is not known at all is off by RANDOM_PSI_DEG and not by more.
+    """
+    if not pixels.size:
+        return float("nan"), float("nan")
+    some = image.at(pixels[:: -(-pixels.size // NOISE_PIXELS)])
+    derived = dominant(some.matrices.astype(float))
+    stderr = []
+    for name in ("dominant_diattenuation_orientation_deg", "dominant_diattenuation_linear"):
+        stderr.append(np.sqrt(some.variance_of(derived[name].gradient)))
+    return rmsd(np.minimum(stderr[0], RANDOM_PSI_DEG)), rmsd(stderr[1])
 
 
 def _measure_stokes(task: CaptureTask, product: Path, view: ViewingGeometry) -> CaptureMeasure:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,13 @@ if TYPE_CHECKING:
 #: Longest side of a panel in pixels; larger images are thinned before drawing, which changes no file.
 PANEL_PIXELS = 600
 SIMULATED = "SIMULATED"
+PAGE_DPI = 100
+#: A standard error of xi0 above this is no knowledge of it: valid values lie between 0.25 and 1.
+UNKNOWN_XI0 = 0.1
+#: Orientation is drawn in grey where its standard error is above this: it is not known there.
+WORST_ORIENTATION_DEG = 20.0
+#: Keywords of `imshow` for orientations.
+CYCLIC = {"cmap": "twilight", "vmin": 0, "vmax": 180}
 
 
 def draw_product(path: Path, figure: Path) -> None:
@@ -42,17 +50,25 @@ def product_figure(product: Product) -> Figure:
         lit = _lit(elements[0, 0], thin(product.get("mueller_errors")[0, 0]))
         return mueller_figure(elements, lit, _title(product), product.simulated)
     if product.kind == "stokes":
-        maps = {name: thin(product.get(name)) for name in ("s0", "dolp", "aolp_deg")}
+        names = ("s0", "dolp", "dolp_errors", "aolp_deg", "aolp_deg_errors")
+        maps = {name: thin(product.get(name)) for name in names}
         dark = ~_lit(maps["s0"], thin(product.get("s0_errors")))
-        maps["dolp"][dark] = maps["aolp_deg"][dark] = np.nan
+        for name in names[1:]:
+            maps[name][dark] = np.nan
         return stokes_figure(maps, _title(product), product.simulated)
     if product.kind == "xi0":
         xi0, errors, valid = (thin(product.get(name)) for name in ("xi0", "xi0_errors", "valid"))
         shown = np.where(valid > 0, xi0, np.nan)
         limit = max(_percentile(errors[valid > 0], 95), 1e-6)
+        known = np.where(errors <= UNKNOWN_XI0, errors, np.nan)
+        label = f"standard error of $\\xi_0$ (grey: > {UNKNOWN_XI0:g})"
         panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = [
-            ("$\\xi_0$ where valid", shown, {"cmap": "viridis", "vmin": 0.25, "vmax": 1}),
-            ("standard error of $\\xi_0$", errors, {"cmap": "magma", "vmin": 0, "vmax": limit}),
+            ("$\\xi_0$ where valid", shown, {"cmap": "viridis", "vmin": 0.25, "vmax": _percentile(shown, 99.8)}),
+            (
+                label,
+                known,
+                {"cmap": "magma", "vmin": 0, "vmax": limit},
+            ),
             ("valid", valid, {"cmap": "gray", "vmin": 0, "vmax": 1}),
         ]
         return map_figure(panels, _title(product), product.simulated)
@@ -93,22 +109,22 @@ def mueller_figure(elements: NDArray[Any], lit: NDArray[np.bool_], title: str, s
                 panel.imshow(m00, cmap="gray", vmin=0, vmax=max(_percentile(m00, 99.5), 1e-30))
                 continue
             shown = panel.imshow(normalized[i, j], cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
-    figure.colorbar(shown, ax=panels, shrink=0.8, label="$m_{ij}/m_{00}$ (first panel: $m_{00}$; plain grey: too dark)")
+    label = "$m_{ij}/m_{00}$, instrument frames (first panel: $m_{00}$; plain grey: too dark)"
+    figure.colorbar(shown, ax=panels, shrink=0.8, label=label)
     _entitle(figure, title, simulated)
     return figure
 
 
 def stokes_figure(maps: dict[str, NDArray[Any]], title: str, simulated: bool) -> Figure:
-    """S0 (grey), degree of linear polarization, and its angle on a cyclic colour map."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(13, 4.2), layout="constrained")
-    s0, dolp, aolp = figure.subplots(1, 3)
-    _map(figure, s0, maps["s0"], "$S_0$", cmap="gray", vmin=0, vmax=_percentile(maps["s0"], 99.5))
-    _map(figure, dolp, maps["dolp"], "degree of linear polarization", cmap="viridis", vmin=0, vmax=1)
-    _map(figure, aolp, maps["aolp_deg"], "angle of linear polarization / degrees", cmap="twilight", vmin=0, vmax=180)
-    _entitle(figure, title, simulated)
-    return figure
+    """S0 (grey), degree of linear polarization with its standard error, and its angle on a cyclic colour map."""
+    angle = np.where(maps["aolp_deg_errors"] > WORST_ORIENTATION_DEG, np.nan, maps["aolp_deg"])
+    panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = [
+        ("$S_0$ / counts", maps["s0"], {"cmap": "gray", "vmin": 0}),
+        ("degree of linear polarization", maps["dolp"], {"cmap": "viridis", "vmin": 0}),
+        ("its standard error", maps["dolp_errors"], {"cmap": "magma", "vmin": 0}),
+        ("angle of linear polarization, PSA frame / degrees", angle, CYCLIC),
+    ]
+    return grid_figure(panels, title, simulated)
 
 
 def map_figure(panels: Sequence[tuple[str, NDArray[Any], dict[str, Any]]], title: str, simulated: bool) -> Figure:
@@ -119,6 +135,25 @@ def map_figure(panels: Sequence[tuple[str, NDArray[Any], dict[str, Any]]], title
     axes = figure.subplots(1, len(panels), squeeze=False)[0]
     for axis, (label, values, keywords) in zip(axes, panels, strict=True):
         _map(figure, axis, values, label, **keywords)
+    _entitle(figure, title, simulated)
+    return figure
+
+
+def grid_figure(
+    panels: Sequence[tuple[str, NDArray[Any], dict[str, Any]]], title: str, simulated: bool, columns: int = 4
+) -> Figure:
+    """Maps in rows of `columns`, as in `map_figure`; where no `vmax` is given it is the 99.5th percentile."""
+    from matplotlib.figure import Figure
+
+    shape = panels[0][1].shape
+    rows = -(-len(panels) // columns)
+    high = 0.5 + 3.6 * max(0.4, shape[0] / max(shape[1], 1))
+    figure = Figure(figsize=(4.25 * min(columns, len(panels)), 0.6 + rows * high), layout="constrained")
+    axes = figure.subplots(rows, min(columns, len(panels)), squeeze=False)
+    for axis in axes.flat[len(panels) :]:
+        axis.set_axis_off()
+    for axis, (label, values, keywords) in zip(axes.flat, panels, strict=False):
+        _map(figure, axis, values, label, **({"vmax": max(_percentile(values, 99.5), 1e-30)} | keywords))
     _entitle(figure, title, simulated)
     return figure
 
@@ -142,6 +177,13 @@ def photon_transfer_figure(product: Product) -> Figure:
     lower.set_xlabel("signal above black / counts")
     _entitle(figure, f"photon transfer: {product.header.title}", product.simulated)
     return figure
+
+
+def png(figure: Figure) -> bytes:
+    """A figure as a PNG for a page."""
+    out = BytesIO()
+    figure.savefig(out, format="png", dpi=PAGE_DPI)
+    return out.getvalue()
 
 
 def thin(image: NDArray[Any]) -> NDArray[Any]:

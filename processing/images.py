@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -68,6 +68,21 @@ class MuellerImage:
     def matrices(self) -> NDArray[np.float32]:
         """View (rows, columns, 4, 4)."""
         return np.moveaxis(self.values, (0, 1), (-2, -1))
+
+    def at(self, pixels: NDArray[np.int64]) -> Self:
+        """The image of some pixels alone (n rows of one), given by their numbers in row-major order."""
+        count = self.mask.size
+
+        def pick(values: NDArray[Any]) -> NDArray[Any]:
+            return values.reshape(*values.shape[:-2], count)[..., pixels, None]
+
+        return replace(
+            self,
+            values=pick(self.values),
+            errors=pick(self.errors),
+            mask=pick(self.mask),
+            residual_rms=pick(self.residual_rms),
+        )
 
     def intensity_variance(self) -> NDArray[np.float64]:
         """Variance (N, pixels) of every intensity, from the fitted intensities and the noise of the reduction."""

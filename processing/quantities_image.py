@@ -180,8 +180,10 @@ def _facts(writer: ProductWriter, maps: Mapping[str, Plane]) -> dict[str, Any]:
         )
         return facts
     names = ("depolarization_index", "entropy", "td_missed", "diattenuation_linear", "polarizance_linear")
-    facts |= {f"median_{name}": _median(writer.get(name)[known]) for name in names}
-    facts["median_xi0"] = _median(xi[0][known])
+    facts["median_xi0"], facts["median_xi0_error"] = _median(xi[0][known]), _median(xi_errors[0][known])
+    for name in names:
+        facts[f"median_{name}"] = _median(writer.get(name)[known])
+        facts[f"median_{name}_error"] = _median(writer.get(f"{name}_errors")[known])
     for name in maps:
         if name.endswith("_defined") or name == "negative_determinant":
             facts[f"pixels_{name}"] = int(np.sum(writer.get(name)[known]))

@@ -223,6 +223,8 @@ def reduce_mueller(
             if stored:
                 stored.result()
         facts = mueller_facts(inversion, noise, correction, product, len(states), choice.weighted)
+        if choice.physical:
+            facts["physical_estimate"] = f"{choice.physical}, as mueller_physical beside the plain one"
         product.seal(facts)
     return facts
 

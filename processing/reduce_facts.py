@@ -11,7 +11,7 @@ from processing.capture import CaptureError
 from processing.correction import Correction, Mask
 from processing.inversion import Inversion
 from processing.noise import NoiseModel
-from processing.product import ProductWriter
+from processing.product import LIT_ERRORS, ProductWriter
 
 #: Above this median, the model and not the noise makes the residual (the median of a good one is within 0.1 of 1).
 SUSPICIOUS_CHI_SQUARE = 1.5
@@ -44,6 +44,9 @@ def mueller_facts(
     signal = np.tensordot(inversion.w.mean(axis=0), elements.reshape(16, *residual.shape), axes=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = residual / signal
+        errors, m00 = product.get("mueller_errors", some), elements[0, 0]
+        lit = m00 > LIT_ERRORS * np.nan_to_num(errors[0, 0])
+        each = (errors.reshape(16, *m00.shape)[1:] / m00)[:, lit]
     facts: dict[str, Any] = {
         "states": states,
         "intensities_per_pixel": inversion.w.shape[0],
@@ -56,6 +59,7 @@ def mueller_facts(
         "weighted": weighted,
         "median_residual_rms_count": _median(residual),
         "median_residual_over_signal": _median(relative),
+        "median_standard_error_of_mij_over_m00": _median(each),
         "pixels": mask.size,
         "masked": counts,
     }

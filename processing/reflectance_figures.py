@@ -19,29 +19,31 @@ _OTHERS = ("tab:green", "tab:purple", "tab:orange", "tab:brown")
 
 
 def campaign_figure(result: CampaignResult, title: str) -> Figure:
-    """RMSD of psi, |D| and xi0 against arm angle, with the paper's averages dashed and the noise of xi0 dotted."""
+    """RMSD of psi, |D| and xi0 against arm angle, with the paper's averages dashed and the part of the noise dotted."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 4.2), layout="constrained")
     panels = figure.subplots(1, 3)
     quantities = (
-        ("psi_deg", "$\\epsilon(\\psi)$ / degrees", "psi_deg"),
-        ("magnitude_percent", "$\\epsilon(|D|)$ / %", "magnitude_percent"),
-        ("xi0_percent", "$\\epsilon(\\xi_0)$ / %", "xi0_percent"),
+        ("psi_deg", "$\\epsilon(\\psi)$ / degrees", "psi_noise_deg"),
+        ("magnitude_percent", "$\\epsilon(|D|)$ / %", "magnitude_noise_percent"),
+        ("xi0_percent", "$\\epsilon(\\xi_0)$ / %", "xi0_noise_percent"),
     )
     for number, nm in enumerate(sorted({r.wavelength_nm for r in result.rows})):
         colour, marker = STYLES.get(round(nm), (_OTHERS[number % 4], "o"))
         rows = [r for r in result.rows if r.wavelength_nm == nm]
         omega = [r.omega_deg for r in rows]
-        for panel, (name, label, of_paper) in zip(panels, quantities, strict=True):
+        for panel, (name, label, noise) in zip(panels, quantities, strict=True):
             panel.plot(omega, [getattr(r, name) for r in rows], color=colour, marker=marker, label=f"{nm:g} nm")
+            panel.plot(omega, [getattr(r, noise) for r in rows], color=colour, linestyle=":")
             if round(nm) in PAPER:
-                panel.axhline(getattr(PAPER[round(nm)], of_paper), color=colour, linestyle="--", linewidth=0.8)
+                panel.axhline(getattr(PAPER[round(nm)], name), color=colour, linestyle="--", linewidth=0.8)
             panel.set_xlabel("$\\Omega$ / degrees")
             panel.set_ylabel(label)
-        panels[2].plot(omega, [r.xi0_noise_percent for r in rows], color=colour, linestyle=":")
     for panel in panels:
         panel.set_ylim(bottom=0)
+        panel.plot([], [], color="0.3", linestyle=":", label="noise alone")
+        panel.plot([], [], color="0.3", linestyle="--", linewidth=0.8, label="paper, average")
         panel.legend(fontsize=8)
     figure.suptitle(f"SIMULATED   {title}" if result.simulated else title, fontsize=11)
     return figure

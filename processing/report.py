@@ -7,27 +7,31 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import version
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from processing.capture import Capture
+from processing.capture import Capture, CaptureError
 from processing.errors import ProcessError
-from processing.figures import map_figure, product_figure, thin
+from processing.figures import map_figure, png, product_figure, thin
+from processing.mueller_maps import mueller_maps
 from processing.product import Product, Step, is_product, step_text
 from processing.report_html import Figure, Section, render
+from processing.report_tables import table_section
+from processing.tables import ScatteringTable, is_table
 
 #: File types that a report takes in.
-SUFFIXES = (".h5", ".csv", ".png", ".svg")
-DPI = 100
+PICTURES = (".png", ".svg")
+SUFFIXES = (".h5", ".csv", *PICTURES)
 #: Rows of a CSV that are shown.
 ROWS = 200
 
 
 def collect(sources: Sequence[Path]) -> list[Path]:
-    """Files for a report: those given, and those in the folders given, oldest first within a folder.
+    """Files for a report: those given, and those in the folders given; curves and pictures first, then the oldest.
+
+    A picture beside an HDF5 file of its name shows what that file's own section shows, and is left out.
 
     Raises
     ------
@@ -37,7 +41,9 @@ def collect(sources: Sequence[Path]) -> list[Path]:
     for source in sources:
         if source.is_dir():
             inside = [p for p in source.rglob("*") if p.suffix in SUFFIXES and p.is_file()]
-            files += sorted(inside, key=lambda p: (p.stat().st_mtime, p.name))
+            twins = [p for p in inside if p.suffix in PICTURES and p.with_suffix(".h5").is_file()]
+            kept = set(inside) - set(twins)
+            files += sorted(kept, key=lambda p: (p.suffix == ".h5", p.stat().st_mtime, p.name))
         elif source.is_file():
             if source.suffix not in SUFFIXES:
                 raise ProcessError(f"{source}: a report takes {', '.join(SUFFIXES)} files.")
@@ -70,7 +76,7 @@ def write_report(
     sections: list[Section] = []
     for count, file in enumerate(files, 1):
         if file.suffix == ".h5":
-            section = _product(file) if is_product(file) else _capture(file)
+            section = _section(file)
         elif file.suffix == ".csv":
             section = _curve(file)
         else:
@@ -83,18 +89,38 @@ def write_report(
     return out
 
 
+def _section(path: Path) -> Section:
+    if is_product(path):
+        return _product(path)
+    if is_table(path):
+        return table_section(path)
+    try:
+        return _capture(path)
+    except CaptureError as error:
+        return Section(path.name, [("kind", "not shown")], warnings=[str(error)])
+
+
 def _kind_of_data(files: Sequence[Path]) -> bool:
-    """Whether the captures and products are simulated; ProcessError if some are and some are not."""
+    """Whether the captures, products and tables are simulated; ProcessError if some are and some are not."""
     found: dict[bool, Path] = {}
     for file in files:
-        if file.suffix == ".h5":
-            with Product(file) if is_product(file) else Capture(file) as opened:
-                found.setdefault(opened.simulated, file)
+        if file.suffix != ".h5":
+            continue
+        # A file of another program says nothing; its section says what it is.
+        with suppress(CaptureError):
+            found.setdefault(_is_simulated(file), file)
     if len(found) == 2:
         raise ProcessError(
             f"{found[True]} is simulated and {found[False]} is measured; they are never mixed. Make one report of each."
         )
     return True in found
+
+
+def _is_simulated(path: Path) -> bool:
+    if is_table(path):
+        return ScatteringTable.load(path).simulated
+    with Product(path) if is_product(path) else Capture(path) as opened:
+        return opened.simulated
 
 
 def _capture(path: Path) -> Section:
@@ -139,7 +165,7 @@ def _capture(path: Path) -> Section:
                 drawn = map_figure(
                     [(f"state {state}, counts", frame, {"cmap": "gray"})], header.title, capture.simulated
                 )
-                figures.append(Figure(_png(drawn), "first frame of the sample"))
+                figures.append(Figure(png(drawn), "first frame of the sample"))
         return Section(path.name, summary, figures, named, warnings, notes)
 
 
@@ -151,11 +177,15 @@ def _product(path: Path) -> Section:
         figures = []
         # A kind without a figure is reported by its numbers.
         with suppress(ProcessError):
-            figures.append(Figure(_png(product_figure(product)), f"{product.kind} image"))
+            figures.append(Figure(png(product_figure(product)), f"{product.kind} image"))
         if product.kind == "mueller" and "residual_rms" in product.names:
             residual = thin(product.get("residual_rms"))
-            drawn = map_figure([("residual rms / counts", residual, {"cmap": "magma"})], path.name, product.simulated)
-            figures.append(Figure(_png(drawn), "residual of the fit"))
+            title = product.header.title
+            drawn = map_figure([("residual rms / counts", residual, {"cmap": "magma"})], title, product.simulated)
+            figures.append(
+                Figure(png(mueller_maps(product, title)), "coherency eigenvalues, xi0 and its error, DoLP, AoLP")
+            )
+            figures.append(Figure(png(drawn), "residual of the fit"))
         datasets = [("dataset", "unit", "what it is")]
         datasets += [(name, product.units(name), product.long_name(name)) for name in product.names]
         provenance = "\n".join(line for step in product.steps for line in _provenance(step))
@@ -175,19 +205,26 @@ def _curve(path: Path) -> Section:
             rows = [row for row in csv.reader(file) if row]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ProcessError(f"{path}: cannot be read as CSV ({error})") from error
-    shown = rows[: ROWS + 1]
+    shown = [rows[0], *([_rounded(cell) for cell in row] for row in rows[1 : ROWS + 1])] if rows else []
     name = path.name if len(rows) <= ROWS + 1 else f"{path.name}: first {ROWS} of {len(rows) - 1} rows"
     return Section(path.name, [], (), [(name, shown)] if shown else ())
 
 
-def _png(figure: Any) -> bytes:
-    out = BytesIO()
-    figure.savefig(out, format="png", dpi=DPI)
-    return out.getvalue()
+def _rounded(cell: str) -> str:
+    try:
+        number = float(cell)
+    except ValueError:
+        return cell
+    return f"{number:.5g}" if number == number else "-"
 
 
 def _pairs(values: dict[str, Any]) -> list[tuple[str, str]]:
-    return [("", ""), *((name.replace("_", " "), _shown(value)) for name, value in values.items())]
+    return [("", ""), *((_label(name), _shown(value)) for name, value in values.items())]
+
+
+def _label(name: str) -> str:
+    words = name.removesuffix("_s").replace("_", " ")
+    return f"{words} / s" if name.endswith("_s") else words
 
 
 def _shown(value: Any) -> str:

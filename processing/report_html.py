@@ -13,9 +13,10 @@ h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2.5rem; border-bot
 h3 { font-size: 1rem; margin-bottom: .3rem; }
 table { border-collapse: collapse; margin: .5rem 0; } td, th { padding: .15rem .8rem .15rem 0; text-align: left;
   vertical-align: top; font-variant-numeric: tabular-nums; } th { font-weight: 600; }
+.scroll { overflow-x: auto; }
 img { max-width: 100%; } .simulated { background: #7a0000; color: #fff; padding: .5rem 1rem; font-weight: 600; }
 .warning { background: #fff3cd; border-left: 4px solid #d39e00; padding: .4rem .8rem; margin: .3rem 0; }
-nav a { margin-right: 1rem; } details { margin: .3rem 0; } pre { white-space: pre-wrap; font-size: 13px; }
+nav a { display: block; } details { margin: .3rem 0; } pre { white-space: pre-wrap; font-size: 13px; }
 """
 
 
@@ -83,9 +84,9 @@ def _section(number: int, section: Section) -> list[str]:
 
 
 def _table(head: Sequence[Sequence[str]], rows: Sequence[Sequence[str]]) -> str:
-    lines = ["<table>"]
+    lines = ['<div class="scroll"><table>']
     for row in head:
         if any(row):
             lines.append("<tr>" + "".join(f"<th>{escape(c)}</th>" for c in row) + "</tr>")
     lines += ["<tr>" + "".join(f"<td>{escape(c)}</td>" for c in row) + "</tr>" for row in rows]
-    return "".join([*lines, "</table>"])
+    return "".join([*lines, "</table></div>"])

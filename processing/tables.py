@@ -186,6 +186,15 @@ class ScatteringTable:
         return table
 
 
+def is_table(path: Path | str) -> bool:
+    """Whether a file is a table that `ScatteringTable.save` wrote."""
+    try:
+        with h5py.File(path, "r") as h5:
+            return "umov_table" in h5.attrs
+    except OSError:
+        return False
+
+
 def _kind(simulated: bool) -> str:
     return "simulated" if simulated else "measured"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -64,9 +65,11 @@ def campaign_command(
 
 COLUMNS = (
     ("psi_deg", "psi/deg"),
+    ("psi_noise_deg", "its noise"),
     ("magnitude_percent", "|D|/%"),
+    ("magnitude_noise_percent", "its noise"),
     ("xi0_percent", "xi0/%"),
-    ("xi0_noise_percent", "noise of xi0/%"),
+    ("xi0_noise_percent", "its noise"),
     ("common", "common"),
     ("eigenvalue_deviation", "eigenvalues"),
 )
@@ -76,16 +79,24 @@ def lines(result: CampaignResult) -> list[str]:
     """The table for people: a block a wavelength, its averages, and the paper's."""
     from processing.campaign import PAPER
 
-    out = []
+    def row(head: str, values: Sequence[float | None]) -> str:
+        cells = [f"{'' if v is None else '-' if v != v else f'{v:.3f}':>11}" for v in values]
+        return f"  {head:>5} {' '.join(cells)}".rstrip()
+
+    out = ["RMSD, and the part of it that the noise of the captures makes (first order)"]
     for nm in sorted({r.wavelength_nm for r in result.rows}):
-        out.append(f"{nm:g} nm   RMSD against Omega")
-        out.append("  Omega " + " ".join(f"{label:>15}" for _, label in COLUMNS))
+        out.append(f"{nm:g} nm")
+        out.append("  Omega " + " ".join(f"{label:>11}" for _, label in COLUMNS))
         for r in (r for r in result.rows if r.wavelength_nm == nm):
-            out.append(f"  {r.omega_deg:5g} " + " ".join(f"{getattr(r, name):15.3f}" for name, _ in COLUMNS))
-        out.append("   mean " + " ".join(f"{result.average(nm, name):15.3f}" for name, _ in COLUMNS))
+            out.append(row(f"{r.omega_deg:g}", [getattr(r, name) for name, _ in COLUMNS]))
+        out.append(row("mean", [result.average(nm, name) for name, _ in COLUMNS]))
         if round(nm) in PAPER:
             p = PAPER[round(nm)]
-            out.append(f"  paper {p.psi_deg:15.2f} {p.magnitude_percent:15.2f} {p.xi0_percent:15.2f}")
+            out.append(row("paper", [p.psi_deg, None, p.magnitude_percent, None, p.xi0_percent]))
+    out.append(
+        "common: part of the virtual sphere where both instruments have a value; eigenvalues: 99th percentile of "
+        "the largest deviation of xi1..xi3 from their mean, noise included; -: no capture for it"
+    )
     return out
 
 

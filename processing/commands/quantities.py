@@ -24,9 +24,7 @@ def quantities_command(
     also: Annotated[list[str] | None, typer.Option(help="More decompositions: symmetric, differential.")] = None,
     pair: Annotated[
         list[str] | None,
-        typer.Option(
-            help="GENERATOR,ANALYZER: light between two polarizers, e.g. 45,right. Default: the paper's three."
-        ),
+        typer.Option(help="GENERATOR,ANALYZER: light between two polarizers, e.g. 45,right, beside the paper's three."),
     ] = None,
     instrument: Annotated[Path | None, typer.Option(help="Instrument file, where a capture is reduced here.")] = None,
     out: Annotated[Path | None, typer.Option(help="Product file; default: beside the source.")] = None,
@@ -42,7 +40,7 @@ def quantities_command(
     from processing.quantities import PAPER_PAIRS
     from processing.quantities_image import quantities_of_mueller
 
-    pairs = dict(_pair(text) for text in pair) if pair else PAPER_PAIRS
+    pairs = {**PAPER_PAIRS, **dict(_pair(text) for text in pair or ())}
     product = reduced(source, instrument)
     target = out or product.with_name(product.name.removesuffix(".h5").rsplit(".", 1)[0] + ".quantities.h5")
     step = Step("quantities", {"source": product.name, "also": also, "pairs": pairs}, (file_identity(product),))

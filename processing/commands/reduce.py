@@ -54,6 +54,10 @@ def reduce_command(
     draw(product, figure, no_figure)
 
 
+#: Endings of the names of facts that are standard errors of other facts.
+ERRORS = ("_error", "_stderr")
+
+
 @dataclass(frozen=True)
 class ReduceOptions:
     """What `process reduce` was asked for; all of it goes into the provenance."""
@@ -155,12 +159,30 @@ def summary(product: Path, facts: dict[str, Any], simulated: bool) -> None:
     if simulated:
         typer.echo("SIMULATED data")
     for name, value in facts.items():
-        if name not in ("warnings", "masked"):
-            shown = f"{value:.5g}" if isinstance(value, float) else str(value)
-            typer.echo(f"  {name.replace('_', ' ')}: {shown}")
+        if name not in ("warnings", "masked") and not name.endswith(ERRORS):
+            typer.echo(f"  {name.replace('_', ' ')}: {_shown(value)}{_with_error(name, facts)}")
     for warning in facts["warnings"]:
         typer.echo(f"warning: {warning}", err=True)
     typer.echo(str(product))
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if value is None or value != value:
+        return "none"
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
+
+
+def _with_error(name: str, facts: dict[str, Any]) -> str:
+    """Standard error of a fact, in the same line: of one pixel for a median over pixels, else of the number."""
+    base = name.removesuffix("_e_per_count").removesuffix("_e")
+    for ending in ERRORS:
+        error = facts.get(f"{name}{ending}", facts.get(f"{base}{ending}"))
+        if error is not None:
+            text = "unknown" if error != error else f"{error:.2g}"
+            return f" (standard error of a pixel {text})" if name.startswith("median") else f" +- {text}"
+    return ""
 
 
 def _newer(product: Path, source: Path) -> bool:

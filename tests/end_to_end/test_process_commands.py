@@ -249,7 +249,8 @@ def test_noise_options_of_reduce(measured: Measured, tmp_path: Path, instrument:
     extra = ["--weighted", "--covariance", "--physical", "likelihood"]
     code, out, err = process("reduce", capture, *extra)
     assert (code, err) == (0, "")
-    assert "weighted: True" in out
+    assert "weighted: yes" in out
+    assert "physical estimate: likelihood" in out
     with Product(tmp_path / "states.mueller.h5") as product:
         assert {"mueller", "mueller_physical", "mueller_covariance"} <= set(product.names)
         assert product.steps[0].arguments["weighted"] is True

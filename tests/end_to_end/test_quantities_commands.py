@@ -100,7 +100,7 @@ def test_pairs_and_refusals(process: Run, capture: Path, tmp_path: Path) -> None
     assert code == 0, err
     with Product(out) as product:
         assert "45_to_right" in product.names
-        assert "crossed_linear" not in product.names
+        assert "crossed_linear" in product.names
     assert process("quantities", capture, "--out", out)[0] == 2
     for option, value, message in [
         ("--pair", "up,down", "give GENERATOR,ANALYZER"),
