@@ -57,7 +57,9 @@ def find_exposure(
     """
     camera = rig.require_camera()
     black = rig.config.detector.black_level_counts
-    low_s, high_s = rig.config.exposure_s[0], min(rig.config.exposure_s[1], auto.longest_s)
+    # The table holds the start times the factors of the bracket: all of them must fit the rig.
+    least, most = float(table.exposure_s.min()) / auto.start_s, float(table.exposure_s.max()) / auto.start_s
+    low_s, high_s = rig.config.exposure_s[0] / least, min(rig.config.exposure_s[1] / most, auto.longest_s)
     span = camera.full_scale - black
     exposure_s = min(max(auto.start_s, low_s), high_s)
     brightest = 0.0

@@ -190,6 +190,17 @@ def test_exposure_is_found_for_each_geometry(acquire, small_rig, campaign, tmp_p
     assert len(set(exposures.values())) == 3
 
 
+def test_found_exposure_leaves_room_for_the_bracket(acquire, small_rig, tmp_path):
+    plan = tmp_path / "plan.yaml"
+    plan.write_text("kind: plan\nexposure_s: {kind: auto}\nbracket: [1, 8]\ndarks: 1\n")
+    rig = small_rig(top={"exposure_s": [1e-5, 0.08]}, flux_e_per_s=2e5)
+    code, _, err = acquire("--plan", plan, "--rig", rig, "--out", tmp_path)
+    assert code == 0, err
+    assert "the longest allowed" in err
+    with Capture(next(tmp_path.glob("*.h5"))) as capture:
+        np.testing.assert_allclose(np.unique(capture.column("exposure_s")), [0.01, 0.08])
+
+
 def test_a_state_that_saturates_begins_the_capture_again(acquire, small_rig, tmp_path):
     # A lamp so unsteady that some state is much brighter than those probed.
     effects = [{"kind": "source_flicker", "sigma": 0.2}]
