@@ -22,6 +22,9 @@ def run(app: typer.Typer, argv: Sequence[str] | None = None) -> None:
     except ProcessError as error:
         typer.echo(f"error: {error}", err=True)
         sys.exit(error.exit_code)
+    except FileNotFoundError as error:
+        typer.echo(f"error: {error.filename}: no such file or folder", err=True)
+        sys.exit(2)
     except OSError as error:
         typer.echo(f"error: {error}", err=True)
         sys.exit(1)

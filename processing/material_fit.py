@@ -8,7 +8,7 @@ coefficients of each pixel are projected out, with alpha_0 >= 0: a negative corr
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,6 +56,21 @@ class MaterialFit:
     def stderr(self) -> FloatArray:
         """(4,), standard errors."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def notes(self, sources: Sequence[str]) -> list[str]:
+        """Lines for the material file: where the constants come from, their errors and correlations."""
+        errors = ", ".join(f"{name} {error:.2g}" for name, error in zip(NAMES, self.stderr, strict=True))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            correlation = self.covariance / np.outer(self.stderr, self.stderr)
+        pairs = [(i, j) for i in range(4) for j in range(i + 1, 4) if np.isfinite(correlation[i, j])]
+        between = ", ".join(f"{NAMES[i]} {NAMES[j]} {correlation[i, j]:+.2f}" for i, j in pairs)
+        lost = ", ".join(name for name in NAMES if not self.identified[name])
+        return [
+            f"fitted to {', '.join(sources)}: {self.pixels} pixels, condition number {self.condition:.3g}",
+            f"standard errors: {errors} (noise and misfit, not errors of the geometry)",
+            f"correlations: {between or 'not known'}",
+            *([f"NOT IDENTIFIED by these data: {lost}"] if lost else []),
+        ]
 
     def model(self, name: str, wavelength_nm: float) -> polarized_diffuse.Model:
         """The fitted reflectance model."""

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from processing.campaign import PAPER, CampaignResult
+from processing.geometry.viewing import ViewingGeometry
 from processing.stokes_design import Prediction
+from processing.tables import ScatteringTable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -47,6 +49,31 @@ def campaign_figure(result: CampaignResult, title: str) -> Figure:
         panel.legend(fontsize=8)
     figure.suptitle(f"SIMULATED   {title}" if result.simulated else title, fontsize=11)
     return figure
+
+
+def tables_figure(
+    reference: ScatteringTable, other: ScatteringTable, view: ViewingGeometry, omega_deg: float, shape: tuple[int, int]
+) -> Figure:
+    """xi0 of two tables on a virtual object, and their difference."""
+    from processing.figures import grid_figure
+
+    image = view.at(omega_deg, *shape)
+    a, b = (image.fill(t.lookup(image.points.angles)[0]) for t in (reference, other))
+    finite = np.concatenate([v[np.isfinite(v)] for v in (a, b)])
+    top = float(np.percentile(finite, 99.5)) if finite.size else 1.0
+    spread = np.abs(b - a)[np.isfinite(b - a)]
+    limit = max(float(np.percentile(spread, 99)), 1e-6) if spread.size else 1.0
+    both = {"vmin": 0.25, "vmax": top}
+    return grid_figure(
+        [
+            ("$\\xi_0$, reference", a, both),
+            ("$\\xi_0$, other", b, both),
+            ("other - reference", b - a, {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}),
+        ],
+        f"virtual object, {reference.wavelength_nm:g} nm, $\\Omega$ = {omega_deg:g} degrees",
+        reference.simulated,
+        columns=3,
+    )
 
 
 def stokes_design_figure(predictions: Mapping[float, Sequence[Prediction]]) -> Figure:

@@ -26,7 +26,7 @@ def tabulate(
     """Add the images of products to a table; a new one is made if none is given.
 
     Mueller matrices are turned into the renderer's axes pixel by pixel, so that pixels of one bin are alike.
-    xi0 products add their valid pixels.
+    xi0 products add their valid pixels, with the variance of each, so that tables can be compared with their noise.
 
     Raises
     ------
@@ -40,7 +40,7 @@ def tabulate(
             if header.omega_deg is None:
                 raise ProcessError(f"{source}: the capture does not say its arm angle; it belongs to no bin.")
             if table is None:
-                names, frames = (MUELLER, "renderer") if kind == "mueller" else (("xi0",), "")
+                names, frames = (MUELLER, "renderer") if kind == "mueller" else (("xi0", "xi0_variance"), "")
                 table = ScatteringTable(names, header.wavelength_nm, layout, simulated, frames)
             if abs(table.wavelength_nm - header.wavelength_nm) > 0.5:
                 raise ProcessError(
@@ -55,8 +55,9 @@ def tabulate(
                     m = np.moveaxis(product.get("mueller", rows), (0, 1), (-2, -1))[image.mask]
                     values = to_renderer_frames(m, image.points).reshape(-1, 16).T
                 else:
-                    xi0 = np.where(product.get("valid", rows) > 0, product.get("xi0", rows), np.nan)
-                    values = xi0[image.mask][None]
+                    valid = product.get("valid", rows)[image.mask] > 0
+                    xi0, error = (product.get(name, rows)[image.mask] for name in ("xi0", "xi0_errors"))
+                    values = np.where(valid, np.stack([xi0, np.nan_to_num(error) ** 2]), np.nan)
                 table.add(image.points.angles, values, simulated)
         if progress:
             progress(done, len(sources))

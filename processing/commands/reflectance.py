@@ -74,7 +74,10 @@ def fit_material_command(
     typer.echo(f"  residual over polarized signal: {100 * fit.residual:.2f} %")
     if fit.correlation == fit.correlation:
         typer.echo(f"  mean linear correlation: {fit.correlation:.4f}")
-    out.write_text(dump_yaml(fit.model(name, nm)), encoding="utf-8")
+    notes = fit.notes([p.name for p in sources])
+    typer.echo("\n".join(f"  {note}" for note in notes[2:]))
+    header = "".join(f"# {note}\n" for note in notes)
+    out.write_text(header + dump_yaml(fit.model(name, nm)), encoding="utf-8")
     typer.echo(str(out))
 
 

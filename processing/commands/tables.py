@@ -11,6 +11,7 @@ import typer
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
     app.command("table")(table_command)
+    app.command("compare-tables")(compare_command)
     app.command("export-pbsdf")(export_command)
     app.command("import-pbsdf")(import_command)
 
@@ -39,6 +40,50 @@ def table_command(
     typer.echo(f"  {', '.join(table.quantities[:4])}{' ...' if len(table.quantities) > 4 else ''}")
     typer.echo(f"  bins filled: {table.bins.size} of {91 * 91 * 360}, samples: {int(table.count.sum())}")
     typer.echo(str(out))
+
+
+def compare_command(
+    reference: Annotated[Path, typer.Argument(help="Table of xi0 (`process table`, or of a campaign).")],
+    other: Annotated[Path, typer.Argument(help="Table of xi0 to compare with it, of the same wavelength.")],
+    geometry: Annotated[Path, typer.Option(help="Geometry file of the virtual object and its camera.")],
+    omega: Annotated[str, typer.Option(help="Arm angles in degrees, separated by commas.")] = "35",
+    size: Annotated[int, typer.Option(min=16, help="Rows and columns of the virtual image.")] = 600,
+    figure: Annotated[Path, typer.Option(help="Figure of the first angle (PNG).")] = Path("compare_tables.png"),
+) -> None:
+    """Evaluate two tables of xi0 on a virtual object and compare them, as in the paper's Sec. V-B."""
+    from processing.campaign import compare_on_sphere
+    from processing.errors import ProcessError
+    from processing.geometry.viewing import ViewingGeometry
+    from processing.reflectance_figures import tables_figure
+    from processing.tables import ScatteringTable
+
+    tables = [ScatteringTable.load(p) for p in (reference, other)]
+    for path, table in zip((reference, other), tables, strict=True):
+        if table.quantities[:2] != ("xi0", "xi0_variance"):
+            raise ProcessError(f"{path} holds {', '.join(table.quantities[:3])}; give tables of xi0 products.")
+    a, b = tables
+    if abs(a.wavelength_nm - b.wavelength_nm) > 0.5:
+        raise ProcessError(f"{reference} is at {a.wavelength_nm:g} nm and {other} at {b.wavelength_nm:g} nm.")
+    if a.simulated != b.simulated:
+        raise ProcessError("one table is simulated and the other measured; they are never compared.")
+    try:
+        angles = [float(text) for text in omega.split(",")]
+    except ValueError as error:
+        raise ProcessError(f"--omega {omega!r}: give numbers in degrees, e.g. 20,35,50") from error
+    view = ViewingGeometry.load(geometry)
+    if a.simulated:
+        typer.echo("SIMULATED data")
+    typer.echo(f"{a.wavelength_nm:g} nm, RMSD of xi0 on the virtual object, and what noise alone makes of it")
+    typer.echo("  Omega     xi0/%  its noise    common")
+    for angle in angles:
+        found = compare_on_sphere(a, b, view, angle, (size, size))
+        if not found["common"]:
+            typer.echo(f"  {angle:5g}  no direction in which both tables have a value")
+            continue
+        xi0, noise = found["xi0_percent"], found["xi0_noise_percent"]
+        typer.echo(f"  {angle:5g} {xi0:9.3f} {noise:10.3f} {found['common']:9.3f}")
+    tables_figure(a, b, view, angles[0], (size, size)).savefig(figure, dpi=150)
+    typer.echo(str(figure))
 
 
 def export_command(

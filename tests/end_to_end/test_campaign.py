@@ -91,6 +91,36 @@ def test_campaign_of_a_true_model_has_small_deviations(folder, configs, process)
     assert (folder / "campaign/campaign.png").stat().st_size > 10_000
 
 
+def test_tables_compared_by_hand_give_the_campaigns_number(here, configs, process, tmp_path):
+    tables = [here.tables[kind, 662.0] for kind in ("mueller", "stokes")]
+    rest = ["--geometry", configs / "geometries/one_inch_sphere.yaml", "--figure", tmp_path / "f.png"]
+    code, out, err = process("compare-tables", *tables, *rest, "--omega", "35,60", "--size", 180)
+    assert code == 0, err
+    for row in here.rows:
+        line = next(text for text in out.splitlines() if text.strip().startswith(f"{row.omega_deg:g} "))
+        assert [float(v) for v in line.split()[1:]] == pytest.approx(
+            [row.xi0_percent, row.xi0_noise_percent, row.common], abs=6e-4
+        )
+    assert (tmp_path / "f.png").stat().st_size > 10_000
+    code, _, err = process("compare-tables", *tables, *rest, "--omega", "x")
+    assert (code, "give numbers in degrees" in err) == (2, True)
+
+
+def test_report_of_a_campaign_shows_its_tables_and_eigenvalues(folder, here, process, tmp_path):
+    results = here.tables["mueller", 662.0].parent
+    code, _, err = process("report", results, "--out", tmp_path / "r.html")
+    assert code == 0, err
+    text = (tmp_path / "r.html").read_text()
+    assert "table over theta_h, theta_d, phi_d, simulated" in text
+    assert "coherency eigenvalues, xi0 and its error" in text
+
+
+def test_noise_of_psi_and_magnitude_explains_no_more_than_there_is(here):
+    for row in here.rows:
+        assert 0 < row.psi_noise_deg < 1.1 * row.psi_deg
+        assert 0 < row.magnitude_noise_percent < 1.1 * row.magnitude_percent
+
+
 def test_workers_give_the_same_numbers(folder, here, configs, tmp_path):
     files = configs / "geometries/one_inch_sphere.yaml", configs / "materials/red_print.yaml"
     task = CaptureTask(str(folder / "drr_35.h5"), "mueller", str(tmp_path), *map(str, files), BORDER_PX)
