@@ -9,6 +9,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 
+from drivers.agreeing import AgreeingReadings
 from drivers.axis_types import AxisConfig, AxisIdentity, Limits, Position
 from drivers.errors import (
     CommandRejected,
@@ -178,6 +179,7 @@ class MotionAxis(ABC):
         self._stops = 0
         self._closed = False
         self._start_lock = threading.Lock()
+        self._readings = AgreeingReadings()
         # Set by the driver's open(), from what the controller reports.
         self.counts_per_deg: float = 1.0
         self.speed_deg_s: float = math.nan
@@ -230,7 +232,7 @@ class MotionAxis(ABC):
         return distance / v + v / a
 
     def read_position(self) -> Position:
-        """Read the position; at rest, two readings in a row must agree.
+        """Read the position; at rest, readings in a row must agree.
 
         Most protocols have no checksum, so a changed digit looks like a position; Zaber's has eight bits.
 
@@ -245,23 +247,8 @@ class MotionAxis(ABC):
     def _read_confirmed(self) -> tuple[int | float, bool]:
         """Return the counts, and False if they are those of an axis in motion."""
         tolerance = self.config.tolerance_deg * abs(self.counts_per_deg)
-        seen, moving = [self._do_read_counts()], 0
-        while len(seen) < 6:
-            seen.append(self._do_read_counts())
-            if seen[-1] == seen[-2]:
-                return seen[-1], True
-            # A servo trembles within the tolerance, and so can a changed last digit: the middle of three is right.
-            middle = sorted(seen[-3:])[1]
-            if len(seen) >= 3 and max(seen[-3:]) - min(seen[-3:]) <= tolerance:
-                return middle, True
-            # In motion readings differ. One reply that says "moving" may itself be the disturbed one.
-            moving = moving + 1 if self._do_is_moving() else 0
-            if moving == 3:
-                return middle, False
-        raise ReplyError(
-            f"axis {self.name}, read position",
-            f"readings at rest that contradict each other: {seen}",
-            "The line is disturbed: check cable, grounding and baud rate",
+        return self._readings.read(
+            f"axis {self.name}, read position", self._do_read_counts, self._do_is_moving, tolerance
         )
 
     def is_homed(self) -> bool:

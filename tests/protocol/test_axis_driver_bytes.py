@@ -199,8 +199,8 @@ def test_esp301_bytes() -> None:
 
 
 def test_readings_that_disagree_are_no_position() -> None:
-    answers = iter(range(10, 100, 10))
-    pairs = [(b"1TP\r\n", f"1TP{next(answers)}.00000\r\n".encode()) for _ in range(6)]
+    answers = iter(range(10, 190, 10))
+    pairs = [(b"1TP\r\n", f"1TP{next(answers)}.00000\r\n".encode()) for _ in range(18)]
     steps: list[tuple[bytes, bytes]] = [pairs[0]]
     for pair in pairs[1:]:
         steps += [pair, (b"1TS\r\n", b"1TS000033\r\n")]

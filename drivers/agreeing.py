@@ -1,0 +1,79 @@
+"""A number read over a line without checksum: readings have to agree before one is believed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from drivers.errors import ReplyError
+
+# On a line that changed something this short a time ago, two garbled replies may well be alike.
+_MEMORY_S = 60.0
+_CALM, _DISTURBED = 2, 4
+_TRIES = 6
+
+
+class AgreeingReadings:
+    """Reads a position until readings agree: two in a row on a calm line, four on one that was disturbed lately.
+
+    A dropped digit looks like a position, and at one byte in ten the same digit is dropped twice in a thousand
+    readings.
+    """
+
+    def __init__(self) -> None:
+        self._disturbed_s = -float("inf")
+
+    def read(
+        self, asked: str, read: Callable[[], float], is_moving: Callable[[], bool], tolerance: float
+    ) -> tuple[float, bool]:
+        """Return the number, and False if it is that of an axis in motion.
+
+        Parameters
+        ----------
+        asked : str
+            What is read, for the error.
+        read, is_moving : callable
+            Ask the device.
+        tolerance : float
+            By how much readings of a servo at rest may tremble.
+
+        Raises
+        ------
+        ReplyError
+            Readings at rest contradict each other.
+        """
+        try:
+            return self._read(asked, read, is_moving, tolerance)
+        except ReplyError:
+            self._disturbed_s = time.monotonic()
+            raise
+
+    def _read(
+        self, asked: str, read: Callable[[], float], is_moving: Callable[[], bool], tolerance: float
+    ) -> tuple[float, bool]:
+        disturbed = time.monotonic() - self._disturbed_s < _MEMORY_S
+        alike = _DISTURBED if disturbed else _CALM
+        seen, moving = [read()], 0
+        while len(seen) < _TRIES * (alike - 1):
+            seen.append(read())
+            if len(seen) >= alike and len(set(seen[-alike:])) == 1:
+                return seen[-1], True
+            if seen[-1] == seen[-2]:
+                continue
+            # A servo trembles within the tolerance, and so can a changed last digit: the middle is right.
+            window = sorted(seen[-2 * alike + 1 :])
+            middle = window[len(window) // 2]
+            if len(window) == 2 * alike - 1 and window[-1] - window[0] <= tolerance:
+                return middle, True
+            # In motion readings differ. One reply that says "moving" may itself be the disturbed one.
+            moving = moving + 1 if is_moving() else 0
+            if moving == 3:
+                return middle, False
+            if moving == 0 and abs(seen[-1] - seen[-2]) > tolerance:
+                self._disturbed_s = time.monotonic()
+                alike = _DISTURBED
+        raise ReplyError(
+            asked,
+            f"readings at rest that contradict each other: {seen}",
+            "The line is disturbed: check cable, grounding and baud rate",
+        )
