@@ -35,7 +35,8 @@ class ReflectanceChanges:
 
     What only an object in front of a camera has (`processing.diagnosis.surface_view`):
     centre_mm, scale : the sphere stands off its place by (x, y), and is larger by this part of its radius.
-    support : irradiance by depolarized light from below over that by the source.
+    support : irradiance of the object's middle by depolarized light from a disc below over that by the source.
+    support_rad, support_log_depth : the disc's half angle is larger by this, and its depth by this factor (its log).
     """
 
     diffuse_a: float = 0.0
@@ -50,6 +51,8 @@ class ReflectanceChanges:
     centre_mm: tuple[float, float] = (0.0, 0.0)
     scale: float = 0.0
     support: float = 0.0
+    support_rad: float = 0.0
+    support_log_depth: float = 0.0
 
     def dominant(self, geometry: ScatteringGeometry, index: complex) -> Array:
         """Dominant process (N, 4, 4), element 00 equal to 1, in the axes that the geometry states."""

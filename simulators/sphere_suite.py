@@ -66,6 +66,12 @@ def drawn(kind: str, random: np.random.Generator, scene: Scene, instrument: Inst
     return replace(nothing, kind=kind, scene=_unlisted_scene(kind, random, scene))
 
 
+def first_surface_of(material: Any) -> first_surface.Model:
+    """The material without its diffuse term: what the paper's story starts with."""
+    plain = {nm: first_surface.Constants(n=c.n, k=c.k) for nm, c in material.constants.items()}
+    return first_surface.Model(name="first surface alone", constants=plain)
+
+
 def _with(kind: str, random: np.random.Generator, so_far: SphereFault) -> SphereFault:
     scene, instrument, truth = so_far.scene, so_far.instrument, dict[str, float]()
     if kind == "arm_zero":
@@ -87,8 +93,7 @@ def _with(kind: str, random: np.random.Generator, so_far: SphereFault) -> Sphere
         a, b = float(np.exp(random.uniform(np.log(0.02), np.log(0.3)))), random.uniform(1.5, 3.0)
         constants = so_far.material.constants
         true = {nm: c.model_copy(update={"a": a, "b": b}) for nm, c in constants.items()}
-        plain = {nm: first_surface.Constants(n=c.n, k=c.k) for nm, c in constants.items()}
-        believed = first_surface.Model(name="first surface alone", constants=plain)
+        believed = first_surface_of(so_far.material)
         surface = Scene(scene.spec, so_far.material.model_copy(update={"constants": true}))
         # Without a diffuse term the model's exponent stands at 2.
         return _added(so_far, kind, {"a": a, "log_b": float(np.log(b / 2))}, scene=surface, material=believed)

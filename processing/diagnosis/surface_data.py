@@ -34,6 +34,8 @@ DARK = 0.1
 #: Tiles along each side of the object, half of them held out in turn.
 TILES = 8
 FOLDS = 2
+#: Mean square of the modulated signal of a tile's pixels from which on they are used, in units of their noise.
+LEAST_MODULATION = 1.0
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,24 @@ class SurfaceData:
     wavelength_nm: float
     omega_deg: float
     clipped_fraction: float
+
+    def kept(self, pixels: NDArray[np.bool_]) -> SurfaceData:
+        """The same with some of the pixels alone."""
+        same = {name: getattr(self, name)[pixels] for name in ("y", "variance", "fold", "tile", "where")}
+        return replace(self, view=self.view.kept(pixels), **same)
+
+    def polarized(self, flat: Array) -> NDArray[np.bool_]:
+        """Pixels (P,) of the tiles whose light is modulated by more than the noise of a pixel.
+
+        The others have no say in the dominant process: what they add to a sum over pixels is noise. `flat` (L,) is what
+        depolarized light gives in each row. Nothing else is assumed of the sample.
+        """
+        sigma = np.sqrt(self.variance)
+        y, e = self.y / sigma, flat / sigma
+        e /= np.linalg.norm(e, axis=1, keepdims=True)
+        modulation = np.sum(y**2, axis=1) - np.sum(e * y, axis=1) ** 2 - (y.shape[1] - 1)
+        pixels = np.maximum(np.bincount(self.tile), 1)
+        return np.asarray((np.bincount(self.tile, modulation) / pixels > LEAST_MODULATION)[self.tile])
 
 
 def read_surface(

@@ -12,10 +12,10 @@ from pydantic import BaseModel, ConfigDict
 from processing.cloude import xi0_and_dominant
 from processing.deviation import linear_diattenuation, magnitude, orientation_difference, rmsd
 from processing.diagnosis.candidate import Candidate
-from processing.diagnosis.fit import Fit, prior
 from processing.diagnosis.problem import Space
 from processing.diagnosis.result import CaptureReport, Diagnosis, Error, FoundEffect, Ranked, Unexplained, Verdict
 from processing.diagnosis.search import CHANCE, Found, Say
+from processing.diagnosis.surface_errors import standard_errors
 from processing.diagnosis.surface_problem import SurfaceProblem
 from processing.diagnosis.surface_recommend import recommended
 from processing.diagnosis.surface_search import SurfaceSearch
@@ -104,7 +104,7 @@ def diagnose_surface(problem: SurfaceProblem, material: str, say: Say) -> Surfac
         error_before=_error(problem, found.before.rms, found.before.chi2_reduced),
         error_after=_error(problem, found.after.rms, found.after.chi2_reduced),
         noise_floor_percent=100 * noise_floor(problem),
-        effects=tuple(_effect(problem, search, found, c) for c in found.effects),
+        effects=_effects(problem, search, found),
         unobservable=_unobservable(found),
         recommendation=recommended(problem, found.space, found.fit, rivals, verdict, before)
         + (CONFIRM if found.effects and _degeneracy_in_doubt(problem, found) else ""),
@@ -186,16 +186,6 @@ def constants(problem: SurfaceProblem, space: Space, values: Array) -> dict[str,
     return {"n": index.real, "k": max(index.imag, 0.0), "a": view.a + surface.diffuse_a, "b": b}
 
 
-def covariance(problem: SurfaceProblem, space: Space, fit: Fit, spread: float) -> Array:
-    """Covariance (K, K) of the values: the noise of alpha_0 adds to the scatter of the gradient, not to the slope."""
-    weak = np.diag(prior(space))
-    raw = fit.sums.curvature.sum(axis=0) + weak
-    told = raw - problem.noise_information(space, fit.values)
-    lowest = np.linalg.eigvalsh(told).min() if space.size else 1.0
-    bread = np.linalg.inv(told if lowest > 0 else raw)
-    return np.asarray(bread @ raw @ bread * spread)
-
-
 def noise_floor(problem: SurfaceProblem) -> float:
     """Rms noise over the mean signal."""
     parts = [np.mean(c.variance) / np.mean(c.y) ** 2 for c in problem.captures]
@@ -232,27 +222,30 @@ def _error(problem: SurfaceProblem, rms: float, chi2: float) -> Error:
     return Error(rms_percent=100 * rms, chi2_reduced=chi2, held_out=problem.held_out)
 
 
-def _effect(problem: SurfaceProblem, search: SurfaceSearch, found: Found, candidate: Candidate) -> FoundEffect:
+def _effects(problem: SurfaceProblem, search: SurfaceSearch, found: Found) -> tuple[FoundEffect, ...]:
     spread = 1.0 + search.structure(found.after, found.space.size)
-    error = np.sqrt(np.maximum(np.diag(covariance(problem, found.space, found.fit, spread)), 0))
-    part = found.space.slices[found.space.candidates.index(candidate)]
-    parameters = {
-        p.name: EffectParameter(value=float(v), stderr=float(s), unit=p.unit)
-        for p, v, s in zip(candidate.parameters, found.fit.values[part], error[part], strict=True)
-    }
-    return FoundEffect(
-        kind=candidate.kind,
-        element=candidate.place or None,
-        parameters=parameters,
-        evidence=found.evidence.get(candidate, 0.0),
-        indistinguishable_from=(
-            *dict.fromkeys(c.short for c in found.sets.get(candidate, ())),
-            *((DEGENERACY,) if _degeneracy_in_doubt(problem, found) else ()),
-        ),
-        scope="instrument",
-        removal_chance=found.chance.get(candidate, 1.0),
-        confident=True,
-    )
+    error = standard_errors(problem, found.space, found.fit, spread)
+    doubt = (DEGENERACY,) if _degeneracy_in_doubt(problem, found) else ()
+    out = []
+    for candidate in found.effects:
+        part = found.space.slices[found.space.candidates.index(candidate)]
+        rivals = dict.fromkeys(c.short for c in found.sets.get(candidate, ()))
+        out.append(
+            FoundEffect(
+                kind=candidate.kind,
+                element=candidate.place or None,
+                parameters={
+                    p.name: EffectParameter(value=float(v), stderr=float(s), unit=p.unit)
+                    for p, v, s in zip(candidate.parameters, found.fit.values[part], error[part], strict=True)
+                },
+                evidence=found.evidence.get(candidate, 0.0),
+                indistinguishable_from=(*rivals, *doubt),
+                scope="instrument",
+                removal_chance=found.chance.get(candidate, 1.0),
+                confident=True,
+            )
+        )
+    return tuple(out)
 
 
 def _unobservable(found: Found) -> tuple[str, ...]:

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from processing.changes import Changes
 from processing.diagnosis.candidate import Candidate
 from processing.diagnosis.problem import Space, Sums
-from processing.diagnosis.surface_data import FOLDS, SurfaceData
+from processing.diagnosis.surface_data import FEWEST_PIXELS, FOLDS, SurfaceData
 from processing.effects._reflectance import ReflectanceEffect
 from processing.effects.base import Parameter, all_effects, apply_to
+from processing.errors import ProcessError
 from processing.instrument import InstrumentModel
 from processing.reflectance_changes import ReflectanceChanges
 
@@ -39,15 +40,21 @@ class Pixels:
     Attributes
     ----------
     e, f : (P, L) unit vectors that the two coefficients span; f is zero where the model modulates nothing.
-    residual : (P, L); alpha_0, alpha_id : (P,); strength : (P,) length of the second column.
+    hold : (P,) 0 to 1, how little the second coefficient is free: see `SurfaceProblem.pixels`.
+    residual, free : (P, L), and the part of each row's noise that is left in it.
+    alpha_0, alpha_id : (P,); strength : (P,) length of the second column.
+    most : (P,) the alpha_0 of a pixel whose light is m0's alone.
     """
 
     e: Array
     f: Array
+    hold: Array
     residual: Array
+    free: Array
     alpha_0: Array
     alpha_id: Array
     strength: Array
+    most: Array
     columns: Array
     flat: Array
     extra: Array
@@ -55,12 +62,8 @@ class Pixels:
     def outside(self, v: Array) -> Array:
         """What the two coefficients cannot take up of v (P, L)."""
         out = v - self.e * np.sum(self.e * v, axis=1, keepdims=True)
-        return np.asarray(out - self.f * np.sum(self.f * out, axis=1, keepdims=True))
-
-    @property
-    def free(self) -> Array:
-        """(P, L), part of each row's noise that is left in the residual."""
-        return np.asarray(1 - self.e**2 - self.f**2)
+        along = np.sum(self.f * out, axis=1) * (1 - np.sqrt(self.hold))
+        return np.asarray(out - self.f * along[:, None])
 
 
 class SurfaceProblem:
@@ -76,6 +79,8 @@ class SurfaceProblem:
     def __init__(self, model: InstrumentModel, captures: Sequence[SurfaceData]) -> None:
         self.model, self.captures = model, tuple(captures)
         self.shape = captures[0].view.view.shape.kind
+        self.captures = self._polarized()
+        captures = self.captures
         self.sigma: list[Array] = [np.sqrt(c.variance) for c in captures]
         # Weights from the fitted signals: from the noisy ones they would go with the noise.
         empty, none = Space(()), np.zeros(0)
@@ -85,6 +90,21 @@ class SurfaceProblem:
             c.view.learn_polarized(p.alpha_0, p.strength**2)
         self.sigma = [np.sqrt(c.slope * np.maximum(u, 0) + c.floor) for c, u in zip(self.captures, fitted, strict=True)]
         self.noise = [c.variance / s**2 for c, s in zip(self.captures, self.sigma, strict=True)]
+
+    def _polarized(self) -> tuple[SurfaceData, ...]:
+        """The captures with the pixels that can speak; those without enough of them are left out."""
+        out = []
+        for k, data in enumerate(self.captures):
+            w = self.rows(k, self.changes(k, Space(()), np.zeros(0))[0])
+            here = data.kept(data.polarized(w[:, 0]))
+            if len(here.y) >= FEWEST_PIXELS:
+                out.append(here)
+        if not out:
+            raise ProcessError(
+                "no polarization stands out of the noise of these captures, so they say nothing about the dominant "
+                "process. Take them with more light, more frames, or another polarization of the source."
+            )
+        return tuple(out)
 
     def nominal(self) -> tuple[Candidate, ...]:
         """Nothing is nominal."""
@@ -151,20 +171,44 @@ class SurfaceProblem:
         return columns, w[:, 0] / self.sigma[k], light
 
     def pixels(self, k: int, space: Space, values: Array) -> Pixels:
-        """Projection and residual of one capture."""
+        """Projection and residual of one capture.
+
+        Where the modelled light is hardly polarized, or p-polarized near the Brewster angle (traps 6 and 11), noise
+        would be met by any amount of alpha_0. So alpha_0 is q M with M the pixel's light, and q is within 1 of its mean
+        over the tile, as xi0 from 0 to 1 allows. Elsewhere, where the light is seen at all, this holds nothing.
+        """
         columns, flat, light = self._columns(k, space, values)
-        y = self.captures[k].y / self.sigma[k] - light
-        length = np.sqrt(np.sum(flat**2, axis=1, keepdims=True))
-        e = flat / length
+        data = self.captures[k]
+        y = data.y / self.sigma[k] - light
+        length = np.sqrt(np.sum(flat**2, axis=1))
+        e = flat / length[:, None]
         f = columns - e * np.sum(e * columns, axis=1, keepdims=True)
-        strength = np.sqrt(np.sum(f**2, axis=1, keepdims=True))
-        modulates = strength > LEAST_MODULATION * np.sqrt(np.sum(columns**2, axis=1, keepdims=True))
-        f = np.where(modulates, f / np.maximum(strength, 1e-300), 0.0)
+        strength = np.sqrt(np.sum(f**2, axis=1))
+        modulates = strength > LEAST_MODULATION * np.sqrt(np.sum(columns**2, axis=1))
+        f = np.where(modulates[:, None], f / np.maximum(strength, 1e-300)[:, None], 0.0)
         level, modulation = np.sum(e * y, axis=1), np.sum(f * y, axis=1)
-        alpha_0 = np.where(modulates[:, 0], modulation / np.maximum(strength[:, 0], 1e-300), 0.0)
-        alpha_id = (level - alpha_0 * np.sum(e * columns, axis=1)) / length[:, 0]
-        residual = y - e * level[:, None] - f * modulation[:, None]
-        return Pixels(e, f, residual, alpha_0, alpha_id, strength[:, 0], columns, flat, light)
+        # Mean of q over each tile, from the same weighted squares.
+        most = np.maximum(level, 0.0) / length
+        full = np.where(modulates, strength * most, 0.0)
+        hold, weight = _held(full, data.tile)
+        q = np.bincount(data.tile, hold * full * modulation)[data.tile] / weight
+        alpha_0 = hold * most * (full * modulation + q)
+        alpha_id = (level - alpha_0 * np.sum(e * columns, axis=1)) / length
+        along = modulation - np.sqrt(hold) * (modulation - full * q)
+        return Pixels(
+            e=e,
+            f=f,
+            hold=hold,
+            residual=y - e * level[:, None] - f * along[:, None],
+            free=1 - e**2 - f**2 * (1 - _left(full, data.tile))[:, None],
+            alpha_0=alpha_0,
+            alpha_id=alpha_id,
+            strength=strength,
+            most=most,
+            columns=columns,
+            flat=flat,
+            extra=light,
+        )
 
     def relinearize(self, space: Space, values: Array) -> bool:
         """Nothing is expanded here."""
@@ -187,24 +231,30 @@ class SurfaceProblem:
             np.add.at(out.count, data.fold, here.free.sum(axis=1))
             if not derivatives or not space.size:
                 continue
-            d = self.derivatives(k, space, values, here)
+            d, less = self.derivatives(k, space, values, here)
             for fold in range(self.folds):
                 mine = d[:, data.fold == fold].reshape(space.size, -1)
                 out.gradient[fold] += mine @ here.residual[data.fold == fold].reshape(-1)
+                out.gradient[fold] -= less[:, data.fold == fold].sum(axis=1) / 2
                 out.curvature[fold] += mine @ mine.T
         return out
 
-    def derivatives(self, k: int, space: Space, values: Array, here: Pixels) -> Array:
-        """Derivative (K, P, L) of the residual by every value."""
-        d = np.empty((space.size, *here.residual.shape))
-        typical = space.joined("typical")
+    def derivatives(self, k: int, space: Space, values: Array, here: Pixels) -> tuple[Array, Array]:
+        """Derivatives (K, P, L) of the residual by every value, and (K, P) of the noise that is expected in it."""
+        d, less = np.empty((space.size, *here.residual.shape)), np.empty((space.size, len(here.most)))
+        typical, tile = space.joined("typical"), self.captures[k].tile
+        before, noise = _left(here.strength * here.most, tile), self.noise[k].mean(axis=1)
         for j in range(space.size):
-            moved = values.copy()
-            moved[j] += STEP * typical[j]
+            moved, step = values.copy(), STEP * typical[j]
+            moved[j] += step
             columns, flat, light = self._columns(k, space, moved)
             change = (columns - here.columns) * here.alpha_0[:, None] + (flat - here.flat) * here.alpha_id[:, None]
-            d[j] = -here.outside(change + light - here.extra) / (STEP * typical[j])
-        return d
+            d[j] = -here.outside(change + light - here.extra) / step
+            strength = np.sqrt(
+                np.sum((columns - here.e * np.sum(here.e * columns, axis=1, keepdims=True)) ** 2, axis=1)
+            )
+            less[j] = noise * (_left(strength * here.most, tile) - before) / step
+        return d, less
 
     def noise_information(self, space: Space, values: Array) -> Array:
         """Part (K, K) of the curvature that comes from the noise of alpha_0 and tells nothing about the values."""
@@ -218,7 +268,20 @@ class SurfaceProblem:
                 moved[j] += STEP * typical[j]
                 columns, _, _ = self._columns(k, space, moved)
                 d[j] = here.outside(columns - here.columns) / (STEP * typical[j])
-            d /= np.where(here.strength > 0, here.strength, np.inf)[:, None]
+            free = (1 - here.hold) / np.where(here.strength > 0, here.strength, np.inf)
+            d *= free[:, None]
             flat = d.reshape(space.size, -1)
             out += flat @ flat.T
         return out
+
+
+def _held(full: Array, tile: NDArray[np.int64]) -> tuple[Array, Array]:
+    """How little q is free at pixels (P,), and the weight behind its mean over the tile (P,)."""
+    hold = 1 / (1 + full**2)
+    return hold, np.asarray(np.bincount(tile, hold * full**2)[tile] + 1e-300)
+
+
+def _left(full: Array, tile: NDArray[np.int64]) -> Array:
+    """Part (P,) of the noise along the second column that is left over once q and its mean are fitted."""
+    hold, weight = _held(full, tile)
+    return np.asarray(hold * (1 - hold * full**2 / weight))

@@ -59,7 +59,7 @@ def _apart(problem: SurfaceProblem, space: Space, fit: Fit, rivals: Sequence[Can
         parts = []
         for k in range(len(problem.captures)):
             here = problem.pixels(k, Space(()), np.zeros(0))
-            parts.append(problem.derivatives(k, alone, np.zeros(alone.size), here).reshape(alone.size, -1))
+            parts.append(problem.derivatives(k, alone, np.zeros(alone.size), here)[0].reshape(alone.size, -1))
         signatures.append(np.concatenate(parts, axis=1).T)
     smallest = 1.0
     for i, first in enumerate(signatures):

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from processing.diagnosis.candidate import Candidate
-from processing.diagnosis.fit import Fit, HeldOut
+from processing.diagnosis.fit import LEAST_GAIN, Fit, HeldOut, held_out, minimize
 from processing.diagnosis.problem import Space
-from processing.diagnosis.search import Search, Trial
+from processing.diagnosis.search import Found, Search, Trial
 from processing.effects._reflectance import ReflectanceEffect
 
 #: Every effect of the pool is fitted, not only those that promise most: the model is far from linear in them.
@@ -16,6 +16,8 @@ LEADERS = 12
 #: nearly any smooth pattern over an object.
 LEAST_SHARE = 0.3
 PROMISE = 0.2
+#: Steps, in typical sizes, from which a minimum is looked for once more.
+NEAR = 1.0
 #: Standard deviations of the noise up to which a total excess is no structure: the noise is known to some percent only.
 NO_STRUCTURE = 4.0
 
@@ -24,6 +26,20 @@ class SurfaceSearch(Search):
     """The search in one `SurfaceProblem`."""
 
     _start: float | None = None
+
+    def run(self) -> Found:
+        """Search; then look for a deeper minimum near the one that was found."""
+        found = super().run()
+        typical, fit = found.space.joined("typical"), found.fit
+        for k in range(found.space.size):
+            for sign in (NEAR, -NEAR):
+                start = found.fit.values.copy()
+                start[k] += sign * typical[k]
+                tried = minimize(self.problem, found.space, start, steps=8)
+                fit = tried if tried.excess < fit.excess - LEAST_GAIN else fit
+        if fit is not found.fit:
+            found.fit, found.after = fit, held_out(self.problem, found.space, fit)
+        return found
 
     def _trials(
         self,

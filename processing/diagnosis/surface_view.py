@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from copy import copy
+from dataclasses import astuple, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, Delaunay
 
 from processing import mueller
 from processing.errors import ProcessError
@@ -19,8 +21,13 @@ from processing.reflectance_changes import ReflectanceChanges
 
 Array = NDArray[np.float64]
 
-#: Direction from the object to its support; just off the vertical, where the axes of a beam have no direction.
-SUPPORT: Array = unit([0.0, -1.0, 1e-3])
+#: The support: a level disc, cut into parts, that the object's middle sees in this half angle, this many times the
+#: object's half width below it.
+SUPPORT_PARTS, SUPPORT_DEG, SUPPORT_DEPTH = 16, 35.0, 2.0
+#: It is computed at one in so many pixels of a sphere.
+EVERY = 13
+#: Patterns of its light that are kept; a fit changes one value at a time.
+KEPT = 8
 #: Steps of theta_h in which the polarized light of a surface is learnt from its own pixels.
 BINS = 16
 
@@ -52,6 +59,15 @@ class SurfaceView:
         # What is not a sphere stands as its file says; an error of the arm moves the source alone.
         _, self.points, self.normal = view.shape.intersect(self.eye, self.rays, omega_deg)
         self._theta_h, self._alpha_0 = np.zeros(1), np.zeros(1)
+        self._below: dict[tuple[object, ...], Array] = {}
+        self._between: Between | None = None
+
+    def kept(self, pixels: NDArray[np.bool_]) -> SurfaceView:
+        """The same with some of the pixels alone."""
+        out = copy(self)
+        out.rays, out.points, out.normal = self.rays[pixels], self.points[pixels], self.normal[pixels]
+        out._below, out._between = {}, None
+        return out
 
     def geometry(self, changes: ReflectanceChanges) -> ScatteringGeometry:
         """Directions at the pixels, for the sphere and the source where the changes put them."""
@@ -81,24 +97,89 @@ class SurfaceView:
         return replace(changes, diffuse_a=changes.diffuse_a + self.a, diffuse_log_b=log_b, arm_rad=0.0)
 
     def learn_polarized(self, alpha_0: Array, weight: Array) -> None:
-        """Take from the pixels how much polarized light (P,) the surface sends back, as a function of theta_h."""
-        theta = self.geometry(ReflectanceChanges()).angles.theta_h
+        """Take from the pixels the polarized light (P,) that the surface sends back for an irradiance, over theta_h."""
+        g = self.geometry(ReflectanceChanges())
+        theta, cosine = g.angles.theta_h, dot(g.normal, g.to_source)
         edges = np.quantile(theta, np.linspace(0, 1, BINS + 1))
         bins = np.clip(np.searchsorted(edges, theta, side="right") - 1, 0, BINS - 1)
         total = np.maximum(np.bincount(bins, weight, BINS), 1e-300)
         self._theta_h = np.bincount(bins, weight * theta, BINS) / total
-        self._alpha_0 = np.bincount(bins, weight * alpha_0, BINS) / total
+        lit = np.maximum(np.bincount(bins, weight * cosine**2, BINS), 1e-300)
+        self._alpha_0 = np.bincount(bins, weight * cosine * alpha_0, BINS) / lit
 
     def extra(self, changes: ReflectanceChanges) -> Array | None:
         """Mueller matrices (P, 4, 4) of light that came from the support, in the units of alpha_0; None without it."""
         if not changes.support:
             return None
-        g = self.geometry(changes)
-        below = ScatteringGeometry(g.normal, np.broadcast_to(SUPPORT, g.normal.shape), g.to_camera)
-        weight = changes.support * np.maximum(dot(g.normal, SUPPORT), 0.0)
-        weight = weight * np.interp(below.angles.theta_h, self._theta_h, self._alpha_0)
-        m = self._complete(changes).dominant(below, self.index) @ mueller.IDEAL_DEPOLARIZER
-        return np.asarray(weight[:, None, None] * m)
+        # Of what else may be wrong only the material counts here: the rest changes a small term by a little.
+        one = ReflectanceChanges(
+            diffuse_a=changes.diffuse_a,
+            diffuse_log_b=changes.diffuse_log_b,
+            index=changes.index,
+            volume=changes.volume,
+            support_rad=changes.support_rad,
+            support_log_depth=changes.support_log_depth,
+        )
+        key = astuple(one)
+        if key not in self._below:
+            if len(self._below) >= KEPT:
+                self._below.clear()
+            self._below[key] = self._from_below(one)
+        out = changes.support * self._below[key]
+        return mueller.rotation(-changes.analyzer_rad) @ out if changes.analyzer_rad else out
+
+    def _from_below(self, changes: ReflectanceChanges) -> Array:
+        if self._between is None and isinstance(self.view.shape, Sphere):
+            self._between = Between(self.rays[:, :2] / self.rays[:, 2:])
+        between = self._between
+        some = slice(None) if between is None else between.nodes
+        points, g, complete = self.points[some], self.geometry(ReflectanceChanges())[some], self._complete(changes)
+        shape = self.view.shape
+        middle = np.asarray(shape.centre_mm) if isinstance(shape, Sphere) else self.points.mean(axis=0)
+        half_width = shape.radius_mm if isinstance(shape, Sphere) else float(np.ptp(self.points[:, 0])) / 2
+        depth = SUPPORT_DEPTH * half_width * np.exp(changes.support_log_depth)
+        column = np.zeros((len(points), 4))
+        for part in middle + _disc(depth, depth * np.tan(np.deg2rad(SUPPORT_DEG) + changes.support_rad)):
+            way = part - points
+            square = dot(way, way)
+            below = ScatteringGeometry(g.normal, unit(way), g.to_camera)
+            # A part shines and is seen under the same angle.
+            weight = np.maximum(dot(g.normal, below.to_source), 0.0) * np.maximum(-below.to_source[:, 1], 0.0)
+            weight = weight * depth**2 / square / SUPPORT_PARTS
+            weight = weight * np.interp(below.angles.theta_h, self._theta_h, self._alpha_0)
+            column += weight[:, None] * complete.dominant(below, self.index)[..., 0]
+        # The support's light is not polarized.
+        out = np.zeros((len(self.points), 4, 4))
+        out[..., 0] = column if between is None else between(column)
+        return out
+
+
+class Between:
+    """Linear interpolation of what is smooth over a sphere, from some of its pixels to all.
+
+    Attributes
+    ----------
+    nodes : (S,) numbers of the pixels at which values have to be given.
+    """
+
+    def __init__(self, where: Array) -> None:
+        self.nodes = np.union1d(np.arange(0, len(where), EVERY), ConvexHull(where).vertices)
+        grid = Delaunay(where[self.nodes])
+        inside = np.maximum(grid.find_simplex(where, tol=1e-6), 0)
+        first = np.einsum("pij,pj->pi", grid.transform[inside, :2], where - grid.transform[inside, 2])
+        self._weights = np.column_stack([first, 1 - first.sum(axis=1)])
+        self._corners = grid.simplices[inside]
+
+    def __call__(self, values: Array) -> Array:
+        """Values (P, ...) at all pixels of values (S, ...) at the nodes."""
+        return np.asarray(np.einsum("pi,pi...->p...", self._weights, values[self._corners]))
+
+
+def _disc(depth_mm: float, radius_mm: float) -> Array:
+    """Middles (SUPPORT_PARTS, 3) of equal parts of a level disc below the origin."""
+    k = np.arange(SUPPORT_PARTS) + 0.5
+    turn, ring = np.pi * (3 - np.sqrt(5)) * k, radius_mm * np.sqrt(k / SUPPORT_PARTS)
+    return np.stack([ring * np.cos(turn), np.full_like(k, -depth_mm), ring * np.sin(turn)], axis=1)
 
 
 def material_constants(material: ReflectanceModel, wavelength_nm: float) -> tuple[complex, float, float]:

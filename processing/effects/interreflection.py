@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from processing.changes import Conditions
 from processing.effects._reflectance import ReflectanceEffect
 from processing.effects.base import Array, Parameter
@@ -18,11 +20,12 @@ from processing.reflectance_changes import ReflectanceChanges
 class This(ReflectanceEffect):
     """Weight of light that met two facets over that which met one; place "support": light from below.
 
-    The support's light arrives depolarized and the surface polarizes it as it does the source's; the parameter is its
-    irradiance over the source's where both fall straight on the surface.
+    The support's light arrives depolarized from a level disc below, and the surface polarizes it as it does the
+    source's. The parameters: irradiance of the object's middle over the source's; by how much the half angle of the
+    disc, seen from there, differs from 35 degrees; logarithm of its depth over twice the object's half width.
     """
 
-    # Where the support stands and how far it reaches is not known.
+    # A support is no disc of one brightness, and where its light is cut off by the object itself is not known.
     rough = 0.2
 
     def places_on(self, shape: str) -> Sequence[str]:
@@ -30,7 +33,8 @@ class This(ReflectanceEffect):
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         if place == "support":
-            return (Parameter("support", "1", -0.05, 2.0, 0.02),)
+            form = (Parameter("reach", "degree", -30, 40, 10), Parameter("log_depth", "1", -0.6, 3.0, 0.3))
+            return (Parameter("support", "1", -0.05, 2.0, 0.02), *form)
         return (Parameter("twice", "1", -0.05, 1.0, 0.05),)
 
     def bend(self, changes: ReflectanceChanges, values: Array) -> None:
@@ -39,5 +43,7 @@ class This(ReflectanceEffect):
     def bend_at(self, changes: ReflectanceChanges, place: str, values: Array) -> None:
         if place == "support":
             changes.support += float(values[0])
+            changes.support_rad += float(np.deg2rad(values[1]))
+            changes.support_log_depth += float(values[2])
         else:
             self.bend(changes, values)

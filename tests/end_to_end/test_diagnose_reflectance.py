@@ -18,7 +18,7 @@ from processing.product import Product
 from processing.reflectance.base import load_reflectance
 from simulators import scene_faults
 from simulators.scene import Scene
-from simulators.sphere_suite import SphereFault, drawn, take
+from simulators.sphere_suite import SphereFault, first_surface_of, take
 
 NM, OMEGA_DEG = 662.0, 35.0
 FIRST_SURFACE = "kind: first_surface\nname: red print, first surface alone\nconstants:\n  662: {n: 1.30, k: 0.08}\n"
@@ -37,7 +37,7 @@ def scene(configs: Path) -> Scene:
 
 def capture(folder: Path, configs: Path, scene: Scene, name: str, seed: int = 1) -> Path:
     declared = InstrumentModel.load(configs / f"instruments/{name}.yaml")
-    fault = drawn("polarized_diffuse", np.random.default_rng(0), scene, declared)
+    fault = SphereFault("the paper's", scene, declared, first_surface_of(scene.material))
     path = folder / f"{name}.h5"
     take(path, fault, declared, NM, OMEGA_DEG, seed)
     return path
