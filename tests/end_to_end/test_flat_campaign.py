@@ -35,7 +35,7 @@ def campaign(tmp_path_factory, configs) -> Path:
     yaml, source = YAML(), configs / "rigs" / "simulated.yaml"
     rig = yaml.load(source)
     rig["simulator"] |= {"rows": SHAPE[0], "columns": SHAPE[1], "clock_speed": 200, "camera_wait_s": 60}
-    rig["simulator"] |= {"effects": UNDECLARED, "flux_e_per_s": 1.5e6}
+    rig["simulator"] |= {"effects": UNDECLARED, "flux_e_per_s": 4e6}
     for mode in rig["modes"].values():
         mode["instrument"] = str((source.parent / mode["instrument"]).resolve())
     samples = rig["simulator"]["samples"]
@@ -47,7 +47,7 @@ def campaign(tmp_path_factory, configs) -> Path:
         (folder / f"{mode}.yaml").write_text(f"kind: plan\nmode: {mode}\ndarks: 4\nstates: {table}\n")
     (folder / "campaign.yaml").write_text(
         f"kind: campaign\nname: flats\nplans: {{drr: drr.yaml, stokes: stokes.yaml}}\nsamples: [{{name: red_sphere}}]\n"
-        f"wavelengths_nm: [662]\nomega_deg: {list(OMEGAS)}\nexposure_s: {{kind: auto}}\nreferences:\n"
+        f"wavelengths_nm: [662]\nomega_deg: {list(OMEGAS)}\nexposure_s: 0.004\nreferences:\n"
         "  - {sample: {kind: air, name: air}, omega_deg: 180, modes: [drr], every: 2}\n"
         "  - {sample: {name: white_diffuser}, omega_deg: 20, modes: [drr, stokes], every: 2, role: flat}\n"
     )
