@@ -222,7 +222,10 @@ def reduce_mueller(
                     progress(rows.stop, capture.frame_shape[0])
             if stored:
                 stored.result()
-        facts = mueller_facts(inversion, noise, correction, product, len(states), choice.weighted)
+        try:
+            facts = mueller_facts(inversion, noise, correction, product, len(states), choice.weighted)
+        except CaptureError as error:
+            raise CaptureError(f"{capture.path}: {error}{_without_numbers(capture, states)}") from error
         if choice.physical:
             facts["physical_estimate"] = f"{choice.physical}, as mueller_physical beside the plain one"
         product.seal(facts)
@@ -250,6 +253,14 @@ def _block(solver: Solver, rows: slice, planes: Mapping[str, Plane]) -> dict[str
     if "mueller_physical" in planes and "mueller_physical" not in found:
         found["mueller_physical"] = nearest(found["mueller"])
     return {name: found[name].reshape(*plane.leading, *shape) for name, plane in planes.items()}
+
+
+def _without_numbers(capture: Capture, states: NDArray[np.int64]) -> str:
+    """Which states have frames without a single number, as the end of a message."""
+    empty = np.array([k for k in states if not np.isfinite(capture.frames(int(k))).any()], dtype=np.int64)
+    if not empty.size:
+        return ""
+    return f" State(s) {_some(empty)} hold no number at all: take them again, or import without them."
 
 
 def _some(values: NDArray[np.int64]) -> str:

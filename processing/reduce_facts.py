@@ -15,6 +15,8 @@ from processing.product import LIT_ERRORS, ProductWriter
 
 #: Above this median, the model and not the noise makes the residual (the median of a good one is within 0.1 of 1).
 SUSPICIOUS_CHI_SQUARE = 1.5
+#: Below this the noise is overstated.
+TOO_SMALL_CHI_SQUARE = 0.5
 
 
 def mueller_facts(
@@ -75,6 +77,11 @@ def mueller_facts(
             warnings.append(
                 f"the residual is {np.sqrt(ratio):.2g} times what the noise explains: the model lacks something. "
                 "The standard errors do not contain it. Run `diagnose`."
+            )
+        elif ratio < TOO_SMALL_CHI_SQUARE:
+            warnings.append(
+                f"the residual is only {np.sqrt(ratio):.2g} of what the noise explains, so the standard errors are too "
+                "large: the gain or read noise is not this camera's, or a black level was not subtracted"
             )
     return facts | {"warnings": warnings}
 

@@ -72,7 +72,8 @@ def test_import_reduce_figure(suffix: str, tmp_path: Path, instrument: Path, pro
     assert (code, err) == (0, "")
     figure = tmp_path / "m.png"
     code, out, err = process("reduce", tmp_path / "states.h5", "--figure", figure)
-    assert (code, err) == (0, "")
+    # Frames without noise under a gain that promises some: told.
+    assert (code, "the residual is only" in err) == (0, True)
     assert "condition number: 7.14" in out
     assert "SIMULATED" not in out
     drawn = cv2.imread(str(figure))
@@ -248,7 +249,7 @@ def test_noise_options_of_reduce(measured: Measured, tmp_path: Path, instrument:
     assert process("import", "--states", measured.states, *options, *noise)[0] == 0
     extra = ["--weighted", "--covariance", "--physical", "likelihood"]
     code, out, err = process("reduce", capture, *extra)
-    assert (code, err) == (0, "")
+    assert (code, "the residual is only" in err) == (0, True)
     assert "weighted: yes" in out
     assert "physical estimate: likelihood" in out
     with Product(tmp_path / "states.mueller.h5") as product:
@@ -281,7 +282,7 @@ def test_xi0_reduces_first_and_reuses_the_product(
     options = ["--wavelength-nm", 662, "--instrument", instrument, *noise]
     assert process("import", "--states", measured.states, *options)[0] == 0
     code, out, err = process("xi0", tmp_path / "states.h5", "--figure", tmp_path / "xi0.png")
-    assert (code, err) == (0, "")
+    assert (code, "the residual is only" in err) == (0, True)
     assert (tmp_path / "xi0.png").stat().st_size > 10_000
     with Product(tmp_path / "states.xi0.h5") as product:
         assert [s.name for s in product.steps] == ["reduce", "xi0"]
