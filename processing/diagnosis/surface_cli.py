@@ -62,5 +62,6 @@ def _show_surface(d: SurfaceDiagnosis) -> None:
         if before.psi_deg is not None and after.psi_deg is not None:
             typer.echo(
                 f"    modelled against measured dominant process: psi {before.psi_deg:.1f} -> {after.psi_deg:.1f} "
-                f"degrees, |D| {before.magnitude_percent:.1f} -> {after.magnitude_percent:.1f} % (noise included)"
+                f"degrees, |D| {before.magnitude_percent:.1f} -> {after.magnitude_percent:.1f} % (noise alone: "
+                f"{after.psi_noise_deg:.1f} degrees, {after.magnitude_noise_percent:.1f} %)"
             )

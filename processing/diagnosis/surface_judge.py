@@ -7,16 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
 
-from processing.cloude import xi0_and_dominant
-from processing.deviation import linear_diattenuation, magnitude, orientation_difference, rmsd
+from processing.deviation import rmsd
 from processing.diagnosis.candidate import Candidate
 from processing.diagnosis.problem import Space
 from processing.diagnosis.result import CaptureReport, Diagnosis, Error, FoundEffect, Ranked, Unexplained, Verdict
 from processing.diagnosis.search import CHANCE, Found, Say
 from processing.diagnosis.surface_errors import standard_errors
 from processing.diagnosis.surface_problem import SurfaceProblem
+from processing.diagnosis.surface_quantities import Quantities, quantities
 from processing.diagnosis.surface_recommend import recommended
 from processing.diagnosis.surface_search import SurfaceSearch
 from processing.instrument import EffectParameter
@@ -40,22 +39,6 @@ DEGENERACY = "not_triply_degenerate"
 AS_LIKELY = 0.015
 #: More effects than this at once are not an explanation.
 MOST_EFFECTS = 3
-
-
-class Quantities(BaseModel):
-    """What the model says, one capture.
-
-    `psi_deg` and `magnitude_percent` are root mean square differences between the modelled and the measured dominant
-    process (a full Mueller capture only; noise is in them), `xi0` the median, `unphysical` the part of the pixels
-    whose xi0 is outside [1/4, 1], `xi0_change` the root mean square change by the correction.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    psi_deg: float | None
-    magnitude_percent: float | None
-    xi0: float
-    unphysical: float
 
 
 class SurfaceDiagnosis(Diagnosis):
@@ -153,29 +136,6 @@ def structure(problem: SurfaceProblem, k: int, space: Space, values: Array) -> d
         if directions > 0:
             out[name] = float((square - directions * level.sum()) / np.sqrt(2 * directions * np.sum(level**2)))
     return out
-
-
-def quantities(problem: SurfaceProblem, k: int, space: Space, values: Array) -> tuple[Quantities, Array]:
-    """What the model with these values says of a capture, and xi0 of its pixels (P,)."""
-    here, data = problem.pixels(k, space, values), problem.captures[k]
-    optics, surface = problem.changes(k, space, values)
-    total = here.alpha_0 + here.alpha_id
-    with np.errstate(divide="ignore", invalid="ignore"):
-        xi0 = (here.alpha_0 + here.alpha_id / 4) / total
-        # Where the model modulates little, xi0 is noise.
-        xi0[here.strength * total < 1 / 0.05] = np.nan
-    good = xi0[np.isfinite(xi0)]
-    psi = size = None
-    w = problem.rows(k, optics)
-    if np.linalg.matrix_rank(w, rtol=1e-8) == 16:
-        m = (data.y @ np.linalg.pinv(w).T).reshape(-1, 4, 4)
-        _, m0 = xi0_and_dominant(m)
-        measured, modelled = linear_diattenuation(m0), linear_diattenuation(data.view.dominant(surface))
-        psi = float(np.rad2deg(rmsd(orientation_difference(modelled, measured))))
-        size = 100 * rmsd(magnitude(modelled) - magnitude(measured))
-    outside = float(np.mean((good < 0.25) | (good > 1))) if good.size else float("nan")
-    median = float(np.median(good)) if good.size else float("nan")
-    return Quantities(psi_deg=psi, magnitude_percent=size, xi0=median, unphysical=outside), xi0
 
 
 def constants(problem: SurfaceProblem, space: Space, values: Array) -> dict[str, float]:

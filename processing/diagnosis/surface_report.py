@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.diagnosis.surface_judge import SurfaceJudged, quantities
+from processing.diagnosis.space import Space
+from processing.diagnosis.surface_judge import SurfaceJudged
 from processing.diagnosis.surface_problem import SurfaceProblem
+from processing.diagnosis.surface_quantities import dominant_errors, quantities
 from processing.errors import ProcessError
 from processing.report_html import Figure, Section, render
 
@@ -54,10 +56,18 @@ def write_surface_report(path: Path, judged: SurfaceJudged, problem: SurfaceProb
         before, after = d.quantities_before[k], d.quantities_after[k]
         facts.append(("median xi0", f"{before.xi0:.4f}, {after.xi0:.4f}; rms change {d.xi0_change[k]:.4f}"))
         if before.psi_deg is not None and after.psi_deg is not None:
-            facts.append(("psi of m0, model - measured", f"{before.psi_deg:.2f}, {after.psi_deg:.2f} degrees rms"))
-            facts.append(("|D| of m0", f"{before.magnitude_percent:.2f}, {after.magnitude_percent:.2f} % rms"))
-        picture = _png(residual_figure(judged, problem, k))
-        sections.append(Section(capture.name, facts, [Figure(picture, "Residual and xi0, before and after")]))
+            psi, size = (
+                f"{before.psi_deg:.2f}, {after.psi_deg:.2f}",
+                (before.magnitude_percent, after.magnitude_percent),
+            )
+            facts.append(("psi of m0, model - measured", f"{psi} degrees rms; noise alone {after.psi_noise_deg:.2f}"))
+            facts.append(("|D| of m0", f"{size[0]:.2f}, {size[1]:.2f} % rms; {after.magnitude_noise_percent:.2f}"))
+        figures = [Figure(_png(residual_figure(judged, problem, k)), "Residual and xi0, before and after")]
+        figures.append(Figure(_png(states_figure(judged, problem, k)), "Residual of each state (and channel)"))
+        if before.psi_deg is not None:
+            caption = "Dominant process, model less measured, before and after"
+            figures.append(Figure(_png(dominant_figure(judged, problem, k)), caption))
+        sections.append(Section(capture.name, facts, figures))
     title = f"diagnose: {d.material} with {d.instrument}"
     try:
         with path.open("x", encoding="utf-8") as file:
@@ -70,8 +80,7 @@ def residual_figure(judged: SurfaceJudged, problem: SurfaceProblem, k: int) -> A
     """Residual of each tile along its leading component, rms of each pixel, and xi0; before and after."""
     from matplotlib.figure import Figure as Picture
 
-    found, data = judged.found, problem.captures[k]
-    pairs = ((found.base, np.zeros(0)), (found.space, found.fit.values))
+    data, pairs = problem.captures[k], _models(judged)
     first = problem.pixels(k, *pairs[0]).residual
     _, vectors = np.linalg.eigh(first.T @ first)
     figure = Picture(figsize=(11, 6.4), layout="constrained")
@@ -95,6 +104,48 @@ def residual_figure(judged: SurfaceJudged, problem: SurfaceProblem, k: int) -> A
             axis.set_title(f"{name}, {'after' if row else 'before'}", fontsize=9)
             axis.set_axis_off()
     return figure
+
+
+def states_figure(judged: SurfaceJudged, problem: SurfaceProblem, k: int) -> Any:
+    """Rms residual of each row of W over the pixels, before and after."""
+    from matplotlib.figure import Figure as Picture
+
+    figure = Picture(figsize=(11, 2.6), layout="constrained")
+    axis = figure.subplots()
+    for name, (space, values) in zip(("before", "after"), _models(judged), strict=True):
+        here = problem.pixels(k, space, values)
+        rms = np.sqrt(np.mean(here.residual**2, axis=0) / np.mean(here.free * problem.noise[k], axis=0))
+        axis.plot(rms, "o-", ms=3, label=name)
+    axis.axhline(1.0, color="0.6", lw=0.8)
+    axis.set_ylim(bottom=0)
+    axis.set_xlabel("state (and channel)")
+    axis.set_ylabel("rms residual / noise")
+    axis.legend()
+    return figure
+
+
+def dominant_figure(judged: SurfaceJudged, problem: SurfaceProblem, k: int) -> Any:
+    """Modelled less measured psi and |D| of the dominant process, before and after, of a full Mueller capture."""
+    from matplotlib.figure import Figure as Picture
+
+    data = problem.captures[k]
+    figure = Picture(figsize=(11, 2.9), layout="constrained")
+    axes = figure.subplots(1, 4)
+    names = (("psi / degree", 90.0), ("|D| / %", 50.0))
+    for column, (space, values) in enumerate(_models(judged)):
+        errors = dominant_errors(problem, k, space, values, data.y) or ()
+        for row, ((name, wide), error) in enumerate(zip(names, errors, strict=False)):
+            axis = axes[2 * row + column]
+            drawn = axis.imshow(_image(data.where, data.shape, error), vmin=-wide, vmax=wide, cmap="RdBu")
+            figure.colorbar(drawn, ax=axis, shrink=0.8)
+            axis.set_title(f"{name}, {'after' if column else 'before'}", fontsize=9)
+            axis.set_axis_off()
+    return figure
+
+
+def _models(judged: SurfaceJudged) -> tuple[tuple[Space, Array], tuple[Space, Array]]:
+    found = judged.found
+    return (found.base, np.zeros(0)), (found.space, found.fit.values)
 
 
 def _image(where: NDArray[np.int64], shape: tuple[int, int], values: Array) -> Array:

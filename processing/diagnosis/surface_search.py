@@ -59,6 +59,11 @@ class SurfaceSearch(Search):
         needed = max(LEAST_SHARE * (out.excess - 2 * self.noise_of(out)), rough * max(self._start - out.excess, 0.0))
         return [t for t in trials if out.excess - t.out.excess >= needed]
 
+    def _observability(self, found: Found) -> None:
+        # With what was found: first surface alone does not even know the normal.
+        offered = [c for c in self.pool if c not in found.space.candidates]
+        found.information = {c: info for c, (_, info) in self.scores(found.space, found.fit, offered).items()}
+
     def structure(self, after: HeldOut, parameters: int) -> float:
         """Chi-square for each direction of structure that is left beyond what errors of the noise may cause."""
         excess = after.excess - NO_STRUCTURE * self.noise_of(after)

@@ -33,7 +33,7 @@ def corrected_material(
     known[key] = polarized_diffuse.Constants(**diagnosis.constants)
     names = ", ".join(c.name for c in diagnosis.captures)
     source = f"diagnose, {diagnosis.wavelength_nm:g} nm, from {names}"
-    return polarized_diffuse.Model(name=material.name, source=source, constants=known)
+    return polarized_diffuse.Model(name=f"{material.name}, corrected", source=source, constants=known)
 
 
 def corrected_geometry(view: ViewingGeometry, diagnosis: SurfaceDiagnosis) -> ViewingGeometry:
