@@ -23,6 +23,7 @@ from processing.capture import Capture
 from processing.capture_schema import Sample
 from processing.correction import Correction
 from processing.errors import NotDetermined, ProcessError
+from processing.flat import FEW
 from processing.instrument import Element, InstrumentModel
 from processing.reduce import relative_exposure, sample_states
 
@@ -85,16 +86,26 @@ def known_mueller(sample: Sample) -> NDArray[np.float64]:
     )
 
 
-def region_means(capture: Capture, rows: slice, columns: slice) -> NDArray[np.float64]:
-    """Mean signal (N, channels) of a region in every state of the sample, black subtracted."""
-    black = Correction.of(capture).black
+def region_means(capture: Capture, rows: slice, columns: slice) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Mean signal (N, channels) of a region, black subtracted, and the states of the sample that it belongs to.
+
+    States in which the region saturates are left out.
+    """
+    correction = Correction.of(capture)
+    black = correction.black
     means_of_dark = black.means if black.means.shape[2] == 1 else black.means[:, :, rows, columns]
-    states = sample_states(capture)
-    share = black.weights(capture.column("exposure_s")[states].astype(float))
-    means = [capture.frames(int(k), rows)[:, :, columns].mean(axis=(1, 2)) for k in states]
-    if not means or means[0].size == 0 or not np.all(np.isfinite(means)):
+    means, used = [], []
+    for k in sample_states(capture):
+        frame = capture.frames(int(k), rows)[:, :, columns]
+        if correction.saturation is None or np.mean(frame >= correction.saturation) <= FEW:
+            means.append(frame.mean(axis=(1, 2)))
+            used.append(int(k))
+    if not means:
+        raise CalibrationError(f"{capture.path}: the region is saturated in every state; take less exposure.")
+    if means[0].size == 0 or not np.all(np.isfinite(means)):
         raise CalibrationError(f"{capture.path}: the region holds no pixels, or no numbers; choose another one.")
-    return np.asarray(np.asarray(means) - share @ means_of_dark.mean(axis=(2, 3)))
+    share = black.weights(capture.column("exposure_s")[used].astype(float))
+    return np.asarray(means) - np.asarray(share @ means_of_dark.mean(axis=(2, 3))), np.array(used)
 
 
 def fit_train(
@@ -173,9 +184,8 @@ def calibrate(
 ) -> Calibration:
     """Fit to the region means of a capture of a known sample; see `fit_train`."""
     sample = known_mueller(capture.header.sample)
-    states = sample_states(capture)
+    signal, states = region_means(capture, rows, columns)
     angles = {name: values[states] for name, values in capture.angles_deg.items()}
-    signal = region_means(capture, rows, columns)
     return fit_train(model, angles, signal, sample, free, relative_exposure(capture, states))
 
 

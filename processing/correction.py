@@ -89,6 +89,8 @@ class Correction:
             )
         top = saturation(capture)
         flat = Flat.of(list(flat_from) or [capture], black, top)
+        if flat is not None and flat.lost.any():
+            bad = flat.lost if bad is None else bad | flat.lost
         return cls(black, source, flat, bad, top, tuple(warnings))
 
 

@@ -15,6 +15,8 @@ from processing.noise import NoiseModel
 
 #: A response below this is a dead pixel; dividing by less would blow its noise up without end.
 LEAST_RESPONSE = 1e-3
+#: Part of a region's pixels that may be at the top of the range, as hot pixels are, in a state that is used.
+FEW = 1e-3
 #: Wavelengths nearer than this are one filter.
 SAME_NM = 0.5
 
@@ -28,12 +30,14 @@ class Flat:
     response : (channels, rows, columns) float32, mean 1 in each channel.
     frames : how many frames it is the mean of.
     level : (channels,), counts above black of one frame.
+    lost : (rows, columns) bool, pixels whose response is not known because they saturate or are no brighter than black.
     source : in words.
     """
 
     response: NDArray[np.float32]
     frames: int
     level: NDArray[np.float64]
+    lost: NDArray[np.bool_]
     source: str
 
     @classmethod
@@ -43,7 +47,7 @@ class Flat:
         Parameters
         ----------
         black : for captures without dark states of their own.
-        saturation : counts from which on a pixel is saturated; a flat state with such a pixel is left out.
+        saturation : counts from which on a pixel is saturated; a flat state with more than a few such is left out.
 
         Raises
         ------
@@ -53,20 +57,23 @@ class Flat:
         if not captures:
             return None
         total = np.zeros((captures[0].channels, *captures[0].frame_shape))
+        lost = np.zeros(captures[0].frame_shape, bool)
         used = frames = 0
         for capture in captures:
             own = Black.of(capture) or black or Black.level(capture.header.detector.black_level_counts)
             exposure, repeats = capture.column("exposure_s").astype(float), capture.column("repeats")
             for k in capture.states_with("flat"):
                 frame = capture.frames(int(k))
+                clipped = np.zeros(lost.shape, bool) if saturation is None else (frame >= saturation).any(axis=0)
                 # In a bracket the long exposures saturate; the others hold the same response.
-                if saturation is None or not (frame >= saturation).any():
+                if clipped.mean() <= FEW:
                     total += frame - own.at(exposure[k])
+                    lost |= clipped
                     used += 1
                     frames += int(repeats[k])
         names = ", ".join(c.path.name for c in captures)
         if not used:
-            raise CaptureError(f"{names}: every flat state has saturated pixels; retake them with less exposure.")
+            raise CaptureError(f"{names}: every flat state is saturated; retake them with less exposure.")
         with np.errstate(invalid="ignore", divide="ignore"):
             level = np.nanmean(total, axis=(1, 2)) / used
             response = total / used / level[:, None, None]
@@ -74,8 +81,9 @@ class Flat:
             raise CaptureError(
                 f"{names}: the flat states are no brighter than the black; retake them or leave them out."
             )
+        lost |= (response < LEAST_RESPONSE).any(axis=0)
         response = np.maximum(response, LEAST_RESPONSE).astype(np.float32)
-        return cls(response, frames, level, f"mean of {frames} flat frame(s) of {names}")
+        return cls(response, frames, level, lost, f"mean of {frames} flat frame(s) of {names}")
 
     def relative_variance(self, noise: NoiseModel) -> NDArray[np.float32]:
         """Variance (channels, rows, columns) of the response over its square."""

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from processing.black import Black
-from processing.capture import Capture
+from processing.calibrate import calibrate
+from processing.capture import Capture, CaptureError
 from processing.correction import Correction
 from processing.images import MuellerImage
 from processing.instrument import InstrumentModel
@@ -17,6 +18,7 @@ from processing.reduce_stokes import reduce_stokes
 from processing.states import rotating_retarders
 from processing.yaml_file import dump_yaml
 from simulators.bench import DETECTOR, FixedScene, SimulatedBench
+from simulators.bench_effects import with_element
 
 ANGLES = {"psg": np.arange(6.0)}
 ROLE = ("dark", "dark", "sample", "sample", "sample", "sample")
@@ -69,7 +71,7 @@ def bench(instrument: InstrumentModel, level: np.ndarray, flux: float, dark_curr
     return SimulatedBench(scene, instrument, 662, *SHAPE, DETECTOR, flux, dark_current, seed=3)
 
 
-def bracketed(synthetic_capture, model: InstrumentModel, stand: SimulatedBench, dark_s: list[float], angles: dict):
+def bracketed(synthetic_capture, model: InstrumentModel, stand: SimulatedBench, dark_s: list, angles: dict, **header):
     """A capture of both exposures in each pose, with darks of the exposures `dark_s`, from the bench."""
     n, d = len(next(iter(angles.values()))), len(dark_s)
     turned = {axis: np.concatenate([np.zeros(d), np.repeat(values, 2)]) for axis, values in angles.items()}
@@ -81,7 +83,7 @@ def bracketed(synthetic_capture, model: InstrumentModel, stand: SimulatedBench, 
         ]
     )
     role = ("dark",) * d + ("sample",) * (2 * n)
-    header = {"detector": DETECTOR, "instrument_yaml": dump_yaml(model), "mosaic": model.mosaic}
+    header |= {"detector": DETECTOR, "instrument_yaml": dump_yaml(model), "mosaic": model.mosaic}
     return synthetic_capture(frames[:, None], turned, role=role, exposure_s=exposure, **header)
 
 
@@ -138,3 +140,32 @@ def test_bracketed_mosaic_uses_the_long_exposure_where_it_can(synthetic_capture,
         assert np.isfinite(s0).all()
     expected = flux * LONG_S / DETECTOR.gain_e_per_count * level[::2] * (MUELLER[0] @ light)
     assert ((s0 - expected) / error).std() == pytest.approx(1, abs=0.08)
+
+
+def test_calibration_leaves_out_exposures_that_saturate(synthetic_capture, configs) -> None:
+    """Air at two exposures, the long one clipped in the bright states, with a strong dark current."""
+    model = InstrumentModel.load(configs / "instruments" / "rgb950.yaml")
+    stand = bench(model.at(662), np.ones(SHAPE[1]), 1e6, 500.0, np.eye(4))
+    angles = dict(rotating_retarders(1.0).angles_deg)
+    path = bracketed(synthetic_capture, model, stand, [SHORT_S, LONG_S] * 4, angles, sample={"kind": "air"})
+    off = with_element(model.at(662), "psg_retarder", retardance_deg=125.0)
+    with Capture(path) as capture:
+        frames = np.stack([capture.frames(k) for k in range(8, 88)])
+        assert 0.2 < np.mean(frames >= 4095 - 64) < 0.5
+        found = calibrate(capture, off, ["psg_retarder.retardance_deg"], slice(None), slice(None))
+    truth = next(e for e in model.at(662).elements() if e.name == "psg_retarder").retardance_deg
+    assert found.values[0] == pytest.approx(truth, abs=5 * found.stderr[0] + 0.01)
+    assert found.residual_over_mean < 1e-3
+
+
+def test_hot_pixel_of_a_flat_is_a_bad_pixel(synthetic_capture) -> None:
+    flat = np.full((2, 1, 40, 50), 2000, np.uint16)
+    flat[:, 0, 7, 9] = 4095
+    role = {"role": ("flat", "flat"), "detector": {"bits": 12, "black_level_counts": 64.0}}
+    with Capture(synthetic_capture(flat, {"psg": np.zeros(2)}, **role)) as capture:
+        correction = Correction.of(capture)
+    assert np.argwhere(correction.bad).tolist() == [[7, 9]]
+    flat[:, 0, :20] = 4095
+    over = synthetic_capture(flat, {"psg": np.zeros(2)}, name="over.h5", **role)
+    with Capture(over) as capture, pytest.raises(CaptureError, match="every flat state is saturated"):
+        Correction.of(capture)
