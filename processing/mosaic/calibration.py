@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.capture import Capture
-from processing.correction import BlockReader, Correction
+from processing.correction import BlockReader, Correction, Mask
 from processing.errors import NotDetermined, ProcessError
 from processing.instrument import InstrumentModel
 from processing.inversion import multiply_tiles
@@ -66,11 +66,13 @@ def fit_response(
     rows, columns = capture.frame_shape
     response = np.empty((LINEAR, rows, columns), np.float32)
     residual = np.empty((rows, columns), np.float32)
-    mask = np.zeros(rows * columns, np.uint8)
+    saturated = 0
     for block in capture.row_blocks():
         frames = reader.read(block)
         corrected = np.empty(frames.shape, np.float32)
-        reader.load(frames, 0, frames.shape[2], corrected, mask[: frames.shape[2]])
+        mask = np.zeros(frames.shape[2], np.uint8)
+        reader.load(frames, 0, frames.shape[2], corrected, mask)
+        saturated += int(np.count_nonzero(mask & np.uint8(Mask.SATURATED)))
         signal: NDArray[np.float32] = corrected[:, 0, :]
         part = np.empty((LINEAR, frames.shape[2]), np.float32)
         multiply_tiles(inverse, signal, part)
@@ -82,6 +84,10 @@ def fit_response(
     response /= 2 * np.nanmean(response[0])
     layout = MosaicLayout.of(mosaic, [c.name for c in model.channels])
     facts = _facts(response, residual, layout, len(states))
+    if saturated:
+        facts["warnings"].append(
+            f"{saturated} of {rows * columns} pixels saturate in some state, and their response is wrong: expose less"
+        )
     with ProductWriter(out, "analyzers", capture.header, (rows, columns), PLANES, (step,), overwrite) as writer:
         writer.write(slice(0, rows), response=response, residual_rms=residual)
         writer.seal(facts)
