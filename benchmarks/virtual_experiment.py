@@ -98,30 +98,31 @@ def take(scene: Scene, folder: Path, azimuth_deg: float) -> None:
                 print(".", end="", file=sys.stderr, flush=True)
 
 
+COLUMNS = {
+    "psi / deg": ("psi_deg", 2),
+    "its noise": ("psi_noise_deg", 2),
+    "abs D / %": ("magnitude_percent", 2),
+    "noise of abs D": ("magnitude_noise_percent", 2),
+    "xi0 / %": ("xi0_percent", 2),
+    "noise of xi0": ("xi0_noise_percent", 2),
+    "common": ("common", 2),
+    "eigenvalues": ("eigenvalue_deviation", 3),
+}
+
+
 def table(result: CampaignResult) -> list[str]:
     out = []
     for nm in WAVELENGTHS_NM:
-        out += [
-            f"{nm:g} nm:",
-            "",
-            "| Omega | psi / deg | abs D / % | xi0 / % | of it noise / % | common | eigenvalues |",
-        ]
-        out.append("|---|---|---|---|---|---|---|")
+        out += [f"{nm:g} nm:", "", "| Omega | " + " | ".join(COLUMNS) + " |", "|" + "---|" * (1 + len(COLUMNS))]
         for r in (r for r in result.rows if r.wavelength_nm == nm):
-            out.append(
-                f"| {r.omega_deg:g} | {r.psi_deg:.2f} | {r.magnitude_percent:.2f} | {r.xi0_percent:.2f} | "
-                f"{r.xi0_noise_percent:.2f} | {r.common:.2f} | {r.eigenvalue_deviation:.3f} |"
-            )
-        means = [
-            result.average(nm, q)
-            for q in ("psi_deg", "magnitude_percent", "xi0_percent", "xi0_noise_percent", "common")
-        ]
+            cells = [f"{getattr(r, name):.{digits}f}" for name, digits in COLUMNS.values()]
+            out.append(f"| {r.omega_deg:g} | " + " | ".join(cells) + " |")
+        means = [f"{result.average(nm, name):.2f}" for name, _ in list(COLUMNS.values())[:-1]]
+        out.append("| mean | " + " | ".join(means) + " | |")
         paper = PAPER[round(nm)]
-        out.append("| mean | " + " | ".join(f"{m:.2f}" for m in means) + " | |")
-        out.append(
-            f"| paper | {paper.psi_deg:.2f} | {paper.magnitude_percent:.2f} | {paper.xi0_percent:.2f} | | | "
-            f"{'0.09' if nm == 451 else '0.03'} at most |"
-        )
+        most = "0.09" if nm == 451 else "0.03"
+        cells = [f"{paper.psi_deg:.2f}", "", f"{paper.magnitude_percent:.2f}", "", f"{paper.xi0_percent:.2f}", "", ""]
+        out.append("| paper | " + " | ".join([*cells, f"{most} at most"]) + " |")
         out.append("")
     return out
 
