@@ -94,13 +94,14 @@ class CaptureData:
 
     def undone(self, signal: Array, slope: Array) -> CaptureData:
         """The capture with corrected counts, of the given slope over the old ones: the noise is stretched with them."""
-        variance = slope**2 * self.variance()
+        # A bend weighs dark pixels by their slope: none may have a negative variance here.
+        variance = slope**2 * np.maximum(self.variance(), self.floor.reshape(-1, 1, 1, 1) / 2)
         return replace(self, signal=signal.astype(np.float32), true_variance=variance.astype(np.float32))
 
     def with_noise_of(self, signal: Array, slope: Array) -> CaptureData:
         """The same counts with the noise that corrected counts tell: photon noise follows the light, not the counts."""
         shape = (-1, 1, 1, 1)
-        variance = self.slope.reshape(shape) * signal / slope**2 + self.floor.reshape(shape)
+        variance = self.slope.reshape(shape) * np.maximum(signal, 0) / slope**2 + self.floor.reshape(shape)
         return replace(self, true_variance=variance.astype(np.float32))
 
 

@@ -87,6 +87,7 @@ class Found:
     information: dict[Candidate, Array] = field(default_factory=dict)  # with no effect active
     untestable: tuple[Candidate, ...] = ()
     nameless: list[Candidate] = field(default_factory=list)
+    imitable: bool = False  # values for each state were added on the way, which can hide plain effects
 
     @property
     def effects(self) -> tuple[Candidate, ...]:
@@ -108,7 +109,7 @@ class Search:
         """Search; see the module."""
         base_fit = self._calibrated()
         found = self._greedy(base_fit, self.pool)
-        if any(c.effect.per_state for c in found.effects):
+        if found.imitable:
             found = self._plainer(base_fit, found)
         self._sets(found)
         self._observability(found)
@@ -120,6 +121,7 @@ class Search:
         space, fit, out = self.base, base_fit, before
         ranking: list[Trial] = []
         alone: dict[Candidate, float] = {}
+        imitable = False
         for _ in range(MOST_EFFECTS):
             trials = self._trials(space, fit, out, pool)
             if not ranking:
@@ -129,6 +131,7 @@ class Search:
             if not trials:
                 break
             best = trials[0]
+            imitable |= best.candidate.effect.per_state
             self.say(f"{best.candidate.label}: {100 * out.rms:.4g} % -> {100 * best.out.rms:.4g} % on held-out data")
             space, fit, out = best.space, best.fit, best.out
             if self.problem.adopt_noise(space, fit.values):
@@ -136,7 +139,7 @@ class Search:
                 out = held_out(self.problem, space, fit)
                 base_fit = minimize(self.problem, self.base, base_fit.values)
                 before = held_out(self.problem, self.base, base_fit)
-        found = Found(self.base, before, base_fit, space, fit, out, ranking=ranking, alone=alone)
+        found = Found(self.base, before, base_fit, space, fit, out, ranking=ranking, alone=alone, imitable=imitable)
         self._prune(found)
         return found
 
