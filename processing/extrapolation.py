@@ -43,6 +43,8 @@ def extrapolate_mueller(
         "method": "TD model, xi0 and M00 from the Stokes image, dominant process from the reflectance model",
         "valid_pixels": int(valid.sum()),
         "pixels": int(valid.size),
+        "median_xi0": float(np.median(found.xi0[valid])) if valid.any() else None,
+        "median_xi0_error": float(np.median(found.xi0_stderr[valid])) if valid.any() else None,
         "warnings": ["extrapolated: elements that the capture did not measure are the model's"],
     }
     with ProductWriter(out, "extrapolated", header, shape, PLANES, steps, overwrite) as writer:

@@ -45,10 +45,11 @@ def draw_product(path: Path, figure: Path) -> None:
 
 def product_figure(product: Product) -> Figure:
     """Matplotlib figure of a product; raises ProcessError for a kind without one."""
-    if product.kind == "mueller":
+    if product.kind in ("mueller", "extrapolated"):
         elements = thin(product.get("mueller"))
         lit = _lit(elements[0, 0], thin(product.get("mueller_errors")[0, 0]))
-        return mueller_figure(elements, lit, _title(product), product.simulated)
+        title = _title(product) if product.kind == "mueller" else f"extrapolated: {_title(product)}"
+        return mueller_figure(elements, lit, title, product.simulated)
     if product.kind == "stokes":
         names = ("s0", "dolp", "dolp_errors", "aolp_deg", "aolp_deg_errors")
         maps = {name: thin(product.get(name)) for name in names}
@@ -78,7 +79,7 @@ def product_figure(product: Product) -> Figure:
         return quantities_figure(product, _title(product))
     if product.kind == "camera":
         return photon_transfer_figure(product)
-    raise ProcessError(f"{product.path}: no figure is defined for a {product.kind} image.")
+    raise ProcessError(f"{product.path}: there is no figure of the {product.kind} kind.")
 
 
 def mueller_figure(elements: NDArray[Any], lit: NDArray[np.bool_], title: str, simulated: bool) -> Figure:

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from processing.commands.drawing import FigureFile, NoFigure, draw
+
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
@@ -86,6 +88,8 @@ def extrapolate_command(
     geometry: Annotated[Path, typer.Option(help="Geometry file: camera, source, shape.")],
     material: Annotated[Path, typer.Option(help="Material file: the dominant process.")],
     out: Annotated[Path | None, typer.Option(help="Product file; default: beside the source.")] = None,
+    figure: FigureFile = None,
+    no_figure: NoFigure = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
 ) -> None:
     """A full Mueller image from a linear Stokes capture: TD model with the estimated xi0 and M00."""
@@ -100,3 +104,4 @@ def extrapolate_command(
     given = {"source": product.name, "geometry": str(geometry), "material": str(material)}
     step = Step("extrapolate", given, tuple(file_identity(p) for p in (product, geometry, material)))
     summary(target, extrapolate_mueller(product, geometry, material, target, step, overwrite), simulated)
+    draw(target, figure, no_figure)
