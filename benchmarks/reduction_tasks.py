@@ -31,8 +31,11 @@ from simulators.undeclared import Bench, Scene, digitize, expose, write_capture
 
 ROOT = Path(__file__).resolve().parents[1]
 INSTRUMENT = ROOT / "configs/instruments/rgb950.yaml"
-#: A retardance map of 16 degrees from end to end, on both retarders; terms x, y, x^2, x y, y^2, degrees.
-FIELD_DEG = {"x": 4.0, "y": -2.0, "x2": 3.0, "xy": 1.0, "y2": 0.0}
+#: A retardance map for each retarder, about 16 degrees from end to end; terms x, y, x^2, x y, y^2, degrees.
+FIELD_DEG = {
+    "psg_retarder": {"x": 4.0, "y": -2.0, "x2": 3.0, "xy": 1.0, "y2": 0.0},
+    "psa_retarder": {"x": -1.0, "y": 5.0, "x2": 0.0, "xy": -2.0, "y2": 3.0},
+}
 
 
 def write_frames(path: Path, shape: tuple[int, int]) -> tuple[float, float]:
@@ -66,11 +69,12 @@ class OpenCapture:
         self.capture = Capture(path)
         model = InstrumentModel.load(INSTRUMENT).at(662)
         if field_retardance:
-            values = {k: EffectParameter(value=v, unit="degree") for k, v in FIELD_DEG.items()}
-            effects = [
-                AppliedEffect(kind="field_retardance", element=e, parameters=values, scope="instrument")
-                for e in ("psg_retarder", "psa_retarder")
-            ]
+            effects = []
+            for element, terms in FIELD_DEG.items():
+                values = {k: EffectParameter(value=v, unit="degree") for k, v in terms.items()}
+                effects.append(
+                    AppliedEffect(kind="field_retardance", element=element, parameters=values, scope="instrument")
+                )
             model = model.model_copy(update={"effects": tuple(effects)})
         states = sample_states(self.capture)
         changes = capture_changes(self.capture, model, states)

@@ -2,7 +2,7 @@
 
 Building and inverting W for each pixel would take minutes. The matrix is worked out at Chebyshev nodes of the image;
 a singular value decomposition of these samples leaves as many fixed matrices as the wanted precision needs (of the
-pseudo-inverse 3 with one retarder that varies by 16 degrees, 5 with two), and a pixel costs one product with them.
+pseudo-inverse 3 with one retarder that varies by 16 degrees, 9 with two), and a pixel costs one product with them.
 """
 
 from __future__ import annotations
