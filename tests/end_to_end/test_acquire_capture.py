@@ -113,6 +113,17 @@ def test_averaged_frames_say_so(acquire, small_rig, tmp_path):
         assert capture.column("repeats").tolist() == [5, 5, 5]
 
 
+def test_exposure_is_recorded_as_the_camera_reads_it_back(acquire, small_rig, tmp_path):
+    """The simulated camera sets whole microseconds; over a bracket, half of one would be 2 % of the short exposure."""
+    plan = tmp_path / "plan.yaml"
+    text = "kind: plan\nmode: stokes\nexposure_s: 0.0000254\nbracket: [1, 100]\ndarks: 1\n"
+    plan.write_text(text + "states: {kind: fixed, states: 2}\n")
+    code, out, err = acquire("--plan", plan, "--rig", small_rig(), "--out", tmp_path)
+    assert code == 0, err
+    with Capture(_path(out)) as capture:
+        np.testing.assert_allclose(capture.column("exposure_s"), np.tile([25e-6, 2540e-6], 3), rtol=1e-9)
+
+
 def test_bracketed_capture_sees_dark_and_bright_pixels(acquire, small_rig, tmp_path):
     """Eight times the exposure saturates the bright pixels; the reduction takes those from the short one.
 
