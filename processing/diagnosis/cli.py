@@ -108,7 +108,7 @@ def show(d: Diagnosis) -> None:
 
 
 def _show_effect(effect: FoundEffect) -> None:
-    doubt = "" if effect.confident else " (helps, but explains less than what is left: its name may be wrong)"
+    doubt = "" if effect.confident else " (it helps, but its name may be wrong)"
     where = f" of {effect.element}" if effect.element else ""
     typer.echo(f"  {effect.kind}{where}: evidence {effect.evidence:.0f}{doubt}")
     for name, p in effect.parameters.items():

@@ -75,7 +75,7 @@ def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
     else:
         tried = tuple(t.candidate for t in found.ranking[:5]) if verdict == "unexplained" else ()
     unseen = _unobservable(found)
-    rivals = [c for e in found.effects for c in (e, *found.sets.get(e, ())) if found.sets.get(e)]
+    rivals = [(e, *found.sets[e]) for e in found.effects if found.sets.get(e)]
     unexplained = None
     if verdict in ("unexplained", "partly_explained"):
         empirical = _empirical(problem, search, found)

@@ -30,9 +30,20 @@ VISIBLE = 1e-4
 
 
 def recommended(
+    problem: InstrumentProblem,
+    space: Space,
+    fit: Fit,
+    sets: Sequence[Sequence[Candidate]],
+    unseen: Sequence[Candidate],
+) -> str:
+    """What to capture next: for every set that cannot be told apart, else to show what is unseen."""
+    return " ".join(dict.fromkeys(_capture(problem, space, fit, rivals, unseen) for rivals in sets or ((),)))
+
+
+def _capture(
     problem: InstrumentProblem, space: Space, fit: Fit, rivals: Sequence[Candidate], unseen: Sequence[Candidate]
 ) -> str:
-    """One sentence: the capture that separates the rivals and shows the unseen, or that there is none of the usual."""
+    """One sentence: the capture that separates the rivals, or shows the unseen, or that none of the usual does."""
     rows_side = [c for c in rivals if not c.effect.corrects_counts and c.effect.group != "reflectance"]
     have = [c.sample for c in problem.captures]
     best, power = "", 0.0

@@ -85,13 +85,15 @@ def _effects(judged: Judged) -> str:
             if isinstance(p.value, tuple):
                 value = f"{len(p.value)} values, {min(p.value):.4g} to {max(p.value):.4g}"
             else:
-                value = f"{p.value:.5g}" + (f" +- {p.stderr:.2g}" if isinstance(p.stderr, float) else "")
-            doubt = "" if e.confident else "name may be wrong"
-            also = ", ".join(e.indistinguishable_from)
-            rows.append([e.kind, e.element or "", name, value, p.unit, f"{e.evidence:.0f}", also, doubt])
+                value = f"{p.value:.5g}" + (f" ± {p.stderr:.2g}" if isinstance(p.stderr, float) else "")
+            # What is told of the effect as a whole stands in its first row.
+            kind = e.kind if e.confident else f"{e.kind} (the name may be wrong)"
+            whole = (kind, e.element or "", f"{e.evidence:.0f}", ", ".join(e.indistinguishable_from))
+            kind, element, evidence, also = whole if name == next(iter(e.parameters)) else ("", "", "", "")
+            rows.append([kind, element, name, value, p.unit, evidence, also])
     if not rows:
         return "<p>No effect is named.</p>"
-    head = ["effect", "element", "parameter", "value", "unit", "evidence", "cannot be told from", ""]
+    head = ["effect", "element", "parameter", "value", "unit", "evidence", "cannot be told from"]
     return "<h2>Effects</h2>" + _table(head, rows)
 
 
@@ -112,7 +114,7 @@ def _picture(figure: Figure, alt: str) -> str:
 def _maps(before: Residual, after: Residual) -> Figure:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10, 7.5))
+    figure = Figure(figsize=(10, 8), layout="constrained")
     axes = figure.subplots(2, 2)
     pairs = ((before, "before"), (after, "after"))
     loud = [np.sqrt(np.mean(r.image.astype(float) ** 2, axis=0)) for r, _ in pairs]
@@ -121,23 +123,27 @@ def _maps(before: Residual, after: Residual) -> Figure:
     wide = max(float(np.abs(m).max()) for m in states) or 1.0
     for column, (_, name) in enumerate(pairs):
         image = axes[0, column].imshow(loud[column], vmin=0, vmax=top)
-        axes[0, column].set_title(f"rms over the states, {name}")
-        figure.colorbar(image, ax=axes[0, column], label="noise")
+        axes[0, column].set_title(f"{name}: rms over the states")
+        figure.colorbar(image, ax=axes[0, column], label="residual / noise of one intensity")
         image = axes[1, column].imshow(states[column], vmin=-wide, vmax=wide, cmap="RdBu")
-        axes[1, column].set_title(f"leading component of before, {name}")
-        figure.colorbar(image, ax=axes[1, column], label="noise")
+        axes[1, column].set_title(f"{name}: leading pattern over the states of before")
+        figure.colorbar(image, ax=axes[1, column], label="amplitude / noise of one intensity")
+        for axis in axes[:, column]:
+            axis.set_xlabel("column, pixels")
+            axis.set_ylabel("row, pixels")
     return figure
 
 
 def _states(before: Residual, after: Residual) -> Figure:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10, 3.5))
+    figure = Figure(figsize=(10, 3.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     left.plot(before.per_state, "o-", ms=3, label="before")
     left.plot(after.per_state, "o-", ms=3, label="after")
     left.set_xlabel("state (and channel)")
-    left.set_ylabel("rms residual, noise of one intensity")
+    left.set_ylabel("rms residual / noise of one intensity")
+    left.set_title("each state, over the pixels")
     left.set_ylim(bottom=0)
     left.legend()
     orders = np.arange(1, HARMONICS + 1)
@@ -145,7 +151,9 @@ def _states(before: Residual, after: Residual) -> Figure:
         right.bar(orders + 0.1 * k - 0.2, before.harmonics[axis], 0.1, color=f"C{k}", alpha=0.4, label=f"{axis} before")
         right.bar(orders + 0.1 * k, after.harmonics[axis], 0.1, color=f"C{k}", label=f"{axis} after")
     right.set_xlabel("harmonic, periods a turn")
-    right.set_ylabel("amplitude, noise of one intensity")
+    right.set_ylabel("amplitude / noise of one intensity")
+    right.set_title("harmonics of the mean residual")
+    right.set_xticks(orders)
     if before.harmonics:
         right.legend(fontsize=7)
     return figure
