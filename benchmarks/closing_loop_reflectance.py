@@ -1,4 +1,4 @@
-"""The paper's story with both instruments, for docs/closing-the-loop-reflectance.md: numbers, and the figure.
+"""The paper's story with both instruments, for docs/closing-the-loop.md: numbers, and the figure.
 
     python benchmarks/closing_loop_reflectance.py --figure docs/images/closing_loop_reflectance.png
 
@@ -24,10 +24,9 @@ from processing.images import StokesImage
 from processing.instrument import InstrumentModel
 from processing.product import Step
 from processing.reduce_stokes import reduce_stokes
-from processing.reflectance import first_surface
 from processing.xi0_image import estimate_from_stokes
 from simulators.scene import Scene
-from simulators.sphere_suite import drawn, take
+from simulators.sphere_suite import SphereFault, first_surface_of, take
 
 ROOT = Path(__file__).resolve().parents[1]
 NM, OMEGA_DEG, BORDER = 662.0, 35.0, 4
@@ -44,12 +43,10 @@ def main() -> None:
         captures, instruments = {}, {}
         for kind in ("rgb950", "linear_stokes"):
             instruments[kind] = InstrumentModel.load(ROOT / f"configs/instruments/{kind}.yaml")
-            fault = drawn("polarized_diffuse", np.random.default_rng(0), scene, instruments[kind])
+            fault = SphereFault("the paper's", scene, instruments[kind], first_surface_of(scene.material))
             captures[kind] = folder / f"{kind}.h5"
             take(captures[kind], fault, instruments[kind], NM, OMEGA_DEG, seed=1)
         plain = fault.material
-        if not isinstance(plain, first_surface.Model):
-            raise TypeError("the story starts with first surface alone")
         product = folder / "stokes.h5"
         with Capture(captures["linear_stokes"]) as capture:
             model = instruments["linear_stokes"].at(NM)
@@ -72,6 +69,7 @@ def main() -> None:
                     corrected_material(plain, d),
                 ]
             )
+        rows.append(["the true material: noise alone", scene.material])
         maps = [compared(scene, image, material) for _, material in rows]
         for (title, _), m in zip(rows, maps, strict=True):
             print(f"{title}: psi {m['psi_rms']:.2f} deg, |D| {m['size_rms']:.2f} %, xi0 {m['xi0_rms']:.4f}")

@@ -112,6 +112,13 @@ class ReflectanceProblem:
         """The noise does not depend on the effects."""
         return False
 
+    def residual_squares(self, space: Space, values: Array) -> Array:
+        """Sum of squares (N,) that each point leaves over, in the units of the intensities."""
+        q, size, _ = np.linalg.svd(self._columns(space, values), full_matrices=False)
+        q = q * (size > 1e-6 * size[:, :1])[:, None, :]
+        r = self.y - np.einsum("nlr,nr->nl", q, np.einsum("nlr,nl->nr", q, self.y))
+        return np.asarray(np.sum((r * self.sigma) ** 2, axis=1))
+
     def sums(self, space: Space, values: Array, *, derivatives: bool = True) -> Sums:
         """Excess, and with `derivatives` its half gradient and curvature, of every fold."""
         k = space.size if derivatives else 0

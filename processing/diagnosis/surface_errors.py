@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from processing.diagnosis.fit import Fit, minimize, prior
 from processing.diagnosis.space import Space
 from processing.diagnosis.surface_problem import SurfaceProblem
+from processing.diagnosis.surface_search import bent
 
 Array = NDArray[np.float64]
 
@@ -29,10 +30,10 @@ def standard_errors(problem: SurfaceProblem, space: Space, fit: Fit, spread: flo
     told = raw - problem.noise_information(space, fit.values)
     bread = np.linalg.inv(told if np.linalg.eigvalsh(told).min() > 0 else raw)
     error = np.sqrt(np.maximum(np.diag(bread @ raw @ bread), 0.0))
-    wide = [
-        _wide(problem, space, fit, j, AT * error[j], (AT * error[j]) ** 2 / max(bread[j, j], 1e-300))
-        for j in range(space.size)
-    ]
+    wide = np.ones(space.size)
+    for j in np.flatnonzero(bent(space)):
+        step = AT * error[j]
+        wide[j] = _wide(problem, space, fit, int(j), step, step**2 / max(bread[j, j], 1e-300))
     return np.asarray(error * wide * np.sqrt(spread))
 
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
 from processing.diagnosis.candidate import Candidate
 from processing.diagnosis.fit import LEAST_GAIN, Fit, HeldOut, held_out, minimize
 from processing.diagnosis.problem import Space
@@ -31,7 +34,7 @@ class SurfaceSearch(Search):
         """Search; then look for a deeper minimum near the one that was found."""
         found = super().run()
         typical, fit = found.space.joined("typical"), found.fit
-        for k in range(found.space.size):
+        for k in np.flatnonzero(bent(found.space)):
             for sign in (NEAR, -NEAR):
                 start = found.fit.values.copy()
                 start[k] += sign * typical[k]
@@ -69,6 +72,11 @@ class SurfaceSearch(Search):
         excess = after.excess - NO_STRUCTURE * self.noise_of(after)
         weighty, _ = self.directions(excess)
         return float(max(excess, 0.0) / max(weighty - parameters, 1.0))
+
+
+def bent(space: Space) -> NDArray[np.bool_]:
+    """(K,) values of effects whose valley is bent."""
+    return np.array([getattr(c.effect, "bent", False) for c in space.candidates for _ in c.parameters], dtype=bool)
 
 
 def _roughness(candidate: Candidate) -> float:

@@ -19,10 +19,12 @@ class ReflectanceEffect(Effect):
     ----------
     rough : part of what it explains (chi-square) that its simple form may leave over; beside it no effect is named
         that explains less.
+    bent : its values trade off along a bent valley, so that curvature at one point tells neither minimum nor error.
     """
 
     group = "reflectance"
     rough: ClassVar[float] = 1e-3
+    bent: ClassVar[bool] = False
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ()

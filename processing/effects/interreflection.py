@@ -27,6 +27,7 @@ class This(ReflectanceEffect):
 
     # A support is no disc of one brightness, and where its light is cut off by the object itself is not known.
     rough = 0.2
+    bent = True
 
     def places_on(self, shape: str) -> Sequence[str]:
         return ("", "support")

@@ -16,6 +16,8 @@ from processing.reflectance_changes import ReflectanceChanges
 class This(ReflectanceEffect):
     """Weight a sin^b(theta_h) of the diffuse term in the Jones matrix; log_b = ln b."""
 
+    bent = True
+
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         return (Parameter("a", "1", -2.0, 2.0, 0.1), Parameter("log_b", "1", -1.5, 2.0, 0.5))
 

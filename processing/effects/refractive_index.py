@@ -16,6 +16,8 @@ from processing.reflectance_changes import ReflectanceChanges
 class This(ReflectanceEffect):
     """What has to be added to n and k; more than these bounds is another material, or no first surface at all."""
 
+    bent = True
+
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         return (Parameter("n", "1", -0.3, 0.3, 0.05), Parameter("k", "1", -0.3, 0.3, 0.05))
 

@@ -95,6 +95,25 @@ def test_first_surface_lacks_polarized_diffuse(name, configs, scene, tmp_path, c
     assert "exists and is not replaced" in capsys.readouterr().err
 
 
+def test_what_acquire_writes_in_stokes_mode_is_enough(acquire, small_rig, configs, tmp_path, capfd):
+    rig = small_rig(rows=240, columns=240)
+    assert acquire("--omega", 35, "--mode", "stokes", "--rig", rig, "--out", tmp_path)[0] == 0
+    (path,) = tmp_path.glob("*.h5")
+    plain, out = tmp_path / "plain.yaml", tmp_path / "d.json"
+    plain.write_text(FIRST_SURFACE)
+    given = ["--reflectance", plain, "--geometry", configs / "geometries/one_inch_sphere.yaml", "--json", out]
+    stokes, mueller = (configs / f"instruments/{name}.yaml" for name in ("linear_stokes", "rgb950"))
+    assert run(diagnose, path, "--instrument", stokes, *given) == 0
+    d = SurfaceDiagnosis.model_validate(json.loads(out.read_text()))
+    assert (d.verdict, [e.kind for e in d.effects]) == ("explained", ["polarized_diffuse"])
+    assert d.effects[0].parameters["a"].value == pytest.approx(0.17, abs=3.5 * d.effects[0].parameters["a"].stderr)
+    # First surface alone does not know the normal; with what was found a sphere off its place would show.
+    assert "registration[sphere]" not in d.unobservable
+    capfd.readouterr()
+    assert run(diagnose, path, "--instrument", mueller, *given) == 2
+    assert "Use the instrument file that belongs to the capture" in capfd.readouterr().err
+
+
 def test_geometry_and_instrument_that_were_found_end_the_error(configs, scene, tmp_path, capsys):
     declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
     moved = scene_faults.ArmZero(scene_faults.moved_sphere(scene, 0.5, -0.3, 0.02), 2.0)

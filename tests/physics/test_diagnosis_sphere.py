@@ -5,13 +5,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from processing.capture import Capture
+from processing.diagnosis.fit import minimize
 from processing.diagnosis.problem import Space
+from processing.diagnosis.surface_data import read_surface
+from processing.diagnosis.surface_errors import standard_errors
 from processing.diagnosis.surface_judge import SurfaceDiagnosis
 from processing.diagnosis.surface_problem import SurfaceProblem
 from processing.diagnosis.surface_run import diagnose_object
 from processing.errors import ProcessError
 from processing.instrument import InstrumentModel
 from simulators import scene_faults
+from simulators.laws import Xi0Law
 from simulators.scene import Scene
 from simulators.sphere_suite import SphereFault, drawn, take
 
@@ -112,6 +117,36 @@ def test_two_effects_at_once(scene, configs, tmp_path):
     assert set(found) == {"arm_zero", "illumination_azimuth"}
     assert found["arm_zero"].value == pytest.approx(2.0, abs=3.5 * found["arm_zero"].stderr)
     assert found["illumination_azimuth"].value == pytest.approx(1.0, abs=3.5 * found["illumination_azimuth"].stderr)
+
+
+@pytest.mark.parametrize(("omega_deg", "light"), [(102.0, 1.0), (60.0, 0.1)])
+def test_an_index_where_little_is_polarized_has_an_honest_error(scene, configs, tmp_path, omega_deg, light):
+    # Horizontal light at 102 degrees: p-polarized at the Brewster angle, nearly nothing comes back.
+    declared = InstrumentModel.load(configs / "instruments/linear_stokes.yaml")
+    fault = drawn("refractive_index", np.random.default_rng(5), scene, declared)
+    path = tmp_path / "capture.h5"
+    take(path, fault, declared, NM, omega_deg, 3, light)
+    with Capture(path) as capture:
+        data = read_surface(capture, declared.at(NM), scene.object.geometry, fault.material)
+    problem = SurfaceProblem(declared.at(NM), [data])
+    space = Space(tuple(c for c in problem.pool() if c.kind == "refractive_index"))
+    fit = minimize(problem, space, np.zeros(2))
+    error = standard_errors(problem, space, fit, 1.0)
+    truth = np.array([fault.parameters["refractive_index"][n] for n in ("n", "k")])
+    assert np.all(np.abs(fit.values - truth) < 3.5 * error)
+    assert error[0] < 0.05
+
+
+def test_without_polarization_there_is_nothing_to_say(scene, configs, tmp_path):
+    declared = InstrumentModel.load(configs / "instruments/linear_stokes.yaml")
+    white = {nm: s.model_copy(update={"xi0": Xi0Law(base=0.25)}) for nm, s in scene.object.surface.items()}
+    fault = SphereFault(
+        "white", Scene(scene.object.model_copy(update={"surface": white}), scene.material), declared, None
+    )
+    path = tmp_path / "capture.h5"
+    take(path, fault, declared, NM, OMEGA_DEG, 1)
+    with pytest.raises(ProcessError, match="no polarization stands out of the noise"):
+        diagnose_object([path], declared, scene.material, scene.object.geometry)
 
 
 def test_derivatives_are_those_of_the_residual(scene, configs, tmp_path):
