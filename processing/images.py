@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
@@ -103,6 +104,10 @@ class MuellerImage:
         Rebuilt from W, the noise model and the fitted intensities, then scaled so that its diagonal is `errors`
         squared (which also holds what the dark frames and left-out states add).
         """
+        return self._covariance
+
+    @cached_property
+    def _covariance(self) -> NDArray[np.float64]:
         inverse = self._inverse()
         variance = self.intensity_variance()
         if self.facts["weighted"]:
@@ -121,8 +126,8 @@ class MuellerImage:
         """
         g = np.asarray(gradient).reshape(-1, 16)
         if self.facts["weighted"]:
-            full = self.covariance().reshape(-1, 16, 16)
-            return np.asarray(np.einsum("pi,pij,pj->p", g, full, g, optimize=True).reshape(self.mask.shape))
+            full = self._covariance.reshape(-1, 16, 16)
+            return np.asarray(np.einsum("pi,pi->p", (full @ g[:, :, None])[..., 0], g).reshape(self.mask.shape))
         inverse, variance = self._inverse(), self.intensity_variance()
         found = np.einsum("pn,np->p", np.square(g @ inverse), variance)
         # Flats, dark frames and left-out states change all errors of a pixel much alike.
