@@ -14,6 +14,7 @@ from acquisition.capture_writer import PARTIAL, bytes_needed, check_space
 from acquisition.checks import Check, refuse_failed
 from acquisition.errors import AcquisitionError, InterlockOpened, PlanRefused, Stopped
 from acquisition.estimate import capture_seconds, last_pose_deg
+from acquisition.interlocks import LOOK_S
 from acquisition.job import Job, Result, check_with_devices, existing, job_of
 from acquisition.job import prepare as prepare_job
 from acquisition.observer import Observer
@@ -142,6 +143,7 @@ class CampaignRun:
                 changed = self.operator.prepare(capture.plan, source_selects=selects)
                 self.folder.log("capture started", capture=capture.name, states_done=done, operator=changed)
                 self.folder.record(capture.name, status="running", reference=capture.reference)
+                self._wait_for_door(rig, capture)
                 result = self._take_once(capture, job, rig)
             except Stopped:
                 return None
@@ -164,6 +166,20 @@ class CampaignRun:
             )  # fmt: skip
             self._record_end(capture, result.status, result.states_done, result.path.name, result.saturated_fraction)
             return result
+
+    def _wait_for_door(self, rig: Rig, capture: CampaignCapture) -> None:
+        """A door open between captures: wait, if the campaign goes on by itself. Raises InterlockOpened."""
+        if rig.source is None or not rig.source.interlock_open():
+            return
+        if not self.campaign.continue_after_interlock:
+            raise InterlockOpened(
+                f"the door is open before {capture.name}. Nothing was moved. Close it, then the same command goes on."
+            )
+        self.folder.log("waiting", capture=capture.name, why="the door is open")
+        for observer in self.observers:
+            observer.warning("the door is open; going on when it is closed")
+        while rig.source.interlock_open() and not self.stop.requested:
+            time.sleep(LOOK_S)
 
     def _take_once(self, capture: CampaignCapture, job: Job, rig: Rig) -> Result:
         final = self.folder.folder / capture.name

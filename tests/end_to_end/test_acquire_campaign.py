@@ -1,6 +1,7 @@
 """`acquire --campaign`: the whole is checked first, and the same command goes on where it stopped."""
 
 import json
+import threading
 
 import numpy as np
 import pytest
@@ -120,6 +121,29 @@ def test_an_open_door_is_not_tried_again_unattended(acquire, small_rig, campaign
     assert [entry["event"] for entry in log].count("capture failed") == 1
     code, _, err = acquire("--campaign", file, "--rig", small_rig(), "--out", tmp_path)
     assert code == 0, err
+
+
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_a_door_open_between_captures(acquire, small_rig, campaign, tmp_path, monkeypatch, goes_on):
+    from acquisition.campaign_run import CampaignRun
+
+    take, taken = CampaignRun._take, []
+
+    def opened_before_the_second(self, capture, job):
+        taken.append(capture.name)
+        if len(taken) == 2:
+            shutter = self.rig.simulation.emulators["shutter"]
+            shutter.trip(True)
+            threading.Timer(0.5, shutter.trip, (False,)).start()
+        return take(self, capture, job)
+
+    monkeypatch.setattr(CampaignRun, "_take", opened_before_the_second)
+    lines = {"retries": "3", "retry_wait_s": "1", "continue_after_interlock": str(goes_on).lower()}
+    file = campaign(plans="{stokes: stokes.yaml}", references="[]", **lines)
+    code, _, err = acquire("--campaign", file, "--rig", small_rig(), "--out", tmp_path)
+    assert "the door is open" in err
+    assert code == (0 if goes_on else 1)
+    assert len(list((tmp_path / "small").glob("*.h5"))) == (2 if goes_on else 1)
 
 
 def test_books_that_a_full_disc_cut_off_are_caught_up(acquire, small_rig, campaign, tmp_path):
