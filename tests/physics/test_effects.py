@@ -170,7 +170,7 @@ def test_an_effect_of_one_capture_holds_for_that_capture_only(configs):
         kind="source_drift",
         scope="capture",
         captures=("one",),
-        parameters={"fraction": EffectParameter(value=0.1, unit="1")},
+        parameters={n: EffectParameter(value=v, unit="1") for n, v in (("fraction", 0.1), ("curvature", 0.0))},
     )
     changed = model.model_copy(update={"effects": (drift,)})
     assert np.ptp(changes_of(changed, capture.conditions, "one").gain) == pytest.approx(0.1)
