@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 #: The prior that keeps unseen parameters still is this many times wider than a typical size.
 PRIOR_WIDTH = 10.0
 STEPS = 15
-#: Times that corrections of counts are expanded anew about where a fit ended.
+#: Times that corrections of counts are expanded anew in one fit.
 EXPANSIONS = 2
 #: The fit ends when a step promises less than this in chi-square, or this fraction of the excess.
 LEAST_GAIN = 0.01
@@ -44,11 +44,15 @@ def minimize(
     folds: Sequence[int] | None = None,
     free: NDArray[np.bool_] | None = None,
     steps: int = STEPS,
+    expansions: int = EXPANSIONS,
 ) -> Fit:
-    """Least squares by Levenberg-Marquardt with bounds, on the data of the folds given; `free` (K,) may hold some."""
+    """Least squares by Levenberg-Marquardt with bounds, on the data of the folds given; `free` (K,) may hold some.
+
+    Corrections of counts are expanded anew at most `expansions` times about where the fit ended.
+    """
     fit = _descend(problem, space, start, folds, free, steps)
     if folds is None:
-        for _ in range(EXPANSIONS):
+        for _ in range(expansions):
             if not problem.relinearize(space, fit.values):
                 break
             fit = _descend(problem, space, fit.values, folds, free, steps)

@@ -263,11 +263,14 @@ class Search:
         best: Fit | None = None
         for start in (np.zeros(candidate.size), *candidate.starts):
             first = np.ones(1) if candidate.effect.switch else start
-            tried = minimize(self.problem, both, np.concatenate([fit.values, first]))
+            tried = minimize(self.problem, both, np.concatenate([fit.values, first]), expansions=0)
             if best is None or tried.excess < best.excess:
                 best = tried
         if best is None:
             raise ValueError("a candidate needs at least one start")
+        if fit.excess - best.excess > 0.5 * DECISIVE * self.n0:
+            # To expand anew costs a pass over all pixels; what explains nothing is not worth it.
+            best = minimize(self.problem, both, best.values)
         held = held_out(self.problem, both, best)
         evidence = self._evidence(out, held, both.size)
         rank = _rank(held.excess, out.excess, weighty, candidate.cost, self.n0)
