@@ -121,10 +121,11 @@ def _direction(theta_phi_deg: Any) -> Any:
 
 
 def source_panel(axis: Any, judged: Judged, title: str) -> None:
-    """The source's factor in each state, as found."""
+    """The source's factor in each state, as found, about its mean."""
     d = judged.diagnosis
     (found,) = (e.parameters["states"] for e in d.effects if e.kind == "source_flicker")
-    axis.errorbar(range(len(found.value)), 100 * np.array(found.value), 100 * np.array(found.stderr), fmt="o", ms=3)
+    # The errors are common to all states (a throughput) and would say nothing about the differences.
+    axis.plot(100 * (np.array(found.value) - np.mean(found.value)), "o", ms=3)
     axis.axhline(0, color="0.5", lw=0.8)
     axis.set_ylabel("source_flicker, %")
     axis.set_xlabel("state")
