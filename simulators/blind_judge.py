@@ -87,10 +87,10 @@ def judge(cases: Sequence[Case], results: Mapping[str, Result]) -> Score:
             score.set_sizes += [1 + len(e["indistinguishable_from"]) for e in result["effects"] if e["confident"]]
         good = _mark(score, case, kinds, result, seen)
         if not good:
-            strengths = ", ".join(f"{d:.0f}" for d in case.detectable)
+            truth = " + ".join(f"{t.kind} ({d:.0f})" for t, d in zip(case.faults, case.detectable, strict=True))
             sets = "; ".join("|".join(sorted(s)) for s in named_sets(result))
             score.lines.append(
-                f"{case.name} {case.sample} {case.wavelength_nm:g} nm, truth {row} ({strengths}): "
+                f"{case.name} {case.sample} {case.wavelength_nm:g} nm, truth {truth or row}: "
                 f"{result['verdict']} {sets or '-'}"
             )
     return score
