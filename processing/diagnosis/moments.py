@@ -130,7 +130,10 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
     variance = data.variance().reshape(rows, height, width)
     scale = variance.mean(axis=0)
     good = data.usable & (scale > 0) & inside(height, width)
-    sigma = np.sqrt(np.mean(variance[:, good] / scale[good], axis=1))
+    # Where too much was subtracted a dark state is negative all over; its noise is not less than that of the read-out.
+    least = np.repeat(data.floor, c)[:, None] / 2
+    mean_variance = np.mean(variance[:, good] / scale[good], axis=1)
+    sigma = np.sqrt(np.maximum(mean_variance, np.mean(least / scale[good], axis=1)))
     tiles = None
     by_state = holds_out_states(data)
     index, x, y = _grid(height, width)
