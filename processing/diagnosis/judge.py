@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from processing.diagnosis.candidate import Candidate
 from processing.diagnosis.fit import covariance, minimize
+from processing.diagnosis.moments import FEATURES, features
 from processing.diagnosis.problem import InstrumentProblem
 from processing.diagnosis.recommend import recommended
 from processing.diagnosis.result import (
@@ -318,15 +319,20 @@ def _capture(problem: InstrumentProblem, k: int, found: Found, before: Residual,
 
 
 def closure(problem: InstrumentProblem, k: int, space: Space, values: Array) -> float | None:
-    """Mean of I0 + I90 - I45 - I135 over mean S0, percent, after dividing by the gains of the channels."""
+    """Mean of I0 + I90 - I45 - I135 over mean S0, percent, of corrected counts over the gains of their channels."""
     model, data = problem.model, problem.captures[k]
     if model.mosaic is None or {c.name for c in model.channels} != {"0", "45", "90", "135"}:
         return None
     changes = problem.changes(k, space, values)
-    names = [c.name for c in model.channels]
-    sign = np.array([1.0 if n in ("0", "90") else -1.0 for n in names])
+    coefficients = problem.coefficients(k, changes).reshape(len(FEATURES), *data.signal.shape[:2])
     good = data.usable & ~data.clipped
     if not good.any():
         return None
-    means = data.signal[:, :, good].mean(axis=(0, 2), dtype=np.float64) / changes.gain.mean(axis=0)
-    return float(100 * (sign @ means) / (means.sum() / 2))
+    means = np.zeros(len(model.channels))
+    for channel, c in enumerate(model.channels):
+        sign = 1.0 if c.name in ("0", "90") else -1.0
+        for state in range(data.signal.shape[0]):
+            counts = data.signal[state, channel][good].astype(np.float64)
+            corrected = np.tensordot(coefficients[:, state, channel], features(counts)[0], axes=1)
+            means[channel] += sign * corrected.mean() / changes.gain[state, channel]
+    return float(100 * means.sum() / (np.abs(means).sum() / 2))
