@@ -95,14 +95,18 @@ class InstrumentProblem:
     far_from_linear = False
 
     def __init__(
-        self, model: InstrumentModel, captures: Sequence[CaptureData], undone: Mapping[Candidate, Array] | None = None
+        self,
+        model: InstrumentModel,
+        captures: Sequence[CaptureData],
+        undone: Mapping[Candidate, Array] | None = None,
+        folds: int | None = None,
     ) -> None:
         self.undone = dict(undone or {})
         self._others: list[InstrumentProblem] = []
         self._noise_at: dict[Candidate, Array] = {}
         self.model = model
         self.captures = tuple(captures)
-        self.folds = FOLDS_OF_STATES if any(holds_out_states(c) for c in captures) else FOLDS_OF_TILES
+        self.folds = folds or (FOLDS_OF_STATES if any(holds_out_states(c) for c in captures) else FOLDS_OF_TILES)
         self.moments: tuple[Moments, ...] = tuple(moments_of(c, self.folds) for c in captures)
         self._built: list[dict[tuple[str, bytes], Array]] = [{} for _ in captures]
         self.noise_known = all(c.noise_known for c in captures)
@@ -155,8 +159,12 @@ class InstrumentProblem:
             return False
         undone = _pointwise(space, values)
         captures = [c.undone(*_undone(c, undone)) for c in self.captures]
-        self._others.append(InstrumentProblem(self.model, captures, undone))
+        self._others.append(InstrumentProblem(self.model, captures, undone, self.folds))
         return True
+
+    def undivided(self) -> InstrumentProblem:
+        """The same with nothing held out: one set of unknowns for all states, not one for each part of them."""
+        return InstrumentProblem(self.model, self.captures, folds=1)
 
     def adopt_noise(self, space: Space, values: Array) -> bool:
         """Take the noise from the light that these values tell, for all that follows; False if that is as before.

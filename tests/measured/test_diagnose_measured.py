@@ -47,12 +47,16 @@ def test_wollaston_the_source_is_the_cause(shared_data, configs, tmp_path):
     for k, n in enumerate(np.argsort(theta)):
         lines.append(f"{k},{np.rad2deg(theta[n]):.6f},{left[n]},{right[n]}")
     path = imported(tmp_path, lines, instrument, 1600, "air")
-    d = diagnose_captures([path], InstrumentModel.load(instrument))[0].diagnosis
+    judged, problem = diagnose_captures([path], InstrumentModel.load(instrument))
+    d = judged.diagnosis
     assert d.error_before.rms_percent > 2.0
     assert d.error_after.rms_percent < 0.2
     named = [e for e in d.effects if e.confident]
     assert [e.kind for e in named] == ["source_flicker"]
     assert d.verdict == "explained"
+    # The values hold for all states together, with one throughput, not only for each part that was held out.
+    whole = problem.undivided().sums(judged.found.space, judged.found.fit.values, derivatives=False)
+    assert np.sqrt(whole.square.sum() / whole.count.sum()) < 0.002
     # Both channels saw it: their sum, which is modulated only as far as they differ, shows the same gains.
     gains = 1 + np.array(named[0].parameters["states"].value)
     total = (left + right)[np.argsort(theta)]
