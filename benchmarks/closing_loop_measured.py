@@ -70,15 +70,14 @@ def mirror(folder: Path) -> Judged:
 
 
 def closures(folder: Path) -> list[tuple[str, float]]:
-    """Closure of both pictures in percent, before and after the gains that `camera` teaches."""
+    """Closure of both pictures in percent, before and with what `camera` alone teaches."""
     paths, out = [], []
     for name in ("camera", "fruits"):
         file = SHARED / f"dofp-imx250mzr/polanalyser_{name}_IMX250MZR.png"
         path, model = imported(folder / name, ["state,file", f"0,{file}"], "linear_stokes", 550, "unknown")
         paths.append(path)
     learnt = diagnose_captures(paths[:1], model)[0].diagnosis
-    gains = tuple(e for e in learnt.effects if e.confident)
-    better = extended(model, learnt.model_copy(update={"effects": gains}))
+    better = extended(model, learnt)
     for name, path in zip(("camera", "fruits"), paths, strict=True):
         for when, used in (("before", model.at(550)), ("after", better.at(550))):
             with Capture(path) as capture:
@@ -169,7 +168,7 @@ def main() -> None:
     for k, (_, value) in enumerate(bars):
         axes[1, 0].annotate(f"{value:.3f}", (k, value), ha="center", va="bottom", fontsize=8)
     axes[1, 0].set_ylabel("I0 + I90 - I45 - I135, % of S0")
-    axes[1, 0].set_title("polarization camera: gains learnt on `camera` alone", fontsize=9)
+    axes[1, 0].set_title("polarization camera: learnt on `camera` alone", fontsize=9)
     theta, *left = ptfe()
     edges = np.arange(0, 91, 7.5)
     for errors, label in zip(left, ("before: first surface, n = 1.35", "after: volume_scattering"), strict=True):
