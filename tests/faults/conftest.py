@@ -1,5 +1,6 @@
 """Runs of `acquire` in a process of their own, to be killed, stopped and starved; and how captures compare."""
 
+import math
 import os
 import subprocess
 import sys
@@ -121,7 +122,10 @@ def intact(configs: Path) -> Callable[[Path], int]:
             for state in range(len(capture.done)):
                 true = dict(zip(axes, read_stamp(capture.frames(state)[0]), strict=True))
                 for axis in capture.angles_deg:
-                    assert true[axis] == pytest.approx(capture.angles_deg[axis][state], abs=5e-4), (state, axis)
+                    off_deg = true[axis] - float(capture.angles_deg[axis][state])
+                    # A rotator that was homed again counts its turns anew: its switch comes once a turn.
+                    off_deg = off_deg if axis == "arm" else math.remainder(off_deg, 360.0)
+                    assert abs(off_deg) < 5e-4, (state, axis, true[axis], off_deg)
             return len(capture.done)
 
     return check

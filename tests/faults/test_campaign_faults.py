@@ -63,23 +63,55 @@ class Weather(Observer):
         self.injected[f"{device} {kind}"] += 1
 
 
-def _campaign(tmp_path, configs):
+def _campaign(tmp_path, configs, full=FULL):
     plans = {}
     for mode in ("drr", "stokes"):
         text = (configs / "plans" / f"{mode}.yaml").read_text().replace("exposure_s: 0.02", "exposure_s: 0.002")
-        if not FULL:
+        if not full:
             text = text.replace("states: 40, step_deg: 9", "states: 18, step_deg: 20").replace("darks: 4", "darks: 1")
         plans[mode] = tmp_path / f"{mode}.yaml"
         plans[mode].write_text(text)
     file = tmp_path / "campaign.yaml"
-    omega = "{start: 20, stop: 90, step: 5}" if FULL else "[40, 60]"
+    omega = "{start: 20, stop: 90, step: 5}" if full else "[40, 60]"
     file.write_text(
         f"kind: campaign\nname: night\nplans: {{drr: {plans['drr']}, stokes: {plans['stokes']}}}\n"
-        f"samples: [{{name: red_sphere}}]\nwavelengths_nm: {'[451, 662]' if FULL else '[662]'}\nomega_deg: {omega}\n"
+        f"samples: [{{name: red_sphere}}]\nwavelengths_nm: {'[451, 662]' if full else '[662]'}\nomega_deg: {omega}\n"
         "references: [{sample: {kind: air, name: air}, omega_deg: 180, modes: [drr], every: 8}]\n"
         "retries: 50\nretry_wait_s: 0.05\ncontinue_after_interlock: true\n"
     )
     return Campaign.load(file)
+
+
+class PowerCut(Observer):
+    """Takes the rotators their reference when a capture has ended, many turns away from where they began."""
+
+    def __init__(self):
+        self.run = None
+        self.turned_deg = []
+
+    def run_ended(self, status, details):
+        emulator = self.run.rig.simulation.emulators["rotators"]
+        self.turned_deg.append(max(axis.true_deg() for axis in emulator.axes))
+        for axis in emulator.axes:
+            axis.lose_reference()
+
+
+def test_rotators_homed_again_between_captures_count_their_turns_anew(quick_rig, intact, configs, tmp_path):
+    config = load_rig(quick_rig(flux_e_per_s=8e6))
+    campaign = _campaign(tmp_path, configs, full=False)
+    jobs = [entry for entry in campaign_run.prepare(campaign, config) if entry[1].plan.mode == "drr"]
+    stop, cut = StopRequest(), PowerCut()
+    folder = CampaignFolder(tmp_path / "night", campaign)
+    cut.run = CampaignRun(
+        campaign, config, folder, Operator(lambda text: None, stop, True, True), stop, [cut], home=True
+    )
+    try:
+        assert cut.run.run(jobs)
+    finally:
+        folder.close()
+    assert min(cut.turned_deg) > 360.0
+    for capture, job in jobs:
+        assert intact(tmp_path / "night" / capture.name) == len(job.table)
 
 
 def test_unattended_campaign_survives_random_faults(quick_rig, intact, configs, tmp_path):
