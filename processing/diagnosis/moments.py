@@ -102,7 +102,7 @@ class Moments:
 
     Attributes
     ----------
-    sigma : (L,) noise of each row in the weighted units.
+    sigma : (L,) noise of each row in the weighted units; left : (L,) part of its variance that the pixels show.
     relative : turns a weighted square into a square relative to the mean signal.
     spread : mean square over squared mean of the variances: 1 if all pixels and states are equally noisy.
     noise_floor : rms noise over the mean signal.
@@ -111,6 +111,7 @@ class Moments:
     blocks: tuple[Block, ...]
     tiles: Tiles | None
     sigma: Array
+    left: Array
     relative: float
     spread: float
     noise_floor: float
@@ -134,6 +135,8 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
     least = np.repeat(data.floor, c)[:, None] / 2
     mean_variance = np.mean(variance[:, good] / scale[good], axis=1)
     sigma = np.sqrt(np.maximum(mean_variance, np.mean(least / scale[good], axis=1)))
+    left = data.row_noise_left
+    shown = variance * left[:, None, None]
     tiles = None
     by_state = holds_out_states(data)
     index, x, y = _grid(height, width)
@@ -145,18 +148,18 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
         fold_of_tile = (np.arange(x.size) // side + np.arange(x.size) % side) % folds
         fold_of_pixel = fold_of_tile[index]
         held = f"every tile of the image is predicted by a fit to the other tiles ({folds} parts, interleaved)"
-        tiles = _tiles(u, variance, scale, good & ~data.clipped, index, x, y, fold_of_tile)
+        tiles = _tiles(u, shown, scale, good & ~data.clipped, index, x, y, fold_of_tile)
     blocks: list[Block] = []
     for clipped in (False, True):
         for fold in range(1 if by_state else folds):
             pick = good & (data.clipped == clipped) & (fold_of_pixel == fold)
             if pick.any():
-                blocks += _blocks(data, u, variance, scale, pick, fold, clipped, folds if by_state else 0)
+                blocks += _blocks(data, u, shown, scale, pick, fold, clipped, folds if by_state else 0)
     share = variance[:, good] / scale[good] / sigma[:, None] ** 2
     mean = float(np.mean(u[:, good]))
     relative = float(np.mean(scale[good])) / mean**2
     floor = float(np.sqrt(np.mean(variance[:, good]))) / mean
-    return Moments(tuple(blocks), tiles, sigma, relative, float(np.mean(share**2)), floor, held)
+    return Moments(tuple(blocks), tiles, sigma, left, relative, float(np.mean(share**2)), floor, held)
 
 
 def inside(height: int, width: int) -> NDArray[np.bool_]:

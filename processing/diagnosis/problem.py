@@ -23,6 +23,7 @@ from processing.diagnosis.moments import (
     FEATURES,
     FOLDS_OF_STATES,
     FOLDS_OF_TILES,
+    MARGIN,
     Moments,
     holds_out_states,
     moments_of,
@@ -104,6 +105,9 @@ class InstrumentProblem:
         self.undone = dict(undone or {})
         self._others: list[InstrumentProblem] = []
         self._noise_at: dict[Candidate, Array] = {}
+        # The captures before their frames were moved back, and by how much each was.
+        self.still = tuple(captures)
+        self.shifts_px = tuple(np.zeros((c.conditions.states, 2)) for c in captures)
         self.model = model
         self.captures = tuple(captures)
         self.folds = folds or (FOLDS_OF_STATES if any(holds_out_states(c) for c in captures) else FOLDS_OF_TILES)
@@ -157,10 +161,24 @@ class InstrumentProblem:
         known, _ = self.near(space, values)
         if _distance(known.undone, space, values) < EXACT:
             return False
-        undone = _pointwise(space, values)
-        captures = [c.undone(*_undone(c, undone)) for c in self.captures]
-        self._others.append(InstrumentProblem(self.model, captures, undone, self.folds))
+        undone = _exact(space, values)
+        bent = {c: v for c, v in undone.items() if c.effect.pointwise}
+        still = [c.undone(*_undone(c, bent)) if bent else c for c in self.captures]
+        shifts = [self._shift_px(k, undone) for k in range(len(still))]
+        if max(np.abs(s).max() for s in shifts) > MARGIN:
+            return False
+        moved = [c.moved_back(s) if s.any() else c for c, s in zip(still, shifts, strict=True)]
+        other = InstrumentProblem(self.model, moved, undone, self.folds)
+        other.still, other.shifts_px = tuple(still), tuple(shifts)
+        self._others.append(other)
         return True
+
+    def _shift_px(self, capture: int, undone: Mapping[Candidate, Array]) -> Array:
+        changes = Changes(self.captures[capture].conditions)
+        for candidate, values in undone.items():
+            if candidate.effect.moves_image and candidate.capture in (None, capture):
+                candidate.effect.apply(changes, self.model, candidate.place, values)
+        return changes.shift_px
 
     def undivided(self) -> InstrumentProblem:
         """The same with nothing held out: one set of unknowns for all states, not one for each part of them."""
@@ -172,10 +190,14 @@ class InstrumentProblem:
         The evidence for an effect is always taken with one and the same noise; else a correction could gain by the
         noise that it pretends.
         """
-        if _distance(self._noise_at, space, values) < EXACT or any(c.noise_estimated for c in self.captures):
+        at = _exact(space, values, pointwise=True)
+        if _distance(self._noise_at, space, values, pointwise=True) < EXACT or any(
+            c.noise_estimated for c in self.captures
+        ):
             return False
-        self._noise_at = _pointwise(space, values)
+        self._noise_at = at
         self.captures = tuple(c.with_noise_of(*_undone(c, self._noise_at)) for c in self.captures)
+        self.still = self.captures
         self.moments = tuple(moments_of(c, self.folds) for c in self.captures)
         self.spread = max(m.spread for m in self.moments)
         self._others.clear()
@@ -318,7 +340,7 @@ class InstrumentProblem:
         np.add.at(out.freedom, tiles.fold, np.sum(free * noise, axis=1))
         left = np.einsum("tll->tl", ps - (ps @ q) @ q.transpose(0, 2, 1)) @ sigma**2
         np.add.at(out.square, tiles.fold, left * self.moments[k].relative)
-        np.add.at(out.count, tiles.fold, free.sum(axis=1) * tiles.pixels)
+        np.add.at(out.count, tiles.fold, free @ self.moments[k].left * tiles.pixels)
         if not derivatives or space.size == 0:
             return
         # dr_k = -P dA_k A+ y = -B_k y: <r, dr_k> = -tr(P S B_k^T), <dr_k, dr_l> = tr(B_k S B_l^T).
@@ -351,17 +373,19 @@ class InstrumentProblem:
         return np.asarray(a / self.moments[k].sigma[:, None])
 
 
-def _distance(undone: Mapping[Candidate, Array], space: Space, values: Array) -> float:
-    """Largest distance of a pointwise correction from where it was undone, in typical sizes."""
+def _distance(undone: Mapping[Candidate, Array], space: Space, values: Array, *, pointwise: bool = False) -> float:
+    """Largest distance of a correction from where it was undone, in typical sizes; of the `pointwise` ones alone."""
     away = [0.0]
     for candidate, part in zip(space.candidates, space.slices, strict=True):
-        if candidate.effect.pointwise:
+        if candidate.effect.pointwise or (candidate.effect.moves_image and not pointwise):
             away.append(float(np.max(np.abs(values[part] - undone.get(candidate, 0.0)) / candidate.typical)))
     return max(away)
 
 
-def _pointwise(space: Space, values: Array) -> dict[Candidate, Array]:
-    return {c: values[p] for c, p in zip(space.candidates, space.slices, strict=True) if c.effect.pointwise}
+def _exact(space: Space, values: Array, *, pointwise: bool = False) -> dict[Candidate, Array]:
+    """Values of what can be undone exactly; of the `pointwise` corrections alone."""
+    active = zip(space.candidates, space.slices, strict=True)
+    return {c: values[p] for c, p in active if c.effect.pointwise or (c.effect.moves_image and not pointwise)}
 
 
 def _undone(data: CaptureData, undone: Mapping[Candidate, Array]) -> tuple[Array, Array]:

@@ -47,7 +47,7 @@ def add_block(block: Block, a: Array, c: Array, da: Array, dc: Array | None, mom
     out.freedom[f] += free @ n
     out.excess[f] += float(np.sum(r * r)) - free @ n
     out.square[f] += float(np.sum((r / scale[:, None]) ** 2)) * moments.relative
-    out.count[f] += free.sum() * block.pixels
+    out.count[f] += free @ moments.left[rows] * block.pixels
     if dc is None or da.shape[0] == 0:
         return
     k = da.shape[0]

@@ -14,6 +14,7 @@ from processing.diagnosis.problem import InstrumentProblem
 from processing.diagnosis.projection import add_response
 from processing.diagnosis.space import Space
 from processing.effects.field_retardance import terms
+from processing.shifted import shifted_back
 
 Array = NDArray[np.float64]
 
@@ -66,18 +67,18 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     counts = data.signal.reshape(rows, height, width).astype(np.float64)
     y = add_response(counts, problem.coefficients(capture, changes), problem.columns(capture, changes))
     variance = data.variance().reshape(rows, height, width)
-    level = np.sqrt(moments.sigma**2)
-    r = np.full((rows, height, width), np.nan, dtype=np.float32)
+    level = moments.sigma
     free = np.zeros((rows, height, width), dtype=np.float32)
     signal = np.zeros((rows, height, width), dtype=np.float32)
-    for mask, columns in _parts(problem, capture, changes, a, used):
+    for mask, columns in _parts(problem, capture, changes, a, np.ones_like(used)):
         q = _basis(columns / level[:, None])
-        part = y[:, mask] / level[:, None]
-        fitted = q @ (q.T @ part)
-        scale = np.sqrt(variance[:, mask].mean(axis=0))
-        r[:, mask] = (part - fitted) / scale
-        signal[:, mask] = fitted * level[:, None]
-        free[:, mask] = (1 - np.sum(q * q, axis=1))[:, None]
+        signal[:, mask] = (q @ (q.T @ (y[:, mask] / level[:, None]))) * level[:, None]
+        free[:, mask] = (1 - moments.left * np.sum(q * q, axis=1))[:, None]
+    # Frames moved back have noise that neighbours share: the residual is that of the frames as they were taken.
+    taken = problem.still[capture].signal.reshape(counts.shape) - _moved_again(signal, problem.shifts_px[capture])
+    scale = level[:, None, None] * np.sqrt(np.maximum(variance.mean(axis=0), 1e-300))
+    r = ((taken + (y - counts)) / scale).astype(np.float32)
+    r[:, ~used], signal[:, ~used], free[:, ~used] = np.nan, 0.0, 0.0
     noise = variance / level[:, None, None] ** 2 / np.maximum(variance.mean(axis=0), 1e-300)
     expected = (free * noise).astype(np.float32)
     good = np.asarray(np.isfinite(r).all(axis=0))
@@ -103,6 +104,13 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
         leading_share=float(value[-1] / max(value.sum(), 1e-300)),
         left=left,
     )
+
+
+def _moved_again(images: NDArray[np.float32], shift_px: Array) -> NDArray[np.float32]:
+    if not shift_px.any():
+        return images
+    shifts = np.repeat(shift_px, images.shape[0] // shift_px.shape[0], axis=0)
+    return np.stack([shifted_back(image, -x, -y) for image, (x, y) in zip(images, shifts, strict=True)])
 
 
 def _parts(

@@ -57,6 +57,7 @@ class Effect(ABC):
     per_state : parameter k acts on state k alone (which also makes its derivative cheap).
     corrects_counts : it is undone in the counts, not put into the rows of W.
     pointwise : it is undone in each pixel by itself, by `undo`.
+    moves_image : it moves the image (`Changes.shift_px`); it is undone by moving the frames back.
     switch : it is on or off; its parameter is not fitted.
     """
 
@@ -66,6 +67,7 @@ class Effect(ABC):
     per_state: ClassVar[bool] = False
     corrects_counts: ClassVar[bool] = False
     pointwise: ClassVar[bool] = False
+    moves_image: ClassVar[bool] = False
     switch: ClassVar[bool] = False
 
     def first_state(self, place: str) -> int:

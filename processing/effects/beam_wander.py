@@ -20,6 +20,7 @@ class This(Effect):
 
     group = "detector"
     corrects_counts = True
+    moves_image = True
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         axes = moving_axes(model, conditions)

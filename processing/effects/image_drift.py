@@ -18,6 +18,7 @@ class This(Effect):
 
     group = "detector"
     corrects_counts = True
+    moves_image = True
     scope = "capture"
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:

@@ -1,0 +1,35 @@
+"""Images moved by fractions of a pixel, by interpolation with a spline of fifth order."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+#: Pixels on either side that count; what the spline takes from further away is below 1e-4.
+REACH = 10
+
+
+def shifted_back(image: NDArray[np.floating], x_px: float, y_px: float) -> NDArray[np.float32]:
+    """Image (rows, columns) moved back by what it had moved to the right and down; slopes go on beyond its edges."""
+    along_x, along_y = _taps(x_px), _taps(y_px)
+    x, y = along_x.size // 2, along_y.size // 2
+    wide = np.pad(image.astype(np.float32), ((y, y), (x, x)), mode="reflect", reflect_type="odd")
+    moved = cv2.sepFilter2D(wide, -1, along_x, along_y)
+    return np.asarray(moved[y : y + image.shape[0], x : x + image.shape[1]], dtype=np.float32)
+
+
+def noise_left(x_px: float, y_px: float) -> float:
+    """Variance of a pixel after `shifted_back` over that before: interpolation averages the noise of neighbours."""
+    return float(np.sum(_taps(x_px) ** 2) * np.sum(_taps(y_px) ** 2))
+
+
+def _taps(shift_px: float) -> NDArray[np.float64]:
+    reach = REACH + math.ceil(abs(shift_px))
+    one = np.zeros(2 * (reach + REACH) + 1)
+    one[reach + REACH] = 1.0
+    taps = ndimage.shift(one, shift_px, order=5, mode="mirror")[REACH:-REACH]
+    return np.asarray(taps / taps.sum())
