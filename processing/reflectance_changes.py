@@ -37,6 +37,8 @@ class ReflectanceChanges:
     centre_mm, scale : the sphere stands off its place by (x, y), and is larger by this part of its radius.
     support : irradiance of the object's middle by depolarized light from a disc below over that by the source.
     support_rad, support_log_depth : the disc's half angle is larger by this, and its depth by this factor (its log).
+    support_slope : by how much the disc is brighter at its edge, along x and along z, relative to its middle.
+    support_law : relative change, from theta_h 0 to 90 degrees, of the polarized light that the surface sends back.
     """
 
     diffuse_a: float = 0.0
@@ -53,6 +55,8 @@ class ReflectanceChanges:
     support: float = 0.0
     support_rad: float = 0.0
     support_log_depth: float = 0.0
+    support_slope: tuple[float, float] = (0.0, 0.0)
+    support_law: float = 0.0
 
     def dominant(self, geometry: ScatteringGeometry, index: complex) -> Array:
         """Dominant process (N, 4, 4), element 00 equal to 1, in the axes that the geometry states."""

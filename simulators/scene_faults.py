@@ -69,18 +69,27 @@ class LitSupport:
     """A white disc below the sphere, lit by the source, lights the sphere's lower side with depolarized light.
 
     The disc is a Lambertian of albedo 1 in patches; each patch's light meets the same surface, whose triply degenerate
-    matrix then acts on unpolarized light. `strength` is the disc's irradiance over that on the sphere.
+    matrix then acts on unpolarized light. `strength` is the disc's irradiance over that on the sphere; `uneven` by how
+    much the irradiance differs at the disc's edge, along x and along z.
     """
 
     PATCHES = 24
 
-    def __init__(self, scene: Scene, strength: float = 1.0, radius_mm: float = 20.0, below_mm: float = 30.0) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        strength: float = 1.0,
+        radius_mm: float = 20.0,
+        below_mm: float = 30.0,
+        uneven: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
         self.scene, self.strength = scene, strength
         rings = np.sqrt((np.arange(self.PATCHES) + 0.5) / self.PATCHES) * radius_mm
         turns = np.pi * (3 - np.sqrt(5)) * np.arange(self.PATCHES)
         height = np.full(self.PATCHES, -below_mm)
         self.patches = np.stack([rings * np.cos(turns), height, rings * np.sin(turns)], axis=1)
         self.area_mm2 = np.pi * radius_mm**2 / self.PATCHES
+        self.brightness = np.maximum(1 + self.patches[:, ::2] @ np.array(uneven) / radius_mm, 0.0)
 
     def mueller_image(self, omega_deg: float, wavelength_nm: float, rows: int, columns: int) -> NDArray[np.float32]:
         """The scene, and the disc's light on it."""
@@ -93,13 +102,13 @@ class LitSupport:
         radius = spec.geometry.shape.radius_mm if isinstance(spec.geometry.shape, Sphere) else 0.0
         points = np.asarray(centre) + radius * g.normal
         added = np.zeros((len(points), 4, 4))
-        for patch in self.patches:
+        for patch, brightness in zip(self.patches, self.brightness, strict=True):
             towards = patch - points
             square = dot(towards, towards)
             direction = towards / np.sqrt(square)[:, None]
             # The surface's own law holds the cosine of incidence on it.
             seen = (dot(g.normal, direction) > 0) * np.maximum(-direction[:, 1], 0.0)
-            weight = self.strength * self.area_mm2 / np.pi * seen / square
+            weight = self.strength * brightness * self.area_mm2 / np.pi * seen / square
             from_patch = ScatteringGeometry(g.normal, direction, g.to_camera)
             m = _triply_degenerate(self.scene, surface, from_patch, wavelength_nm)
             m[..., 1:] = 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -88,7 +89,15 @@ def _with(kind: str, random: np.random.Generator, so_far: SphereFault) -> Sphere
         moved = scene_faults.moved_sphere(scene, truth["x"], truth["y"], truth["scale"])
         return _added(so_far, kind, truth, scene=moved)
     if kind == "interreflection":
-        return _added(so_far, kind, {}, scene=scene_faults.LitSupport(scene, random.uniform(0.15, 0.6)))
+        towards, uneven = random.uniform(0, 2 * math.pi), random.uniform(0, 0.6)
+        support = scene_faults.LitSupport(
+            scene,
+            strength=random.uniform(0.15, 0.6),
+            radius_mm=random.uniform(14, 30),
+            below_mm=random.uniform(22, 45),
+            uneven=(uneven * math.cos(towards), uneven * math.sin(towards)),
+        )
+        return _added(so_far, kind, {}, scene=support)
     if kind == "polarized_diffuse":
         a, b = float(np.exp(random.uniform(np.log(0.02), np.log(0.3)))), random.uniform(1.5, 3.0)
         constants = so_far.material.constants

@@ -43,6 +43,9 @@ MILD = 7.0
 MOST_AT_ONCE = 2
 #: Share of the scatter of values that belong to one state each which a single wave may hold, if they are to be random.
 ONE_WAVE = 0.85
+#: Standard deviations, and share of what it explains, by which the size of an effect of the source may differ over the
+#: image.
+UNEVEN, UNEVEN_SHARE = 6.0, 0.01
 #: An information about a parameter below this, in chi-square for its typical size, is none.
 SEEN = 4.0
 #: Autocorrelation over the states, in standard deviations, from which on a residual of few pixels is not white.
@@ -128,6 +131,7 @@ def _unname(problem: InstrumentProblem, search: Search, found: Found, after: Seq
     # An effect has to beat chance to be named; values for each state leave too few directions to ask that.
     if not any(c.effect.per_state for c in found.effects):
         small += [c for c in found.effects if found.chance.get(c, 1.0) > CHANCE]
+    small += [c for c in found.effects if c.effect.group == "source" and _uneven(problem, found, c)]
     part = dict(zip(found.space.candidates, found.space.slices, strict=True))
     curvature = found.fit.sums.curvature.sum(axis=0)
     waves = [
@@ -136,6 +140,14 @@ def _unname(problem: InstrumentProblem, search: Search, found: Found, after: Seq
         if c.effect.per_state and _one_wave(found.fit.values[part[c]], curvature[part[c], part[c]]) > ONE_WAVE
     ]
     found.nameless += dict.fromkeys((*small, *waves))
+
+
+def _uneven(problem: InstrumentProblem, found: Found, candidate: Candidate) -> bool:
+    """A source that changes does so by the same share in the whole image; what differs from part to part is none."""
+    if any(c.kind == "field_retardance" for c in found.effects):
+        return False
+    excess, tiles = problem.unevenness(candidate, found.space, found.fit.values)
+    return bool(excess > max(UNEVEN * np.sqrt(2 * tiles), UNEVEN_SHARE * found.gain.get(candidate, 0.0)))
 
 
 def _one_wave(values: Array, information: Array) -> float:

@@ -191,12 +191,14 @@ class InstrumentProblem:
         noise that it pretends.
         """
         at = _exact(space, values, pointwise=True)
-        if _distance(self._noise_at, space, values, pointwise=True) < EXACT or any(
-            c.noise_estimated for c in self.captures
-        ):
+        gone = any(candidate not in at for candidate in self._noise_at)
+        near = not gone and _distance(self._noise_at, space, values, pointwise=True) < EXACT
+        if near or any(c.noise_estimated for c in self.captures):
             return False
         self._noise_at = at
-        self.captures = tuple(c.with_noise_of(*_undone(c, self._noise_at)) for c in self.captures)
+        self.captures = tuple(
+            c.with_noise_of(*_undone(c, at)) if at else replace(c, true_variance=None) for c in self.captures
+        )
         self.still = self.captures
         self.moments = tuple(moments_of(c, self.folds) for c in self.captures)
         self.spread = max(m.spread for m in self.moments)
@@ -353,6 +355,36 @@ class InstrumentProblem:
             out.gradient[fold] += gradient[:, mine].sum(axis=1)
             flat = bs[:, mine].reshape(space.size, -1)
             out.curvature[fold] += flat @ b[:, mine].reshape(space.size, -1).T
+
+    def unevenness(self, candidate: Candidate, space: Space, values: Array) -> tuple[float, int]:
+        """Chi-square by which the size of an effect differs from tile to tile, over what noise gives; number of tiles.
+
+        The effect is scaled tile by tile, all else held. Both zero where the image has no tiles.
+        """
+        problem, local = self.near(space, values)
+        part = space.slices[space.candidates.index(candidate)]
+        out, count = 0.0, 0
+        for k, moments in enumerate(problem.moments):
+            tiles = moments.tiles
+            if tiles is None or candidate.capture not in (None, k):
+                continue
+            a = problem.columns(k, problem.changes(k, space, local))
+            moved = local.copy()
+            moved[part] *= 1 + STEP
+            da = (problem.columns(k, problem.changes(k, space, moved)) - a) / STEP
+            u, size, vt = np.linalg.svd(a, full_matrices=False)
+            keep = size > RANK * size[0]
+            q = u[:, keep]
+            b = (da - q @ (q.T @ da)) @ (vt[keep].T / size[keep]) @ q.T
+            s = tiles.s / moments.sigma[:, None] / moments.sigma
+            ps = s - q @ (q.T @ s)
+            # As in `_tile_sums`: the slope of the excess of each tile by the size of the effect there, and its noise.
+            slope = -np.sum(ps * b, axis=(1, 2)) + (tiles.noise / moments.sigma**2) @ np.diag(b)
+            power = np.sum((b @ s) * b, axis=(1, 2))
+            seen = power > 1e-9 * power.max()
+            count += int(np.count_nonzero(seen))
+            out += float(np.sum(slope[seen] ** 2 / power[seen]))
+        return out - count, count
 
     def tile_columns(self, k: int, changes: Changes) -> Array:
         """A (tiles, L, K) where a retardance varies over the image, rows in units of their noise."""

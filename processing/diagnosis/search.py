@@ -32,6 +32,8 @@ ALIKE = 1e-3
 CHANCE = 1e-4
 #: Growth of the unweighted residual that is still put down to noise.
 WORSE = 1.002
+#: Standard deviations by which the counts may scatter less than a bent response says that they must.
+IMPOSSIBLE = 6.0
 MOST_EFFECTS = 12
 LEADERS = 4
 #: Relative rms residual above which nominal values are searched for from many starts.
@@ -111,6 +113,11 @@ class Search:
         found = self._greedy(base_fit, self.pool)
         if found.imitable:
             found = self._plainer(base_fit, found)
+        if self.problem.adopt_noise(found.space, found.fit.values):
+            # A bend of the response was taken away again, and what the noise was taken to be with it.
+            found.before_fit, found.fit, found.before, found.after = self._again(
+                found.before_fit, found.space, found.fit
+            )
         self._sets(found)
         self._observability(found)
         return found
@@ -131,17 +138,29 @@ class Search:
             if not trials:
                 break
             best = trials[0]
+            if self.problem.adopt_noise(best.space, best.fit.values):
+                base_fit, fit, before, out = self._again(base_fit, space, fit)
+                best.fit = minimize(self.problem, best.space, best.fit.values)
+                best.out = held_out(self.problem, best.space, best.fit)
+                quiet = before.excess < -IMPOSSIBLE * self.noise_of(before)
+                if quiet or self._evidence(out, best.out, best.space.size) < DECISIVE:
+                    self.say(f"{best.candidate.label}: not with the noise that goes with it")
+                    pool = [c for c in pool if c.family != best.candidate.family]
+                    self.problem.adopt_noise(space, fit.values)
+                    base_fit, fit, before, out = self._again(base_fit, space, fit)
+                    continue
             imitable |= best.candidate.effect.per_state
             self.say(f"{best.candidate.label}: {100 * out.rms:.4g} % -> {100 * best.out.rms:.4g} % on held-out data")
             space, fit, out = best.space, best.fit, best.out
-            if self.problem.adopt_noise(space, fit.values):
-                fit = minimize(self.problem, space, fit.values)
-                out = held_out(self.problem, space, fit)
-                base_fit = minimize(self.problem, self.base, base_fit.values)
-                before = held_out(self.problem, self.base, base_fit)
         found = Found(self.base, before, base_fit, space, fit, out, ranking=ranking, alone=alone, imitable=imitable)
         self._prune(found)
         return found
+
+    def _again(self, base_fit: Fit, space: Space, fit: Fit) -> tuple[Fit, Fit, HeldOut, HeldOut]:
+        """Fits of the base and of the effects, and how well they predict, with the noise that holds now."""
+        base_fit = minimize(self.problem, self.base, base_fit.values)
+        fit = minimize(self.problem, space, fit.values)
+        return base_fit, fit, held_out(self.problem, self.base, base_fit), held_out(self.problem, space, fit)
 
     def _plainer(self, base_fit: Fit, found: Found) -> Found:
         """The search without values for each state, if these add nothing to what it finds.
@@ -154,12 +173,21 @@ class Search:
         # Each must beat chance by itself: a few unrelated effects could also nibble at random values.
         if other.effects and all(other.chance[c] < CHANCE for c in other.effects):
             rest = self._trials(other.space, other.fit, other.after, self.pool)
-            if all(t.evidence < DECISIVE for t in rest if t.candidate.effect.per_state):
-                other.ranking, other.alone = found.ranking, found.alone
-                return other
+            nothing_more = all(t.evidence < DECISIVE for t in rest if t.candidate.effect.per_state)
+        else:
+            nothing_more = False
+        # The noise may be another one since: what was found first is fitted to the same.
         found.fit = minimize(self.problem, found.space, found.fit.values)
         found.after = held_out(self.problem, found.space, found.fit)
+        worse = other.fit.excess - found.fit.excess - 2.0 * (found.space.size - other.space.size)
+        if nothing_more and worse < DECISIVE * self._unit(found):
+            other.ranking, other.alone = found.ranking, found.alone
+            return other
         return found
+
+    def _unit(self, found: Found) -> float:
+        """Chi-square of one direction of what is left: noise, and structure."""
+        return self.n0 + self.structure(found.after, found.space.size)
 
     def _calibrated(self) -> Fit:
         space = self.base
@@ -335,7 +363,7 @@ class Search:
                 needed = 0.7 * max(fit.excess - found.fit.excess, 0.0)
                 others = [c for c in self.pool if c != candidate]
                 trials = self._trials(rest, fit, out, others, leaders=6, least=needed)
-                unit = self.n0 + self.structure(found.after, found.space.size)
+                unit = self._unit(found)
                 weighty, _ = self.directions(found.after.excess)
                 close = []
                 for trial in trials:

@@ -49,18 +49,26 @@ class SurfaceSearch(Search):
         space: Space,
         fit: Fit,
         out: HeldOut,
-        without: Sequence[Candidate] = (),
+        pool: Sequence[Candidate],
         leaders: int = LEADERS,
         least: float = 0.0,
     ) -> list[Trial]:
         # What one step promises says little here, so nothing is left out for promising little.
-        trials = super()._trials(space, fit, out, without, max(leaders, LEADERS), PROMISE * least)
+        trials = super()._trials(space, fit, out, pool, max(leaders, LEADERS), PROMISE * least)
         if self._start is None:
             self._start = out.excess
-        # Beside an effect whose form is rough, what its form leaves over must not get a name of its own.
-        rough = max((_roughness(c) for c in space.candidates), default=0.0)
-        needed = max(LEAST_SHARE * (out.excess - 2 * self.noise_of(out)), rough * max(self._start - out.excess, 0.0))
-        return [t for t in trials if out.excess - t.out.excess >= needed]
+        needed = LEAST_SHARE * (out.excess - 2 * self.noise_of(out))
+        # Beside an effect whose form is rough, what its form leaves over must not get a name of its own; what both
+        # together explain without a rest has one.
+        rough = max((_roughness(c) for c in space.candidates), default=0.0) * max(self._start - out.excess, 0.0)
+        return [
+            t
+            for t in trials
+            if out.excess - t.out.excess >= (needed if self._nothing_left(t.out) else max(needed, rough))
+        ]
+
+    def _nothing_left(self, out: HeldOut) -> bool:
+        return out.excess < NO_STRUCTURE * self.noise_of(out)
 
     def _observability(self, found: Found) -> None:
         # With what was found: first surface alone does not even know the normal.

@@ -125,33 +125,37 @@ class SurfaceView:
             if len(self._below) >= KEPT:
                 self._below.clear()
             self._below[key] = self._from_below(one)
-        out = changes.support * self._below[key]
+        slope = 1 + _disc(0.0, 1.0)[:, ::2] @ np.array(changes.support_slope)
+        column = np.einsum("l,t,ltpi->pi", [1.0, changes.support_law], slope, self._below[key])
+        out = np.zeros((len(self.points), 4, 4))
+        # The support's light is not polarized.
+        out[..., 0] = changes.support * (column if self._between is None else self._between(column))
         return mueller.rotation(-changes.analyzer_rad) @ out if changes.analyzer_rad else out
 
     def _from_below(self, changes: ReflectanceChanges) -> Array:
+        """Stokes vectors (2, parts, S, 4) of each part's light at the nodes, and times theta_h over 90 degrees."""
         if self._between is None and isinstance(self.view.shape, Sphere):
             self._between = Between(self.rays[:, :2] / self.rays[:, 2:])
-        between = self._between
-        some = slice(None) if between is None else between.nodes
+        some = slice(None) if self._between is None else self._between.nodes
         points, g, complete = self.points[some], self.geometry(ReflectanceChanges())[some], self._complete(changes)
         shape = self.view.shape
         middle = np.asarray(shape.centre_mm) if isinstance(shape, Sphere) else self.points.mean(axis=0)
         half_width = shape.radius_mm if isinstance(shape, Sphere) else float(np.ptp(self.points[:, 0])) / 2
         depth = SUPPORT_DEPTH * half_width * np.exp(changes.support_log_depth)
-        column = np.zeros((len(points), 4))
-        for part in middle + _disc(depth, depth * np.tan(np.deg2rad(SUPPORT_DEG) + changes.support_rad)):
+        columns = np.zeros((2, SUPPORT_PARTS, len(points), 4))
+        disc = middle + _disc(depth, depth * np.tan(np.deg2rad(SUPPORT_DEG) + changes.support_rad))
+        for k, part in enumerate(disc):
             way = part - points
             square = dot(way, way)
             below = ScatteringGeometry(g.normal, unit(way), g.to_camera)
             # A part shines and is seen under the same angle.
             weight = np.maximum(dot(g.normal, below.to_source), 0.0) * np.maximum(-below.to_source[:, 1], 0.0)
             weight = weight * depth**2 / square / SUPPORT_PARTS
-            weight = weight * np.interp(below.angles.theta_h, self._theta_h, self._alpha_0)
-            column += weight[:, None] * complete.dominant(below, self.index)[..., 0]
-        # The support's light is not polarized.
-        out = np.zeros((len(self.points), 4, 4))
-        out[..., 0] = column if between is None else between(column)
-        return out
+            theta_h = below.angles.theta_h
+            weight = weight * np.interp(theta_h, self._theta_h, self._alpha_0)
+            columns[0, k] = weight[:, None] * complete.dominant(below, self.index)[..., 0]
+            columns[1, k] = (theta_h / (np.pi / 2))[:, None] * columns[0, k]
+        return columns
 
 
 class Between:
