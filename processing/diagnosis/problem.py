@@ -31,7 +31,7 @@ from processing.diagnosis.moments import (
 from processing.diagnosis.projection import RANK, add_block
 from processing.diagnosis.space import Space as Space
 from processing.diagnosis.space import Sums as Sums
-from processing.effects.base import apply_to, turned_by
+from processing.effects.base import apply_to, changes_of, turned_by
 from processing.effects.field_retardance import terms
 from processing.instrument import InstrumentModel
 
@@ -101,19 +101,21 @@ class InstrumentProblem:
         captures: Sequence[CaptureData],
         undone: Mapping[Candidate, Array] | None = None,
         folds: int | None = None,
+        moved_px: Sequence[Array] | None = None,
     ) -> None:
         self.undone = dict(undone or {})
         self._others: list[InstrumentProblem] = []
         self._noise_at: dict[Candidate, Array] = {}
-        # The captures before their frames were moved back, and by how much each was.
-        self.still = tuple(captures)
-        self.shifts_px = tuple(np.zeros((c.conditions.states, 2)) for c in captures)
         self.model = model
-        self.captures = tuple(captures)
-        self.folds = folds or (FOLDS_OF_STATES if any(holds_out_states(c) for c in captures) else FOLDS_OF_TILES)
-        self.moments: tuple[Moments, ...] = tuple(moments_of(c, self.folds) for c in captures)
-        self._built: list[dict[tuple[str, bytes], Array]] = [{} for _ in captures]
-        self.noise_known = all(c.noise_known for c in captures)
+        # The captures as taken, by how much each frame is moved back, and by how much of that the model itself says.
+        self.still = tuple(captures)
+        self.own_px = tuple(changes_of(model, c.conditions, c.name).shift_px for c in captures)
+        self.shifts_px = tuple(self.own_px if moved_px is None else moved_px)
+        self.captures = self._moved_back()
+        self.folds = folds or (FOLDS_OF_STATES if any(holds_out_states(c) for c in self.captures) else FOLDS_OF_TILES)
+        self.moments: tuple[Moments, ...] = tuple(moments_of(c, self.folds) for c in self.captures)
+        self._built: list[dict[tuple[str, bytes], Array]] = [{} for _ in self.captures]
+        self.noise_known = all(c.noise_known for c in self.captures)
         self.holds_out_states = any(m.tiles is None for m in self.moments)
         self.spread = max(m.spread for m in self.moments)
 
@@ -163,15 +165,16 @@ class InstrumentProblem:
             return False
         undone = _exact(space, values)
         bent = {c: v for c, v in undone.items() if c.effect.pointwise}
-        still = [c.undone(*_undone(c, bent)) if bent else c for c in self.captures]
-        shifts = [self._shift_px(k, undone) for k in range(len(still))]
+        still = [c.undone(*_undone(c, bent)) if bent else c for c in self.still]
+        shifts = [own + self._shift_px(k, undone) for k, own in enumerate(self.own_px)]
         if max(np.abs(s).max() for s in shifts) > MARGIN:
             return False
-        moved = [c.moved_back(s) if s.any() else c for c, s in zip(still, shifts, strict=True)]
-        other = InstrumentProblem(self.model, moved, undone, self.folds)
-        other.still, other.shifts_px = tuple(still), tuple(shifts)
-        self._others.append(other)
+        self._others.append(InstrumentProblem(self.model, still, undone, self.folds, shifts))
         return True
+
+    def _moved_back(self) -> tuple[CaptureData, ...]:
+        pairs = zip(self.still, self.shifts_px, strict=True)
+        return tuple(c.moved_back(s) if s.any() and np.abs(s).max() <= MARGIN else c for c, s in pairs)
 
     def _shift_px(self, capture: int, undone: Mapping[Candidate, Array]) -> Array:
         changes = Changes(self.captures[capture].conditions)
@@ -182,7 +185,7 @@ class InstrumentProblem:
 
     def undivided(self) -> InstrumentProblem:
         """The same with nothing held out: one set of unknowns for all states, not one for each part of them."""
-        return InstrumentProblem(self.model, self.captures, folds=1)
+        return InstrumentProblem(self.model, self.still, folds=1)
 
     def adopt_noise(self, space: Space, values: Array) -> bool:
         """Take the noise from the light that these values tell, for all that follows; False if that is as before.
@@ -196,10 +199,10 @@ class InstrumentProblem:
         if near or any(c.noise_estimated for c in self.captures):
             return False
         self._noise_at = at
-        self.captures = tuple(
-            c.with_noise_of(*_undone(c, at)) if at else replace(c, true_variance=None) for c in self.captures
+        self.still = tuple(
+            c.with_noise_of(*_undone(c, at)) if at else replace(c, true_variance=None) for c in self.still
         )
-        self.still = self.captures
+        self.captures = self._moved_back()
         self.moments = tuple(moments_of(c, self.folds) for c in self.captures)
         self.spread = max(m.spread for m in self.moments)
         self._others.clear()
@@ -215,6 +218,8 @@ class InstrumentProblem:
         for applied in self.model.effects:
             if applied.scope == "instrument" or data.name in applied.captures:
                 apply_to(changes, self.model, applied)
+        if self.captures[capture] is not self.still[capture]:
+            changes.shift_px = changes.shift_px - self.own_px[capture]
         for candidate, part in zip(space.candidates, space.slices, strict=True):
             # At zero an effect does nothing: there is no need to ask it.
             if candidate.capture in (None, capture) and values[part].any():

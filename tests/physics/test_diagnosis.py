@@ -92,6 +92,43 @@ def test_random_gains_in_air_are_not_given_a_name(configs, tmp_path):
     assert "empirical" in empirical.note
 
 
+def wandering(bench: Bench) -> Bench:
+    bench.shift.append(lambda k, a: (0.9 * np.cos(a["psg"]), 0.9 * np.sin(a["psg"])))
+    return bench
+
+
+def test_a_small_effect_beside_an_image_that_wanders_by_a_pixel(configs, tmp_path):
+    """Second derivatives of the image leave more of such a shift than the other effect explains."""
+    bench = wandering(Bench(rows=40, columns=40, og=np.deg2rad(0.5)))
+    found = diagnosed(capture(tmp_path, configs, bench, air=False), configs)
+    assert found.verdict == "explained"
+    assert found.error_after.chi2_reduced == pytest.approx(1.0, abs=0.03)
+    by_kind = {e.kind: e for e in found.effects}
+    assert set(by_kind) == {"beam_wander", "psg_azimuth"}
+    for name, true in (("x_cos", 0.9), ("x_sin", 0.0), ("y_cos", 0.0), ("y_sin", 0.9)):
+        value = by_kind["beam_wander"].parameters[name]
+        assert value.value == pytest.approx(true, abs=3.5 * value.stderr)
+
+
+def test_a_written_image_shift_is_consistent_the_next_time(configs, tmp_path, capsys):
+    path = capture(tmp_path, configs, wandering(Bench(rows=40, columns=40)), air=False)
+    new = tmp_path / "new.yaml"
+    command = [str(path), "--instrument", str(configs / "instruments/rgb950.yaml"), "--write", str(new)]
+    with pytest.raises(SystemExit) as end:
+        cli.main(command)
+    assert end.value.code == 0, capsys.readouterr()
+    again = diagnose_captures([path], InstrumentModel.load(new))[0].diagnosis
+    assert again.verdict == "consistent"
+
+
+def test_what_changes_in_a_part_of_the_image_is_no_source(configs, tmp_path):
+    bench = Bench(rows=40, columns=40)
+    bench.material_level.append((0, lambda k: 1 + 0.15 * (1 - np.exp(-3 * k / STATES))))
+    found = diagnosed(capture(tmp_path, configs, bench, air=True), configs)
+    assert not [e for e in found.effects if e.confident]
+    assert found.verdict == "unexplained"
+
+
 def test_what_is_written_is_used_and_nothing_is_overwritten(configs, tmp_path, capsys):
     path = capture(tmp_path, configs, Bench(dg=np.deg2rad(129.0)), air=True)
     instrument, new = configs / "instruments/rgb950.yaml", tmp_path / "new.yaml"
