@@ -131,7 +131,10 @@ def _unname(problem: InstrumentProblem, search: Search, found: Found, after: Seq
     # An effect has to beat chance to be named; values for each state leave too few directions to ask that.
     if not any(c.effect.per_state for c in found.effects):
         small += [c for c in found.effects if found.chance.get(c, 1.0) > CHANCE]
-    small += [c for c in found.effects if c.effect.group == "source" and _uneven(problem, found, c)]
+    uneven = [c for c in found.effects if c.effect.group == "source" and _uneven(problem, found, c)]
+    # What is uneven is another cause, and smaller effects beside it may be parts of it.
+    limit = max((found.gain.get(c, 0.0) for c in uneven), default=0.0)
+    small += uneven + [c for c in found.effects if c not in uneven and found.gain.get(c, np.inf) < limit]
     part = dict(zip(found.space.candidates, found.space.slices, strict=True))
     curvature = found.fit.sums.curvature.sum(axis=0)
     waves = [
@@ -146,8 +149,8 @@ def _uneven(problem: InstrumentProblem, found: Found, candidate: Candidate) -> b
     """A source that changes does so by the same share in the whole image; what differs from part to part is none."""
     if any(c.kind == "field_retardance" for c in found.effects):
         return False
-    excess, tiles = problem.unevenness(candidate, found.space, found.fit.values)
-    return bool(excess > max(UNEVEN * np.sqrt(2 * tiles), UNEVEN_SHARE * found.gain.get(candidate, 0.0)))
+    excess, terms = problem.unevenness(candidate, found.space, found.fit.values)
+    return bool(excess > max(UNEVEN * np.sqrt(2 * terms), UNEVEN_SHARE * found.gain.get(candidate, 0.0)))
 
 
 def _one_wave(values: Array, information: Array) -> float:

@@ -362,9 +362,10 @@ class InstrumentProblem:
             out.curvature[fold] += flat @ b[:, mine].reshape(space.size, -1).T
 
     def unevenness(self, candidate: Candidate, space: Space, values: Array) -> tuple[float, int]:
-        """Chi-square by which the size of an effect differs from tile to tile, over what noise gives; number of tiles.
+        """Chi-square by which the size of an effect varies smoothly over the image, beyond noise, and its terms.
 
-        The effect is scaled tile by tile, all else held. Both zero where the image has no tiles.
+        In each tile the effect is scaled, all else held; then second-order surfaces are laid through the tiles. Both
+        zero where the image has no tiles.
         """
         problem, local = self.near(space, values)
         part = space.slices[space.candidates.index(candidate)]
@@ -386,9 +387,10 @@ class InstrumentProblem:
             # As in `_tile_sums`: the slope of the excess of each tile by the size of the effect there, and its noise.
             slope = -np.sum(ps * b, axis=(1, 2)) + (tiles.noise / moments.sigma**2) @ np.diag(b)
             power = np.sum((b @ s) * b, axis=(1, 2))
-            seen = power > 1e-9 * power.max()
-            count += int(np.count_nonzero(seen))
-            out += float(np.sum(slope[seen] ** 2 / power[seen]))
+            smooth = np.vstack([np.ones(tiles.x.size), terms(tiles.x, tiles.y)])
+            pull = smooth @ slope
+            out += float(pull @ np.linalg.pinv((smooth * power) @ smooth.T, hermitian=True) @ pull)
+            count += len(smooth)
         return out - count, count
 
     def tile_columns(self, k: int, changes: Changes) -> Array:
