@@ -26,11 +26,13 @@ class CountsCorrection:
     full_scale : counts above black.
     response : feature to coefficient, one number or one for each intensity (states, channels).
     shift_px : (states, 2), by how much the image moved to the right and down; it is moved back.
+    pitch : pixels from one pixel to the next of its kind: 2 on a polarization mosaic, whose kinds are moved one by one.
     """
 
     full_scale: float
     response: dict[str, NDArray[np.float64]]
     shift_px: NDArray[np.float64]
+    pitch: int = 1
 
     @property
     def moves(self) -> bool:
@@ -98,12 +100,12 @@ def with_extra(changes: Changes, extra: NDArray[np.float64]) -> Changes:
     return out
 
 
-def counts_correction(changes: Changes | None) -> CountsCorrection | None:
+def counts_correction(changes: Changes | None, model: InstrumentModel) -> CountsCorrection | None:
     """The part of the changes that acts on the counts; None if there is none."""
     if changes is None or not (changes.response or np.any(changes.shift_px)):
         return None
     response = {name: np.asarray(value, dtype=float) for name, value in changes.response.items() if np.any(value)}
-    return CountsCorrection(changes.conditions.full_scale, response, changes.shift_px)
+    return CountsCorrection(changes.conditions.full_scale, response, changes.shift_px, model.pitch)
 
 
 def _feature(name: str, u: NDArray[np.float32]) -> NDArray[np.float32] | np.float32:

@@ -14,6 +14,7 @@ from processing.applied_effects import CountsCorrection
 from processing.black import Black
 from processing.capture import Capture, CaptureError
 from processing.flat import Flat
+from processing.shifted import REACH, shifted_back
 
 
 class Mask(IntFlag):
@@ -163,7 +164,7 @@ class BlockReader:
             self._buffer = np.empty(math.prod(shape), np.float32 if moved else self.capture.dtype)
         block = self._buffer[: math.prod(shape)].reshape(shape)
         if self.counts is not None and self.counts.moves:
-            self._read_moved(rows, block, self.counts.shift_px)
+            self._read_moved(rows, block, self.counts.shift_px, self.counts.pitch)
         else:
             self.capture.read_block(self.states, rows, block)
         means, flat, bad = self.correction.black.means, self.correction.flat, self.correction.bad
@@ -175,29 +176,21 @@ class BlockReader:
         self._bad = None if bad is None else bad[rows].reshape(-1)
         return block.reshape(len(self.states), channels, -1)
 
-    def _read_moved(self, rows: slice, block: NDArray[np.generic], shift_px: NDArray[np.float64]) -> None:
-        """Fill `block` with counts of images moved back by their drift; a border of that width repeats its edge.
+    def _read_moved(self, rows: slice, block: NDArray[np.generic], shift_px: NDArray[np.float64], pitch: int) -> None:
+        """Fill `block` with counts of images moved back; beyond an edge of the frame slopes go on.
 
         The black is moved with them, which matters only where it differs from pixel to pixel.
         """
-        import cv2
-
-        margin = math.ceil(float(np.abs(shift_px).max())) + 3
-        height, width = self.capture.frame_shape
+        margin = (math.ceil(float(np.abs(shift_px).max()) / pitch) + REACH) * pitch
+        height = self.capture.frame_shape[0]
         first, last = max(rows.start - margin, 0), min(rows.stop + margin, height)
         for k, state in enumerate(self.states):
-            x, y = shift_px[k]
-            back = np.array([[1.0, 0.0, x], [0.0, 1.0, y]])
+            x, y = shift_px[k] / pitch
             frame = self.capture.frames(int(state), slice(first, last)).astype(np.float32)
             for channel, image in enumerate(frame):
-                moved = cv2.warpAffine(
-                    image,
-                    back,
-                    (width, last - first),
-                    flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
-                    borderMode=cv2.BORDER_REPLICATE,
-                )
-                block[k, channel] = moved[rows.start - first : rows.stop - first]
+                for i, j in np.ndindex(pitch, pitch):
+                    image[i::pitch, j::pitch] = shifted_back(image[i::pitch, j::pitch], x, y)
+                block[k, channel] = image[rows.start - first : rows.stop - first]
 
     def load(
         self, frames: NDArray[np.generic], start: int, stop: int, out: NDArray[np.float32], mask: NDArray[np.uint8]

@@ -171,6 +171,11 @@ class InstrumentModel(_Part):
         """Read an instrument file. Raises ConfigError with file, line and key."""
         return load_yaml(path, cls)
 
+    @property
+    def pitch(self) -> int:
+        """Pixels of the sensor from one pixel to the next behind the same polarizer; 1 without a mosaic."""
+        return len(self.mosaic) if self.mosaic else 1
+
     def elements(self) -> tuple[AnyElement, ...]:
         """All elements: generator, analyzer, then those of the channels."""
         return (*self.generator, *self.analyzer, *(e for c in self.channels for e in c.elements))

@@ -201,7 +201,7 @@ def reduce_mueller(
     w = measurement_matrix(capture, model, states, changes)
     inversion = Inversion.of(w.reshape(-1, 16), what=f"{capture.path}: ")
     correction = correction or Correction.of(capture)
-    reader = BlockReader(capture, states, correction, counts_correction(changes))
+    reader = BlockReader(capture, states, correction, counts_correction(changes, model))
     choice = choice or Choice()
     noise = choice.noise or NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
     solver = choice.solver(MuellerSolver(inversion, reader, noise), field_of(capture, model, states, changes))

@@ -111,7 +111,7 @@ def reduce_stokes(
     model_rows, analyzers = channel_rows(capture, model, states, changes)
     correction = correction or Correction.of(capture)
     noise = noise or NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
-    merged = merge(capture, states, correction, noise, counts_correction(changes), progress)
+    merged = merge(capture, states, correction, noise, counts_correction(changes, model), progress)
     frame = merged.signal
     if response is not None:
         frame = correct(frame, response, layout, analyzers)

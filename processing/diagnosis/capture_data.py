@@ -54,6 +54,7 @@ class CaptureData:
     usable : (rows, columns) True where every state has a number and the pixel is not dark.
     dark_fraction : part of the pixels that are too dark, or too close to dark ones, to be used.
     binned : side of the squares over which pixels were averaged.
+    pitch : pixels of the sensor from one pixel here to the next.
     """
 
     name: str
@@ -71,6 +72,7 @@ class CaptureData:
     simulated: bool
     wavelength_nm: float
     binned: int = 1
+    pitch: int = 1
     dark_fraction: float = 0.0
     noise_estimated: bool = False
     true_variance: NDArray[np.float32] | None = None
@@ -109,7 +111,7 @@ class CaptureData:
         return replace(self, signal=signal.astype(np.float32), true_variance=variance.astype(np.float32))
 
     def moved_back(self, shift_px: Array) -> CaptureData:
-        """The capture with every frame moved back by what it had moved to the right and down, (N, 2) pixels."""
+        """The capture with every frame moved back by what it had moved to the right and down, (N, 2) pixels here."""
         signal, variance = self.signal.copy(), self.variance().astype(np.float32)
         for n, (x, y) in enumerate(shift_px):
             for channel in range(signal.shape[1]):
@@ -163,6 +165,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
         usable=np.asarray(np.isfinite(raw).all(axis=(0, 1))),
         simulated=capture.simulated,
         wavelength_nm=capture.header.wavelength_nm,
+        pitch=model.pitch,
     )
     data = replace(data, signal=np.nan_to_num(data.signal))
     repeats = np.maximum(capture.column("repeats")[states].astype(float), 1)
@@ -257,4 +260,5 @@ def _binned(data: CaptureData) -> CaptureData:
         clipped=whole(data.clipped, "any"),
         usable=whole(data.usable, "all"),
         binned=side,
+        pitch=data.pitch * side,
     )

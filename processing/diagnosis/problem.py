@@ -107,9 +107,9 @@ class InstrumentProblem:
         self._others: list[InstrumentProblem] = []
         self._noise_at: dict[Candidate, Array] = {}
         self.model = model
-        # The captures as taken, by how much each frame is moved back, and by how much of that the model itself says.
+        # The captures as taken, by how many of their pixels each frame is moved back, and what of that the model says.
         self.still = tuple(captures)
-        self.own_px = tuple(changes_of(model, c.conditions, c.name).shift_px for c in captures)
+        self.own_px = tuple(changes_of(model, c.conditions, c.name).shift_px / c.pitch for c in captures)
         self.shifts_px = tuple(self.own_px if moved_px is None else moved_px)
         self.captures = self._moved_back()
         self.folds = folds or (FOLDS_OF_STATES if any(holds_out_states(c) for c in self.captures) else FOLDS_OF_TILES)
@@ -181,7 +181,7 @@ class InstrumentProblem:
         for candidate, values in undone.items():
             if candidate.effect.moves_image and candidate.capture in (None, capture):
                 candidate.effect.apply(changes, self.model, candidate.place, values)
-        return changes.shift_px
+        return changes.shift_px / self.captures[capture].pitch
 
     def undivided(self) -> InstrumentProblem:
         """The same with nothing held out: one set of unknowns for all states, not one for each part of them."""
@@ -219,7 +219,7 @@ class InstrumentProblem:
             if applied.scope == "instrument" or data.name in applied.captures:
                 apply_to(changes, self.model, applied)
         if self.captures[capture] is not self.still[capture]:
-            changes.shift_px = changes.shift_px - self.own_px[capture]
+            changes.shift_px = changes.shift_px - self.own_px[capture] * data.pitch
         for candidate, part in zip(space.candidates, space.slices, strict=True):
             # At zero an effect does nothing: there is no need to ask it.
             if candidate.capture in (None, capture) and values[part].any():
@@ -242,7 +242,7 @@ class InstrumentProblem:
         for name, value in changes.response.items():
             c[FEATURES.index(name)] += value
         # What the shift took away, to second order, from derivatives of the fitted image (which has no shift).
-        x, y = np.repeat(changes.shift_px, channels, axis=0).T
+        x, y = np.repeat(changes.shift_px / self.captures[capture].pitch, channels, axis=0).T
         for name, value in (("dx", x), ("dy", y), ("dxx", -x * x / 2), ("dxy", -x * y), ("dyy", -y * y / 2)):
             c[FEATURES.index(name)] = value
         return c

@@ -73,16 +73,21 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     for mask, columns in _parts(problem, capture, changes, a, np.ones_like(used)):
         q = _basis(columns / level[:, None])
         signal[:, mask] = (q @ (q.T @ (y[:, mask] / level[:, None]))) * level[:, None]
-        free[:, mask] = (1 - moments.left * np.sum(q * q, axis=1))[:, None]
-    # Frames moved back have noise that neighbours share: the residual is that of the frames as they were taken.
-    taken = problem.still[capture].signal.reshape(counts.shape) - _moved_again(signal, problem.shifts_px[capture])
-    scale = level[:, None, None] * np.sqrt(np.maximum(variance.mean(axis=0), 1e-300))
-    r = ((taken + (y - counts)) / scale).astype(np.float32)
-    r[:, ~used], signal[:, ~used], free[:, ~used] = np.nan, 0.0, 0.0
+        free[:, mask] = (1 - np.sum(q * q, axis=1))[:, None]
+    scale = level[:, None] * np.sqrt(variance[:, used].mean(axis=0))
+    r = np.full((rows, height, width), np.nan, dtype=np.float32)
+    r[:, used] = (y - signal)[:, used] / scale
+    # Frames moved back have noise that neighbours share: these are asked in the frames as they were taken.
+    taken = r
+    if problem.shifts_px[capture].any():
+        again = _moved_again(signal, problem.shifts_px[capture])
+        taken = np.full_like(r, np.nan)
+        taken[:, used] = (problem.still[capture].signal.reshape(y.shape) + (y - counts) - again)[:, used] / scale
+    signal[:, ~used], free[:, ~used] = 0.0, 0.0
     noise = variance / level[:, None, None] ** 2 / np.maximum(variance.mean(axis=0), 1e-300)
     expected = (free * noise).astype(np.float32)
     good = np.asarray(np.isfinite(r).all(axis=0))
-    tests, left = _tests(r, signal, expected, good, a.shape[1], moments.spread, data.noise_known)
+    tests, left = _tests(r, taken, signal, expected, moments.left, good, a.shape[1], moments.spread, data.noise_known)
     n, channels = data.signal.shape[:2]
     mean = r[:, good].mean(axis=1) if good.any() else np.zeros(rows)
     states = mean.reshape(n, channels).mean(axis=1)
@@ -107,8 +112,6 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
 
 
 def _moved_again(images: NDArray[np.float32], shift_px: Array) -> NDArray[np.float32]:
-    if not shift_px.any():
-        return images
     shifts = np.repeat(shift_px, images.shape[0] // shift_px.shape[0], axis=0)
     return np.stack([shifted_back(image, -x, -y) for image, (x, y) in zip(images, shifts, strict=True)])
 
@@ -130,8 +133,10 @@ def _basis(a: Array) -> Array:
 
 def _tests(
     r: NDArray[np.float32],
+    taken: NDArray[np.float32],
     signal: NDArray[np.float32],
     expected: NDArray[np.float32],
+    shown: Array,
     good: NDArray[np.bool_],
     columns: int,
     spread: float,
@@ -141,7 +146,8 @@ def _tests(
     if count < 30 or not noise_known:
         return {}, 0.0
     flat, wanted = r[:, good].astype(np.float64), expected[:, good].astype(np.float64)
-    freedom = wanted.sum()
+    # Of smooth patterns moved frames keep all the noise, of single pixels only a part.
+    freedom = shown @ wanted.sum(axis=1)
     # Name to chi-square beyond noise, and its standard deviation with nothing but noise.
     found = {"sum of squares": (np.sum(flat**2) - freedom, np.sqrt(2 * freedom * spread))}
     # Linear in the signal: every pixel's residual against the leading components of the fitted signal.
@@ -164,8 +170,8 @@ def _tests(
     )
     # Neighbours: noise of two pixels is independent.
     for name, axis in (("neighbours, rows", 1), ("neighbours, columns", 2)):
-        if r.shape[axis] > 2:
-            first, second = np.delete(r, -1, axis), np.delete(r, 0, axis)
+        if taken.shape[axis] > 2:
+            first, second = np.delete(taken, -1, axis), np.delete(taken, 0, axis)
             both = np.isfinite(first) & np.isfinite(second)
             product = (first * second)[both].astype(np.float64)
             if product.size > 100:

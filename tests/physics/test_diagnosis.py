@@ -11,7 +11,7 @@ from processing.diagnosis import cli
 from processing.diagnosis.result import Diagnosis
 from processing.diagnosis.run import diagnose_captures
 from processing.instrument import InstrumentModel
-from simulators.blind_suite import state_angles
+from simulators.blind_suite import declared_bench, state_angles
 from simulators.undeclared import Bench, Scene, digitize, expose, write_capture
 
 STATES = 40
@@ -99,7 +99,7 @@ def wandering(bench: Bench) -> Bench:
 
 def test_a_small_effect_beside_an_image_that_wanders_by_a_pixel(configs, tmp_path):
     """Second derivatives of the image leave more of such a shift than the other effect explains."""
-    bench = wandering(Bench(rows=40, columns=40, og=np.deg2rad(0.5)))
+    bench = wandering(Bench(rows=32, columns=32, og=np.deg2rad(0.5)))
     found = diagnosed(capture(tmp_path, configs, bench, air=False), configs)
     assert found.verdict == "explained"
     assert found.error_after.chi2_reduced == pytest.approx(1.0, abs=0.03)
@@ -111,7 +111,7 @@ def test_a_small_effect_beside_an_image_that_wanders_by_a_pixel(configs, tmp_pat
 
 
 def test_a_written_image_shift_is_consistent_the_next_time(configs, tmp_path, capsys):
-    path = capture(tmp_path, configs, wandering(Bench(rows=40, columns=40)), air=False)
+    path = capture(tmp_path, configs, wandering(Bench(rows=32, columns=32)), air=False)
     new = tmp_path / "new.yaml"
     command = [str(path), "--instrument", str(configs / "instruments/rgb950.yaml"), "--write", str(new)]
     with pytest.raises(SystemExit) as end:
@@ -119,6 +119,24 @@ def test_a_written_image_shift_is_consistent_the_next_time(configs, tmp_path, ca
     assert end.value.code == 0, capsys.readouterr()
     again = diagnose_captures([path], InstrumentModel.load(new))[0].diagnosis
     assert again.verdict == "consistent"
+
+
+def test_shifts_on_a_mosaic_are_told_in_pixels_of_the_sensor(configs, tmp_path):
+    file = configs / "instruments/mosaic_polarimeter.yaml"
+    random, nm = np.random.default_rng(3), 662.0
+    model = InstrumentModel.load(file)
+    bench = declared_bench(model.at(nm), nm, 64, mosaic=True, electrons=20_000.0)
+    bench.shift.append(lambda k, a: (1.2 * (k / 15 - 0.5), -0.7 * (k / 15 - 0.5)))
+    angles = {"psg": state_angles(16, True, False)["psg"]}
+    counts = digitize(bench, expose(bench, Scene(random), angles), random)
+    path = tmp_path / "capture.h5"
+    write_capture(path, bench, counts, angles, Sample(kind="unknown"), file.read_text())
+    (effect,) = diagnose_captures([path], model)[0].diagnosis.effects
+    assert effect.kind == "image_drift"
+    for name, true in (("x", 1.2), ("y", -0.7)):
+        value = effect.parameters[name]
+        assert value.value == pytest.approx(true, abs=3.5 * value.stderr)
+        assert value.stderr < 0.2
 
 
 def test_what_changes_in_a_part_of_the_image_is_no_source(configs, tmp_path):

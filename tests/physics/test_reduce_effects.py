@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from processing import mueller
+from processing.applied_effects import CountsCorrection
 from processing.capture import Capture
 from processing.changes import Conditions
+from processing.correction import BlockReader, Correction
 from processing.effects.base import all_effects, changes_of
 from processing.effects.field_retardance import terms
 from processing.images import MuellerImage
@@ -135,6 +137,29 @@ def test_a_moving_image_is_moved_back(rgb950: InstrumentModel, synthetic_capture
     before, after = error(reduced(path, rgb950), expected), error(reduced(path, real), expected)
     assert before > 0.004
     assert after < before / 5
+
+
+def test_pixels_of_a_mosaic_are_moved_among_their_own_kind(rgb950: InstrumentModel, synthetic_capture) -> None:
+    y, x = np.indices((32, 40)).astype(float)
+    levels = np.array([[1.0, 0.1], [0.4, 3.0]])[np.arange(32)[:, None] % 2, np.arange(40) % 2]
+    shift = np.array([[0.0, 0.0], [1.4, -0.6]])
+    frames = np.stack([levels * (2000 + 500 * np.sin((x - a) / 7) * np.cos((y - b) / 9)) for a, b in shift])
+    path = synthetic_capture(frames[:, None], {"psg": np.zeros(2), "psa": np.zeros(2)}, title="test")
+    with Capture(path) as capture:
+        correction, states = Correction.of(capture), np.arange(2)
+
+        def off(pitch: int) -> float:
+            counts = CountsCorrection(1.0, {}, shift, pitch)
+            # In blocks of rows, the second one in the middle of a pair.
+            first, second = (
+                BlockReader(capture, states, correction, counts).read(rows).copy()
+                for rows in (slice(0, 15), slice(15, 32))
+            )
+            moved = np.concatenate([first, second], axis=2).reshape(2, 32, 40)
+            return float(np.max(np.abs(moved[1] / moved[0] - 1)[6:-6, 6:-6]))
+
+        assert off(2) < 2e-3
+        assert off(1) > 0.1
 
 
 def test_retardance_that_varies_over_the_image(rgb950: InstrumentModel, synthetic_capture) -> None:
