@@ -82,6 +82,19 @@ def _campaign(tmp_path, configs, full=FULL):
     return Campaign.load(file)
 
 
+def _night(tmp_path, campaign, config, jobs, observer):
+    """Run the jobs unattended, `observer` at work; it knows the run as `run`. Returns the folder."""
+    stop = StopRequest()
+    folder = CampaignFolder(tmp_path / "night", campaign)
+    operator = Operator(lambda text: None, stop, True, True)
+    observer.run = CampaignRun(campaign, config, folder, operator, stop, [observer], home=True)
+    try:
+        assert observer.run.run(jobs)
+    finally:
+        folder.close()
+    return tmp_path / "night"
+
+
 class PowerCut(Observer):
     """Takes the rotators their reference when a capture has ended, many turns away from where they began."""
 
@@ -100,18 +113,11 @@ def test_rotators_homed_again_between_captures_count_their_turns_anew(quick_rig,
     config = load_rig(quick_rig(flux_e_per_s=8e6))
     campaign = _campaign(tmp_path, configs, full=False)
     jobs = [entry for entry in campaign_run.prepare(campaign, config) if entry[1].plan.mode == "drr"]
-    stop, cut = StopRequest(), PowerCut()
-    folder = CampaignFolder(tmp_path / "night", campaign)
-    cut.run = CampaignRun(
-        campaign, config, folder, Operator(lambda text: None, stop, True, True), stop, [cut], home=True
-    )
-    try:
-        assert cut.run.run(jobs)
-    finally:
-        folder.close()
+    cut = PowerCut()
+    night = _night(tmp_path, campaign, config, jobs, cut)
     assert min(cut.turned_deg) > 360.0
     for capture, job in jobs:
-        assert intact(tmp_path / "night" / capture.name) == len(job.table)
+        assert intact(night / capture.name) == len(job.table)
 
 
 def test_unattended_campaign_survives_random_faults(quick_rig, intact, configs, tmp_path):
@@ -125,23 +131,15 @@ def test_unattended_campaign_survives_random_faults(quick_rig, intact, configs, 
     campaign = _campaign(tmp_path, configs)
     jobs = campaign_run.prepare(campaign, config)
     weather = Weather(FAULTS, sum(len(job.table) for _, job in jobs), seed=FAULTS)
-    stop = StopRequest()
-    folder = CampaignFolder(tmp_path / "night", campaign)
-    weather.run = CampaignRun(
-        campaign, config, folder, Operator(lambda text: None, stop, True, True), stop, [weather], home=True
-    )
-    try:
-        assert weather.run.run(jobs)
-    finally:
-        folder.close()
+    night = _night(tmp_path, campaign, config, jobs, weather)
     assert sum(weather.injected.values()) == FAULTS
     states = 0
     for capture, job in jobs:
-        done = intact(tmp_path / "night" / capture.name)
+        done = intact(night / capture.name)
         assert done == len(job.table)
         states += done
-    events = Counter(json.loads(line)["event"] for line in (tmp_path / "night" / "log.jsonl").read_text().splitlines())
-    index = json.loads((tmp_path / "night" / "index.json").read_text())
+    events = Counter(json.loads(line)["event"] for line in (night / "log.jsonl").read_text().splitlines())
+    index = json.loads((night / "index.json").read_text())
     assert {entry["status"] for entry in index.values()} == {"complete"}
     print(f"{FAULTS} faults, {len(jobs)} captures, {states} states intact, {events['capture failed']} runs resumed")
     print(dict(sorted(weather.injected.items())))

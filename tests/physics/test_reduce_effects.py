@@ -139,7 +139,7 @@ def test_a_moving_image_is_moved_back(rgb950: InstrumentModel, synthetic_capture
     assert after < before / 5
 
 
-def test_pixels_of_a_mosaic_are_moved_among_their_own_kind(rgb950: InstrumentModel, synthetic_capture) -> None:
+def test_pixels_of_a_mosaic_are_moved_among_their_own_kind(synthetic_capture) -> None:
     y, x = np.indices((32, 40)).astype(float)
     levels = np.array([[1.0, 0.1], [0.4, 3.0]])[np.arange(32)[:, None] % 2, np.arange(40) % 2]
     shift = np.array([[0.0, 0.0], [1.4, -0.6]])
