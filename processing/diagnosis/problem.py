@@ -109,7 +109,8 @@ class InstrumentProblem:
         self.model = model
         # The captures as taken, by how many of their pixels each frame is moved back, and what of that the model says.
         self.still = tuple(captures)
-        self.own_px = tuple(changes_of(model, c.conditions, c.name).shift_px / c.pitch for c in captures)
+        own = (changes_of(model, c.conditions, c.name).shift_px / c.pitch for c in captures)
+        self.own_px = tuple(s if _movable(s) else np.zeros_like(s) for s in own)
         self.shifts_px = tuple(self.own_px if moved_px is None else moved_px)
         self.captures = self._moved_back()
         self.folds = folds or (FOLDS_OF_STATES if any(holds_out_states(c) for c in self.captures) else FOLDS_OF_TILES)
@@ -165,16 +166,16 @@ class InstrumentProblem:
             return False
         undone = _exact(space, values)
         bent = {c: v for c, v in undone.items() if c.effect.pointwise}
-        still = [c.undone(*_undone(c, bent)) if bent else c for c in self.still]
         shifts = [own + self._shift_px(k, undone) for k, own in enumerate(self.own_px)]
-        if max(np.abs(s).max() for s in shifts) > MARGIN:
+        if not all(_movable(s) for s in shifts):
             return False
+        still = [c.undone(*_undone(c, bent)) if bent else c for c in self.still]
         self._others.append(InstrumentProblem(self.model, still, undone, self.folds, shifts))
         return True
 
     def _moved_back(self) -> tuple[CaptureData, ...]:
         pairs = zip(self.still, self.shifts_px, strict=True)
-        return tuple(c.moved_back(s) if s.any() and np.abs(s).max() <= MARGIN else c for c, s in pairs)
+        return tuple(c.moved_back(s) if s.any() else c for c, s in pairs)
 
     def _shift_px(self, capture: int, undone: Mapping[Candidate, Array]) -> Array:
         changes = Changes(self.captures[capture].conditions)
@@ -218,8 +219,7 @@ class InstrumentProblem:
         for applied in self.model.effects:
             if applied.scope == "instrument" or data.name in applied.captures:
                 apply_to(changes, self.model, applied)
-        if self.captures[capture] is not self.still[capture]:
-            changes.shift_px = changes.shift_px - self.own_px[capture] * data.pitch
+        changes.shift_px = changes.shift_px - self.own_px[capture] * data.pitch
         for candidate, part in zip(space.candidates, space.slices, strict=True):
             # At zero an effect does nothing: there is no need to ask it.
             if candidate.capture in (None, capture) and values[part].any():
@@ -410,6 +410,11 @@ class InstrumentProblem:
         w = self.model.rows(angles, tiled).reshape(count, -1, 16) * data.row_exposure[:, None]
         a = w if data.sample is None else (w @ data.sample)[..., None]
         return np.asarray(a / self.moments[k].sigma[:, None])
+
+
+def _movable(shift_px: Array) -> bool:
+    """Whether frames can be moved back by (N, 2) pixels and no used pixel needs what lies beyond the edge."""
+    return bool(np.abs(shift_px).max() <= MARGIN)
 
 
 def _distance(undone: Mapping[Candidate, Array], space: Space, values: Array, *, pointwise: bool = False) -> float:

@@ -55,6 +55,24 @@ class Residual:
         return name, self.tests[name]
 
 
+@dataclass(frozen=True)
+class Images:
+    """What the tests look at, each (L, rows, columns); NaN or zero where a pixel is not used.
+
+    Attributes
+    ----------
+    residual : in units of the noise; taken : the same in the frames before they were moved back.
+    signal : the fit, in counts over full scale; expected : variance of the residual of a smooth pattern.
+    good : (rows, columns) pixels that are used.
+    """
+
+    residual: NDArray[np.float32]
+    taken: NDArray[np.float32]
+    signal: NDArray[np.float32]
+    expected: NDArray[np.float32]
+    good: NDArray[np.bool_]
+
+
 def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -> Residual:
     """Residual of a capture at the values of a fit, pixel by pixel, and its tests."""
     problem, values = problem.near(space, fit.values)
@@ -67,14 +85,18 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     counts = data.signal.reshape(rows, height, width).astype(np.float64)
     y = add_response(counts, problem.coefficients(capture, changes), problem.columns(capture, changes))
     variance = data.variance().reshape(rows, height, width)
-    level = moments.sigma
+    level, mean_variance = moments.sigma, variance.mean(axis=0)
+    shared = np.zeros((rows, rows))
     free = np.zeros((rows, height, width), dtype=np.float32)
     signal = np.zeros((rows, height, width), dtype=np.float32)
     for mask, columns in _parts(problem, capture, changes, a, np.ones_like(used)):
         q = _basis(columns / level[:, None])
         signal[:, mask] = (q @ (q.T @ (y[:, mask] / level[:, None]))) * level[:, None]
         free[:, mask] = (1 - np.sum(q * q, axis=1))[:, None]
-    scale = level[:, None] * np.sqrt(variance[:, used].mean(axis=0))
+        # Rows that interpolation has averaged unequally share noise with the fit of a pixel: P N Q Q^T is not zero.
+        fit_of_noise = moments.left[:, None] * (q @ q.T)
+        shared += np.sqrt(mean_variance[mask & used]).sum() * (fit_of_noise - q @ (q.T @ fit_of_noise)) * level
+    scale = level[:, None] * np.sqrt(mean_variance[used])
     r = np.full((rows, height, width), np.nan, dtype=np.float32)
     r[:, used] = (y - signal)[:, used] / scale
     # Frames moved back have noise that neighbours share: these are asked in the frames as they were taken.
@@ -84,10 +106,11 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
         taken = np.full_like(r, np.nan)
         taken[:, used] = (problem.still[capture].signal.reshape(y.shape) + (y - counts) - again)[:, used] / scale
     signal[:, ~used], free[:, ~used] = 0.0, 0.0
-    noise = variance / level[:, None, None] ** 2 / np.maximum(variance.mean(axis=0), 1e-300)
+    noise = variance / level[:, None, None] ** 2 / np.maximum(mean_variance, 1e-300)
     expected = (free * noise).astype(np.float32)
     good = np.asarray(np.isfinite(r).all(axis=0))
-    tests, left = _tests(r, taken, signal, expected, moments.left, good, a.shape[1], moments.spread, data.noise_known)
+    images = Images(r, taken, signal, expected, good)
+    tests, left = _tests(images, moments.left, shared, a.shape[1], moments.spread, data.noise_known)
     n, channels = data.signal.shape[:2]
     mean = r[:, good].mean(axis=1) if good.any() else np.zeros(rows)
     states = mean.reshape(n, channels).mean(axis=1)
@@ -132,16 +155,18 @@ def _basis(a: Array) -> Array:
 
 
 def _tests(
-    r: NDArray[np.float32],
-    taken: NDArray[np.float32],
-    signal: NDArray[np.float32],
-    expected: NDArray[np.float32],
+    images: Images,
     shown: Array,
-    good: NDArray[np.bool_],
+    shared: Array,
     columns: int,
     spread: float,
     noise_known: bool,
 ) -> tuple[dict[str, float], float]:
+    """Chi-square of each test over its standard deviation, and the largest that is certainly left.
+
+    `shown` (L,) is the part of the noise that single pixels show, `shared` (L, L) the mean of residual times fit.
+    """
+    r, signal, expected, good = images.residual, images.signal, images.expected, images.good
     count = int(good.sum())
     if count < 30 or not noise_known:
         return {}, 0.0
@@ -155,7 +180,7 @@ def _tests(
     _, size, vt = np.linalg.svd(s @ s.T)
     keep = min(columns, int(np.sum(size > 1e-10 * size[0])))
     weights = (vt[:keep] @ s) / np.sqrt(np.maximum(size[:keep], 1e-300))[:, None]
-    linear = flat @ weights.T
+    linear = flat @ weights.T - shared @ (vt[:keep].T / np.sqrt(np.maximum(size[:keep], 1e-300)))
     null = wanted @ (weights.T**2)
     found["linear in the signal"] = (np.sum(linear**2) - null.sum(), np.sqrt(2 * null.sum() * spread))
     # Brightness: against the square of the signal, its linear part taken away.
@@ -170,8 +195,8 @@ def _tests(
     )
     # Neighbours: noise of two pixels is independent.
     for name, axis in (("neighbours, rows", 1), ("neighbours, columns", 2)):
-        if taken.shape[axis] > 2:
-            first, second = np.delete(taken, -1, axis), np.delete(taken, 0, axis)
+        if r.shape[axis] > 2:
+            first, second = np.delete(images.taken, -1, axis), np.delete(images.taken, 0, axis)
             both = np.isfinite(first) & np.isfinite(second)
             product = (first * second)[both].astype(np.float64)
             if product.size > 100:
