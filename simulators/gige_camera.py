@@ -111,7 +111,7 @@ class GigeCamera:
         self._lost_ratio = lost_ratio
         self._description = description
         self._wait_s = wait_s
-        # Holds frames back after their exposure, as a busy host or a full link does.
+        # Holds frames of exposures that start from now on back, as a busy host or a full link does.
         self.delivery_delay_s = 0.0
         self._error: BaseException | None = None
         self._gone = threading.Event()
@@ -253,7 +253,7 @@ class GigeCamera:
     # --- the exposure, in the camera's own thread --------------------------------------------------------
 
     def _fill(self, buffer: int, _: int, exposure_us: int, gain_raw: int, code: int) -> None:
-        start_s = time.monotonic()
+        start_s, delay_s = time.monotonic(), self.delivery_delay_s
         camera = self._camera
         try:
             info = self._info(buffer, exposure_us, gain_raw)
@@ -268,7 +268,7 @@ class GigeCamera:
                 camera.set_property("gvsp-lost-ratio", 1.0)
         del camera
         # The frame is sent when this returns, and no frame leaves a camera before its exposure has ended.
-        self._gone.wait(max(0.0, start_s + exposure_us * 1e-6 + self.delivery_delay_s - time.monotonic()))
+        self._gone.wait(max(0.0, start_s + exposure_us * 1e-6 + delay_s - time.monotonic()))
 
     def _info(self, buffer: int, exposure_us: int, gain_raw: int) -> ExposureInfo:
         sfnc = self._description == "sfnc"

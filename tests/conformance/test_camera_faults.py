@@ -31,12 +31,22 @@ class Scene:
         self.before: Callable[[int], None] = lambda _: None
 
     def __call__(self, info: ExposureInfo) -> NDArray[np.uint16]:
-        self.exposures += 1
-        self.before(self.exposures)
+        number = self.exposures + 1
+        self.before(number)
         # The rest of the picture changes too: memory that was not filled again would show the frame before.
-        pixels = np.full((info.height, info.width), 100 + self.exposures, np.uint16)
-        stamp(pixels, [self.angle_deg, info.exposure_s, self.exposures])
+        pixels = np.full((info.height, info.width), 100 + number, np.uint16)
+        stamp(pixels, [self.angle_deg, info.exposure_s, number])
+        self.exposures = number
         return pixels
+
+
+def expose_unasked(simulated: GigeCamera, scene: Scene) -> None:
+    """Start an exposure behind the driver's back; returns when it has begun, however busy the machine is."""
+    before, deadline_s = scene.exposures, time.monotonic() + 10
+    simulated.fire()
+    while scene.exposures == before:
+        assert time.monotonic() < deadline_s, "the camera did not start the exposure"
+        time.sleep(0.001)
 
 
 @pytest.fixture
@@ -155,7 +165,7 @@ def test_a_stray_exposure_before_the_trigger_is_not_taken_for_its_own(
     camera.configure(CameraSettings(exposure_s=0.6))
     camera.capture()
     scene.angle_deg = 1.0
-    simulated.fire()
+    expose_unasked(simulated, scene)
     time.sleep(pause_s)
     scene.angle_deg = 2.0
     frame = camera.capture()[0]
@@ -173,7 +183,7 @@ def test_a_stray_frame_that_arrives_after_the_trigger_is_not_taken_for_its_own(
     for number in range(3):
         scene.angle_deg = 1.0
         simulated.delivery_delay_s = 0.3
-        simulated.fire()
+        expose_unasked(simulated, scene)
         time.sleep(0.1)
         scene.angle_deg = 2.0
         simulated.delivery_delay_s = 0.0 if number else 0.05
