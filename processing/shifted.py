@@ -15,21 +15,26 @@ REACH = 10
 
 def shifted_back(image: NDArray[np.floating], x_px: float, y_px: float) -> NDArray[np.float32]:
     """Image (rows, columns) moved back by what it had moved to the right and down; slopes go on beyond its edges."""
-    along_x, along_y = _taps(x_px), _taps(y_px)
+    along_x, along_y = taps(x_px), taps(y_px)
     x, y = along_x.size // 2, along_y.size // 2
     wide = np.pad(image.astype(np.float32), ((y, y), (x, x)), mode="reflect", reflect_type="odd")
     moved = cv2.sepFilter2D(wide, -1, along_x, along_y)
     return np.asarray(moved[y : y + image.shape[0], x : x + image.shape[1]], dtype=np.float32)
 
 
-def noise_left(x_px: float, y_px: float) -> float:
-    """Variance of a pixel after `shifted_back` over that before: interpolation averages the noise of neighbours."""
-    return float(np.sum(_taps(x_px) ** 2) * np.sum(_taps(y_px) ** 2))
-
-
-def _taps(shift_px: float) -> NDArray[np.float64]:
+def taps(shift_px: float) -> NDArray[np.float64]:
+    """Weights of neighbours along one axis, an odd number of them, that move an image back by so many pixels."""
     reach = REACH + math.ceil(abs(shift_px))
     one = np.zeros(2 * (reach + REACH) + 1)
     one[reach + REACH] = 1.0
-    taps = ndimage.shift(one, shift_px, order=5, mode="mirror")[REACH:-REACH]
-    return np.asarray(taps / taps.sum())
+    weights = ndimage.shift(one, shift_px, order=5, mode="mirror")[REACH:-REACH]
+    return np.asarray(weights / weights.sum())
+
+
+def neighbour_noise(x_px: float, y_px: float) -> tuple[float, float]:
+    """Covariance of the noise of neighbours down and across an image moved back so, for unit noise before."""
+    across, down = taps(x_px), taps(y_px)
+    return (
+        float(np.sum(down[1:] * down[:-1]) * np.sum(across**2)),
+        float(np.sum(down**2) * np.sum(across[1:] * across[:-1])),
+    )

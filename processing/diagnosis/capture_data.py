@@ -15,7 +15,7 @@ from processing.correction import Correction
 from processing.instrument import InstrumentModel
 from processing.noise import NoiseModel
 from processing.reduce import measurement_matrix, relative_exposure, sample_states
-from processing.shifted import noise_left, shifted_back
+from processing.shifted import shifted_back
 
 Array = NDArray[np.float64]
 
@@ -49,8 +49,8 @@ class CaptureData:
     clipped_states : (N,) True for states in which some pixel is.
     noise_estimated : slope and floor describe the scatter of these very counts, not the photons and the read-out.
     true_variance : (N, channels, rows, columns) where the variance is not a line in the counts any more.
-    noise_left : (N,) part of the variance that the scatter of single pixels shows; less than 1 where frames were moved,
-        which averages neighbours and adds no information.
+    moved_px : (N, 2) by how much each frame was moved back, from what it had moved to the right and down; pixels here.
+        That averages the noise of neighbours, and adds no information.
     usable : (rows, columns) True where every state has a number and the pixel is not dark.
     dark_fraction : part of the pixels that are too dark, or too close to dark ones, to be used.
     binned : side of the squares over which pixels were averaged.
@@ -76,7 +76,7 @@ class CaptureData:
     dark_fraction: float = 0.0
     noise_estimated: bool = False
     true_variance: NDArray[np.float32] | None = None
-    noise_left: Array | None = None
+    moved_px: Array | None = None
 
     @property
     def values_per_pixel(self) -> int:
@@ -89,10 +89,10 @@ class CaptureData:
         return np.repeat(self.exposure, self.signal.shape[1])
 
     @property
-    def row_noise_left(self) -> Array:
-        """`noise_left` (values_per_pixel,) of each row of W."""
-        left = np.ones(self.conditions.states) if self.noise_left is None else self.noise_left
-        return np.repeat(left, self.signal.shape[1])
+    def row_moved_px(self) -> Array:
+        """`moved_px` (values_per_pixel, 2) of each row of W; zero where nothing was moved."""
+        moved = np.zeros((self.conditions.states, 2)) if self.moved_px is None else self.moved_px
+        return np.repeat(moved, self.signal.shape[1], axis=0)
 
     def variance(self) -> Array:
         """Variance (N, channels, rows, columns) in full scale squared; right on average over noisy signals.
@@ -117,8 +117,7 @@ class CaptureData:
             for channel in range(signal.shape[1]):
                 signal[n, channel] = shifted_back(signal[n, channel], x, y)
                 variance[n, channel] = shifted_back(variance[n, channel], x, y)
-        left = np.array([noise_left(x, y) for x, y in shift_px])
-        return replace(self, signal=signal, true_variance=variance, noise_left=left)
+        return replace(self, signal=signal, true_variance=variance, moved_px=shift_px)
 
     def with_noise_of(self, signal: Array, slope: Array) -> CaptureData:
         """The same counts with the noise that corrected counts tell: photon noise follows the light, not the counts."""

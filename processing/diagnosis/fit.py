@@ -48,8 +48,10 @@ def minimize(
 ) -> Fit:
     """Least squares by Levenberg-Marquardt with bounds, on the data of the folds given; `free` (K,) may hold some.
 
-    Corrections of counts are expanded anew at most `expansions` times about where the fit ended.
+    Corrections of counts are expanded about the start, and at most `expansions` times anew about where the fit ended.
     """
+    if folds is None and expansions:
+        problem.relinearize(space, start)
     fit = _descend(problem, space, start, folds, free, steps)
     if folds is None:
         for _ in range(expansions):
@@ -188,7 +190,14 @@ def _one_step(full: Fit, space: Space, folds: Sequence[int]) -> Array:
     return np.asarray(np.clip(full.values - step, lower, upper))
 
 
-def covariance(problem: Problem, space: Space, fit: Fit, spread: float) -> Array:
-    """Covariance (K, K) of the values; `spread` scales the noise where structure is left over."""
-    h = fit.sums.curvature.sum(axis=0) + np.diag(prior(space))
-    return np.asarray(np.linalg.inv(h) * spread)
+def covariance(space: Space, fit: Fit, noise_only: Array) -> tuple[Array, Array]:
+    """Covariance (K, K) of the values of a fit, for noise of one; and the inverse (K, K) of the gradient's slope.
+
+    The part `noise_only` (K, K) of the curvature comes from noise in the derivatives: it adds to the scatter of the
+    gradient, not to its slope.
+    """
+    weak = np.diag(prior(space))
+    raw = fit.sums.curvature.sum(axis=0) + weak
+    told = raw - noise_only
+    bread = np.linalg.inv(told if space.size and np.linalg.eigvalsh(told).min() > 0 else raw)
+    return bread @ raw @ bread, bread

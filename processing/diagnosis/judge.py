@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from processing.diagnosis.candidate import Candidate
 from processing.diagnosis.fit import covariance, minimize
-from processing.diagnosis.moments import FEATURES, features
+from processing.diagnosis.moments import DERIVATIVES, FEATURES, features
 from processing.diagnosis.problem import InstrumentProblem
 from processing.diagnosis.recommend import recommended
 from processing.diagnosis.result import (
@@ -225,6 +225,11 @@ def _spread(search: Search, found: Found) -> float:
     return unit + search.structure(found.after, found.space.size)
 
 
+def _covariance(problem: InstrumentProblem, search: Search, found: Found) -> Array:
+    noise_only = problem.noise_information(found.space, found.fit.values)
+    return covariance(found.space, found.fit, noise_only)[0] * _spread(search, found)
+
+
 def _parameters(candidate: Candidate, values: Array, stderr: Array) -> dict[str, EffectParameter]:
     if candidate.effect.switch:
         return {"left_out": EffectParameter(value=1.0, unit="1", note="pixels with a clipped state are left out")}
@@ -238,7 +243,7 @@ def _parameters(candidate: Candidate, values: Array, stderr: Array) -> dict[str,
 
 
 def _effect(problem: InstrumentProblem, search: Search, found: Found, candidate: Candidate) -> FoundEffect:
-    error = np.sqrt(np.maximum(np.diag(covariance(problem, found.space, found.fit, _spread(search, found))), 0))
+    error = np.sqrt(np.maximum(np.diag(_covariance(problem, search, found)), 0))
     part = found.space.slices[found.space.candidates.index(candidate)]
     return FoundEffect(
         kind=candidate.kind,
@@ -256,7 +261,7 @@ def _effect(problem: InstrumentProblem, search: Search, found: Found, candidate:
 def _calibrated(problem: InstrumentProblem, search: Search, found: Found) -> dict[str, EffectParameter]:
     if not found.base.candidates:
         return {}
-    error = np.sqrt(np.maximum(np.diag(covariance(problem, found.space, found.fit, _spread(search, found))), 0))
+    error = np.sqrt(np.maximum(np.diag(_covariance(problem, search, found)), 0))
     out = {}
     for candidate in found.base.candidates:
         index = found.space.slices[found.space.candidates.index(candidate)].start
@@ -352,6 +357,6 @@ def closure(problem: InstrumentProblem, k: int, space: Space, values: Array) -> 
         sign = 1.0 if c.name in ("0", "90") else -1.0
         for state in range(data.signal.shape[0]):
             counts = data.signal[state, channel][good].astype(np.float64)
-            corrected = np.tensordot(coefficients[:, state, channel], features(counts)[0], axes=1)
+            corrected = np.tensordot(coefficients[:-DERIVATIVES, state, channel], features(counts)[0], axes=1)
             means[channel] += sign * corrected.mean() / changes.gain[state, channel]
     return float(100 * means.sum() / (np.abs(means).sum() / 2))

@@ -13,8 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.blas import dsyrk
 
 from processing.diagnosis.capture_data import CaptureData
+from processing.shifted import taps
 
 Array = NDArray[np.float64]
 
@@ -31,17 +33,9 @@ VALUE = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21
 FIRST = np.array([22.0, -67.0, -58.0, 0.0, 58.0, 67.0, -22.0]) / 252
 SECOND = np.array([-13.0, 67.0, -19.0, -70.0, -19.0, 67.0, -13.0]) / 132
 MARGIN = 3
-#: Noise of each derivative for unit noise of the pixels.
-DERIVATIVE_NOISE = {
-    name: float(np.sum(first**2) * np.sum(second**2))
-    for name, first, second in (
-        ("dx", FIRST, VALUE),
-        ("dy", VALUE, FIRST),
-        ("dxx", SECOND, VALUE),
-        ("dxy", FIRST, FIRST),
-        ("dyy", VALUE, SECOND),
-    )
-}
+#: Filters down and across the image of a pixel itself and of its derivatives, in the order of FEATURES.
+POINT = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+PATTERNS = ((POINT, POINT), (VALUE, FIRST), (FIRST, VALUE), (VALUE, SECOND), (FIRST, FIRST), (SECOND, VALUE))
 #: Parts that are held out in turn: of the image, or of the states (of which there are few, so each part is smaller).
 FOLDS_OF_TILES = 2
 FOLDS_OF_STATES = 5
@@ -135,7 +129,8 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
     least = np.repeat(data.floor, c)[:, None] / 2
     mean_variance = np.mean(variance[:, good] / scale[good], axis=1)
     sigma = np.sqrt(np.maximum(mean_variance, np.mean(least / scale[good], axis=1)))
-    left = data.row_noise_left
+    shared = np.stack([shared_noise(x, y) for x, y in data.row_moved_px])
+    left = shared[:, 0, 0]
     shown = variance * left[:, None, None]
     tiles = None
     by_state = holds_out_states(data)
@@ -150,11 +145,12 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
         held = f"every tile of the image is predicted by a fit to the other tiles ({folds} parts, interleaved)"
         tiles = _tiles(u, shown, scale, good & ~data.clipped, index, x, y, fold_of_tile)
     blocks: list[Block] = []
+    around = image_derivatives(u).reshape(DERIVATIVES, rows, -1)
     for clipped in (False, True):
         for fold in range(1 if by_state else folds):
             pick = good & (data.clipped == clipped) & (fold_of_pixel == fold)
             if pick.any():
-                blocks += _blocks(data, u, shown, scale, pick, fold, clipped, folds if by_state else 0)
+                blocks += _blocks(data, around, variance, shared, scale, pick, fold, clipped, folds if by_state else 0)
     share = variance[:, good] / scale[good] / sigma[:, None] ** 2
     mean = float(np.mean(u[:, good]))
     relative = float(np.mean(scale[good])) / mean**2
@@ -205,18 +201,19 @@ def _tiles(
 
 def _blocks(
     data: CaptureData,
-    u: NDArray[np.float32],
+    around: NDArray[np.float32],
     variance: Array,
+    shared: Array,
     scale: Array,
     pick: NDArray[np.bool_],
     fold: int,
     clipped: bool,
     parts_of_states: int,
 ) -> list[Block]:
+    u = data.signal.reshape(data.values_per_pixel, -1)
     rows = u.shape[0]
     size = len(FEATURES) * rows
     pixels = int(pick.sum())
-    around = image_derivatives(u).reshape(DERIVATIVES, rows, -1)
     noise = np.zeros((rows, len(FEATURES), len(FEATURES)))
     total = np.zeros((size, size)) if pixels > size else None
     chunks = []
@@ -224,22 +221,18 @@ def _blocks(
     for start in range(0, flat.size, 8192):
         p = flat[start : start + 8192]
         weight = 1 / np.sqrt(scale.reshape(-1)[p])
-        values = u.reshape(rows, -1)[:, p].astype(np.float64)
-        z, slopes = features(values)
+        z = np.empty((len(FEATURES), rows, p.size))
+        z[:-DERIVATIVES], slopes = features(u[:, p].astype(np.float64))
         z[-DERIVATIVES:] = around[:, :, p]
         z *= weight
-        share = variance.reshape(rows, -1)[:, p] * weight**2
-        noise += np.einsum("flp,glp,lp->lfg", slopes, slopes, share, optimize=True)
-        # Neighbours are taken to be as noisy as the pixel itself.
-        for name, part in DERIVATIVE_NOISE.items():
-            k = FEATURES.index(name)
-            noise[:, k, k] += part * share.sum(axis=1)
+        noise += _noise(slopes, variance.reshape(rows, -1)[:, p] * weight**2, shared)
+        flat_z = z.reshape(size, -1)
         if total is None:
-            chunks.append(z.reshape(size, -1))
+            chunks.append(flat_z)
         else:
-            flat_z = z.reshape(size, -1)
-            total += flat_z @ flat_z.T
-    root = np.concatenate(chunks, axis=1) if total is None else _square_root(total)
+            total += dsyrk(1.0, flat_z.T, trans=1)
+    # Only the upper triangle was summed.
+    root = np.concatenate(chunks, axis=1) if total is None else _square_root(np.triu(total) + np.triu(total, 1).T)
     z = root.reshape(len(FEATURES), rows, -1)
     counts = _square_root(z[0] @ z[0].T)
     free = np.repeat(~data.clipped_states, data.signal.shape[1]) if clipped else np.ones(rows, dtype=bool)
@@ -254,18 +247,41 @@ def _blocks(
     ]
 
 
+def shared_noise(x_px: float, y_px: float) -> Array:
+    """Covariance (6, 6) of the noise of a pixel and its derivatives, for unit noise of the pixels of the frame as taken.
+
+    The frame was moved back by so many pixels since, which makes the noise of neighbours alike.
+    """
+    across = np.stack([np.convolve(kernel, taps(x_px)) for _, kernel in PATTERNS])
+    down = np.stack([np.convolve(kernel, taps(y_px)) for kernel, _ in PATTERNS])
+    return np.asarray((across @ across.T) * (down @ down.T))
+
+
+def _noise(slopes: Array, share: Array, shared: Array) -> Array:
+    """Expected noise (L, F, F) of products of features, summed over pixels; neighbours count as noisy as the pixel."""
+    plain = len(slopes)
+    out = np.zeros((share.shape[0], len(FEATURES), len(FEATURES)))
+    out[:, :plain, :plain] = np.einsum("flp,glp,lp->lfg", slopes, slopes, share, optimize=True) * shared[:, :1, :1]
+    cross = np.einsum("flp,lp->lf", slopes, share)[:, :, None] * shared[:, :1, 1:]
+    out[:, :plain, plain:], out[:, plain:, :plain] = cross, cross.transpose(0, 2, 1)
+    out[:, plain:, plain:] = share.sum(axis=1)[:, None, None] * shared[:, 1:, 1:]
+    return out
+
+
 def features(u: Array) -> tuple[Array, Array]:
-    """Features (F, ...) of signals and their derivatives by the signal; the gradients of the image are left zero."""
-    z, slope = np.zeros((len(FEATURES), *u.shape)), np.zeros((len(FEATURES), *u.shape))
-    log = np.log(np.maximum(u, TINY))
+    """Features of signals that need no neighbours, (F - 5, ...), and their derivatives by the signal."""
+    z, slope = np.empty((2, len(FEATURES) - DERIVATIVES, *u.shape))
+    # Products: numpy's powers beyond the second take ten times as long.
+    log, square = np.log(np.maximum(u, TINY)), u * u
+    cube, log_square = square * u, log * log
     z[0], slope[0] = u, 1.0
-    z[1] = 1.0
-    z[2], slope[2] = u**2, 2 * u
-    z[3], slope[3] = u**3, 3 * u**2
-    z[4], slope[4] = u**4, 4 * u**3
+    z[1], slope[1] = 1.0, 0.0
+    z[2], slope[2] = square, 2 * u
+    z[3], slope[3] = cube, 3 * square
+    z[4], slope[4] = square * square, 4 * cube
     z[5], slope[5] = u * log, log + 1
-    z[6], slope[6] = u * log**2, log**2 + 2 * log
-    z[7], slope[7] = u * log**3, log**3 + 3 * log**2
+    z[6], slope[6] = u * log_square, log_square + 2 * log
+    z[7], slope[7] = u * log_square * log, log_square * log + 3 * log_square
     return z, slope
 
 
@@ -276,8 +292,7 @@ def image_derivatives(u: NDArray[np.floating]) -> NDArray[np.float32]:
     out = np.zeros((DERIVATIVES, *u.shape), dtype=np.float32)
     if min(u.shape[1:]) <= 2 * MARGIN + 2:
         return out
-    pairs = ((VALUE, FIRST), (FIRST, VALUE), (VALUE, SECOND), (FIRST, FIRST), (SECOND, VALUE))
-    for k, (along_y, along_x) in enumerate(pairs):
+    for k, (along_y, along_x) in enumerate(PATTERNS[1:]):
         out[k] = correlate1d(correlate1d(u, along_x, axis=2), along_y, axis=1)
     return out
 

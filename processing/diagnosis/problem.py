@@ -20,6 +20,7 @@ from processing.changes import Changes
 from processing.diagnosis.candidate import Candidate, nominal_values, pool
 from processing.diagnosis.capture_data import CaptureData
 from processing.diagnosis.moments import (
+    DERIVATIVES,
     FEATURES,
     FOLDS_OF_STATES,
     FOLDS_OF_TILES,
@@ -28,7 +29,7 @@ from processing.diagnosis.moments import (
     holds_out_states,
     moments_of,
 )
-from processing.diagnosis.projection import RANK, add_block
+from processing.diagnosis.projection import RANK, add_block, noise_information
 from processing.diagnosis.space import Space as Space
 from processing.diagnosis.space import Sums as Sums
 from processing.effects.base import apply_to, changes_of, turned_by
@@ -259,6 +260,20 @@ class InstrumentProblem:
                 self._tile_sums(k, space, values, changes, out, derivatives)
             else:
                 self._block_sums(k, space, values, changes, out, derivatives)
+        return out
+
+    def noise_information(self, space: Space, values: Array) -> Array:
+        """Part (K, K) of the curvature that comes from the noise of image derivatives and tells nothing about values."""
+        other, local = self.near(space, values)
+        if other is not self:
+            return other.noise_information(space, local)
+        out = np.zeros((space.size, space.size))
+        for k, moments in enumerate(self.moments):
+            changes = self.changes(k, space, values)
+            a = self.columns(k, changes)
+            _, dc = self._derivatives(k, space, values, a, self.coefficients(k, changes))
+            if np.any(dc[:, -DERIVATIVES:]):
+                out += sum(noise_information(block, a, dc, moments) for block in moments.blocks)
         return out
 
     def _has_field(self, space: Space) -> bool:

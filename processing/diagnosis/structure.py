@@ -14,7 +14,7 @@ from processing.diagnosis.problem import InstrumentProblem
 from processing.diagnosis.projection import add_response
 from processing.diagnosis.space import Space
 from processing.effects.field_retardance import terms
-from processing.shifted import shifted_back
+from processing.shifted import neighbour_noise
 
 Array = NDArray[np.float64]
 
@@ -61,13 +61,12 @@ class Images:
 
     Attributes
     ----------
-    residual : in units of the noise; taken : the same in the frames before they were moved back.
+    residual : in units of the noise.
     signal : the fit, in counts over full scale; expected : variance of the residual of a smooth pattern.
     good : (rows, columns) pixels that are used.
     """
 
     residual: NDArray[np.float32]
-    taken: NDArray[np.float32]
     signal: NDArray[np.float32]
     expected: NDArray[np.float32]
     good: NDArray[np.bool_]
@@ -99,18 +98,13 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     scale = level[:, None] * np.sqrt(mean_variance[used])
     r = np.full((rows, height, width), np.nan, dtype=np.float32)
     r[:, used] = (y - signal)[:, used] / scale
-    # Frames moved back have noise that neighbours share: these are asked in the frames as they were taken.
-    taken = r
-    if problem.shifts_px[capture].any():
-        again = _moved_again(signal, problem.shifts_px[capture])
-        taken = np.full_like(r, np.nan)
-        taken[:, used] = (problem.still[capture].signal.reshape(y.shape) + (y - counts) - again)[:, used] / scale
     signal[:, ~used], free[:, ~used] = 0.0, 0.0
     noise = variance / level[:, None, None] ** 2 / np.maximum(mean_variance, 1e-300)
     expected = (free * noise).astype(np.float32)
     good = np.asarray(np.isfinite(r).all(axis=0))
-    images = Images(r, taken, signal, expected, good)
-    tests, left = _tests(images, moments.left, shared, a.shape[1], moments.spread, data.noise_known)
+    images = Images(r, signal, expected, good)
+    alike = np.array([neighbour_noise(x, y) for x, y in data.row_moved_px])
+    tests, left = _tests(images, moments.left, alike, shared, a.shape[1], moments.spread, data.noise_known)
     n, channels = data.signal.shape[:2]
     mean = r[:, good].mean(axis=1) if good.any() else np.zeros(rows)
     states = mean.reshape(n, channels).mean(axis=1)
@@ -134,11 +128,6 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     )
 
 
-def _moved_again(images: NDArray[np.float32], shift_px: Array) -> NDArray[np.float32]:
-    shifts = np.repeat(shift_px, images.shape[0] // shift_px.shape[0], axis=0)
-    return np.stack([shifted_back(image, -x, -y) for image, (x, y) in zip(images, shifts, strict=True)])
-
-
 def _parts(
     problem: InstrumentProblem, capture: int, changes: Changes, a: Array, used: NDArray[np.bool_]
 ) -> list[tuple[NDArray[np.bool_], Array]]:
@@ -157,6 +146,7 @@ def _basis(a: Array) -> Array:
 def _tests(
     images: Images,
     shown: Array,
+    alike: Array,
     shared: Array,
     columns: int,
     spread: float,
@@ -164,7 +154,8 @@ def _tests(
 ) -> tuple[dict[str, float], float]:
     """Chi-square of each test over its standard deviation, and the largest that is certainly left.
 
-    `shown` (L,) is the part of the noise that single pixels show, `shared` (L, L) the mean of residual times fit.
+    `shown` (L,) is the part of the noise that single pixels show, `alike` (L, 2) what neighbours down and across share
+    of it, `shared` (L, L) the mean of residual times fit.
     """
     r, signal, expected, good = images.residual, images.signal, images.expected, images.good
     count = int(good.sum())
@@ -193,14 +184,15 @@ def _tests(
         np.sum(along**2) - expectation.sum(),
         np.sqrt(2 * np.sum(expectation**2) * spread + 1e-300),
     )
-    # Neighbours: noise of two pixels is independent.
-    for name, axis in (("neighbours, rows", 1), ("neighbours, columns", 2)):
-        if r.shape[axis] > 2:
-            first, second = np.delete(images.taken, -1, axis), np.delete(images.taken, 0, axis)
-            both = np.isfinite(first) & np.isfinite(second)
-            product = (first * second)[both].astype(np.float64)
+    # Neighbours: noise of two pixels is independent, or as alike as moving the frames has made it.
+    for k, name in enumerate(("neighbours, rows", "neighbours, columns")):
+        if r.shape[k + 1] > 2:
+            first, second = np.delete(r, -1, k + 1), np.delete(r, 0, k + 1)
+            both = np.isfinite(first).all(axis=0) & np.isfinite(second).all(axis=0)
+            product = (first * second)[:, both].astype(np.float64)
             if product.size > 100:
-                found[name] = (product.sum(), np.sqrt(np.sum(product**2)))
+                null = alike[:, k] @ np.delete(expected, -1, k + 1)[:, both].sum(axis=1, dtype=np.float64)
+                found[name] = (product.sum() - null, np.sqrt(np.sum(product**2)))
     # Tiles: mean residual of every row over patches of the image.
     found["patches"] = _patches(r, expected, spread)
     left = max(chi2 - 2 * deviation for chi2, deviation in found.values())

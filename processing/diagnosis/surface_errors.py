@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.diagnosis.fit import Fit, minimize, prior
+from processing.diagnosis.fit import Fit, covariance, minimize
 from processing.diagnosis.space import Space
 from processing.diagnosis.surface_problem import SurfaceProblem
 from processing.diagnosis.surface_search import bent
@@ -25,11 +25,8 @@ def standard_errors(problem: SurfaceProblem, space: Space, fit: Fit, spread: flo
     """
     if not space.size:
         return np.zeros(0)
-    weak = np.diag(prior(space))
-    raw = fit.sums.curvature.sum(axis=0) + weak
-    told = raw - problem.noise_information(space, fit.values)
-    bread = np.linalg.inv(told if np.linalg.eigvalsh(told).min() > 0 else raw)
-    error = np.sqrt(np.maximum(np.diag(bread @ raw @ bread), 0.0))
+    both, bread = covariance(space, fit, problem.noise_information(space, fit.values))
+    error = np.sqrt(np.maximum(np.diag(both), 0.0))
     wide = np.ones(space.size)
     for j in np.flatnonzero(bent(space)):
         step = AT * error[j]
