@@ -248,9 +248,9 @@ def _blocks(
 
 
 def shared_noise(x_px: float, y_px: float) -> Array:
-    """Covariance (6, 6) of the noise of a pixel and its derivatives, for unit noise of the pixels of the frame as taken.
+    """Covariance (6, 6) of the noise of a pixel and its derivatives in a frame that was moved back by so many pixels.
 
-    The frame was moved back by so many pixels since, which makes the noise of neighbours alike.
+    For unit noise of the pixels of the frame as taken, which moving it makes alike among neighbours.
     """
     across = np.stack([np.convolve(kernel, taps(x_px)) for _, kernel in PATTERNS])
     down = np.stack([np.convolve(kernel, taps(y_px)) for kernel, _ in PATTERNS])

@@ -263,7 +263,7 @@ class InstrumentProblem:
         return out
 
     def noise_information(self, space: Space, values: Array) -> Array:
-        """Part (K, K) of the curvature that comes from the noise of image derivatives and tells nothing about values."""
+        """Part (K, K) of the curvature that is noise of image derivatives and tells nothing about the values."""
         other, local = self.near(space, values)
         if other is not self:
             return other.noise_information(space, local)

@@ -39,7 +39,7 @@ def add_block(block: Block, a: Array, c: Array, da: Array, dc: Array | None, mom
     u, size, vt = np.linalg.svd(a[rows], full_matrices=False)
     keep = size > RANK * size[0]
     q = u[:, keep]
-    around = np.any(c[-DERIVATIVES:]) or (dc is not None and bool(np.any(dc[:, -DERIVATIVES:])))
+    around = bool(np.any(c[-DERIVATIVES:])) or (dc is not None and bool(np.any(dc[:, -DERIVATIVES:])))
     if around:
         # Derivatives of the fitted image in place of those of the noisy frames.
         z = np.concatenate([z[:-DERIVATIVES], q @ (q.T @ (z[-DERIVATIVES:] * scale[:, None])) / scale[:, None]])

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from processing.shifted import noise_left, shifted_back
+from processing.diagnosis.moments import image_derivatives, shared_noise
+from processing.shifted import neighbour_noise, shifted_back
 
 
 def picture(x, y):
@@ -24,10 +25,15 @@ def test_whole_pixels_are_exact():
     assert shifted_back(image, 2.0, -1.0)[5:-5, 5:-5] == pytest.approx(
         np.roll(image, (1, -2), (0, 1))[5:-5, 5:-5], abs=1e-4
     )
-    assert noise_left(2.0, -1.0) == pytest.approx(1.0, abs=1e-6)
+    assert shared_noise(2.0, -1.0) == pytest.approx(shared_noise(0.0, 0.0), abs=1e-6)
+    assert neighbour_noise(2.0, -1.0) == pytest.approx((0.0, 0.0), abs=1e-6)
 
 
-@pytest.mark.parametrize("shift", [(0.5, 0.5), (0.2, -0.4)])
-def test_noise_that_interpolation_leaves(shift):
-    noise = np.random.default_rng(1).normal(size=(500, 500))
-    assert shifted_back(noise, *shift).var() == pytest.approx(noise_left(*shift), rel=0.02)
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.5, 0.5), (0.2, -0.4)])
+def test_noise_of_pixels_and_derivatives_after_moving(shift):
+    moved = shifted_back(np.random.default_rng(1).normal(size=(900, 900)), *shift)
+    parts = np.concatenate([moved[None, None], image_derivatives(moved[None])])[:, 0, 20:-20, 20:-20].reshape(6, -1)
+    # The slowest of these patterns, seven pixels wide, have some ten thousand independent values.
+    assert parts @ parts.T / parts.shape[1] == pytest.approx(shared_noise(*shift), abs=0.005)
+    rows, columns = np.mean(moved[1:] * moved[:-1]), np.mean(moved[:, 1:] * moved[:, :-1])
+    assert (rows, columns) == pytest.approx(neighbour_noise(*shift), abs=0.005)

@@ -1,0 +1,59 @@
+"""Noise alone has no excess and no gradient, whatever is done to the counts."""
+
+import numpy as np
+import pytest
+
+from processing.changes import Conditions
+from processing.diagnosis.capture_data import CaptureData
+from processing.diagnosis.moments import DERIVATIVES, FEATURES, moments_of
+from processing.diagnosis.projection import add_block, noise_information
+from processing.diagnosis.space import Sums
+
+STATES, SIDE, SIGMA = 8, 240, 0.01
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    """A flat scene of which nothing but noise can move."""
+    random = np.random.default_rng(4)
+    signal = 0.5 + SIGMA * random.normal(size=(STATES, 1, SIDE, SIDE))
+    return CaptureData(
+        name="noise",
+        signal=signal.astype(np.float32),
+        conditions=Conditions({}, STATES, ("all",), np.arange(STATES) / STATES, 4095.0),
+        exposure=np.ones(STATES),
+        sample=None,
+        slope=np.zeros(STATES),
+        floor=np.full(STATES, SIGMA**2),
+        noise_known=True,
+        noise_source="",
+        clipped=np.zeros((SIDE, SIDE), dtype=bool),
+        clipped_states=np.zeros(STATES, dtype=bool),
+        usable=np.ones((SIDE, SIDE), dtype=bool),
+        simulated=True,
+        wavelength_nm=662.0,
+    )
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_shift_of_noise_promises_nothing(noisy, moved):
+    random = np.random.default_rng(5)
+    data = noisy.moved_back(random.uniform(-0.6, 0.6, (STATES, 2))) if moved else noisy
+    moments = moments_of(data, 1)
+    # Two unknowns: brightness and something else.
+    a = np.stack([np.ones(STATES), random.normal(size=STATES)], axis=1) / moments.sigma[:, None]
+    c = np.zeros((len(FEATURES), STATES))
+    c[0] = 1.0
+    c[-DERIVATIVES:] = random.normal(size=(DERIVATIVES, STATES))
+    dc = np.zeros((2, len(FEATURES), STATES))
+    dc[0, FEATURES.index("dx")] = random.normal(size=STATES)
+    dc[1, FEATURES.index("dyy")] = random.normal(size=STATES)
+    sums, (block,) = Sums.empty(1, 2), moments.blocks
+    add_block(block, a, c, np.zeros((2, *a.shape)), dc, moments, sums)
+    # Derivatives take in some tens of neighbours, which leaves as many times fewer independent values.
+    assert abs(sums.excess[0]) < 5 * np.sqrt(2 * 50 * sums.freedom[0])
+    error = np.sqrt(np.diag(sums.curvature[0]))
+    assert np.all(np.abs(sums.gradient[0]) < 5 * error)
+    # All of the curvature is noise.
+    part = noise_information(block, a, dc, moments)
+    assert part == pytest.approx(sums.curvature[0], rel=0.03, abs=0.03 * np.max(part))
