@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from processing.diagnosis.fit import held_out, minimize
-from processing.diagnosis.problem import Space
+from processing.diagnosis.space import Space
 from processing.diagnosis.surface_judge import DEGENERACY, SurfaceDiagnosis
 from processing.diagnosis.surface_problem import SurfaceProblem
 from processing.diagnosis.surface_run import diagnose_object

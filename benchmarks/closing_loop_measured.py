@@ -21,8 +21,8 @@ from processing import mueller
 from processing.capture import Capture
 from processing.diagnosis.capture_data import read_capture
 from processing.diagnosis.fit import held_out, minimize
+from processing.diagnosis.instrument_problem import InstrumentProblem
 from processing.diagnosis.judge import Judged, closure
-from processing.diagnosis.problem import InstrumentProblem
 from processing.diagnosis.reflectance_problem import FOLDS, ReflectanceProblem
 from processing.diagnosis.run import diagnose_captures
 from processing.diagnosis.space import Space

@@ -13,7 +13,7 @@ from processing.capture import Capture
 from processing.diagnosis.candidate import pool
 from processing.diagnosis.capture_data import CaptureData, read_capture
 from processing.diagnosis.fit import minimize
-from processing.diagnosis.problem import InstrumentProblem
+from processing.diagnosis.instrument_problem import InstrumentProblem
 from processing.diagnosis.space import Space
 from processing.instrument import InstrumentModel
 from simulators.faults_undeclared import Truth

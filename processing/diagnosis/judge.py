@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from processing.diagnosis.candidate import Candidate
 from processing.diagnosis.fit import covariance, minimize
+from processing.diagnosis.found import Found
+from processing.diagnosis.instrument_problem import InstrumentProblem
 from processing.diagnosis.moments import DERIVATIVES, FEATURES, features
-from processing.diagnosis.problem import InstrumentProblem
 from processing.diagnosis.recommend import recommended
 from processing.diagnosis.result import (
     CaptureReport,
@@ -23,9 +24,10 @@ from processing.diagnosis.result import (
     Unexplained,
     Verdict,
 )
-from processing.diagnosis.search import CHANCE, Found, Say, Search
+from processing.diagnosis.search import CHANCE, Say, Search
 from processing.diagnosis.space import Space
 from processing.diagnosis.structure import LIMIT, Residual, description, residual
+from processing.diagnosis.unevenness import unevenness
 from processing.instrument import EffectParameter
 
 Array = NDArray[np.float64]
@@ -149,7 +151,7 @@ def _uneven(problem: InstrumentProblem, found: Found, candidate: Candidate) -> b
     """A source that changes does so by the same share in the whole image; what differs from part to part is none."""
     if any(c.kind == "field_retardance" for c in found.effects):
         return False
-    excess, terms = problem.unevenness(candidate, found.space, found.fit.values)
+    excess, terms = unevenness(problem, candidate, found.space, found.fit.values)
     return bool(excess > max(UNEVEN * np.sqrt(2 * terms), UNEVEN_SHARE * found.gain.get(candidate, 0.0)))
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from processing import mueller
 from processing.diagnosis.candidate import Candidate
 from processing.diagnosis.fit import Fit
-from processing.diagnosis.problem import InstrumentProblem
+from processing.diagnosis.instrument_problem import InstrumentProblem
 from processing.diagnosis.space import Space
 
 Array = NDArray[np.float64]

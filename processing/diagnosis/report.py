@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from processing.cloude import xi0_and_dominant
 from processing.diagnosis.fit import Fit
+from processing.diagnosis.instrument_problem import InstrumentProblem
 from processing.diagnosis.judge import Judged
-from processing.diagnosis.problem import InstrumentProblem
 from processing.diagnosis.projection import add_response
 from processing.diagnosis.space import Space
 from processing.diagnosis.structure import HARMONICS, Residual

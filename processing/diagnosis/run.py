@@ -7,8 +7,8 @@ from pathlib import Path
 
 from processing.capture import Capture, CaptureError
 from processing.diagnosis.capture_data import CaptureData, read_capture
+from processing.diagnosis.instrument_problem import InstrumentProblem
 from processing.diagnosis.judge import Judged, diagnose
-from processing.diagnosis.problem import InstrumentProblem
 from processing.diagnosis.search import Say
 from processing.instrument import InstrumentModel
 

@@ -7,7 +7,6 @@ could explain by chance in the few independent directions that such structure ha
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from scipy import stats
 
 from processing.diagnosis.candidate import Candidate
 from processing.diagnosis.fit import Fit, HeldOut, held_out, minimize, prior, score
+from processing.diagnosis.found import Found, Trial
 from processing.diagnosis.problem import Problem
 from processing.diagnosis.space import Space
 
@@ -30,8 +30,6 @@ CLOSE = 14.0
 ALIKE = 1e-3
 #: Chance that one candidate explains as much of a structure that it has nothing to do with.
 CHANCE = 1e-4
-#: Growth of the unweighted residual that is still put down to noise.
-WORSE = 1.002
 #: Standard deviations by which the counts may scatter less than a bent response says that they must.
 IMPOSSIBLE = 6.0
 MOST_EFFECTS = 12
@@ -39,62 +37,6 @@ LEADERS = 4
 #: Relative rms residual above which nominal values are searched for from many starts.
 FAR_OFF = 0.05
 STARTS = 24
-
-
-@dataclass
-class Trial:
-    """A candidate fitted together with the active effects."""
-
-    candidate: Candidate
-    space: Space
-    fit: Fit
-    out: HeldOut
-    evidence: float = 0.0
-    rank: float = 0.0
-
-    @property
-    def at_bound(self) -> bool:
-        """A value stands at a bound: the data ask for something else."""
-        lower, upper = self.space.joined("lower"), self.space.joined("upper")
-        near = np.minimum(self.fit.values - lower, upper - self.fit.values) < 1e-3 * (upper - lower)
-        for candidate, part in zip(self.space.candidates, self.space.slices, strict=True):
-            near[part] &= not candidate.effect.switch
-        return bool(near.any())
-
-    def sound(self, before: HeldOut) -> bool:
-        """No value runs to its bound, and the residual itself does not grow.
-
-        What fits better only where the weights are large is not an explanation. A bend of the response changes the
-        scale in which the residual is told, so it is not asked.
-        """
-        return not self.at_bound and (self.candidate.effect.pointwise or self.out.rms <= WORSE * before.rms)
-
-
-@dataclass
-class Found:
-    """Result of the search: the final space and fit, and for each effect what else could be it."""
-
-    base: Space
-    before: HeldOut
-    before_fit: Fit
-    space: Space
-    fit: Fit
-    after: HeldOut
-    evidence: dict[Candidate, float] = field(default_factory=dict)
-    chance: dict[Candidate, float] = field(default_factory=dict)
-    gain: dict[Candidate, float] = field(default_factory=dict)
-    sets: dict[Candidate, tuple[Candidate, ...]] = field(default_factory=dict)
-    ranking: list[Trial] = field(default_factory=list)
-    alone: dict[Candidate, float] = field(default_factory=dict)  # share of the excess that each explains by itself
-    information: dict[Candidate, Array] = field(default_factory=dict)  # with no effect active
-    untestable: tuple[Candidate, ...] = ()
-    nameless: list[Candidate] = field(default_factory=list)
-    imitable: bool = False  # values for each state were added on the way, which can hide plain effects
-
-    @property
-    def effects(self) -> tuple[Candidate, ...]:
-        """Effects found, without the nominal values of the train."""
-        return self.space.candidates[len(self.base.candidates) :]
 
 
 class Search:

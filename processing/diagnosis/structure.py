@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from processing.changes import Changes
 from processing.diagnosis.fit import Fit
+from processing.diagnosis.instrument_problem import InstrumentProblem
 from processing.diagnosis.moments import inside
-from processing.diagnosis.problem import InstrumentProblem
 from processing.diagnosis.projection import add_response
 from processing.diagnosis.space import Space
+from processing.diagnosis.tile_sums import tile_columns
 from processing.effects.field_retardance import terms
 from processing.shifted import neighbour_noise
 
@@ -131,10 +132,11 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
 def _parts(
     problem: InstrumentProblem, capture: int, changes: Changes, a: Array, used: NDArray[np.bool_]
 ) -> list[tuple[NDArray[np.bool_], Array]]:
-    tiles = problem.moments[capture].tiles
+    moments = problem.moments[capture]
+    tiles = moments.tiles
     if not changes.field_retardance_rad or tiles is None:
         return [(used, a)]
-    columns = problem.tile_columns(capture, changes) * problem.moments[capture].sigma[:, None]
+    columns = tile_columns(problem.model, problem.captures[capture], moments, changes) * moments.sigma[:, None]
     return [(used & (tiles.index == t), columns[t]) for t in range(tiles.x.size)]
 
 

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from processing.deviation import rmsd
 from processing.diagnosis.candidate import Candidate
-from processing.diagnosis.problem import Space
+from processing.diagnosis.found import Found
 from processing.diagnosis.result import CaptureReport, Diagnosis, Error, FoundEffect, Ranked, Unexplained, Verdict
-from processing.diagnosis.search import CHANCE, Found, Say
+from processing.diagnosis.search import CHANCE, Say
+from processing.diagnosis.space import Space
 from processing.diagnosis.surface_errors import standard_errors
 from processing.diagnosis.surface_problem import SurfaceProblem
 from processing.diagnosis.surface_quantities import Quantities, quantities

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from processing.changes import Changes
 from processing.diagnosis.candidate import Candidate
-from processing.diagnosis.problem import Space, Sums
+from processing.diagnosis.space import Space, Sums
 from processing.diagnosis.surface_data import FEWEST_PIXELS, FOLDS, SurfaceData
 from processing.effects._reflectance import ReflectanceEffect
 from processing.effects.base import Parameter, all_effects, apply_to

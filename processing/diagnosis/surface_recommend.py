@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from processing.diagnosis.candidate import Candidate
 from processing.diagnosis.fit import Fit
-from processing.diagnosis.problem import Space
 from processing.diagnosis.recommend import APART
+from processing.diagnosis.space import Space
 from processing.diagnosis.surface_problem import SurfaceProblem
 
 Array = NDArray[np.float64]

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from processing.diagnosis.candidate import Candidate
 from processing.diagnosis.fit import LEAST_GAIN, Fit, HeldOut, held_out, minimize
-from processing.diagnosis.problem import Space
-from processing.diagnosis.search import Found, Search, Trial
+from processing.diagnosis.found import Found, Trial
+from processing.diagnosis.search import Search
+from processing.diagnosis.space import Space
 from processing.effects._reflectance import ReflectanceEffect
 
 #: Every effect of the pool is fitted, not only those that promise most: the model is far from linear in them.

@@ -9,8 +9,8 @@ import pytest
 
 from processing.capture import Capture
 from processing.diagnosis.capture_data import read_capture
+from processing.diagnosis.instrument_problem import InstrumentProblem
 from processing.diagnosis.judge import closure
-from processing.diagnosis.problem import InstrumentProblem
 from processing.diagnosis.run import diagnose_captures
 from processing.diagnosis.space import Space
 from processing.diagnosis.write import extended

@@ -7,9 +7,9 @@ import pytest
 
 from processing import mueller
 from processing.diagnosis.fit import held_out, minimize
-from processing.diagnosis.problem import Space
 from processing.diagnosis.reflectance_problem import FOLDS, ReflectanceProblem
 from processing.diagnosis.search import Search
+from processing.diagnosis.space import Space
 from processing.geometry.frames import ScatteringGeometry, change_frames
 
 pytestmark = pytest.mark.measured

@@ -50,7 +50,7 @@ def test_a_shift_of_noise_promises_nothing(noisy, moved):
     dc[1, FEATURES.index("dyy")] = random.normal(size=STATES)
     sums, (block,) = Sums.empty(1, 2), moments.blocks
     add_block(block, a, c, np.zeros((2, *a.shape)), dc, moments, sums)
-    # Derivatives share some noise with neighbours: the variance of the excess is up to twice that of independent values.
+    # Derivatives share noise with neighbours: the excess varies up to twice as much as with independent values.
     assert abs(sums.excess[0]) < 5 * np.sqrt(2 * 2 * sums.freedom[0])
     error = np.sqrt(np.diag(sums.curvature[0]))
     assert np.all(np.abs(sums.gradient[0]) < 5 * error)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from processing.diagnosis.problem import Space
 from processing.diagnosis.reflectance_problem import ReflectanceProblem
 from processing.diagnosis.search import Search
+from processing.diagnosis.space import Space
 from processing.instrument import InstrumentModel
 from processing.states import rotating_retarders
 from processing.xi0 import estimate

@@ -7,7 +7,7 @@ import pytest
 
 from processing.capture import Capture
 from processing.diagnosis.fit import minimize
-from processing.diagnosis.problem import Space
+from processing.diagnosis.space import Space
 from processing.diagnosis.surface_data import read_surface
 from processing.diagnosis.surface_errors import standard_errors
 from processing.diagnosis.surface_judge import SurfaceDiagnosis

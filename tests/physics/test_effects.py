@@ -8,7 +8,7 @@ import pytest
 from processing.changes import Changes, Conditions
 from processing.diagnosis.candidate import Candidate
 from processing.diagnosis.capture_data import CaptureData
-from processing.diagnosis.problem import InstrumentProblem
+from processing.diagnosis.instrument_problem import InstrumentProblem
 from processing.diagnosis.space import Space
 from processing.effects._reflectance import ReflectanceEffect
 from processing.effects.base import EffectError, all_effects, apply_to, changes_of
