@@ -50,6 +50,8 @@ ONE_WAVE = 0.85
 UNEVEN, UNEVEN_SHARE = 6.0, 0.01
 #: An information about a parameter below this, in chi-square for its typical size, is none.
 SEEN = 4.0
+#: Share of the noise that is not known: information must be more than that.
+NOT_EXACT = 0.05
 #: Autocorrelation over the states, in standard deviations, from which on a residual of few pixels is not white.
 WHITE = 4.0
 
@@ -84,7 +86,7 @@ def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
         after = before
     else:
         tried = tuple(t.candidate for t in found.ranking[:5]) if verdict == "unexplained" else ()
-    unseen = _unobservable(found)
+    unseen = _unobservable(problem, found)
     rivals = [(e, *found.sets[e]) for e in found.effects if found.sets.get(e)]
     unexplained = None
     if verdict in ("unexplained", "partly_explained"):
@@ -276,11 +278,16 @@ def _calibrated(problem: InstrumentProblem, search: Search, found: Found) -> dic
     return out
 
 
-def _unobservable(found: Found) -> tuple[str, ...]:
+def _unobservable(problem: InstrumentProblem, found: Found) -> tuple[str, ...]:
     names = []
     for candidate, information in found.information.items():
-        gain = np.diag(information) * candidate.typical**2
-        if "@" not in candidate.place and np.all(gain < SEEN):
+        gain, least = np.diag(information) * candidate.typical**2, np.full(candidate.size, SEEN)
+        if candidate.effect.moves_image:
+            # Noise alone has slopes too, from one pixel to the next, which a shift would change.
+            one = Space((candidate,))
+            noise = np.diag(problem.noise_information(one, np.zeros(one.size))) * candidate.typical**2
+            gain, least = gain - noise, np.maximum(least, NOT_EXACT * noise)
+        if "@" not in candidate.place and np.all(gain < least):
             names.append(candidate.short)
     names += [f"{c.short} (as many values as the data have)" for c in found.untestable]
     return tuple(dict.fromkeys(names))

@@ -110,6 +110,22 @@ def test_a_small_effect_beside_an_image_that_wanders_by_a_pixel(configs, tmp_pat
         assert value.value == pytest.approx(true, abs=3.5 * value.stderr)
 
 
+def test_a_shift_of_an_even_image_cannot_be_seen(configs, tmp_path):
+    def unobservable(waves: float) -> set[str]:
+        random, bench = np.random.default_rng(7), Bench(rows=64, columns=64)
+        scene, angles = Scene(random), state_angles(STATES, False, False)
+        scene.waves *= waves
+        path = tmp_path / f"waves{waves:g}.h5"
+        counts = digitize(bench, expose(bench, scene, angles), random)
+        text = (configs / "instruments/rgb950.yaml").read_text()
+        write_capture(path, bench, counts, angles, Sample(kind="unknown"), text)
+        return {name.partition(" ")[0].partition("[")[0] for name in diagnosed(path, configs).unobservable}
+
+    shifts = {"image_drift", "beam_wander"}
+    assert shifts <= unobservable(0.0)
+    assert not shifts & unobservable(1.0)
+
+
 def test_a_written_image_shift_is_consistent_the_next_time(configs, tmp_path, capsys):
     path = capture(tmp_path, configs, wandering(Bench(rows=32, columns=32)), air=False)
     new = tmp_path / "new.yaml"
