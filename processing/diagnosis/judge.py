@@ -34,13 +34,14 @@ Array = NDArray[np.float64]
 
 #: Share of the excess that must be explained before anything is named while structure is left.
 SHARE = 0.97
-#: Share of the excess that one effect explains by itself, if it is to be named beside much that is unexplained; and
-#: standard deviations of the worst test that are not yet much.
-ALONE = 0.9
-#: An effect that explains so many times what is left, or what the weak ones besides it explain, keeps its name too: no
-#: effect's model is exact to a few per cent.
-TIMES = 20.0
+#: Standard deviations of the worst test up to which what is left unexplained is not yet much.
 MILD = 7.0
+#: An effect keeps its name beside much that is unexplained if it explains so many times that, in chi-square: no effect's
+#: model is exact to more than 5 % of its size. The same beside weak effects that come with it.
+TIMES = 400.0
+#: Where the noise is not known from the detector, what is left may be noise: an effect is named then if it explains this
+#: share of the excess by itself.
+ALONE = 0.9
 #: More effects at once than these are less likely than one cause that is not in the list.
 MOST_AT_ONCE = 2
 #: Share of the scatter of values that belong to one state each which a single wave may hold, if they are to be random.
@@ -121,17 +122,18 @@ def _unname(problem: InstrumentProblem, search: Search, found: Found, after: Seq
     structure |= not problem.noise_known and bool(found.effects)
     left = max(found.after.excess - problem.noise_known * 2 * search.noise_of(found.after), 0.0)
     worst = max((r.worst[1] for r in after if r.tests), default=np.inf)
+    sharp = problem.noise_known and not any(c.noise_estimated for c in problem.captures)
+    alone = [] if sharp else [c for c in found.effects if found.alone.get(c, 0.0) >= ALONE]
     small = []
     if structure and worst > MILD:
-        # With much structure left, several effects together may imitate one that is not in the list: only what
-        # explains nearly everything by itself, or far more than is left, keeps its name.
+        # With much structure left, several effects together may imitate one that is not in the list.
         remains = TIMES * sum(r.left if r.tests else np.inf for r in after)
-        small = [c for c in found.effects if found.alone.get(c, 0.0) < ALONE and found.gain.get(c, 0.0) < remains]
+        small = [c for c in found.effects if c not in alone and found.gain.get(c, 0.0) < remains]
     elif structure:
         small = [c for c in found.effects if found.gain.get(c, np.inf) < left]
     weak = sorted(found.effects, key=lambda c: -found.gain.get(c, 0.0))[MOST_AT_ONCE:]
     rest = TIMES * sum(found.gain.get(c, 0.0) for c in weak)
-    small += [c for c in found.effects if weak and found.alone.get(c, 0.0) < ALONE and found.gain.get(c, 0.0) < rest]
+    small += [c for c in found.effects if weak and c not in alone and found.gain.get(c, 0.0) < rest]
     # An effect has to beat chance to be named; values for each state leave too few directions to ask that.
     if not any(c.effect.per_state for c in found.effects):
         small += [c for c in found.effects if found.chance.get(c, 1.0) > CHANCE]
