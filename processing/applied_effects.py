@@ -87,7 +87,8 @@ def extra_retardance(changes: Changes, x: NDArray[np.float64], y: NDArray[np.flo
     """
     from processing.effects.field_retardance import terms
 
-    return np.stack([coefficients @ terms(x, y) for coefficients in changes.field_retardance_rad.values()])
+    parts = [coefficients @ terms(x, y) for coefficients in changes.field_retardance_rad.values()]
+    return np.stack(parts) if parts else np.zeros((0, np.size(x)))
 
 
 def with_extra(changes: Changes, extra: NDArray[np.float64]) -> Changes:

@@ -9,7 +9,7 @@ of the counts.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -35,6 +35,8 @@ from processing.effects.base import apply_to, changes_of, turned_by
 from processing.instrument import InstrumentModel
 
 Array = NDArray[np.float64]
+#: Makes A (..., L, K) of the changes of a capture.
+Columns = Callable[[int, Changes], Array]
 STEP = 1e-4
 #: Distance, in typical sizes, from the point of expansion up to which a correction of counts is exact enough.
 EXACT = 0.3
@@ -227,7 +229,7 @@ class InstrumentProblem:
         for k, moments in enumerate(self.moments):
             changes = self.changes(k, space, values)
             a = self.columns(k, changes)
-            _, dc = self._derivatives(k, space, values, a, self.coefficients(k, changes))
+            dc = self._slopes_of_counts(k, space, values, self.coefficients(k, changes))
             if np.any(dc[:, -DERIVATIVES:]):
                 out += sum(noise_information(block, a, dc, moments) for block in moments.blocks)
         return out
@@ -237,7 +239,10 @@ class InstrumentProblem:
 
     def _block_sums(self, k: int, space: Space, values: Array, changes: Changes, out: Sums, derivatives: bool) -> None:
         a, c = self.columns(k, changes), self.coefficients(k, changes)
-        da, dc = self._derivatives(k, space, values, a, c) if derivatives else (np.zeros((0, *a.shape)), None)
+        da, dc = np.zeros((0, *a.shape)), None
+        if derivatives:
+            da = self._slopes(space, values, k, a, self.columns)
+            dc = self._slopes_of_counts(k, space, values, c)
         for block in self.moments[k].blocks:
             if block.clipped and changes.drop_clipped:
                 # What is left of a clipped pixel is its states without any clipping, if they are enough.
@@ -247,64 +252,74 @@ class InstrumentProblem:
             if block.rows.size:
                 add_block(block, a, c, da, dc, self.moments[k], out)
 
-    def _derivatives(self, k: int, space: Space, values: Array, a: Array, c: Array) -> tuple[Array, Array]:
-        da, dc = np.zeros((space.size, *a.shape)), np.zeros((space.size, *c.shape))
-        channels = len(self.captures[k].conditions.channels)
+    def _slopes(self, space: Space, values: Array, k: int, a: Array, columns: Columns) -> Array:
+        """Derivatives (values, ..., L, K) of a (..., L, K), which `columns` makes of the changes of capture k."""
+        da = np.zeros((space.size, *a.shape))
+        conditions = self.captures[k].conditions
+        channels = len(conditions.channels)
         whole: dict[str, Array] = {}
-        for candidate, part in zip(space.candidates, space.slices, strict=True):
-            if candidate.capture not in (None, k) or candidate.effect.switch:
+        for candidate, part in self._active(k, space):
+            if candidate.effect.corrects_counts:
                 continue
             if candidate.effect.per_state:
                 # Parameter n acts on state n alone: one step of all of them together gives every derivative.
                 moved = values.copy()
                 step = STEP * candidate.typical
                 moved[part] += step
-                slope = (self.columns(k, self.changes(k, space, moved)) - a) / step.repeat(channels)[:, None]
+                slope = (columns(k, self.changes(k, space, moved)) - a) / step.repeat(channels)[:, None]
                 for n in range(candidate.size):
                     rows = slice(n * channels, (n + 1) * channels)
-                    da[part.start + n, rows] = slope[rows]
+                    da[part.start + n, ..., rows, :] = slope[..., rows, :]
                 continue
             first = candidate.effect.first_state(candidate.place)
             if first and not values[part].any():
                 # The same step of the same axis from another state on: one evaluation serves all of them.
                 axis = candidate.place.partition("@")[0]
                 if axis not in whole:
-                    whole[axis] = self._slope_of_axis(k, space, values, axis, a)
-                da[part.start, first * channels :] = whole[axis][first * channels :]
+                    turned = self.changes(k, space, values)
+                    turned.turn_axis(
+                        axis, np.full(self.captures[k].conditions.states, STEP), turned_by(self.model, axis)
+                    )
+                    whole[axis] = (columns(k, turned) - a) / STEP
+                da[part.start, ..., first * channels :, :] = whole[axis][..., first * channels :, :]
                 continue
-            for j in range(candidate.size):
-                moved = values.copy()
-                step_j = STEP * candidate.typical[j]
-                moved[part.start + j] += step_j
-                changes = self.changes(k, space, moved)
-                if candidate.effect.corrects_counts:
-                    dc[part.start + j] = (self.coefficients(k, changes) - c) / step_j
-                else:
-                    da[part.start + j] = (self.columns(k, changes) - a) / step_j
-        return da, dc
+            for j, (moved, step_j) in enumerate(self._moved(candidate, part, values)):
+                da[part.start + j] = (columns(k, self.changes(k, space, moved)) - a) / step_j
+        return da
 
-    def _slope_of_axis(self, k: int, space: Space, values: Array, axis: str, a: Array) -> Array:
-        changes = self.changes(k, space, values)
-        states = self.captures[k].conditions.states
-        changes.turn_axis(axis, np.full(states, STEP), turned_by(self.model, axis))
-        return np.asarray((self.columns(k, changes) - a) / STEP)
+    def _slopes_of_counts(self, k: int, space: Space, values: Array, c: Array) -> Array:
+        """Derivatives (values, F, L) of the coefficients c (F, L)."""
+        dc = np.zeros((space.size, *c.shape))
+        for candidate, part in self._active(k, space):
+            if candidate.effect.corrects_counts:
+                for j, (moved, step) in enumerate(self._moved(candidate, part, values)):
+                    dc[part.start + j] = (self.coefficients(k, self.changes(k, space, moved)) - c) / step
+        return dc
+
+    def _active(self, k: int, space: Space) -> list[tuple[Candidate, slice]]:
+        """Candidates that act on capture k and have values to fit."""
+        pairs = zip(space.candidates, space.slices, strict=True)
+        return [(c, part) for c, part in pairs if c.capture in (None, k) and not c.effect.switch]
+
+    @staticmethod
+    def _moved(candidate: Candidate, part: slice, values: Array) -> Iterator[tuple[Array, float]]:
+        """All values with one of a candidate's after the other moved by a small step, and the step."""
+        for j, step in enumerate(STEP * candidate.typical):
+            moved = values.copy()
+            moved[part.start + j] += step
+            yield moved, step
 
     def _tile_sums(self, k: int, space: Space, values: Array, changes: Changes, out: Sums, derivatives: bool) -> None:
         """The same with another A in every tile of the image."""
         data, moments = self.captures[k], self.moments[k]
         if moments.tiles is None:
             return
-        a = tile_columns(self.model, data, moments, changes)
-        da = np.zeros((space.size if derivatives else 0, *a.shape))
-        for candidate, part in zip(space.candidates, space.slices, strict=True):
-            if not derivatives or candidate.capture not in (None, k):
-                continue
-            for j in range(candidate.size):
-                moved = values.copy()
-                step = STEP * candidate.typical[j]
-                moved[part.start + j] += step
-                da[part.start + j] = tile_columns(self.model, data, moments, self.changes(k, space, moved)) - a
-                da[part.start + j] /= step
+
+        def columns(_: int, changed: Changes) -> Array:
+            return tile_columns(self.model, data, moments, changed)
+
+        a = columns(k, changes)
+        da = self._slopes(space, values, k, a, columns) if derivatives else np.zeros((0, *a.shape))
         add_tiles(moments, a, da, out)
 
 

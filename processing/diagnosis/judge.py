@@ -36,11 +36,11 @@ Array = NDArray[np.float64]
 SHARE = 0.97
 #: Standard deviations of the worst test up to which what is left unexplained is not yet much.
 MILD = 7.0
-#: An effect keeps its name beside much that is unexplained if it explains so many times that, in chi-square: no effect's
-#: model is exact to more than 5 % of its size. The same beside weak effects that come with it.
+#: An effect keeps its name beside much that is unexplained if it explains so many times that, in chi-square: no
+#: effect's model is exact to more than 5 % of its size. The same beside weak effects that come with it.
 TIMES = 400.0
-#: Where the noise is not known from the detector, what is left may be noise: an effect is named then if it explains this
-#: share of the excess by itself.
+#: Where the noise is not known from the detector, what is left may be noise: an effect is named then if it explains
+#: this share of the excess by itself.
 ALONE = 0.9
 #: More effects at once than these are less likely than one cause that is not in the list.
 MOST_AT_ONCE = 2

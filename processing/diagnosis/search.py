@@ -33,6 +33,8 @@ CHANCE = 1e-4
 #: Standard deviations by which the counts may scatter less than a bent response says that they must.
 IMPOSSIBLE = 6.0
 MOST_EFFECTS = 12
+#: Candidates that are scored together where every tile of the image has a matrix of its own, for the memory's sake.
+TOGETHER = 24
 LEADERS = 4
 #: Relative rms residual above which nominal values are searched for from many starts.
 FAR_OFF = 0.05
@@ -204,9 +206,8 @@ class Search:
         counts = [c for c in plain if c.effect.corrects_counts]
         groups = [counts, [c for c in plain if c not in counts]]
         if any(c in tiled for c in space.candidates):
-            # Every tile has its own matrix then: a few candidates at a time, and no slips at every state.
-            light = [c for c in plain if not c.effect.corrects_counts and "@" not in c.place]
-            groups = [light[k : k + 8] for k in range(0, len(light), 8)]
+            # Every tile has its own matrix then, and counts are not corrected for; a part of the candidates at a time.
+            groups = [groups[1][k : k + TOGETHER] for k in range(0, len(groups[1]), TOGETHER)]
         groups += [[c] for c in offered if c.kind == "field_retardance"]
         for group in groups:
             both = Space((*space.candidates, *group))

@@ -2,37 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.applied_effects import extra_retardance, with_extra
 from processing.changes import Changes
 from processing.diagnosis.capture_data import CaptureData
 from processing.diagnosis.moments import Moments, Tiles
 from processing.diagnosis.projection import RANK
 from processing.diagnosis.space import Sums
-from processing.effects.field_retardance import terms
 from processing.instrument import InstrumentModel
 
 Array = NDArray[np.float64]
+#: A retarder's Mueller matrix is linear in 1, cosine and sine of its retardance: three values tell all.
+THIRDS = (0.0, 2 * np.pi / 3, 4 * np.pi / 3)
 
 
 def tile_columns(model: InstrumentModel, data: CaptureData, moments: Moments, changes: Changes) -> Array:
     """A (tiles, L, K) where a retardance varies over the image, rows in units of their noise."""
     tiles = _of(moments)
-    smooth = terms(tiles.x, tiles.y)
-    count = tiles.x.size
-    # All tiles at once: the states are repeated tile by tile, each with its own retardance.
-    n = data.conditions.states
-    tiled = _tiled(changes, count, n)
-    for element, coefficients in changes.field_retardance_rad.items():
-        extra = np.repeat(coefficients @ smooth, n)
-        tiled.retardance_rad[element] = tiled.retardance_rad[element] + extra
-    angles = {axis: np.tile(v, count) for axis, v in data.conditions.angles_deg.items()}
-    w = model.rows(angles, tiled).reshape(count, -1, 16) * data.row_exposure[:, None]
-    a = w if data.sample is None else (w @ data.sample)[..., None]
-    return np.asarray(a / moments.sigma[:, None])
+    extra = extra_retardance(changes, tiles.x, tiles.y)
+    rows = data.values_per_pixel
+    out = np.zeros((tiles.x.size, rows, 16))
+    for nodes in product(THIRDS, repeat=len(extra)):
+        weight = np.prod((1 + 2 * np.cos(extra - np.array(nodes)[:, None])) / 3, axis=0)
+        w = model.rows(data.conditions.angles_deg, with_extra(changes, np.array(nodes))).reshape(rows, 16)
+        out += weight[:, None, None] * w
+    a = out if data.sample is None else (out @ data.sample)[..., None]
+    return np.asarray(a * (data.row_exposure / moments.sigma)[:, None])
 
 
 def add_tiles(moments: Moments, a: Array, da: Array, out: Sums) -> None:
@@ -59,28 +58,16 @@ def add_tiles(moments: Moments, a: Array, da: Array, out: Sums) -> None:
         return
     # dr_k = -P dA_k A+ y = -B_k y: <r, dr_k> = -tr(P S B_k^T), <dr_k, dr_l> = tr(B_k S B_l^T).
     da = da - q @ (q.transpose(0, 2, 1) @ da)
-    b = da @ pinv
-    bs = b @ s
-    gradient = -np.sum(ps * b, axis=(2, 3)) + np.sum(np.diagonal(b, axis1=2, axis2=3) * noise, axis=2)
+    back = pinv.transpose(0, 2, 1)
+    gradient = np.einsum("ktli,tli->kt", da, noise[:, :, None] * back - ps @ back)
+    ds = da @ (pinv @ s @ back)
     for fold in range(len(out.excess)):
         mine = tiles.fold == fold
         out.gradient[fold] += gradient[:, mine].sum(axis=1)
-        flat = bs[:, mine].reshape(len(da), -1)
-        out.curvature[fold] += flat @ b[:, mine].reshape(len(da), -1).T
+        out.curvature[fold] += ds[:, mine].reshape(len(da), -1) @ da[:, mine].reshape(len(da), -1).T
 
 
 def _of(moments: Moments) -> Tiles:
     if moments.tiles is None:
         raise ValueError("a capture that holds out states has no tiles")
     return moments.tiles
-
-
-def _tiled(changes: Changes, count: int, states: int) -> Changes:
-    conditions = replace(changes.conditions, states=states * count)
-    out = Changes(conditions)
-    for name in ("azimuth_rad", "retardance_rad", "extinction", "diattenuation"):
-        for element, value in getattr(changes, name).items():
-            getattr(out, name)[element] = np.tile(value, count) if np.ndim(value) else value
-    out.after, out.stray, out.mixing = dict(changes.after), changes.stray, changes.mixing
-    out.gain = np.tile(changes.gain, (count, 1))
-    return out
