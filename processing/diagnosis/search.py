@@ -44,6 +44,8 @@ STARTS = 24
 class Search:
     """The search over the effects in one problem."""
 
+    decisive = DECISIVE
+
     def __init__(self, problem: Problem, say: Say) -> None:
         self.problem, self.say = problem, say
         self.base = Space(problem.nominal())
@@ -78,7 +80,7 @@ class Search:
             if not ranking:
                 ranking = trials
                 alone = {t.candidate: (out.excess - t.out.excess) / max(out.excess, 1e-300) for t in trials}
-            trials = [t for t in trials if t.evidence >= DECISIVE and t.sound(out)]
+            trials = [t for t in trials if t.evidence >= self.decisive and t.sound(out)]
             if not trials:
                 break
             best = trials[0]
@@ -87,7 +89,7 @@ class Search:
                 best.fit = minimize(self.problem, best.space, best.fit.values)
                 best.out = held_out(self.problem, best.space, best.fit)
                 quiet = before.excess < -IMPOSSIBLE * self.noise_of(before)
-                if quiet or self._evidence(out, best.out, best.space.size) < DECISIVE:
+                if quiet or self._evidence(out, best.out, best.space.size) < self.decisive:
                     self.say(f"{best.candidate.label}: not with the noise that goes with it")
                     pool = [c for c in pool if c.family != best.candidate.family]
                     self.problem.adopt_noise(space, fit.values)
@@ -117,14 +119,14 @@ class Search:
         # Each must beat chance by itself: a few unrelated effects could also nibble at random values.
         if other.effects and all(other.chance[c] < CHANCE for c in other.effects):
             rest = self._trials(other.space, other.fit, other.after, self.pool)
-            nothing_more = all(t.evidence < DECISIVE for t in rest if t.candidate.effect.per_state)
+            nothing_more = all(t.evidence < self.decisive for t in rest if t.candidate.effect.per_state)
         else:
             nothing_more = False
         # The noise may be another one since: what was found first is fitted to the same.
         found.fit = minimize(self.problem, found.space, found.fit.values)
         found.after = held_out(self.problem, found.space, found.fit)
         worse = other.fit.excess - found.fit.excess - 2.0 * (found.space.size - other.space.size)
-        if nothing_more and worse < DECISIVE * self._unit(found):
+        if nothing_more and worse < self.decisive * self._unit(found):
             other.ranking, other.alone = found.ranking, found.alone
             return other
         return found
@@ -183,10 +185,9 @@ class Search:
         offered = [c for c in pool if c.family not in taken]
         offered = [c for c in offered if self._testable(c, space, out.excess)]
         for candidate, (gain, _) in self.scores(space, fit, offered).items():
-            if gain < max(least, 0.5 * DECISIVE * self.n0):
+            if gain < max(least, 0.5 * self.decisive * self.n0):
                 continue
-            # Rank as a Bayesian information criterion over the directions of structure, not over the pixels.
-            rank = _rank(fit.excess - gain, fit.excess, weighty, candidate.cost, self.n0)
+            rank = self._rank(fit.excess - gain, fit.excess, out, weighty, candidate.cost)
             if candidate.family not in scored or rank < scored[candidate.family][0]:
                 scored[candidate.family] = (rank, candidate)
         order = [c for _, c in sorted(scored.values(), key=lambda item: item[0])]
@@ -239,16 +240,22 @@ class Search:
                 best = tried
         if best is None:
             raise ValueError("a candidate needs at least one start")
-        if fit.excess - best.excess > 0.5 * DECISIVE * self.n0:
+        if fit.excess - best.excess > 0.5 * self.decisive * self.n0:
             # To expand anew costs a pass over all pixels; what explains nothing is not worth it.
             best = minimize(self.problem, both, best.values)
         held = held_out(self.problem, both, best)
         evidence = self._evidence(out, held, both.size)
-        rank = _rank(held.excess, out.excess, weighty, candidate.cost, self.n0)
-        if self.n0 and held.excess < 3 * self.noise_of(held):
-            # Nothing is left beyond noise: ahead of all that leave structure, the simplest first.
-            rank = -1e6 + held.excess + candidate.cost * np.log(weighty)
+        rank = self._rank(held.excess, out.excess, out, weighty, candidate.cost)
         return Trial(candidate, both, best, held, evidence, rank)
+
+    def _rank(self, left: float, before: float, out: HeldOut, weighty: float, cost: float) -> float:
+        """Bayesian information criterion over the directions of structure, not over the pixels; the least is best."""
+        if self.n0 and left < 3 * self.noise_of(out):
+            # Nothing is left beyond noise: ahead of all that leave structure, with noise as the measure.
+            return float(-1e6 + left + cost * np.log(weighty))
+        floor = self.n0 * weighty
+        ratio = (max(left, 0.0) + floor + 1e-9) / (max(before, 0.0) + floor + 1e-9)
+        return float(weighty * np.log(ratio) + cost * np.log(weighty))
 
     def _evidence(self, before: HeldOut, after: HeldOut, parameters: int, scaled: bool = False) -> float:
         """Chi-square gain on held-out data, in units of the noise; `scaled`, of the structure left as well."""
@@ -282,7 +289,7 @@ class Search:
                 found.chance[candidate] = self._chance(out, found.after, candidate.size, found.space.size)
                 if evidence < least:
                     weakest, least, kept = candidate, evidence, (rest, fit, out)
-            if weakest is None or least >= DECISIVE:
+            if weakest is None or least >= self.decisive:
                 return
             self.say(f"{weakest.label} is not needed")
             found.space, found.fit, found.after = kept
@@ -346,12 +353,6 @@ class Search:
         untestable = [c for c in offered if c not in testable]
         found.information = {c: info for c, (_, info) in self.scores(found.base, found.before_fit, testable).items()}
         found.untestable = tuple(untestable)
-
-
-def _rank(left: float, before: float, directions: float, size: float, n0: float) -> float:
-    floor = n0 * directions
-    ratio = (max(left, 0.0) + floor + 1e-9) / (max(before, 0.0) + floor + 1e-9)
-    return float(directions * np.log(ratio) + size * np.log(directions))
 
 
 def _without(space: Space, values: Array, candidate: Candidate) -> Array:
