@@ -318,9 +318,14 @@ class InstrumentProblem:
         def columns(_: int, changed: Changes) -> Array:
             return tile_columns(self.model, data, moments, changed)
 
-        a = columns(k, changes)
-        da = self._slopes(space, values, k, a, columns) if derivatives else np.zeros((0, *a.shape))
-        add_tiles(moments, a, da, out)
+        a, c = columns(k, changes), self.coefficients(k, changes)
+        da, dc = np.zeros((0, *a.shape)), np.zeros((0, *c.shape))
+        if derivatives:
+            da = self._slopes(space, values, k, a, columns)
+            dc = self._slopes_of_counts(k, space, values, c)
+        add_tiles(data, moments, moments.tiles, a, c, da, dc, out)
+        if moments.clipped is not None and not changes.drop_clipped:
+            add_tiles(data, moments, moments.clipped, a, c, da, dc, out)
 
 
 def _movable(shift_px: Array) -> bool:

@@ -9,7 +9,8 @@ The expected noise of every product is kept beside it, so that an excess over th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,7 +79,7 @@ class Tiles:
     Attributes
     ----------
     s : (T, L, L); noise : (T, L); x, y : (T,) centres from -1 to 1; fold : (T,).
-    index : (rows, columns) tile of each pixel; pixels : (T,) how many of them count.
+    index : (rows, columns) tile of each pixel; pick : (rows, columns) pixels that count; pixels : (T,) how many.
     """
 
     s: Array
@@ -87,7 +88,10 @@ class Tiles:
     y: Array
     fold: NDArray[np.int64]
     index: NDArray[np.int64]
+    pick: NDArray[np.bool_]
     pixels: Array
+    #: `tile_products` that were asked for before.
+    products: dict[tuple[int, ...], tuple[Array, Array]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -96,6 +100,7 @@ class Moments:
 
     Attributes
     ----------
+    tiles, clipped : of pixels without and with a clipped state; None where states are held out.
     sigma : (L,) noise of each row in the weighted units; left : (L,) part of its variance that the pixels show.
     relative : turns a weighted square into a square relative to the mean signal.
     spread : mean square over squared mean of the variances: 1 if all pixels and states are equally noisy.
@@ -104,6 +109,7 @@ class Moments:
 
     blocks: tuple[Block, ...]
     tiles: Tiles | None
+    clipped: Tiles | None
     sigma: Array
     left: Array
     relative: float
@@ -122,8 +128,7 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
     n, c, height, width = data.signal.shape
     rows = n * c
     u = data.signal.reshape(rows, height, width)
-    variance = data.variance().reshape(rows, height, width)
-    scale = variance.mean(axis=0)
+    variance, scale = _variance(data)
     good = data.usable & (scale > 0) & inside(height, width)
     # Where too much was subtracted a dark state is negative all over; its noise is not less than that of the read-out.
     least = np.repeat(data.floor, c)[:, None] / 2
@@ -132,7 +137,7 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
     shared = np.stack([shared_noise(x, y) for x, y in data.row_moved_px])
     left = shared[:, 0, 0]
     shown = variance * left[:, None, None]
-    tiles = None
+    tiles, clipped_tiles = None, None
     by_state = holds_out_states(data)
     index, x, y = _grid(height, width)
     if by_state:
@@ -144,6 +149,8 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
         fold_of_pixel = fold_of_tile[index]
         held = f"every tile of the image is predicted by a fit to the other tiles ({folds} parts, interleaved)"
         tiles = _tiles(u, shown, scale, good & ~data.clipped, index, x, y, fold_of_tile)
+        if data.clipped.any():
+            clipped_tiles = _tiles(u, shown, scale, good & data.clipped, index, x, y, fold_of_tile)
     blocks: list[Block] = []
     around = image_derivatives(u).reshape(DERIVATIVES, rows, -1)
     for clipped in (False, True):
@@ -155,7 +162,43 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
     mean = float(np.mean(u[:, good]))
     relative = float(np.mean(scale[good])) / mean**2
     floor = float(np.sqrt(np.mean(variance[:, good]))) / mean
-    return Moments(tuple(blocks), tiles, sigma, left, relative, float(np.mean(share**2)), floor, held)
+    return Moments(tuple(blocks), tiles, clipped_tiles, sigma, left, relative, float(np.mean(share**2)), floor, held)
+
+
+def tile_products(data: CaptureData, tiles: Tiles, used: Sequence[int]) -> tuple[Array, Array]:
+    """Second moments (T, F L, F L) of some features together in every tile, and their noise (T, L, F, F).
+
+    `used` are numbers of FEATURES in ascending order, of which the counts are the first.
+    """
+    if tuple(used) == (0,):
+        return tiles.s, tiles.noise[..., None, None]
+    if tuple(used) not in tiles.products:
+        tiles.products[tuple(used)] = _products(data, tiles, list(used))
+    return tiles.products[tuple(used)]
+
+
+def _products(data: CaptureData, tiles: Tiles, used: list[int]) -> tuple[Array, Array]:
+    rows, count = data.values_per_pixel, tiles.x.size
+    u = data.signal.reshape(rows, -1)
+    variance, scale = (part.reshape(*part.shape[:-2], -1) for part in _variance(data))
+    shared = np.stack([shared_noise(x, y) for x, y in data.row_moved_px])
+    around = image_derivatives(data.signal.reshape(rows, *data.signal.shape[2:])).reshape(DERIVATIVES, rows, -1)
+    s, noise = np.zeros((count, len(used) * rows, len(used) * rows)), np.zeros((count, rows, len(used), len(used)))
+    for t in range(count):
+        p = np.flatnonzero((tiles.index == t) & tiles.pick)
+        z = np.empty((len(FEATURES), rows, p.size))
+        z[:-DERIVATIVES], slopes = features(u[:, p].astype(np.float64))
+        z[-DERIVATIVES:] = around[:, :, p]
+        flat = (z[used] / np.sqrt(scale[p])).reshape(len(used) * rows, -1)
+        s[t] = flat @ flat.T
+        noise[t] = _noise(slopes, variance[:, p] / scale[p], shared)[:, used][:, :, used]
+    return s, noise
+
+
+def _variance(data: CaptureData) -> tuple[Array, Array]:
+    """Variance (L, rows, columns), and its mean over the rows of W, with which pixels are weighted."""
+    variance = data.variance().reshape(data.values_per_pixel, *data.signal.shape[2:])
+    return variance, variance.mean(axis=0)
 
 
 def inside(height: int, width: int) -> NDArray[np.bool_]:
@@ -196,7 +239,7 @@ def _tiles(
         part = u[:, r, c] / np.sqrt(scale[r, c])
         s[t], pixels[t] = part @ part.T, r.size
         noise[t] = np.sum(variance[:, r, c] / scale[r, c], axis=1)
-    return Tiles(s, noise, x, y, fold, index, pixels)
+    return Tiles(s, noise, x, y, fold, index, pick, pixels)
 
 
 def _blocks(

@@ -207,8 +207,8 @@ class Search:
         counts = [c for c in plain if c.effect.corrects_counts]
         groups = [counts, [c for c in plain if c not in counts]]
         if any(c in tiled for c in space.candidates):
-            # Every tile has its own matrix then, and counts are not corrected for; a part of the candidates at a time.
-            groups = [groups[1][k : k + TOGETHER] for k in range(0, len(groups[1]), TOGETHER)]
+            # Every tile has its own matrix then: a part of the candidates at a time.
+            groups = [groups[1][k : k + TOGETHER] for k in range(0, len(groups[1]), TOGETHER)] + [[c] for c in counts]
         groups += [[c] for c in offered if c.kind == "field_retardance"]
         for group in groups:
             both = Space((*space.candidates, *group))

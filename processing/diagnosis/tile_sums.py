@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from processing.applied_effects import extra_retardance, with_extra
 from processing.changes import Changes
 from processing.diagnosis.capture_data import CaptureData
-from processing.diagnosis.moments import Moments, Tiles
+from processing.diagnosis.moments import DERIVATIVES, FEATURES, Moments, Tiles, tile_products
 from processing.diagnosis.projection import RANK
 from processing.diagnosis.space import Sums
 from processing.instrument import InstrumentModel
@@ -22,7 +22,9 @@ THIRDS = (0.0, 2 * np.pi / 3, 4 * np.pi / 3)
 
 def tile_columns(model: InstrumentModel, data: CaptureData, moments: Moments, changes: Changes) -> Array:
     """A (tiles, L, K) where a retardance varies over the image, rows in units of their noise."""
-    tiles = _of(moments)
+    tiles = moments.tiles
+    if tiles is None:
+        raise ValueError("a capture that holds out states has no tiles")
     extra = extra_retardance(changes, tiles.x, tiles.y)
     rows = data.values_per_pixel
     out = np.zeros((tiles.x.size, rows, 16))
@@ -34,40 +36,69 @@ def tile_columns(model: InstrumentModel, data: CaptureData, moments: Moments, ch
     return np.asarray(a * (data.row_exposure / moments.sigma)[:, None])
 
 
-def add_tiles(moments: Moments, a: Array, da: Array, out: Sums) -> None:
-    """Add what the tiles say of a (tiles, L, K) and its derivatives (values, tiles, L, K).
+def add_tiles(
+    data: CaptureData, moments: Moments, tiles: Tiles, a: Array, c: Array, da: Array, dc: Array, out: Sums
+) -> None:
+    """Add what tiles say of a (tiles, L, K) and coefficients c (F, L), with their derivatives by each value.
 
-    The counts are taken as they are.
+    As `add_block`, from the second moments: y = B z with z the features of the counts, one below the other.
     """
-    tiles, sigma = _of(moments), moments.sigma
-    s = tiles.s / sigma[:, None] / sigma
-    noise = tiles.noise / sigma**2
+    used = np.flatnonzero(np.any(c, axis=1) | np.any(dc, axis=(0, 2)))
+    s, noise = tile_products(data, tiles, used.tolist())
+    sigma, rows = moments.sigma, a.shape[1]
+    scale = np.tile(1 / sigma, used.size)
+    s, noise = s * scale[:, None] * scale, noise / (sigma**2)[:, None, None]
     u, size, vt = np.linalg.svd(a, full_matrices=False)
     keep = size > RANK * size[:, :1]
     q = u * keep[:, None, :]
     pinv = np.einsum("tri,tr,tlr->til", vt, np.where(keep, 1 / np.maximum(size, 1e-300), 0.0), u)
-    ps = s - q @ (q.transpose(0, 2, 1) @ s)
-    free = 1 - np.einsum("tlr,tlr->tl", q, q)
-    excess = np.einsum("tll->t", ps - (ps @ q) @ q.transpose(0, 2, 1)) - np.sum(free * noise, axis=1)
-    np.add.at(out.excess, tiles.fold, excess)
-    np.add.at(out.freedom, tiles.fold, np.sum(free * noise, axis=1))
-    left = np.einsum("tll->tl", ps - (ps @ q) @ q.transpose(0, 2, 1)) @ sigma**2
+    back = pinv.transpose(0, 2, 1)
+    hat = q @ q.transpose(0, 2, 1)
+    outside = np.eye(rows) - hat
+    # What takes each feature to the rows: derivatives are those of the fitted image.
+    takes = np.where((used < len(FEATURES) - DERIVATIVES)[:, None], np.eye(rows)[:, None], hat[:, :, None])
+    b = c[used].T[:, :, None] * takes
+    residual = (outside @ b.reshape(*hat.shape[:2], -1)).reshape(b.shape)
+    mean = np.einsum("tlfk,tkfh->tlhk", residual, noise)
+    expected = np.sum(mean * residual, axis=(1, 2, 3))
+    zy = s @ b.reshape(*hat.shape[:2], -1).transpose(0, 2, 1)
+    yy = b.reshape(*hat.shape[:2], -1) @ zy
+    ry = outside @ yy
+    np.add.at(out.excess, tiles.fold, np.trace(ry, axis1=1, axis2=2) - expected)
+    np.add.at(out.freedom, tiles.fold, expected)
+    left = np.diagonal(ry @ outside, axis1=1, axis2=2) @ sigma**2
     np.add.at(out.square, tiles.fold, left * moments.relative)
-    np.add.at(out.count, tiles.fold, free @ moments.left * tiles.pixels)
+    np.add.at(out.count, tiles.fold, np.diagonal(outside, axis1=1, axis2=2) @ moments.left * tiles.pixels)
     if not len(da):
         return
-    # dr_k = -P dA_k A+ y = -B_k y: <r, dr_k> = -tr(P S B_k^T), <dr_k, dr_l> = tr(B_k S B_l^T).
-    da = da - q @ (q.transpose(0, 2, 1) @ da)
-    back = pinv.transpose(0, 2, 1)
-    gradient = np.einsum("ktli,tli->kt", da, noise[:, :, None] * back - ps @ back)
-    ds = da @ (pinv @ s @ back)
-    for fold in range(len(out.excess)):
-        mine = tiles.fold == fold
-        out.gradient[fold] += gradient[:, mine].sum(axis=1)
-        out.curvature[fold] += ds[:, mine].reshape(len(da), -1) @ da[:, mine].reshape(len(da), -1).T
+    # dr = -P dA A+ y + P dB z.
+    da = outside @ da
+    carried = np.einsum("tlfk,tmfk->tml", b, mean)
+    gradient = np.einsum("ktli,tli->kt", da, (carried - ry) @ back)
+    ds = da @ (pinv @ yy @ back)
+    curvature = np.zeros((len(out.excess), len(da), len(da)))
+    folds = [tiles.fold == f for f in range(len(out.excess))]
+    for f, mine in enumerate(folds):
+        curvature[f] = _flat(ds[:, mine]) @ _flat(da[:, mine]).T
+    counted = np.flatnonzero(np.any(dc, axis=(1, 2)))
+    rz = outside @ zy.transpose(0, 2, 1)
+    moved = {}
+    for j in counted:
+        db = dc[j, used].T[:, :, None] * takes
+        gradient[j] += np.sum(db * (rz.reshape(db.shape) - mean), axis=(1, 2, 3))
+        moved[j] = outside @ db.reshape(rz.shape)
+    for j in counted:
+        es = moved[j] @ s
+        across = np.einsum("ktli,tli->kt", da, es @ b.reshape(rz.shape).transpose(0, 2, 1) @ back)
+        for f, mine in enumerate(folds):
+            curvature[f, j] -= across[:, mine].sum(axis=1)
+            curvature[f, :, j] -= across[:, mine].sum(axis=1)
+            for i in counted:
+                curvature[f, i, j] += np.sum(es[mine] * moved[i][mine])
+    for f, mine in enumerate(folds):
+        out.gradient[f] += gradient[:, mine].sum(axis=1)
+    out.curvature += curvature
 
 
-def _of(moments: Moments) -> Tiles:
-    if moments.tiles is None:
-        raise ValueError("a capture that holds out states has no tiles")
-    return moments.tiles
+def _flat(x: Array) -> Array:
+    return x.reshape(len(x), -1)

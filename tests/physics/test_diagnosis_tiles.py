@@ -9,8 +9,10 @@ from processing.capture import Capture
 from processing.capture_schema import Sample
 from processing.changes import Changes
 from processing.diagnosis.capture_data import read_capture
-from processing.diagnosis.moments import FOLDS_OF_TILES, moments_of
-from processing.diagnosis.tile_sums import tile_columns
+from processing.diagnosis.moments import FEATURES, FOLDS_OF_TILES, moments_of
+from processing.diagnosis.projection import add_block
+from processing.diagnosis.space import Sums
+from processing.diagnosis.tile_sums import add_tiles, tile_columns
 from processing.effects.field_retardance import terms
 from processing.instrument import InstrumentModel
 from simulators.blind_suite import state_angles
@@ -50,3 +52,29 @@ def test_columns_of_every_tile_are_those_of_its_own_retardance(seen, elements):
             here.retardance_rad[element] = here.retardance_rad[element] + extra
         rows = model.rows(data.conditions.angles_deg, here).reshape(-1, 16)
         assert found[tile] == pytest.approx(rows / moments.sigma[:, None], abs=1e-12 / moments.sigma.min())
+
+
+@pytest.mark.parametrize("shifted", [False, True])
+def test_tiles_that_are_all_alike_say_what_the_blocks_say(seen, shifted):
+    model, data, _ = seen
+    random = np.random.default_rng(9)
+    if shifted:
+        data = data.moved_back(random.uniform(-0.5, 0.5, (data.conditions.states, 2)))
+    moments = moments_of(data, FOLDS_OF_TILES)
+    a = model.rows(data.conditions.angles_deg).reshape(-1, 16) / moments.sigma[:, None]
+    rows = a.shape[0]
+    c, dc = np.zeros((len(FEATURES), rows)), np.zeros((4, len(FEATURES), rows))
+    c[0], c[FEATURES.index("square")], c[FEATURES.index("dx")] = 1.0, 0.02, random.normal(0, 0.1, rows)
+    dc[2, FEATURES.index("one")] = 1.0
+    dc[3, FEATURES.index("dy")] = random.normal(size=rows)
+    da = np.zeros((4, *a.shape))
+    da[:2] = random.normal(size=(2, *a.shape))
+    blocks, tiles = Sums.empty(FOLDS_OF_TILES, 4), Sums.empty(FOLDS_OF_TILES, 4)
+    for block in moments.blocks:
+        add_block(block, a, c, da, dc, moments, blocks)
+    count = moments.tiles.x.size
+    every = np.broadcast_to(a, (count, *a.shape)), np.broadcast_to(da[:, None], (4, count, *a.shape))
+    add_tiles(data, moments, moments.tiles, every[0], c, every[1], dc, tiles)
+    for name in ("excess", "freedom", "square", "count", "gradient", "curvature"):
+        expected = getattr(blocks, name)
+        assert getattr(tiles, name) == pytest.approx(expected, rel=1e-6, abs=1e-6 * np.abs(expected).max()), name
