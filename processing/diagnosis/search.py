@@ -22,8 +22,10 @@ Array = NDArray[np.float64]
 #: Called with a line that says what is being done.
 Say = Callable[[str], None]
 
-#: Chi-square gain on held-out data from which on an effect is added.
+#: Chi-square gain on held-out data from which on an effect is added: alone, and beside others, whose models are not
+#: exact and leave something that it could take.
 DECISIVE = 25.0
+DECISIVE_BESIDE = 50.0
 #: Two explanations closer than this in chi-square gain are not told apart.
 CLOSE = 14.0
 #: Nor closer than this share of what either explains: models are not exact to that.
@@ -80,7 +82,8 @@ class Search:
             if not ranking:
                 ranking = trials
                 alone = {t.candidate: (out.excess - t.out.excess) / max(out.excess, 1e-300) for t in trials}
-            trials = [t for t in trials if t.evidence >= self.decisive and t.sound(out)]
+            enough = self._enough(len(space.candidates) - len(self.base.candidates))
+            trials = [t for t in trials if t.evidence >= enough and t.sound(out)]
             if not trials:
                 break
             best = trials[0]
@@ -89,7 +92,7 @@ class Search:
                 best.fit = minimize(self.problem, best.space, best.fit.values)
                 best.out = held_out(self.problem, best.space, best.fit)
                 quiet = before.excess < -IMPOSSIBLE * self.noise_of(before)
-                if quiet or self._evidence(out, best.out, best.space.size) < self.decisive:
+                if quiet or self._evidence(out, best.out, best.space.size) < enough:
                     self.say(f"{best.candidate.label}: not with the noise that goes with it")
                     pool = [c for c in pool if c.family != best.candidate.family]
                     self.problem.adopt_noise(space, fit.values)
@@ -101,6 +104,10 @@ class Search:
         found = Found(self.base, before, base_fit, space, fit, out, ranking=ranking, alone=alone, imitable=imitable)
         self._prune(found)
         return found
+
+    def _enough(self, beside: int) -> float:
+        """Evidence that an effect needs beside so many others."""
+        return max(self.decisive, DECISIVE_BESIDE if beside else 0.0)
 
     def _again(self, base_fit: Fit, space: Space, fit: Fit) -> tuple[Fit, Fit, HeldOut, HeldOut]:
         """Fits of the base and of the effects, and how well they predict, with the noise that holds now."""
@@ -289,7 +296,7 @@ class Search:
                 found.chance[candidate] = self._chance(out, found.after, candidate.size, found.space.size)
                 if evidence < least:
                     weakest, least, kept = candidate, evidence, (rest, fit, out)
-            if weakest is None or least >= self.decisive:
+            if weakest is None or least >= self._enough(len(found.effects) - 1):
                 return
             self.say(f"{weakest.label} is not needed")
             found.space, found.fit, found.after = kept

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from processing.diagnosis.candidate import Candidate
 from processing.diagnosis.fit import LEAST_GAIN, Fit, HeldOut, held_out, minimize
 from processing.diagnosis.found import Found, Trial
-from processing.diagnosis.search import DECISIVE, Search
+from processing.diagnosis.search import DECISIVE_BESIDE, Search
 from processing.diagnosis.space import Space
 from processing.effects._reflectance import ReflectanceEffect
 
@@ -30,7 +30,7 @@ class SurfaceSearch(Search):
     """The search in one `SurfaceProblem`."""
 
     # Smooth patterns over an object imitate each other more than patterns over states do.
-    decisive = 2 * DECISIVE
+    decisive = DECISIVE_BESIDE
 
     _start: float | None = None
 
