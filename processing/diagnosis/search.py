@@ -106,8 +106,8 @@ class Search:
         return found
 
     def _enough(self, beside: int) -> float:
-        """Evidence that an effect needs beside so many others."""
-        return max(self.decisive, DECISIVE_BESIDE if beside else 0.0)
+        """Evidence that an effect needs beside so many others; without known noise, what they leave is the unit of it."""
+        return max(self.decisive, DECISIVE_BESIDE if beside and self.n0 else 0.0)
 
     def _again(self, base_fit: Fit, space: Space, fit: Fit) -> tuple[Fit, Fit, HeldOut, HeldOut]:
         """Fits of the base and of the effects, and how well they predict, with the noise that holds now."""
