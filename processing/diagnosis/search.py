@@ -106,7 +106,7 @@ class Search:
         return found
 
     def _enough(self, beside: int) -> float:
-        """Evidence that an effect needs beside so many others; without known noise, what they leave is the unit of it."""
+        """Evidence that an effect needs beside so many others; without known noise, its unit is what they leave."""
         return max(self.decisive, DECISIVE_BESIDE if beside and self.n0 else 0.0)
 
     def _again(self, base_fit: Fit, space: Space, fit: Fit) -> tuple[Fit, Fit, HeldOut, HeldOut]:
