@@ -137,6 +137,28 @@ def test_a_written_image_shift_is_consistent_the_next_time(configs, tmp_path, ca
     assert again.verdict == "consistent"
 
 
+@pytest.mark.parametrize("other", ["rotation_slip", "image_drift"])
+def test_a_second_effect_beside_a_retardance_that_varies_over_the_image(configs, tmp_path, other):
+    """Every tile has a matrix of its own then, and the counts are corrected all the same."""
+    bench = Bench(rows=40, columns=40)
+    x = np.linspace(-1, 1, 40)
+    bench.field_retardance = np.deg2rad(np.broadcast_to(1.5 * x, (40, 40)))
+    if other == "rotation_slip":
+        bench.angles.append(lambda k, a: a | {"psg": a["psg"] + np.deg2rad(0.4) * (k >= 26)})
+        truth = {"slip": 0.4}
+    else:
+        bench.shift.append(lambda k, a: (0.8 * (k / (STATES - 1) - 0.5), 0.0))
+        truth = {"x": 0.8, "y": 0.0}
+    found = diagnosed(capture(tmp_path, configs, bench, air=True), configs)
+    assert found.verdict == "explained"
+    by_kind = {e.kind: e for e in found.effects}
+    assert set(by_kind) == {"field_retardance", other}
+    for effect, values in (("field_retardance", {"x": 1.5, "y": 0.0}), (other, truth)):
+        for name, true in values.items():
+            told = by_kind[effect].parameters[name]
+            assert told.value == pytest.approx(true, abs=3.5 * told.stderr), name
+
+
 def test_shifts_on_a_mosaic_are_told_in_pixels_of_the_sensor(configs, tmp_path):
     file = configs / "instruments/mosaic_polarimeter.yaml"
     random, nm = np.random.default_rng(3), 662.0
