@@ -27,6 +27,9 @@ FAINTEST = 5.0
 #: Pixels around dark ones that are left out too: at an edge, image derivatives (over 7 pixels) do not tell what a shift
 #: of the image does.
 RIM = 4
+#: Counts of zero this many standard deviations of the read-out below black are cut off, not noise; a state is left out
+#: where more than this share of its pixels are.
+CUT_OFF, MOST_CUT_OFF = 6.0, 0.01
 #: Below this number of pixels their scatter says nothing about the noise.
 FEWEST_PIXELS = 30
 
@@ -53,6 +56,7 @@ class CaptureData:
         That averages the noise of neighbours, and adds no information.
     usable : (rows, columns) True where every state has a number and the pixel is not dark.
     dark_fraction : part of the pixels that are too dark, or too close to dark ones, to be used.
+    cut_off : states of the capture that are left out because their counts are cut off at zero.
     binned : side of the squares over which pixels were averaged.
     pitch : pixels of the sensor from one pixel here to the next.
     """
@@ -74,6 +78,7 @@ class CaptureData:
     binned: int = 1
     pitch: int = 1
     dark_fraction: float = 0.0
+    cut_off: tuple[int, ...] = ()
     noise_estimated: bool = False
     true_variance: NDArray[np.float32] | None = None
     moved_px: Array | None = None
@@ -136,7 +141,12 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     states = sample_states(capture)
     measurement_matrix(capture, model, states)
     correction = Correction.of(capture)
-    raw, clipped, clipped_states = _frames(capture, model, states, correction)
+    raw, clipped, clipped_states, zero = _frames(capture, model, states, correction)
+    keep = zero.mean(axis=(1, 2)) <= MOST_CUT_OFF
+    if not keep.any():
+        raise CaptureError(f"{capture.path}: the counts of every state are cut off at zero. Raise the black level.")
+    cut_off, states = tuple(int(k) for k in states[~keep]), states[keep]
+    raw, clipped_states, zero = raw[keep], clipped_states[keep], zero[keep]
     names = tuple(c.name for c in model.channels)
     if raw.shape[1] != len(names):
         raise CaptureError(
@@ -161,10 +171,11 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
         noise_source="not known: too few pixels and no detector constants; the residual itself is the measure",
         clipped=clipped,
         clipped_states=clipped_states,
-        usable=np.asarray(np.isfinite(raw).all(axis=(0, 1))),
+        usable=np.asarray(np.isfinite(raw).all(axis=(0, 1)) & ~zero.any(axis=0)),
         simulated=capture.simulated,
         wavelength_nm=capture.header.wavelength_nm,
         pitch=model.pitch,
+        cut_off=cut_off,
     )
     data = replace(data, signal=np.nan_to_num(data.signal))
     repeats = np.maximum(capture.column("repeats")[states].astype(float), 1)
@@ -202,9 +213,12 @@ def without_dark_pixels(data: CaptureData) -> CaptureData:
 
 def _frames(
     capture: Capture, model: InstrumentModel, states: NDArray[np.int64], correction: Correction
-) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Counts (N, channels, rows, columns), clipped pixels, clipped states; (N, rows, columns) what is cut off at zero."""
     level = _clip_level(capture, correction)
     frames, clipped = [], np.zeros(capture.frame_shape, dtype=bool)
+    zero = np.zeros((len(states), *capture.frame_shape), dtype=bool)
+    has_zero = _cuts_off(capture)
     clipped_states = np.zeros(len(states), dtype=bool)
     exposure = capture.column("exposure_s")[states].astype(float)
     for n, k in enumerate(states):
@@ -213,18 +227,30 @@ def _frames(
             over = (frame >= level).any(axis=0)
             clipped |= over
             clipped_states[n] = over.any()
+        if has_zero:
+            zero[n] = (frame <= 0).any(axis=0)
         frame -= correction.black.at(exposure[n])
         frames.append(frame if correction.flat is None else frame / correction.flat.response)
     raw = np.stack(frames)
     if model.mosaic is None:
-        return raw, np.asarray(clipped), clipped_states
+        return raw, np.asarray(clipped), clipped_states, zero
     rows, columns = len(model.mosaic), len(model.mosaic[0])
     height, width = raw.shape[2] // rows * rows, raw.shape[3] // columns * columns
     raw = raw[:, :, :height, :width]
     where = {name: (r, c) for r, line in enumerate(model.mosaic) for c, name in enumerate(line)}
     planes = [raw[:, 0, where[c.name][0] :: rows, where[c.name][1] :: columns] for c in model.channels]
-    blocks = clipped[:height, :width].reshape(height // rows, rows, width // columns, columns)
-    return np.stack(planes, axis=1), np.asarray(blocks.any(axis=(1, 3))), clipped_states
+    cells = (height // rows, rows, width // columns, columns)
+    over = np.asarray(clipped[:height, :width].reshape(cells).any(axis=(1, 3)))
+    under = np.asarray(zero[:, :height, :width].reshape(-1, *cells).any(axis=(2, 4)))
+    return np.stack(planes, axis=1), over, clipped_states, under
+
+
+def _cuts_off(capture: Capture) -> bool:
+    """Whether noise cannot reach zero counts, so that they mean a black level that is too low."""
+    detector = capture.header.detector
+    if not capture.integer_counts or detector.gain_e_per_count is None:
+        return False
+    return detector.black_level_counts > CUT_OFF * (detector.read_noise_e or 0.0) / detector.gain_e_per_count
 
 
 def _clip_level(capture: Capture, correction: Correction) -> float | None:

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -67,6 +68,22 @@ def test_azimuths_of_analyzer_and_its_retarder_are_named_together(configs, tmp_p
     both = {effect.kind, *(text.partition("[")[0] for text in effect.indistinguishable_from)}
     assert both == {"psa_azimuth", "analyzer_azimuth"}
     assert "air" in d.recommendation
+
+
+def test_a_state_that_is_cut_off_at_zero_is_left_out(configs, tmp_path):
+    """A black level that is too low for an offset; behind crossed polarizers nothing else is left."""
+    bench = Bench(rows=40, columns=40)
+    bench.transfer.append(lambda e: e - 600 * bench.gain)
+    path = capture(tmp_path, configs, bench, air=True)
+    with h5py.File(path) as h5:
+        counts = h5["entry/instrument/detector/data"][:, 0]
+    empty = np.flatnonzero((counts == 0).mean(axis=(1, 2)) > 0.01)
+    assert 0 < empty.size < 10
+    found = diagnosed(path, configs)
+    assert found.captures[0].cut_off == tuple(empty)
+    assert [e.kind for e in found.effects] == ["detector_offset"]
+    offset = found.effects[0].parameters["offset"]
+    assert offset.value == pytest.approx(-600, abs=3.5 * offset.stderr)
 
 
 def test_nothing_wrong_is_consistent(configs, tmp_path):
