@@ -214,7 +214,7 @@ def without_dark_pixels(data: CaptureData) -> CaptureData:
 def _frames(
     capture: Capture, model: InstrumentModel, states: NDArray[np.int64], correction: Correction
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Counts (N, channels, rows, columns), clipped pixels, clipped states; (N, rows, columns) what is cut off at zero."""
+    """Counts (N, channels, rows, columns), clipped pixels, clipped states, (N, rows, columns) cut off at zero."""
     level = _clip_level(capture, correction)
     frames, clipped = [], np.zeros(capture.frame_shape, dtype=bool)
     zero = np.zeros((len(states), *capture.frame_shape), dtype=bool)

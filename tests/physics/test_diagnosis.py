@@ -73,7 +73,7 @@ def test_azimuths_of_analyzer_and_its_retarder_are_named_together(configs, tmp_p
 def test_a_state_that_is_cut_off_at_zero_is_left_out(configs, tmp_path):
     """A black level that is too low for an offset; behind crossed polarizers nothing else is left."""
     bench = Bench(rows=40, columns=40)
-    bench.transfer.append(lambda e: e - 600 * bench.gain)
+    bench.transfer.append(lambda e: e - 1100 * bench.gain)
     path = capture(tmp_path, configs, bench, air=True)
     with h5py.File(path) as h5:
         counts = h5["entry/instrument/detector/data"][:, 0]
@@ -83,7 +83,7 @@ def test_a_state_that_is_cut_off_at_zero_is_left_out(configs, tmp_path):
     assert found.captures[0].cut_off == tuple(empty)
     assert [e.kind for e in found.effects] == ["detector_offset"]
     offset = found.effects[0].parameters["offset"]
-    assert offset.value == pytest.approx(-600, abs=3.5 * offset.stderr)
+    assert offset.value == pytest.approx(-1100, abs=3.5 * offset.stderr)
 
 
 def test_nothing_wrong_is_consistent(configs, tmp_path):
