@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from processing.changes import Changes
 from processing.diagnosis.fit import Fit
 from processing.diagnosis.instrument_problem import InstrumentProblem
-from processing.diagnosis.moments import inside
+from processing.diagnosis.moments import MARGIN, inside
 from processing.diagnosis.projection import add_response
 from processing.diagnosis.space import Space
 from processing.diagnosis.tile_sums import tile_columns
@@ -63,12 +63,12 @@ class Images:
     Attributes
     ----------
     residual : in units of the noise.
-    signal : the fit, in counts over full scale; expected : variance of the residual of a smooth pattern.
+    around : the fit near by, in counts over full scale; expected : variance of the residual of a smooth pattern.
     good : (rows, columns) pixels that are used.
     """
 
     residual: NDArray[np.float32]
-    signal: NDArray[np.float32]
+    around: NDArray[np.float32]
     expected: NDArray[np.float32]
     good: NDArray[np.bool_]
 
@@ -86,26 +86,23 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     y = add_response(counts, problem.coefficients(capture, changes), problem.columns(capture, changes))
     variance = data.variance().reshape(rows, height, width)
     level, mean_variance = moments.sigma, variance.mean(axis=0)
-    shared = np.zeros((rows, rows))
     free = np.zeros((rows, height, width), dtype=np.float32)
     signal = np.zeros((rows, height, width), dtype=np.float32)
     for mask, columns in _parts(problem, capture, changes, a, np.ones_like(used)):
         q = _basis(columns / level[:, None])
         signal[:, mask] = (q @ (q.T @ (y[:, mask] / level[:, None]))) * level[:, None]
         free[:, mask] = (1 - np.sum(q * q, axis=1))[:, None]
-        # Rows that interpolation has averaged unequally share noise with the fit of a pixel: P N Q Q^T is not zero.
-        fit_of_noise = moments.left[:, None] * (q @ q.T)
-        shared += np.sqrt(mean_variance[mask & used]).sum() * (fit_of_noise - q @ (q.T @ fit_of_noise)) * level
     scale = level[:, None] * np.sqrt(mean_variance[used])
     r = np.full((rows, height, width), np.nan, dtype=np.float32)
     r[:, used] = (y - signal)[:, used] / scale
+    around = _around(signal)
     signal[:, ~used], free[:, ~used] = 0.0, 0.0
     noise = variance / level[:, None, None] ** 2 / np.maximum(mean_variance, 1e-300)
     expected = (free * noise).astype(np.float32)
     good = np.asarray(np.isfinite(r).all(axis=0))
-    images = Images(r, signal, expected, good)
+    images = Images(r, around, expected, good)
     alike = np.array([neighbour_noise(x, y) for x, y in data.row_moved_px])
-    tests, left = _tests(images, moments.left, alike, shared, a.shape[1], moments.spread, data.noise_known)
+    tests, left = _tests(images, moments.left, alike, a.shape[1], moments.spread, data.noise_known)
     n, channels = data.signal.shape[:2]
     mean = r[:, good].mean(axis=1) if good.any() else np.zeros(rows)
     states = mean.reshape(n, channels).mean(axis=1)
@@ -129,6 +126,20 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     )
 
 
+def _around(signal: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The fit of four pixels around each.
+
+    A pixel's own fit shares noise with its residual, since the states of a pixel are not equally noisy: with some
+    100 000 pixels that shows.
+    """
+    wide = np.pad(signal, ((0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN)), mode="edge")
+    last = 2 * MARGIN
+    corners = (
+        wide[:, y : wide.shape[1] - last + y, x : wide.shape[2] - last + x] for y in (0, last) for x in (0, last)
+    )
+    return np.asarray(sum(corners) / 4, dtype=np.float32)
+
+
 def _parts(
     problem: InstrumentProblem, capture: int, changes: Changes, a: Array, used: NDArray[np.bool_]
 ) -> list[tuple[NDArray[np.bool_], Array]]:
@@ -149,7 +160,6 @@ def _tests(
     images: Images,
     shown: Array,
     alike: Array,
-    shared: Array,
     columns: int,
     spread: float,
     noise_known: bool,
@@ -157,9 +167,9 @@ def _tests(
     """Chi-square of each test over its standard deviation, and the largest that is certainly left.
 
     `shown` (L,) is the part of the noise that single pixels show, `alike` (L, 2) what neighbours down and across share
-    of it, `shared` (L, L) the mean of residual times fit.
+    of it.
     """
-    r, signal, expected, good = images.residual, images.signal, images.expected, images.good
+    r, expected, good = images.residual, images.expected, images.good
     count = int(good.sum())
     if count < 30 or not noise_known:
         return {}, 0.0
@@ -168,12 +178,12 @@ def _tests(
     freedom = shown @ wanted.sum(axis=1)
     # Name to chi-square beyond noise, and its standard deviation with nothing but noise.
     found = {"sum of squares": (np.sum(flat**2) - freedom, np.sqrt(2 * freedom * spread))}
-    # Linear in the signal: every pixel's residual against the leading components of the fitted signal.
-    s = signal[:, good].astype(np.float64)
+    # Linear in the signal: every pixel's residual against the leading components of the fitted signal near by.
+    s = images.around[:, good].astype(np.float64)
     _, size, vt = np.linalg.svd(s @ s.T)
     keep = min(columns, int(np.sum(size > 1e-10 * size[0])))
     weights = (vt[:keep] @ s) / np.sqrt(np.maximum(size[:keep], 1e-300))[:, None]
-    linear = flat @ weights.T - shared @ (vt[:keep].T / np.sqrt(np.maximum(size[:keep], 1e-300)))
+    linear = flat @ weights.T
     null = wanted @ (weights.T**2)
     found["linear in the signal"] = (np.sum(linear**2) - null.sum(), np.sqrt(2 * null.sum() * spread))
     # Brightness: against the square of the signal, its linear part taken away.

@@ -95,6 +95,13 @@ def test_nothing_wrong_is_consistent(configs, tmp_path):
         assert d.error_after.rms_percent < 1.05 * d.noise_floor_percent
 
 
+def test_nothing_wrong_is_consistent_on_a_large_image_too(configs, tmp_path):
+    """What a pixel's residual shares with its own fit, through noise that differs from state to state, adds up."""
+    found = diagnosed(capture(tmp_path, configs, Bench(rows=400, columns=400), air=False, seed=4), configs)
+    assert found.verdict == "consistent"
+    assert max(found.captures[0].tests_before.values()) < 4
+
+
 def test_random_gains_in_air_are_not_given_a_name(configs, tmp_path):
     """One known sample and one channel: a gain for each state explains anything, so it explains nothing."""
     bench = Bench()
