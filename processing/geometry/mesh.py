@@ -40,10 +40,6 @@ class Mesh(BaseModel):
         """The same mesh with its file looked up from `folder`."""
         return self.model_copy(update={"file": str(folder / self.file)})
 
-    def to_world(self, points: FloatArray) -> FloatArray:
-        """World coordinates in mm of points (..., 3) in the file's own."""
-        return np.asarray((points * self.scale_mm) @ _turn(self.rotation_deg).T + np.asarray(self.translation_mm))
-
     def intersect(
         self, origin_mm: FloatArray, rays: FloatArray, omega_deg: float
     ) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
