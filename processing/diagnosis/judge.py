@@ -98,7 +98,7 @@ def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
         verdict=verdict,
         error_before=_error(problem, found.before),
         error_after=_error(problem, found.after),
-        noise_floor_percent=_floor(problem),
+        noise_floor_percent=_floor(problem.near(found.space, found.fit.values)[0]),
         effects=tuple(_effect(problem, search, found, c) for c in found.effects),
         unobservable=unseen,
         recommendation=recommended(problem, found.space, found.fit, rivals, _missing(problem, found)),
@@ -221,6 +221,7 @@ def _error(problem: InstrumentProblem, out: object) -> Error:
 
 
 def _floor(problem: InstrumentProblem) -> float | None:
+    """Rms noise over the mean signal, percent; of the corrected counts, since a bend stretches both."""
     if not problem.noise_known:
         return None
     return 100 * float(np.sqrt(np.mean([m.noise_floor**2 for m in problem.moments])))
