@@ -5,6 +5,8 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -60,14 +62,11 @@ def serve(
         clock=Clock(clock_speed),
         faults=FaultSchedule(faults, seed),
     )
-    ended = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: ended.set())
     try:
         emulator = kinds[kind](options)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
-    with PtyPort(emulator) as port:
+    with _signalled() as ended, PtyPort(emulator) as port:
         typer.echo(port.path)
         sys.stdout.flush()
         while not ended.wait(0.2) and port.is_serving():
@@ -88,17 +87,26 @@ def rig(
     from processing.errors import ProcessError
     from simulators import served_rig
 
-    ended = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: ended.set())
     try:
-        with served_rig.serve(rig_file, out, sample, mode, wavelength, omega):
+        with _signalled() as ended, served_rig.serve(rig_file, out, sample, mode, wavelength, omega):
             typer.echo(out)
             sys.stdout.flush()
             ended.wait()
     except (ProcessError, DeviceError) as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(1) from None
+
+
+@contextmanager
+def _signalled() -> Iterator[threading.Event]:
+    """An event that SIGTERM and Ctrl-C set; afterwards they do what they did before."""
+    event = threading.Event()
+    before = {number: signal.signal(number, lambda *_: event.set()) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield event
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _parse_limits(text: str | None) -> tuple[float, float] | None:

@@ -56,7 +56,7 @@ class CaptureData:
         That averages the noise of neighbours, and adds no information.
     usable : (rows, columns) True where every state has a number and the pixel is not dark.
     dark_fraction : part of the pixels that are too dark, or too close to dark ones, to be used.
-    cut_off : states of the capture that are left out because their counts are cut off at zero.
+    cut_off : numbers of states that do not count because their counts are cut off at zero.
     binned : side of the squares over which pixels were averaged.
     pitch : pixels of the sensor from one pixel here to the next.
     """
@@ -92,6 +92,13 @@ class CaptureData:
     def row_exposure(self) -> Array:
         """Exposure (values_per_pixel,) of each row of W."""
         return np.repeat(self.exposure, self.signal.shape[1])
+
+    @property
+    def row_counts(self) -> NDArray[np.bool_]:
+        """(values_per_pixel,) whether a row of W counts."""
+        counts = np.ones(self.conditions.states, dtype=bool)
+        counts[list(self.cut_off)] = False
+        return np.repeat(counts, self.signal.shape[1])
 
     @property
     def row_moved_px(self) -> Array:
@@ -142,11 +149,9 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     measurement_matrix(capture, model, states)
     correction = Correction.of(capture)
     raw, clipped, clipped_states, zero = _frames(capture, model, states, correction)
-    keep = zero.mean(axis=(1, 2)) <= MOST_CUT_OFF
-    if not keep.any():
+    cut_off = zero.mean(axis=(1, 2)) > MOST_CUT_OFF
+    if cut_off.all():
         raise CaptureError(f"{capture.path}: the counts of every state are cut off at zero. Raise the black level.")
-    cut_off, states = tuple(int(k) for k in states[~keep]), states[keep]
-    raw, clipped_states, zero = raw[keep], clipped_states[keep], zero[keep]
     names = tuple(c.name for c in model.channels)
     if raw.shape[1] != len(names):
         raise CaptureError(
@@ -171,11 +176,11 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
         noise_source="not known: too few pixels and no detector constants; the residual itself is the measure",
         clipped=clipped,
         clipped_states=clipped_states,
-        usable=np.asarray(np.isfinite(raw).all(axis=(0, 1)) & ~zero.any(axis=0)),
+        usable=np.asarray(np.isfinite(raw).all(axis=(0, 1)) & ~zero[~cut_off].any(axis=0)),
         simulated=capture.simulated,
         wavelength_nm=capture.header.wavelength_nm,
         pitch=model.pitch,
-        cut_off=cut_off,
+        cut_off=tuple(np.flatnonzero(cut_off).tolist()),
     )
     data = replace(data, signal=np.nan_to_num(data.signal))
     repeats = np.maximum(capture.column("repeats")[states].astype(float), 1)

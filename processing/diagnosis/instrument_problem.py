@@ -92,13 +92,14 @@ class InstrumentProblem:
         """Rows that the unknowns leave over, and the power of each component of the signal, for each capture."""
         out, empty = [], Space(())
         for k, moments in enumerate(self.moments):
-            a = self.columns(k, self.changes(k, empty, np.zeros(0)))
+            use = moments.counts
+            a = self.columns(k, self.changes(k, empty, np.zeros(0)))[use]
             u, size, _ = np.linalg.svd(a, full_matrices=False)
             q = u[:, size > RANK * size[0]]
             z = np.concatenate(
                 [b.counts for b in moments.blocks[:: self.folds if moments.tiles is None else 1]], axis=1
             )
-            part = q.T @ (z / moments.sigma[:, None])
+            part = q.T @ (z[use] / moments.sigma[use, None])
             power = np.maximum(np.linalg.eigvalsh(part @ part.T), 0.0)
             # With a single state, structure can vary over the image only.
             patches = moments.tiles.x.size if moments.tiles and self.captures[k].conditions.states == 1 else 1

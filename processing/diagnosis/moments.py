@@ -101,6 +101,7 @@ class Moments:
     Attributes
     ----------
     tiles, clipped : of pixels without and with a clipped state; None where states are held out.
+    counts : (L,) rows of W that count.
     sigma : (L,) noise of each row in the weighted units; left : (L,) part of its variance that the pixels show.
     relative : turns a weighted square into a square relative to the mean signal.
     spread : mean square over squared mean of the variances: 1 if all pixels and states are equally noisy.
@@ -110,6 +111,7 @@ class Moments:
     blocks: tuple[Block, ...]
     tiles: Tiles | None
     clipped: Tiles | None
+    counts: NDArray[np.bool_]
     sigma: Array
     left: Array
     relative: float
@@ -158,11 +160,15 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
             pick = good & (data.clipped == clipped) & (fold_of_pixel == fold)
             if pick.any():
                 blocks += _blocks(data, around, variance, shared, scale, pick, fold, clipped, folds if by_state else 0)
-    share = variance[:, good] / scale[good] / sigma[:, None] ** 2
-    mean = float(np.mean(u[:, good]))
+    counts = data.row_counts
+    variance = variance[counts][:, good]
+    share = variance / scale[good] / sigma[counts, None] ** 2
+    mean = float(np.mean(u[counts][:, good]))
     relative = float(np.mean(scale[good])) / mean**2
-    floor = float(np.sqrt(np.mean(variance[:, good]))) / mean
-    return Moments(tuple(blocks), tiles, clipped_tiles, sigma, left, relative, float(np.mean(share**2)), floor, held)
+    floor = float(np.sqrt(np.mean(variance))) / mean
+    return Moments(
+        tuple(blocks), tiles, clipped_tiles, counts, sigma, left, relative, float(np.mean(share**2)), floor, held
+    )
 
 
 def tile_products(data: CaptureData, tiles: Tiles, used: Sequence[int]) -> tuple[Array, Array]:
@@ -278,12 +284,13 @@ def _blocks(
     root = np.concatenate(chunks, axis=1) if total is None else _square_root(np.triu(total) + np.triu(total, 1).T)
     z = root.reshape(len(FEATURES), rows, -1)
     counts = _square_root(z[0] @ z[0].T)
-    free = np.repeat(~data.clipped_states, data.signal.shape[1]) if clipped else np.ones(rows, dtype=bool)
+    use = data.row_counts
+    free = use & np.repeat(~data.clipped_states, data.signal.shape[1]) if clipped else use
     if not parts_of_states:
-        return [Block(fold, z, counts, noise, np.arange(rows), clipped, pixels, np.flatnonzero(free))]
+        return [Block(fold, z, counts, noise, np.flatnonzero(use), clipped, pixels, np.flatnonzero(free))]
     states, channels = data.signal.shape[:2]
     halves = np.random.default_rng(0).permutation(states) % parts_of_states
-    parts = [np.repeat(halves == f, channels) for f in range(parts_of_states)]
+    parts = [use & np.repeat(halves == f, channels) for f in range(parts_of_states)]
     return [
         Block(f, z, counts, noise, np.flatnonzero(p), clipped, pixels, np.flatnonzero(p & free))
         for f, p in enumerate(parts)

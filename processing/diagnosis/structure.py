@@ -89,12 +89,14 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     free = np.zeros((rows, height, width), dtype=np.float32)
     signal = np.zeros((rows, height, width), dtype=np.float32)
     for mask, columns in _parts(problem, capture, changes, a, np.ones_like(used)):
-        q = _basis(columns / level[:, None])
+        q = _basis(columns / level[:, None] * moments.counts[:, None])
         signal[:, mask] = (q @ (q.T @ (y[:, mask] / level[:, None]))) * level[:, None]
         free[:, mask] = (1 - np.sum(q * q, axis=1))[:, None]
     scale = level[:, None] * np.sqrt(mean_variance[used])
     r = np.full((rows, height, width), np.nan, dtype=np.float32)
     r[:, used] = (y - signal)[:, used] / scale
+    # Of a row that does not count nothing is left, and no noise is expected.
+    r[~moments.counts], free[~moments.counts] = np.where(used, 0.0, np.nan), 0.0
     around = _around(signal)
     signal[:, ~used], free[:, ~used] = 0.0, 0.0
     noise = variance / level[:, None, None] ** 2 / np.maximum(mean_variance, 1e-300)

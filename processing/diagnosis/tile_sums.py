@@ -43,15 +43,21 @@ def add_tiles(
     """Add what tiles say of a (tiles, L, K) and coefficients c (F, L), with their derivatives by each value."""
     used = np.flatnonzero(np.any(c, axis=1) | np.any(dc, axis=(0, 2)))
     s, noise = tile_products(data, tiles, used.tolist())
-    scale = np.tile(1 / moments.sigma, used.size)
+    use = moments.counts
+    if not use.all():
+        every = np.flatnonzero(np.tile(use, used.size))
+        s, noise = s[:, every][:, :, every], noise[:, use]
+        a, c, da, dc = a[:, use], c[:, use], da[:, :, use], dc[:, :, use]
+    sigma = moments.sigma[use]
+    scale = np.tile(1 / sigma, used.size)
     around = used >= len(FEATURES) - DERIVATIVES
-    all_tiles = _Tiled(s * scale[:, None] * scale, noise / (moments.sigma**2)[:, None, None], a, c[used], around)
+    all_tiles = _Tiled(s * scale[:, None] * scale, noise / (sigma**2)[:, None, None], a, c[used], around)
     squares = np.diagonal(all_tiles.ry @ all_tiles.outside, axis1=1, axis2=2)
     free = np.diagonal(all_tiles.outside, axis1=1, axis2=2)
     np.add.at(out.excess, tiles.fold, squares.sum(axis=1) - all_tiles.expected)
     np.add.at(out.freedom, tiles.fold, all_tiles.expected)
-    np.add.at(out.square, tiles.fold, squares @ moments.sigma**2 * moments.relative)
-    np.add.at(out.count, tiles.fold, free @ moments.left * tiles.pixels)
+    np.add.at(out.square, tiles.fold, squares @ sigma**2 * moments.relative)
+    np.add.at(out.count, tiles.fold, free @ moments.left[use] * tiles.pixels)
     if len(da):
         folds = [tiles.fold == f for f in range(len(out.excess))]
         gradient, curvature = all_tiles.slopes(da, dc[:, used], folds)

@@ -31,14 +31,16 @@ def unevenness(problem: InstrumentProblem, candidate: Candidate, space: Space, v
         moved = local.copy()
         moved[part] *= 1 + STEP
         da = (problem.columns(k, problem.changes(k, space, moved)) - a) / STEP
+        use = moments.counts
+        a, da, sigma = a[use], da[use], moments.sigma[use]
         u, size, vt = np.linalg.svd(a, full_matrices=False)
         keep = size > RANK * size[0]
         q = u[:, keep]
         b = (da - q @ (q.T @ da)) @ (vt[keep].T / size[keep]) @ q.T
-        s = tiles.s / moments.sigma[:, None] / moments.sigma
+        s = tiles.s[:, use][:, :, use] / sigma[:, None] / sigma
         ps = s - q @ (q.T @ s)
         # As in `add_tiles`: the slope of the excess of each tile by the size of the effect there, and its noise.
-        slope = -np.sum(ps * b, axis=(1, 2)) + (tiles.noise / moments.sigma**2) @ np.diag(b)
+        slope = -np.sum(ps * b, axis=(1, 2)) + (tiles.noise[:, use] / sigma**2) @ np.diag(b)
         power = np.sum((b @ s) * b, axis=(1, 2))
         smooth = np.vstack([np.ones(tiles.x.size), terms(tiles.x, tiles.y)])
         pull = smooth @ slope

@@ -74,6 +74,7 @@ def test_a_state_that_is_cut_off_at_zero_is_left_out(configs, tmp_path):
     """A black level that is too low for an offset; behind crossed polarizers nothing else is left."""
     bench = Bench(rows=40, columns=40)
     bench.transfer.append(lambda e: e - 1100 * bench.gain)
+    bench.angles.append(lambda k, a: a | {"psg": a["psg"] + np.deg2rad(0.4) * (k >= 26)})
     path = capture(tmp_path, configs, bench, air=True)
     with h5py.File(path) as h5:
         counts = h5["entry/instrument/detector/data"][:, 0]
@@ -81,9 +82,11 @@ def test_a_state_that_is_cut_off_at_zero_is_left_out(configs, tmp_path):
     assert 0 < empty.size < 10
     found = diagnosed(path, configs)
     assert found.captures[0].cut_off == tuple(empty)
-    assert [e.kind for e in found.effects] == ["detector_offset"]
-    offset = found.effects[0].parameters["offset"]
-    assert offset.value == pytest.approx(-1100, abs=3.5 * offset.stderr)
+    assert found.verdict == "explained"
+    offset, slip = found.effects
+    assert (offset.kind, slip.kind, slip.element) == ("detector_offset", "rotation_slip", "psg@26")
+    assert offset.parameters["offset"].value == pytest.approx(-1100, abs=3.5 * offset.parameters["offset"].stderr)
+    assert slip.parameters["slip"].value == pytest.approx(0.4, abs=3.5 * slip.parameters["slip"].stderr)
 
 
 def test_nothing_wrong_is_consistent(configs, tmp_path):

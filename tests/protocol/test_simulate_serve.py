@@ -66,8 +66,11 @@ def test_wrong_options_are_explained(arguments: list[str], message: str) -> None
 
     from simulators.cli import app
 
+    before = signal.getsignal(signal.SIGINT)
     result = CliRunner().invoke(app, ["serve", *arguments])
     assert result.exit_code == 2
+    # Ctrl-C means what it meant: otherwise every later test in this process is deaf to it.
+    assert signal.getsignal(signal.SIGINT) is before
     assert message in result.output.replace("\n", " ")
 
 
