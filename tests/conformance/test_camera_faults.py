@@ -220,6 +220,15 @@ def test_a_second_program_is_refused_and_the_first_goes_on(camera: aravis.Aravis
     camera.capture()
 
 
+@pytest.fixture
+def ctrl_c() -> Iterator[None]:
+    """Python's own answer to Ctrl-C, which is missing where the tests run in the background of a shell."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("ctrl_c")
 def test_ctrl_c_gets_through_a_long_wait(simulated: GigeCamera) -> None:
     config = aravis.Config(device="127.0.0.1", trigger_timeout_s=30.0)
     with aravis.open("camera", config) as camera:
