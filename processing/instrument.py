@@ -132,6 +132,16 @@ class EffectParameter(_Part):
     unit: str
     note: str | None = None
 
+    @property
+    def told(self) -> str:
+        """The value to the last of two digits of its standard error; the range of many values."""
+        if isinstance(self.value, tuple):
+            return f"{len(self.value)} values, {min(self.value):.4g} to {max(self.value):.4g}"
+        if not isinstance(self.stderr, float) or not 0 < self.stderr < np.inf:
+            return f"{self.value:.5g}"
+        digits = max(0, 1 - int(np.floor(np.log10(self.stderr))))
+        return f"{self.value:.{digits}f} ± {self.stderr:.{digits}f}"
+
 
 class InstrumentModel(_Part):
     """Generator train, analyzer train and detector channels, in the order in which the light passes them.

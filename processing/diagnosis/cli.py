@@ -115,12 +115,8 @@ def _show_effect(effect: FoundEffect) -> None:
     where = f" of {effect.element}" if effect.element else ""
     typer.echo(f"  {effect.kind}{where}: evidence {effect.evidence:.0f}{doubt}")
     for name, p in effect.parameters.items():
-        if isinstance(p.value, tuple):
-            typer.echo(f"      {name}: {len(p.value)} values, {min(p.value):.4g} to {max(p.value):.4g} {p.unit}")
-        elif isinstance(p.stderr, float):
-            typer.echo(f"      {name} = {p.value:.5g} +- {p.stderr:.2g} {p.unit}")
-        else:
-            typer.echo(f"      {name} = {p.value:.5g} {p.unit} ({p.note})")
+        unit, note = "" if p.unit == "1" else f" {p.unit}", f" ({p.note})" if p.note else ""
+        typer.echo(f"      {name}: {p.told}{unit}{note}")
     if effect.indistinguishable_from:
         typer.echo(f"      cannot be told from: {', '.join(effect.indistinguishable_from)}")
 

@@ -82,15 +82,11 @@ def _effects(judged: Judged) -> str:
     rows = []
     for e in judged.diagnosis.effects:
         for name, p in e.parameters.items():
-            if isinstance(p.value, tuple):
-                value = f"{len(p.value)} values, {min(p.value):.4g} to {max(p.value):.4g}"
-            else:
-                value = f"{p.value:.5g}" + (f" ± {p.stderr:.2g}" if isinstance(p.stderr, float) else "")
             # What is told of the effect as a whole stands in its first row.
             kind = e.kind if e.confident else f"{e.kind} (the name may be wrong)"
             whole = (kind, e.element or "", f"{e.evidence:.0f}", ", ".join(e.indistinguishable_from))
             kind, element, evidence, also = whole if name == next(iter(e.parameters)) else ("", "", "", "")
-            rows.append([kind, element, name, value, p.unit, evidence, also])
+            rows.append([kind, element, name, p.told, p.unit, evidence, also])
     if not rows:
         return "<p>No effect is named.</p>"
     head = ["effect", "element", "parameter", "value", "unit", "evidence", "cannot be told from"]

@@ -25,9 +25,8 @@ def write_surface_report(path: Path, judged: SurfaceJudged, problem: SurfaceProb
     rows = [["effect", "where", "parameter", "value", "unit", "evidence", "cannot be told from"]]
     for e in d.effects:
         for name, p in e.parameters.items():
-            value = f"{p.value:.5g} +- {p.stderr:.2g}" if isinstance(p.stderr, float) else str(p.value)
             also = ", ".join(e.indistinguishable_from)
-            rows.append([e.kind, e.element or "", name, value, p.unit, f"{e.evidence:.0f}", also])
+            rows.append([e.kind, e.element or "", name, p.told, p.unit, f"{e.evidence:.0f}", also])
     ranking = [["candidate, alone", "chi2 gain on held-out data", "rms left, %"]]
     ranking += [[r.candidate, f"{r.evidence:.0f}", f"{r.rms_percent:.4f}"] for r in d.ranking]
     summary = [

@@ -11,7 +11,7 @@ from processing.capture_schema import Sample
 from processing.diagnosis import cli
 from processing.diagnosis.result import Diagnosis
 from processing.diagnosis.run import diagnose_captures
-from processing.instrument import InstrumentModel
+from processing.instrument import EffectParameter, InstrumentModel
 from simulators.blind_suite import declared_bench, state_angles
 from simulators.undeclared import Bench, Scene, digitize, expose, write_capture
 
@@ -261,3 +261,17 @@ def test_reduce_with_the_written_model_is_closer_to_the_truth(configs, tmp_path)
         errors.append(np.abs(mean - np.eye(4)).max())
     assert errors[0] > 0.02
     assert errors[1] < 0.004
+
+
+@pytest.mark.parametrize(
+    ("value", "stderr", "told"),
+    [
+        (0.0027915, 0.0022, "0.0028 ± 0.0022"),
+        (-484.19, 0.65, "-484.19 ± 0.65"),
+        (1234.5, 38.0, "1234 ± 38"),
+        (2.0, None, "2"),
+        ((0.1, -0.2), (0.01, 0.01), "2 values, -0.2 to 0.1"),
+    ],
+)
+def test_a_value_is_told_as_far_as_it_is_known(value, stderr, told):
+    assert EffectParameter(value=value, stderr=stderr, unit="1").told == told
