@@ -27,9 +27,10 @@ FAINTEST = 5.0
 #: Pixels around dark ones that are left out too: at an edge, image derivatives (over 7 pixels) do not tell what a shift
 #: of the image does.
 RIM = 4
-#: Counts of zero this many standard deviations of the read-out below black are cut off, not noise; a state is left out
-#: where more than this share of its pixels are.
-CUT_OFF, MOST_CUT_OFF = 6.0, 0.01
+#: Counts of zero this many standard deviations of the read-out below black are cut off, not noise.
+CUT_OFF = 6.0
+#: A state is left out if more than this share of its pixels is cut off.
+MOST_CUT_OFF = 0.01
 #: Below this number of pixels their scatter says nothing about the noise.
 FEWEST_PIXELS = 30
 

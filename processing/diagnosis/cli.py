@@ -87,8 +87,8 @@ def show(d: Diagnosis) -> None:
     typer.echo(f"  held out: {before.held_out}")
     for c in d.captures:
         if c.cut_off:
-            states = ", ".join(str(k) for k in c.cut_off)
-            typer.echo(f"  left out: state {states} of {c.name}, cut off at zero counts; raise the black level")
+            states = f"state{'s' if len(c.cut_off) > 1 else ''} {', '.join(str(k) for k in c.cut_off)}"
+            typer.echo(f"  left out: {states} of {c.name}, cut off at zero counts; raise the black level")
         if c.dark_fraction > 0:
             typer.echo(f"  left out as too dark, with their rim: {c.dark_fraction:.1%} of the pixels of {c.name}")
         if c.closure_before_percent is not None and c.closure_after_percent is not None:

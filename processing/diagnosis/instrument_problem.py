@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +37,7 @@ from processing.instrument import InstrumentModel
 
 Array = NDArray[np.float64]
 #: Makes A (..., L, K) of the changes of a capture.
-Columns = Callable[[int, Changes], Array]
+Columns = Callable[[Changes], Array]
 STEP = 1e-4
 #: Distance, in typical sizes, from the point of expansion up to which a correction of counts is exact enough.
 EXACT = 0.3
@@ -242,7 +243,7 @@ class InstrumentProblem:
         a, c = self.columns(k, changes), self.coefficients(k, changes)
         da, dc = np.zeros((0, *a.shape)), None
         if derivatives:
-            da = self._slopes(space, values, k, a, self.columns)
+            da = self._slopes(k, space, values, a, partial(self.columns, k))
             dc = self._slopes_of_counts(k, space, values, c)
         for block in self.moments[k].blocks:
             if block.clipped and changes.drop_clipped:
@@ -253,8 +254,8 @@ class InstrumentProblem:
             if block.rows.size:
                 add_block(block, a, c, da, dc, self.moments[k], out)
 
-    def _slopes(self, space: Space, values: Array, k: int, a: Array, columns: Columns) -> Array:
-        """Derivatives (values, ..., L, K) of a (..., L, K), which `columns` makes of the changes of capture k."""
+    def _slopes(self, k: int, space: Space, values: Array, a: Array, columns: Columns) -> Array:
+        """Derivatives (values, ..., L, K) of a (..., L, K), which `columns` makes of the changes."""
         da = np.zeros((space.size, *a.shape))
         conditions = self.captures[k].conditions
         channels = len(conditions.channels)
@@ -267,7 +268,7 @@ class InstrumentProblem:
                 moved = values.copy()
                 step = STEP * candidate.typical
                 moved[part] += step
-                slope = (columns(k, self.changes(k, space, moved)) - a) / step.repeat(channels)[:, None]
+                slope = (columns(self.changes(k, space, moved)) - a) / step.repeat(channels)[:, None]
                 for n in range(candidate.size):
                     rows = slice(n * channels, (n + 1) * channels)
                     da[part.start + n, ..., rows, :] = slope[..., rows, :]
@@ -278,14 +279,12 @@ class InstrumentProblem:
                 axis = candidate.place.partition("@")[0]
                 if axis not in whole:
                     turned = self.changes(k, space, values)
-                    turned.turn_axis(
-                        axis, np.full(self.captures[k].conditions.states, STEP), turned_by(self.model, axis)
-                    )
-                    whole[axis] = (columns(k, turned) - a) / STEP
+                    turned.turn_axis(axis, np.full(conditions.states, STEP), turned_by(self.model, axis))
+                    whole[axis] = (columns(turned) - a) / STEP
                 da[part.start, ..., first * channels :, :] = whole[axis][..., first * channels :, :]
                 continue
-            for j, (moved, step_j) in enumerate(self._moved(candidate, part, values)):
-                da[part.start + j] = (columns(k, self.changes(k, space, moved)) - a) / step_j
+            for j, (moved, step_j) in enumerate(self._stepped(candidate, part, values)):
+                da[part.start + j] = (columns(self.changes(k, space, moved)) - a) / step_j
         return da
 
     def _slopes_of_counts(self, k: int, space: Space, values: Array, c: Array) -> Array:
@@ -293,7 +292,7 @@ class InstrumentProblem:
         dc = np.zeros((space.size, *c.shape))
         for candidate, part in self._active(k, space):
             if candidate.effect.corrects_counts:
-                for j, (moved, step) in enumerate(self._moved(candidate, part, values)):
+                for j, (moved, step) in enumerate(self._stepped(candidate, part, values)):
                     dc[part.start + j] = (self.coefficients(k, self.changes(k, space, moved)) - c) / step
         return dc
 
@@ -303,7 +302,7 @@ class InstrumentProblem:
         return [(c, part) for c, part in pairs if c.capture in (None, k) and not c.effect.switch]
 
     @staticmethod
-    def _moved(candidate: Candidate, part: slice, values: Array) -> Iterator[tuple[Array, float]]:
+    def _stepped(candidate: Candidate, part: slice, values: Array) -> Iterator[tuple[Array, float]]:
         """All values with one of a candidate's after the other moved by a small step, and the step."""
         for j, step in enumerate(STEP * candidate.typical):
             moved = values.copy()
@@ -315,14 +314,11 @@ class InstrumentProblem:
         data, moments = self.captures[k], self.moments[k]
         if moments.tiles is None:
             return
-
-        def columns(_: int, changed: Changes) -> Array:
-            return tile_columns(self.model, data, moments, changed)
-
-        a, c = columns(k, changes), self.coefficients(k, changes)
+        columns = partial(tile_columns, self.model, data, moments)
+        a, c = columns(changes), self.coefficients(k, changes)
         da, dc = np.zeros((0, *a.shape)), np.zeros((0, *c.shape))
         if derivatives:
-            da = self._slopes(space, values, k, a, columns)
+            da = self._slopes(k, space, values, a, columns)
             dc = self._slopes_of_counts(k, space, values, c)
         add_tiles(data, moments, moments.tiles, a, c, da, dc, out)
         if moments.clipped is not None and not changes.drop_clipped:

@@ -51,8 +51,8 @@ ONE_WAVE = 0.85
 UNEVEN, UNEVEN_SHARE = 6.0, 0.01
 #: An information about a parameter below this, in chi-square for its typical size, is none.
 SEEN = 4.0
-#: Share of the noise that is not known: information must be more than that.
-NOT_EXACT = 0.05
+#: Relative error of the noise: information that is less than this share of it may be noise.
+NOISE_ERROR = 0.05
 #: Autocorrelation over the states, in standard deviations, from which on a residual of few pixels is not white.
 WHITE = 4.0
 
@@ -87,6 +87,7 @@ def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
         after = before
     else:
         tried = tuple(t.candidate for t in found.ranking[:5]) if verdict == "unexplained" else ()
+    stderr = _standard_errors(problem, search, found)
     unseen = _unobservable(problem, found)
     rivals = [(e, *found.sets[e]) for e in found.effects if found.sets.get(e)]
     unexplained = None
@@ -99,11 +100,11 @@ def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
         error_before=_error(problem, found.before),
         error_after=_error(problem, found.after),
         noise_floor_percent=_floor(problem.near(found.space, found.fit.values)[0]),
-        effects=tuple(_effect(problem, search, found, c) for c in found.effects),
+        effects=tuple(_effect(problem, found, c, stderr) for c in found.effects),
         unobservable=unseen,
         recommendation=recommended(problem, found.space, found.fit, rivals, _missing(problem, found)),
         unexplained=unexplained,
-        calibrated=_calibrated(problem, search, found),
+        calibrated=_calibrated(problem, found, stderr),
         ranking=tuple(
             Ranked(candidate=t.candidate.label, evidence=round(t.evidence, 1), rms_percent=100 * t.out.rms)
             for t in found.ranking[:10]
@@ -232,9 +233,10 @@ def _spread(search: Search, found: Found) -> float:
     return unit + search.structure(found.after, found.space.size)
 
 
-def _covariance(problem: InstrumentProblem, search: Search, found: Found) -> Array:
+def _standard_errors(problem: InstrumentProblem, search: Search, found: Found) -> Array:
     noise_only = problem.noise_information(found.space, found.fit.values)
-    return covariance(found.space, found.fit, noise_only)[0] * _spread(search, found)
+    scatter = covariance(found.space, found.fit, noise_only)[0] * _spread(search, found)
+    return np.asarray(np.sqrt(np.maximum(np.diag(scatter), 0)))
 
 
 def _parameters(candidate: Candidate, values: Array, stderr: Array) -> dict[str, EffectParameter]:
@@ -249,13 +251,12 @@ def _parameters(candidate: Candidate, values: Array, stderr: Array) -> dict[str,
     }
 
 
-def _effect(problem: InstrumentProblem, search: Search, found: Found, candidate: Candidate) -> FoundEffect:
-    error = np.sqrt(np.maximum(np.diag(_covariance(problem, search, found)), 0))
+def _effect(problem: InstrumentProblem, found: Found, candidate: Candidate, stderr: Array) -> FoundEffect:
     part = found.space.slices[found.space.candidates.index(candidate)]
     return FoundEffect(
         kind=candidate.kind,
         element=candidate.place or None,
-        parameters=_parameters(candidate, found.fit.values[part], error[part]),
+        parameters=_parameters(candidate, found.fit.values[part], stderr[part]),
         evidence=found.evidence.get(candidate, 0.0),
         indistinguishable_from=tuple(dict.fromkeys(c.short for c in found.sets.get(candidate, ()))),
         scope=candidate.effect.scope,
@@ -265,10 +266,9 @@ def _effect(problem: InstrumentProblem, search: Search, found: Found, candidate:
     )
 
 
-def _calibrated(problem: InstrumentProblem, search: Search, found: Found) -> dict[str, EffectParameter]:
+def _calibrated(problem: InstrumentProblem, found: Found, stderr: Array) -> dict[str, EffectParameter]:
     if not found.base.candidates:
         return {}
-    error = np.sqrt(np.maximum(np.diag(_covariance(problem, search, found)), 0))
     out = {}
     for candidate in found.base.candidates:
         index = found.space.slices[found.space.candidates.index(candidate)].start
@@ -276,7 +276,7 @@ def _calibrated(problem: InstrumentProblem, search: Search, found: Found) -> dic
         start = float(next(getattr(e, field) for e in problem.model.elements() if e.name == element))
         value = start + float(found.fit.values[index])
         out[candidate.place] = EffectParameter(
-            value=value, stderr=float(error[index]), unit=candidate.parameters[0].unit
+            value=value, stderr=float(stderr[index]), unit=candidate.parameters[0].unit
         )
     return out
 
@@ -289,7 +289,7 @@ def _unobservable(problem: InstrumentProblem, found: Found) -> tuple[str, ...]:
             # Noise alone has slopes too, from one pixel to the next, which a shift would change.
             one = Space((candidate,))
             noise = np.diag(problem.noise_information(one, np.zeros(one.size))) * candidate.typical**2
-            gain, least = gain - noise, np.maximum(least, NOT_EXACT * noise)
+            gain, least = gain - noise, np.maximum(least, NOISE_ERROR * noise)
         if "@" not in candidate.place and np.all(gain < least):
             names.append(candidate.short)
     names += [f"{c.short} (as many values as the data have)" for c in found.untestable]

@@ -185,20 +185,34 @@ def tile_products(data: CaptureData, tiles: Tiles, used: Sequence[int]) -> tuple
 
 def _products(data: CaptureData, tiles: Tiles, used: list[int]) -> tuple[Array, Array]:
     rows, count = data.values_per_pixel, tiles.x.size
-    u = data.signal.reshape(rows, -1)
-    variance, scale = (part.reshape(*part.shape[:-2], -1) for part in _variance(data))
+    variance, scale = _variance(data)
     shared = np.stack([shared_noise(x, y) for x, y in data.row_moved_px])
     around = image_derivatives(data.signal.reshape(rows, *data.signal.shape[2:])).reshape(DERIVATIVES, rows, -1)
     s, noise = np.zeros((count, len(used) * rows, len(used) * rows)), np.zeros((count, rows, len(used), len(used)))
     for t in range(count):
         p = np.flatnonzero((tiles.index == t) & tiles.pick)
-        z = np.empty((len(FEATURES), rows, p.size))
-        z[:-DERIVATIVES], slopes = features(u[:, p].astype(np.float64))
-        z[-DERIVATIVES:] = around[:, :, p]
-        flat = (z[used] / np.sqrt(scale[p])).reshape(len(used) * rows, -1)
-        s[t] = flat @ flat.T
-        noise[t] = _noise(slopes, variance[:, p] / scale[p], shared)[:, used][:, :, used]
+        z, of_pixels = _weighted(data, around, variance, shared, scale, p)
+        flat = z[used].reshape(len(used) * rows, -1)
+        s[t], noise[t] = flat @ flat.T, of_pixels[:, used][:, :, used]
     return s, noise
+
+
+def _weighted(
+    data: CaptureData,
+    around: NDArray[np.float32],
+    variance: Array,
+    shared: Array,
+    scale: Array,
+    pixels: NDArray[np.int64],
+) -> tuple[Array, Array]:
+    """Weighted features (F, L, P) of some pixels, and the noise (L, F, F) of their products."""
+    rows = data.values_per_pixel
+    weight = 1 / np.sqrt(scale.reshape(-1)[pixels])
+    z = np.empty((len(FEATURES), rows, pixels.size))
+    z[:-DERIVATIVES], slopes = features(data.signal.reshape(rows, -1)[:, pixels].astype(np.float64))
+    z[-DERIVATIVES:] = around[:, :, pixels]
+    z *= weight
+    return z, _noise(slopes, variance.reshape(rows, -1)[:, pixels] * weight**2, shared)
 
 
 def _variance(data: CaptureData) -> tuple[Array, Array]:
@@ -259,8 +273,7 @@ def _blocks(
     clipped: bool,
     parts_of_states: int,
 ) -> list[Block]:
-    u = data.signal.reshape(data.values_per_pixel, -1)
-    rows = u.shape[0]
+    rows = data.values_per_pixel
     size = len(FEATURES) * rows
     pixels = int(pick.sum())
     noise = np.zeros((rows, len(FEATURES), len(FEATURES)))
@@ -268,13 +281,8 @@ def _blocks(
     chunks = []
     flat = np.flatnonzero(pick.reshape(-1))
     for start in range(0, flat.size, 8192):
-        p = flat[start : start + 8192]
-        weight = 1 / np.sqrt(scale.reshape(-1)[p])
-        z = np.empty((len(FEATURES), rows, p.size))
-        z[:-DERIVATIVES], slopes = features(u[:, p].astype(np.float64))
-        z[-DERIVATIVES:] = around[:, :, p]
-        z *= weight
-        noise += _noise(slopes, variance.reshape(rows, -1)[:, p] * weight**2, shared)
+        z, of_pixels = _weighted(data, around, variance, shared, scale, flat[start : start + 8192])
+        noise += of_pixels
         flat_z = z.reshape(size, -1)
         if total is None:
             chunks.append(flat_z)
