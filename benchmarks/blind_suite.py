@@ -1,6 +1,7 @@
-"""Run the blind suite: `python benchmarks/blind_suite.py [COUNT] [SEED] [FOLDER] [--only GROUP]`.
+"""Run the blind suite: `python benchmarks/blind_suite.py [COUNT] [SEED] [FOLDER] [--only GROUP | --beside KIND]`.
 
-Prints the confusion matrix. GROUP is single, two, none or unlisted, to draw that kind of case alone. Seeds below 1000
+Prints the confusion matrix. GROUP is single, two, none or unlisted, to draw that kind of case alone; KIND is an effect,
+to draw it and another one in every case. Seeds below 1000
 are for development, 1000 for CI; which seeds a reported run had is in docs/closing-the-loop.md.
 """
 
@@ -47,17 +48,20 @@ def one(capture: str) -> tuple[str, dict]:
 def main() -> None:
     from simulators.blind_judge import judge, table
     from simulators.blind_suite import SHARES, make
+    from simulators.faults_undeclared import LISTED
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("count", nargs="?", type=int, default=300)
     parser.add_argument("seed", nargs="?", type=int, default=5000)
     parser.add_argument("folder", nargs="?", type=Path)
-    parser.add_argument("--only", choices=list(SHARES))
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--only", choices=list(SHARES))
+    which.add_argument("--beside", choices=list(LISTED), metavar="KIND")
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
     folder = options.folder or Path(mkdtemp(prefix="blind_"))
     start = time.perf_counter()
-    cases = make(folder, options.count, options.seed, ROOT / "configs", options.only)
+    cases = make(folder, options.count, options.seed, ROOT / "configs", options.only, options.beside)
     results = {}
     with ProcessPoolExecutor(options.workers) as workers:
         for k, (name, result) in enumerate(workers.map(one, [str(folder / f"{c.name}.h5") for c in cases]), 1):

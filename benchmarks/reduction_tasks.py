@@ -183,14 +183,19 @@ def start_up(target_ms: float) -> Task:
     return Task("acquire --help", target_ms, Program([ROOT / "lab", "acquire", "--help"]), rounds=7)
 
 
-def diagnose(folder: Path, target_ms: float, air: bool) -> Task:
-    """All effects, all pixels of 40 states of 600 x 600, the analyzer's retarder 0.05 degrees off."""
+def diagnose(folder: Path, target_ms: float, air: bool, moves: bool = False) -> Task:
+    """All effects, all pixels of 40 states of 600 x 600, the analyzer's retarder 0.05 degrees off.
+
+    `moves`: the image circles by 0.6 pixel with the generator's retarder, too.
+    """
     bench, random = Bench(rows=SMALL[0], columns=SMALL[1], oa=np.deg2rad(13.41 + 0.05)), np.random.default_rng(1)
+    if moves:
+        bench.shift.append(lambda k, a: (0.6 * np.cos(a["psg"]), 0.6 * np.sin(a["psg"])))
     angles = state_angles(40, False, False)
     counts = digitize(bench, expose(bench, Scene(random, np.eye(4) if air else None), angles), random)
     sample = Sample(kind="air" if air else "unknown")
-    path = folder / f"diagnose_{sample.kind}.h5"
+    path = folder / f"diagnose_{sample.kind}{'_moves' if moves else ''}.h5"
     write_capture(path, bench, counts, angles, sample, INSTRUMENT.read_text(encoding="utf-8"))
     model = InstrumentModel.load(INSTRUMENT)
-    name = f"diagnose, 40 x 600 x 600, all effects, all pixels, sample {sample.kind}"
+    name = f"diagnose, 40 x 600 x 600, all effects, all pixels, sample {sample.kind}{', image moves' if moves else ''}"
     return Task(name, target_ms, lambda: diagnose_captures([path], model), rounds=1)

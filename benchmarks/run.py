@@ -58,6 +58,7 @@ def tasks(peers: PeerProcess | None, folder: Path) -> list[tuple[str, Callable[[
         ("reduce", lambda: reduction.reduce_file(folder, 2500)),
         ("start-up", lambda: reduction.start_up(500)),
         ("diagnose unknown", lambda: reduction.diagnose(folder, 30_000, air=False)),
+        ("diagnose moves", lambda: reduction.diagnose(folder, 30_000, air=False, moves=True)),
         ("diagnose air", lambda: reduction.diagnose(folder, 30_000, air=True)),
     ]
 

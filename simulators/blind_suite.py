@@ -46,13 +46,17 @@ class Case:
     detectable: tuple[float, ...]
 
 
-def make(folder: Path, count: int, seed: int, configs: Path, only: str | None = None) -> list[Case]:
+def make(
+    folder: Path, count: int, seed: int, configs: Path, only: str | None = None, beside: str | None = None
+) -> list[Case]:
     """Write `count` captures and truth.json; the same seed gives the same files.
 
     Parameters
     ----------
     only : one of `SHARES`, to draw that kind of case alone.
+    beside : one of `LISTED`, to draw that fault and another one in every case.
     """
+    only = "two" if beside else only
     folder.mkdir(parents=True, exist_ok=True)
     shares = SHARES if only is None else {only: 1.0}
     groups = [g for g, share in shares.items() for _ in range(round(share * count))][:count]
@@ -62,6 +66,8 @@ def make(folder: Path, count: int, seed: int, configs: Path, only: str | None = 
     for k, group in enumerate(groups):
         random = np.random.default_rng([seed, k])
         chosen = _chosen(group, used[group], random)
+        if beside:
+            chosen = [beside, str(random.choice([n for n in LISTED if n != beside]))]
         used[group] += 1
         cases.append(_case(folder, f"case_{k:03d}", group, chosen, random, configs))
     (folder / "truth.json").write_text(json.dumps([asdict(c) for c in cases], indent=1), encoding="utf-8")

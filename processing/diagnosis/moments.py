@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.blas import dsyrk
 
 from processing.diagnosis.capture_data import CaptureData
 from processing.shifted import taps
+from processing.threads import for_ranges
 
 Array = NDArray[np.float64]
 
@@ -40,6 +40,8 @@ PATTERNS = ((POINT, POINT), (VALUE, FIRST), (FIRST, VALUE), (VALUE, SECOND), (FI
 #: Parts that are held out in turn: of the image, or of the states (of which there are few, so each part is smaller).
 FOLDS_OF_TILES = 2
 FOLDS_OF_STATES = 5
+#: Pixels that are taken together.
+CHUNK = 8192
 #: Tiles along each side of the image, for effects and structure that vary over it.
 TILES = 16
 #: Captures with more rows, or fewer pixels, than these hold out states, others hold out tiles of the image.
@@ -275,21 +277,27 @@ def _blocks(
 ) -> list[Block]:
     rows = data.values_per_pixel
     size = len(FEATURES) * rows
-    pixels = int(pick.sum())
-    noise = np.zeros((rows, len(FEATURES), len(FEATURES)))
-    total = np.zeros((size, size)) if pixels > size else None
-    chunks = []
     flat = np.flatnonzero(pick.reshape(-1))
-    for start in range(0, flat.size, 8192):
-        z, of_pixels = _weighted(data, around, variance, shared, scale, flat[start : start + 8192])
-        noise += of_pixels
-        flat_z = z.reshape(size, -1)
-        if total is None:
-            chunks.append(flat_z)
-        else:
-            total += dsyrk(1.0, flat_z.T, trans=1)
-    # Only the upper triangle was summed.
-    root = np.concatenate(chunks, axis=1) if total is None else _square_root(np.triu(total) + np.triu(total, 1).T)
+    pixels = flat.size
+    # By the first pixel, so that the sums do not depend on which thread was first.
+    parts: dict[int, tuple[Array, Array]] = {}
+
+    def add(start: int, stop: int) -> None:
+        noise = np.zeros((rows, len(FEATURES), len(FEATURES)))
+        products = np.zeros((size, size))
+        for first in range(start, stop, CHUNK):
+            z, of_pixels = _weighted(data, around, variance, shared, scale, flat[first : min(first + CHUNK, stop)])
+            z = z.reshape(size, -1)
+            products += z @ z.T
+            noise += of_pixels
+        parts[start] = products, noise
+
+    if pixels > size:
+        for_ranges(pixels, add, align=CHUNK, smallest=2 * CHUNK)
+        total, noise = (sum(each[1:], each[0]) for each in zip(*(parts[k] for k in sorted(parts)), strict=True))
+        root = _square_root(total)
+    else:
+        root, noise = _weighted(data, around, variance, shared, scale, flat)
     z = root.reshape(len(FEATURES), rows, -1)
     counts = _square_root(z[0] @ z[0].T)
     use = data.row_counts
@@ -298,10 +306,10 @@ def _blocks(
         return [Block(fold, z, counts, noise, np.flatnonzero(use), clipped, pixels, np.flatnonzero(free))]
     states, channels = data.signal.shape[:2]
     halves = np.random.default_rng(0).permutation(states) % parts_of_states
-    parts = [use & np.repeat(halves == f, channels) for f in range(parts_of_states)]
+    rows_of = [use & np.repeat(halves == f, channels) for f in range(parts_of_states)]
     return [
         Block(f, z, counts, noise, np.flatnonzero(p), clipped, pixels, np.flatnonzero(p & free))
-        for f, p in enumerate(parts)
+        for f, p in enumerate(rows_of)
     ]
 
 

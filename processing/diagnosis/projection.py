@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.diagnosis.moments import DERIVATIVES, FEATURES, Block, Moments, features, image_derivatives
+from processing.diagnosis.moments import DERIVATIVES, Block, Moments, features, image_derivatives
 from processing.diagnosis.space import Sums
 
 Array = NDArray[np.float64]
@@ -17,14 +17,16 @@ def add_response(counts: Array, coefficients: Array, a: Array) -> Array:
     """Corrected counts (L, rows, columns) from the coefficients of the features (F, L); a (L, K) in units of noise."""
     if not np.any(coefficients[1:]):
         return counts
-    z = np.zeros((len(FEATURES), *counts.shape))
-    z[:-DERIVATIVES], _ = features(counts)
+    out = coefficients[0][:, None, None] * counts
+    if np.any(coefficients[1:-DERIVATIVES]):
+        z, _ = features(counts)
+        out += np.einsum("fl,flhw->lhw", coefficients[1:-DERIVATIVES], z[1:])
     if np.any(coefficients[-DERIVATIVES:]):
         u, size, _ = np.linalg.svd(a, full_matrices=False)
         q = u[:, size > RANK * size[0]]
         fitted = (q @ (q.T @ counts.reshape(counts.shape[0], -1))).reshape(counts.shape)
-        z[-DERIVATIVES:] = image_derivatives(fitted)
-    return np.asarray(np.einsum("fl,flhw->lhw", coefficients, z))
+        out += np.einsum("fl,flhw->lhw", coefficients[-DERIVATIVES:], image_derivatives(fitted))
+    return np.asarray(out)
 
 
 def add_block(block: Block, a: Array, c: Array, da: Array, dc: Array | None, moments: Moments, out: Sums) -> None:
