@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ruamel.yaml import YAML
 
-from simulators.served_rig import serve
+from simulators.rig.served_rig import serve
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -37,7 +37,9 @@ def main() -> None:
                 )
                 options = ["--plan", folder / "plan.yaml", "--rig", folder / "rig.yaml", "--out", folder]
                 run = subprocess.Popen(
-                    [sys.executable, "-m", "acquisition.cli", *map(str, options)], stdout=subprocess.PIPE, text=True
+                    [sys.executable, "-m", "acquisition.commands.application", *map(str, options)],
+                    stdout=subprocess.PIPE,
+                    text=True,
                 )
                 peak = 0
                 while run.poll() is None:

@@ -21,16 +21,16 @@ from typing import Any
 
 import numpy as np
 
-from processing.diagnosis.fit import held_out, minimize
-from processing.diagnosis.space import Space
-from processing.diagnosis.surface_judge import DEGENERACY, SurfaceDiagnosis
-from processing.diagnosis.surface_problem import SurfaceProblem
-from processing.diagnosis.surface_run import diagnose_object
-from processing.instrument import InstrumentModel
-from simulators.blind_judge import named_sets, right_names
-from simulators.detectable import DETECTABLE
-from simulators.scene import Scene
-from simulators.sphere_suite import LISTED, UNLISTED, SphereFault, drawn, take
+from processing.diagnosis.search.fit import held_out, minimize
+from processing.diagnosis.search.space import Space
+from processing.diagnosis.surface.judge import DEGENERACY, SurfaceDiagnosis
+from processing.diagnosis.surface.problem import SurfaceProblem
+from processing.diagnosis.surface.run import diagnose_object
+from processing.instrument.model import InstrumentModel
+from simulators.bench.scene import Scene
+from simulators.blind.detectable import DETECTABLE
+from simulators.blind.judge import named_sets, right_names
+from simulators.blind.sphere_suite import LISTED, UNLISTED, SphereFault, drawn, take
 
 ROOT = Path(__file__).resolve().parents[1]
 #: One round of cases.

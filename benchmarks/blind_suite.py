@@ -23,9 +23,9 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def one(capture: str) -> tuple[str, dict]:
     """Diagnose one capture with the instrument model that it declares."""
-    from processing.capture import Capture
-    from processing.diagnosis.run import diagnose_captures
-    from processing.instrument import InstrumentModel
+    from processing.diagnosis.instrument.run import diagnose_captures
+    from processing.instrument.model import InstrumentModel
+    from processing.storage.capture import Capture
     from processing.yaml_file import parse_yaml
 
     path = Path(capture)
@@ -46,9 +46,9 @@ def one(capture: str) -> tuple[str, dict]:
 
 
 def main() -> None:
-    from simulators.blind_judge import judge, table
-    from simulators.blind_suite import SHARES, make
-    from simulators.faults_undeclared import LISTED
+    from simulators.blind.judge import judge, table
+    from simulators.blind.suite import SHARES, make
+    from simulators.blind.undeclared_faults import LISTED
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("count", nargs="?", type=int, default=300)

@@ -17,19 +17,19 @@ from typing import Any
 
 import numpy as np
 
-from processing import mueller
-from processing.capture import Capture
-from processing.diagnosis.capture_data import read_capture
-from processing.diagnosis.fit import held_out, minimize
-from processing.diagnosis.instrument_problem import InstrumentProblem
-from processing.diagnosis.judge import Judged, closure
+from processing.diagnosis.instrument.capture_data import read_capture
+from processing.diagnosis.instrument.judge import Judged, closure
+from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.run import diagnose_captures
+from processing.diagnosis.instrument.write import extended
 from processing.diagnosis.reflectance_problem import FOLDS, ReflectanceProblem
-from processing.diagnosis.run import diagnose_captures
-from processing.diagnosis.space import Space
-from processing.diagnosis.write import extended
+from processing.diagnosis.search.fit import held_out, minimize
+from processing.diagnosis.search.space import Space
 from processing.geometry.frames import ScatteringGeometry, change_frames
-from processing.importing import ImportRequest, import_capture, read_sample
-from processing.instrument import InstrumentModel
+from processing.instrument.model import InstrumentModel
+from processing.polarization import mueller
+from processing.storage.capture import Capture
+from processing.storage.importing import ImportRequest, import_capture, read_sample
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared/data"

@@ -16,17 +16,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.capture import Capture
-from processing.deviation import linear_diattenuation, magnitude, orientation_difference, rmsd
-from processing.diagnosis.surface_run import diagnose_object
-from processing.diagnosis.surface_write import corrected_material
-from processing.images import StokesImage
-from processing.instrument import InstrumentModel
-from processing.product import Step
-from processing.reduce_stokes import reduce_stokes
-from processing.xi0_image import estimate_from_stokes
-from simulators.scene import Scene
-from simulators.sphere_suite import SphereFault, first_surface_of, take
+from processing.diagnosis.surface.run import diagnose_object
+from processing.diagnosis.surface.write import corrected_material
+from processing.instrument.model import InstrumentModel
+from processing.maps.xi0 import estimate_from_stokes
+from processing.polarization.image_difference import linear_diattenuation, magnitude, orientation_difference, rmsd
+from processing.reduction.stokes import reduce_stokes
+from processing.storage.capture import Capture
+from processing.storage.images import StokesImage
+from processing.storage.product import Step
+from simulators.bench.scene import Scene
+from simulators.blind.sphere_suite import SphereFault, first_surface_of, take
 
 ROOT = Path(__file__).resolve().parents[1]
 NM, OMEGA_DEG, BORDER = 662.0, 35.0, 4

@@ -9,14 +9,14 @@ import numpy as np
 from measuring import Task, seconds
 from peer_process import PeerProcess
 
-from processing import mueller
-from processing.cloude import coherency_eigenvalues, xi0_and_dominant
-from processing.decompositions.lu_chipman import lu_chipman
-from processing.instrument import InstrumentModel
-from processing.inversion import Inversion, mueller_planes
-from processing.mosaic.fused import LinearStokes, bilinear_stokes
-from processing.mosaic.layout import MosaicLayout
-from processing.states import rotating_retarders
+from processing.instrument.model import InstrumentModel
+from processing.instrument.states import rotating_retarders
+from processing.polarization import mueller
+from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
+from processing.polarization.decompositions.lu_chipman import lu_chipman
+from processing.reduction.mosaic.fused import LinearStokes, bilinear_stokes
+from processing.reduction.mosaic.layout import MosaicLayout
+from processing.reduction.solvers.inversion import Inversion, mueller_planes
 
 HERE = Path(__file__).resolve().parent
 

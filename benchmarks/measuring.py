@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from rich.console import Console
 
-from processing.threads import thread_count
+from processing.computing.threads import thread_count
 
 SMALL, LARGE = (600, 600), (2048, 2448)
 #: Rounds of peers that take seconds.

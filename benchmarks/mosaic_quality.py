@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.mosaic.layout import MosaicLayout
-from processing.mosaic.methods import METHODS, demosaic
+from processing.reduction.mosaic.layout import MosaicLayout
+from processing.reduction.mosaic.methods import METHODS, demosaic
 
 LAYOUT = MosaicLayout.of((("90", "45"), ("135", "0")), ("0", "45", "90", "135"))
 ANGLES = np.deg2rad([0.0, 45.0, 90.0, 135.0])

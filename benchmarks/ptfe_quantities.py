@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from processing import mueller, quantities, triply_degenerate
-from processing.cloude import coherency_eigenvalues, xi0_and_dominant
+from processing.polarization import mueller, quantities, triply_degenerate
+from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
 
 Array = NDArray[np.float64]
 WAVELENGTHS_UM = (0.351, 0.532, 0.633, 1.064)

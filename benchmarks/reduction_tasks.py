@@ -10,24 +10,24 @@ from pathlib import Path
 import numpy as np
 from measuring import LARGE, SMALL, Program, Spent, Task, seconds
 
-from acquisition.capture_writer import CaptureWriter, StateRecord
+from acquisition.capture.writer import CaptureWriter, StateRecord
 from drivers.motion import Position
-from processing.applied_effects import capture_changes
-from processing.capture import Capture
-from processing.capture_schema import CaptureHeader, Detector, Sample
-from processing.correction import BlockReader, Correction
-from processing.diagnosis.run import diagnose_captures
-from processing.field_solver import FieldSolver
-from processing.instrument import AppliedEffect, EffectParameter, InstrumentModel
-from processing.inversion import Inversion
-from processing.mueller_solver import MuellerSolver
-from processing.noise import NoiseModel
-from processing.reduce import BLOCK_PIXELS, field_of, measurement_matrix, sample_states
-from processing.states import rotating_retarders
-from processing.threads import for_ranges
-from processing.weighted import WeightedSolver
-from simulators.blind_suite import state_angles
-from simulators.undeclared import Bench, Scene, digitize, expose, write_capture
+from processing.computing.threads import for_ranges
+from processing.diagnosis.instrument.run import diagnose_captures
+from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
+from processing.instrument.noise import NoiseModel
+from processing.instrument.states import rotating_retarders
+from processing.reduction.counts_to_signal import BlockReader, Correction
+from processing.reduction.effects_of_capture import capture_changes
+from processing.reduction.mueller import BLOCK_PIXELS, field_of, measurement_matrix, sample_states
+from processing.reduction.solvers.field import FieldSolver
+from processing.reduction.solvers.inversion import Inversion
+from processing.reduction.solvers.plain import MuellerSolver
+from processing.reduction.solvers.weighted import WeightedSolver
+from processing.storage.capture import Capture
+from processing.storage.capture_schema import CaptureHeader, Detector, Sample
+from simulators.blind.suite import state_angles
+from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
 
 ROOT = Path(__file__).resolve().parents[1]
 INSTRUMENT = ROOT / "configs/instruments/rgb950.yaml"
@@ -160,7 +160,7 @@ def reduce_file(folder: Path, target_ms: float) -> Task:
     """`process reduce` as a whole program, file to file, without a figure."""
     path = folder / "large.h5"
     write_frames(path, LARGE)
-    argv = [sys.executable, "-m", "processing.cli", "reduce", path, "--out", folder / "large.m.h5"]
+    argv = [sys.executable, "-m", "processing.commands.application", "reduce", path, "--out", folder / "large.m.h5"]
     program = Program([*argv, "--no-figure", "--overwrite"])
     task = Task("process reduce, 40 x 2048 x 2448, file to file", target_ms, program, rounds=5)
     task.also = lambda: [("peak memory", program.peak_mib, 1024, "MiB")]

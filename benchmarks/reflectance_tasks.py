@@ -11,10 +11,10 @@ from measuring import LARGE, Task, seconds
 from processing.geometry.mesh import Mesh
 from processing.geometry.pinhole import PinholeCamera
 from processing.geometry.rusinkiewicz import Angles
-from processing.table_axes import SHAPE
-from processing.tables import ScatteringTable
-from processing.xi0 import xi0_and_m00
-from simulators.scene import Scene
+from processing.polarization.xi0 import xi0_and_m00
+from processing.reflectance.table_axes import SHAPE
+from processing.reflectance.tables import ScatteringTable
+from simulators.bench.scene import Scene
 
 ROOT = Path(__file__).resolve().parents[1]
 ROWS, COLUMNS = LARGE

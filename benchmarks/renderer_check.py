@@ -18,13 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from processing import mueller, pbsdf
 from processing.geometry.frames import ScatteringGeometry, cross, dot, transverse_axes
 from processing.geometry.rusinkiewicz import Angles, directions
+from processing.polarization import mueller
+from processing.reflectance import pbsdf
 from processing.reflectance.base import load_reflectance, normalized_mueller
 from processing.reflectance.fresnel import jones
-from processing.table_axes import SHAPE, TableAxes
-from processing.tables import ScatteringTable
+from processing.reflectance.table_axes import SHAPE, TableAxes
+from processing.reflectance.tables import ScatteringTable
 
 HERE = Path(__file__).parent
 NORMAL = np.array([0.0, 0.0, 1.0])

@@ -26,7 +26,7 @@ from measuring import LARGE, SMALL, Task, measure
 from peer_process import PeerProcess, peer_python
 from rich.console import Console
 
-from processing.threads import thread_count
+from processing.computing.threads import thread_count
 
 
 def tasks(peers: PeerProcess | None, folder: Path) -> list[tuple[str, Callable[[], Task]]]:

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from ruamel.yaml import YAML
 
-from processing.capture import Capture
+from processing.storage.capture import Capture
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -52,7 +52,7 @@ def main() -> None:
         for run in range(given.runs):
             out = Path(name) / str(run)
             arguments = ["--rig", rig, "--omega", "35", "--exposure", str(given.exposure), "--out", out]
-            program = [sys.executable, "-c", "from acquisition.cli import main; main()"]
+            program = [sys.executable, "-c", "from acquisition.commands.application import main; main()"]
             subprocess.run([*program, *map(str, arguments)], check=True, capture_output=True)
             with Capture(next(out.glob("*.h5"))) as capture:
                 ledger = capture.closing["ledger"]

@@ -19,15 +19,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from processing.campaign import PAPER, CampaignResult, run_campaign
+from processing.campaign.executors import executor
+from processing.campaign.run import PAPER, CampaignResult, run_campaign
 from processing.commands.campaign import write_csv
-from processing.executors import executor
 from processing.geometry.sphere import Sphere
-from processing.instrument import InstrumentModel
-from processing.reflectance_figures import campaign_figure
-from simulators.bench import DETECTOR, SimulatedBench
-from simulators.scene import Scene
-from simulators.virtual_capture import write_virtual_capture
+from processing.instrument.model import InstrumentModel
+from processing.reports.reflectance_figures import campaign_figure
+from simulators.bench.bench import DETECTOR, SimulatedBench
+from simulators.bench.scene import Scene
+from simulators.bench.virtual_capture import write_virtual_capture
 
 ROOT = Path(__file__).resolve().parents[1]
 OMEGA_DEG = tuple(float(v) for v in range(20, 91, 5))

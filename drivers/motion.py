@@ -9,7 +9,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 
-from drivers.agreeing import AgreeingReadings
+from drivers.agreed_reading import AgreeingReadings
 from drivers.axis_types import AxisConfig, AxisIdentity, Limits, Position
 from drivers.errors import (
     CommandRejected,

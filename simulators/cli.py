@@ -41,9 +41,9 @@ def serve(
 ) -> None:
     """Serve an emulated controller until SIGTERM; the first line of output is the path of its port."""
     from simulators.clock import Clock
-    from simulators.faults import FaultSchedule, parse_fault
-    from simulators.pty_port import PtyPort
-    from simulators.serve import ServeOptions, served_kinds
+    from simulators.serial.pty_port import PtyPort
+    from simulators.serial.reply_faults import FaultSchedule, parse_fault
+    from simulators.serial.serve import ServeOptions, served_kinds
 
     kinds = served_kinds()
     if kind not in kinds:
@@ -85,7 +85,7 @@ def rig(
     """Serve a whole simulated rig until SIGTERM; any program can open its ports with the rig file written."""
     from drivers.errors import DeviceError
     from processing.errors import ProcessError
-    from simulators import served_rig
+    from simulators.rig import served_rig
 
     try:
         with _signalled() as ended, served_rig.serve(rig_file, out, sample, mode, wavelength, omega):

@@ -82,7 +82,7 @@ def small_rig(configs: Path, tmp_path: Path) -> Callable[..., Path]:
 @pytest.fixture
 def acquire(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., tuple[int, str, str]]:
     """Runs `acquire` in this process; returns exit code, standard output and standard error."""
-    from acquisition.cli import main
+    from acquisition.commands.application import main
 
     def run(*arguments: object) -> tuple[int, str, str]:
         capfd.readouterr()
@@ -116,7 +116,7 @@ class SyntheticCapture:
         """Write frames (states, channels, rows, columns) and angles; `header` are fields of CaptureHeader."""
         import h5py
 
-        from processing.capture_schema import CaptureHeader, create_layout, write_closing
+        from processing.storage.capture_schema import CaptureHeader, create_layout, write_closing
 
         defaults = {"title": "synthetic", "simulated": True, "mode": "test", "wavelength_nm": 662.0}
         path = self.folder / name

@@ -24,7 +24,7 @@ def from_axostep_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
 ) -> None:
     """Make a Mueller product out of a calibrated AxoStep image. It has no standard errors: the file holds none."""
-    from processing.axostep_product import product_of_axostep
+    from processing.storage.axostep_product import product_of_axostep
 
     target = out or source.with_suffix(".mueller.h5")
     told = product_of_axostep(source, target, wavelength_nm, omega_deg, overwrite)
@@ -39,7 +39,7 @@ def to_axostep_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file of that name.")] = False,
 ) -> None:
     """Write a Mueller product in AxoStep's format, for the lab's own tools."""
-    from processing.axostep_product import axostep_of_product
+    from processing.storage.axostep_product import axostep_of_product
 
     target = out or source.with_suffix("").with_suffix(".bmmi")
     axostep_of_product(source, target, overwrite)

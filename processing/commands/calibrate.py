@@ -24,9 +24,9 @@ def calibrate_command(
     write: Annotated[Path | None, typer.Option(help="New instrument file with the fitted values.")] = None,
 ) -> None:
     """Fit element parameters (azimuth_deg, retardance_deg, ...) to region means; the throughput is eliminated."""
-    from processing.calibrate import POOR_FIT, calibrate, write_fitted
-    from processing.capture import Capture
-    from processing.instrument import InstrumentModel
+    from processing.calibration.train import POOR_FIT, calibrate, write_fitted
+    from processing.instrument.model import InstrumentModel
+    from processing.storage.capture import Capture
 
     with Capture(capture) as source:
         wavelength = source.header.wavelength_nm
@@ -56,11 +56,11 @@ def calibrate_mosaic_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
 ) -> None:
     """Fit the analysis vector of every pixel of a polarization sensor (Powell and Gruev)."""
-    from processing.capture import Capture
+    from processing.calibration.mosaic import fit_response
     from processing.commands.reduce import summary
-    from processing.mosaic.calibration import fit_response
-    from processing.product import Step, file_identity
-    from processing.reduce import choose_model
+    from processing.reduction.mueller import choose_model
+    from processing.storage.capture import Capture
+    from processing.storage.product import Step, file_identity
 
     product = out or capture.with_suffix(".analyzers.h5")
     with Capture(capture) as source:
@@ -70,7 +70,7 @@ def calibrate_mosaic_command(
 
 
 def _region(text: str | None, shape: tuple[int, int]) -> tuple[slice, slice]:
-    from processing.calibrate import CalibrationError
+    from processing.calibration.train import CalibrationError
 
     height, width = shape
     if text is None:

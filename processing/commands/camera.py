@@ -23,9 +23,9 @@ def camera_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
 ) -> None:
     """Photon transfer: gain and read noise from states that repeat each other, bad pixels from dark states."""
-    from processing.camera_noise import write_camera
+    from processing.calibration.photon_transfer import write_camera
     from processing.commands.reduce import summary
-    from processing.product import Step, file_identity
+    from processing.storage.product import Step, file_identity
 
     product = out or captures[0].with_suffix(".camera.h5")
     identities = tuple(file_identity(p) for p in captures if p.exists())

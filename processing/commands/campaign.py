@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from processing.campaign import CampaignResult
+    from processing.campaign.run import CampaignResult
 
 
 def register(app: typer.Typer) -> None:
@@ -29,11 +29,11 @@ def campaign_command(
     scheduler: Annotated[str | None, typer.Option(help="Address of a dask.distributed scheduler.")] = None,
 ) -> None:
     """Reduce everything, compare DRR, Stokes and model: RMSD of psi, |D| and xi0 against Omega."""
-    from processing.campaign import run_campaign
-    from processing.console import progress_bar
+    from processing.campaign.executors import executor
+    from processing.campaign.run import run_campaign
+    from processing.commands.progress_bar import progress_bar
     from processing.errors import ProcessError
-    from processing.executors import executor
-    from processing.reflectance_figures import campaign_figure
+    from processing.reports.reflectance_figures import campaign_figure
 
     if not folder.is_dir():
         raise ProcessError(f"{folder}: no such folder. Give the folder that holds the captures.")
@@ -77,7 +77,7 @@ COLUMNS = (
 
 def lines(result: CampaignResult) -> list[str]:
     """The table for people: a block a wavelength, its averages, and the paper's."""
-    from processing.campaign import PAPER
+    from processing.campaign.run import PAPER
 
     def row(head: str, values: Sequence[float | None]) -> str:
         cells = [f"{'' if v is None else '-' if v != v else f'{v:.3f}':>11}" for v in values]

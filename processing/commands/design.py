@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from processing.design import Noise, Score
-    from processing.instrument import InstrumentModel
-    from processing.states import StateTable
+    from processing.calibration.state_design import Noise, Score
+    from processing.instrument.model import InstrumentModel
+    from processing.instrument.states import StateTable
 
 
 def register(app: typer.Typer) -> None:
@@ -57,8 +57,8 @@ def design_command(
         return
     if instrument is None:
         raise ProcessError("give an instrument file, for instance configs/instruments/rgb950.yaml (or --stokes)")
-    from processing.design import Noise, score
-    from processing.instrument import InstrumentModel
+    from processing.calibration.state_design import Noise, score
+    from processing.instrument.model import InstrumentModel
 
     model = InstrumentModel.load(instrument)
     if wavelength is None and model.wavelengths_nm and len(model.wavelengths_nm) > 1:
@@ -93,8 +93,8 @@ def _counts(text: str) -> list[int]:
 def _given(
     model: InstrumentModel, counts: list[int], ratio: float, step: float | None, table: Path | None
 ) -> StateTable:
-    from processing.design import read_table, two_retarders
-    from processing.states import rotating_retarders
+    from processing.calibration.state_design import read_table, two_retarders
+    from processing.instrument.states import rotating_retarders
 
     if table is not None:
         return read_table(table, model.axes)
@@ -104,8 +104,8 @@ def _given(
 
 
 def _optimized(model: InstrumentModel, noise: Noise, counts: list[int], free: str, ratio: float) -> StateTable:
-    from processing.console import progress_bar
-    from processing.design import optimize, two_retarders
+    from processing.calibration.state_design import optimize, two_retarders
+    from processing.commands.progress_bar import progress_bar
     from processing.errors import ProcessError
 
     names = {name.strip() for name in free.split(",")}

@@ -17,7 +17,7 @@ def draw(product: Path, figure: Path | None, no_figure: bool) -> None:
     """Draw a product and say where; nothing with `no_figure`."""
     if no_figure:
         return
-    from processing.figures import draw_product
+    from processing.reports.figures import draw_product
 
     figure = figure or product.with_suffix(".png")
     draw_product(product, figure)

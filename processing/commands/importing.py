@@ -40,10 +40,10 @@ def import_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a capture of that name.")] = False,
 ) -> None:
     """Make a capture out of frames or fluxes measured elsewhere. One row of states.csv is one state."""
-    from processing.capture_schema import Detector
-    from processing.console import progress_bar
-    from processing.importing import ImportRequest, import_capture, read_sample
-    from processing.state_csv import ImportFailed
+    from processing.commands.progress_bar import progress_bar
+    from processing.storage.capture_schema import Detector
+    from processing.storage.importing import ImportRequest, import_capture, read_sample
+    from processing.storage.state_csv import ImportFailed
 
     if gain_e_per_count is not None and gain_e_per_count <= 0:
         raise ImportFailed(f"--gain-e-per-count {gain_e_per_count:g}: must be above 0")

@@ -11,7 +11,7 @@ import typer
 from processing.commands.drawing import FigureFile, NoFigure, draw
 
 if TYPE_CHECKING:
-    from processing.quantities import State
+    from processing.polarization.quantities import State
 
 
 def register(app: typer.Typer) -> None:
@@ -34,11 +34,11 @@ def quantities_command(
 ) -> None:
     """Eigenvalues, depolarization, diattenuation, polarizance, retardance and their standard errors."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from processing.commands.progress_bar import progress_bar
     from processing.commands.reduce import reduced, summary
-    from processing.console import progress_bar
-    from processing.product import Step, file_identity
-    from processing.quantities import PAPER_PAIRS
-    from processing.quantities_image import quantities_of_mueller
+    from processing.maps.quantities import quantities_of_mueller
+    from processing.polarization.quantities import PAPER_PAIRS
+    from processing.storage.product import Step, file_identity
 
     pairs = {**PAPER_PAIRS, **dict(_pair(text) for text in pair or ())}
     product = reduced(source, instrument)
@@ -46,7 +46,7 @@ def quantities_command(
     step = Step("quantities", {"source": product.name, "also": also, "pairs": pairs}, (file_identity(product),))
     with progress_bar("quantities", "rows") as tick:
         facts = quantities_of_mueller(product, target, step, also or (), pairs, overwrite, tick)
-    from processing.product import Product
+    from processing.storage.product import Product
 
     with Product(target) as opened:
         summary(target, facts, opened.simulated)
@@ -55,7 +55,7 @@ def quantities_command(
 
 def _pair(text: str) -> tuple[str, tuple[State, State]]:
     from processing.errors import ProcessError
-    from processing.quantities import STATES
+    from processing.polarization.quantities import STATES
 
     names = [part.strip() for part in text.split(",")]
     if len(names) != 2 or not set(names) <= set(STATES):

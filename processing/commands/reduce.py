@@ -77,13 +77,13 @@ def reduce_file(path: Path, out: Path | None, options: ReduceOptions, overwrite:
     """Reduce one capture with a progress bar: product file, its facts, and whether the data are simulated."""
     # Tiles are spread over our own threads; a second pool inside BLAS would only fight with them.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from processing.camera_noise import read_camera
-    from processing.capture import Capture
-    from processing.console import progress_bar
-    from processing.correction import Correction
+    from processing.calibration.photon_transfer import read_camera
+    from processing.commands.progress_bar import progress_bar
     from processing.errors import ProcessError
-    from processing.product import Step, file_identity
-    from processing.reduce import Choice, choose_model, reduce_mueller
+    from processing.reduction.counts_to_signal import Correction
+    from processing.reduction.mueller import Choice, choose_model, reduce_mueller
+    from processing.storage.capture import Capture
+    from processing.storage.product import Step, file_identity
 
     with ExitStack() as stack:
         capture = stack.enter_context(Capture(path))
@@ -113,8 +113,8 @@ def reduce_file(path: Path, out: Path | None, options: ReduceOptions, overwrite:
                     "--weighted, --covariance and --physical are for Mueller captures."
                 )
             # Imported here: OpenCV is not needed for a Mueller capture.
-            from processing.mosaic.calibration import read_response
-            from processing.reduce_stokes import DEFAULT_METHOD, reduce_stokes
+            from processing.calibration.mosaic import read_response
+            from processing.reduction.stokes import DEFAULT_METHOD, reduce_stokes
 
             method = options.demosaic or DEFAULT_METHOD
             response = read_response(options.analyzers, capture.frame_shape) if options.analyzers else None
@@ -125,7 +125,7 @@ def reduce_file(path: Path, out: Path | None, options: ReduceOptions, overwrite:
 def _flat_file(path: Path, capture: Any) -> Path:
     """The flat capture itself, or the one of a folder that belongs to the capture."""
     from processing.errors import ProcessError
-    from processing.flat import flat_captures, nearest_flat
+    from processing.reduction.flat import flat_captures, nearest_flat
 
     if not path.is_dir():
         return path
@@ -140,7 +140,7 @@ def _flat_file(path: Path, capture: Any) -> Path:
 
 def reduced(source: Path, instrument: Path | None) -> Path:
     """The product of a capture, made now unless it is there already and newer; a product is returned as it is."""
-    from processing.product import is_product
+    from processing.storage.product import is_product
 
     if is_product(source):
         return source

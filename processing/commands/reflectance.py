@@ -27,13 +27,13 @@ def design_command(
     albedo: Annotated[float, typer.Option(min=0, help="M00 at normal incidence that is assumed.")] = 0.5,
 ) -> None:
     """Recommend the illumination of a Stokes capture from the standard error of xi0 that it predicts."""
-    from processing.console import progress_bar
+    from processing.calibration.illumination_design import Assumptions, linear_states, predict
+    from processing.commands.progress_bar import progress_bar
     from processing.errors import ProcessError
     from processing.geometry.viewing import ViewingGeometry
-    from processing.instrument import InstrumentModel
+    from processing.instrument.model import InstrumentModel
     from processing.reflectance.base import load_reflectance
-    from processing.reflectance_figures import stokes_design_figure
-    from processing.stokes_design import Assumptions, linear_states, predict
+    from processing.reports.reflectance_figures import stokes_design_figure
 
     if not stokes:
         raise ProcessError("only --stokes is designed here; `acquire --dry-run` scores a table of Mueller states.")
@@ -62,8 +62,8 @@ def fit_material_command(
     name: Annotated[str, typer.Option(help="Name of the material.")] = "fitted material",
 ) -> None:
     """Fit n + i k, a and b to Mueller images, or to linear Stokes images by maximum linear correlation."""
-    from processing.material_fit import NAMES
-    from processing.material_fit_images import fit_products
+    from processing.maps.material_fit import fit_products
+    from processing.reflectance.material_fit import NAMES
     from processing.yaml_file import dump_yaml
 
     fit, nm, simulated = fit_products(sources, geometry)
@@ -94,8 +94,8 @@ def extrapolate_command(
 ) -> None:
     """A full Mueller image from a linear Stokes capture: TD model with the estimated xi0 and M00."""
     from processing.commands.reduce import reduced, summary
-    from processing.extrapolation import extrapolate_mueller
-    from processing.product import Product, Step, file_identity
+    from processing.maps.extrapolation import extrapolate_mueller
+    from processing.storage.product import Product, Step, file_identity
 
     product = reduced(source, None)
     target = out or product.with_name(product.name.removesuffix(".h5").rsplit(".", 1)[0] + ".extrapolated.h5")

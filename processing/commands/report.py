@@ -20,8 +20,8 @@ def report_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a report of that name.")] = False,
 ) -> None:
     """One HTML file with figures, numbers, provenance, time ledger and warnings; needs nothing else to be read."""
-    from processing.console import progress_bar
-    from processing.report import write_report
+    from processing.commands.progress_bar import progress_bar
+    from processing.reports.report import write_report
 
     with progress_bar("reporting", "files") as tick:
         written = write_report(sources, out, title, overwrite, tick)

@@ -24,10 +24,10 @@ def table_command(
     append: Annotated[bool, typer.Option("--append", help="Add to the table if it exists.")] = False,
 ) -> None:
     """Mean, variance and count over theta_h, theta_d, phi_d from any number of images."""
-    from processing.console import progress_bar
+    from processing.commands.progress_bar import progress_bar
     from processing.errors import ProcessError
-    from processing.table_images import tabulate
-    from processing.tables import ScatteringTable
+    from processing.maps.tables import tabulate
+    from processing.reflectance.tables import ScatteringTable
 
     if layout not in ("degree", "renderer"):
         raise ProcessError(f"--layout {layout!r}: there are degree and renderer")
@@ -51,11 +51,11 @@ def compare_command(
     figure: Annotated[Path, typer.Option(help="Figure of the first angle (PNG).")] = Path("compare_tables.png"),
 ) -> None:
     """Evaluate two tables of xi0 on a virtual object and compare them, as in the paper's Sec. V-B."""
-    from processing.campaign import compare_on_sphere
+    from processing.campaign.run import compare_on_sphere
     from processing.errors import ProcessError
     from processing.geometry.viewing import ViewingGeometry
-    from processing.reflectance_figures import tables_figure
-    from processing.tables import ScatteringTable
+    from processing.reflectance.tables import ScatteringTable
+    from processing.reports.reflectance_figures import tables_figure
 
     tables = [ScatteringTable.load(p) for p in (reference, other)]
     for path, table in zip((reference, other), tables, strict=True):
@@ -93,9 +93,9 @@ def export_command(
     keep_gaps: Annotated[bool, typer.Option("--keep-gaps", help="Leave empty bins black.")] = False,
 ) -> None:
     """Write tables as a Mitsuba .pbsdf."""
-    from processing.console import progress_bar
-    from processing.pbsdf import export
-    from processing.tables import ScatteringTable
+    from processing.commands.progress_bar import progress_bar
+    from processing.reflectance.pbsdf import export
+    from processing.reflectance.tables import ScatteringTable
 
     with progress_bar("writing", "wavelengths") as tick:
         gaps: Literal["nearest", "nan"] = "nan" if keep_gaps else "nearest"
@@ -112,7 +112,7 @@ def import_command(
 ) -> None:
     """Read one wavelength of a Mitsuba .pbsdf into a table."""
     from processing.errors import ProcessError
-    from processing.pbsdf import load
+    from processing.reflectance.pbsdf import load
 
     typer.echo(f"  reading three million bins of {source}", err=True)
     found = load(source, only_nm=wavelength_nm)

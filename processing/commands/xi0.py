@@ -32,11 +32,11 @@ def xi0_command(
 ) -> None:
     """xi0 from a Mueller capture (coherency eigenvalues) or a linear Stokes capture (two coefficients)."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from processing.commands.progress_bar import progress_bar
     from processing.commands.reduce import reduced, summary
-    from processing.console import progress_bar
     from processing.errors import ProcessError
-    from processing.product import Product, Step, file_identity
-    from processing.xi0_image import xi0_of_mueller, xi0_of_stokes
+    from processing.maps.xi0 import xi0_of_mueller, xi0_of_stokes
+    from processing.storage.product import Product, Step, file_identity
 
     product = reduced(source, instrument)
     target = out or product.with_name(product.name.removesuffix(".h5").rsplit(".", 1)[0] + ".xi0.h5")

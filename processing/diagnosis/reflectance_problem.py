@@ -9,15 +9,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from processing import mueller
-from processing.changes import Conditions
-from processing.diagnosis.candidate import Candidate
-from processing.diagnosis.space import Space, Sums
-from processing.effects._reflectance import ReflectanceEffect
-from processing.effects.base import all_effects
+from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.space import Space, Sums
 from processing.geometry.frames import ScatteringGeometry
-from processing.instrument import InstrumentModel, Polarizer
-from processing.reflectance_changes import ReflectanceChanges
+from processing.instrument.changes import Conditions
+from processing.instrument.model import InstrumentModel, Polarizer
+from processing.polarization import mueller
+from processing.reflectance.changes import ReflectanceChanges
+from processing.reflectance.effects.base import ReflectanceEffect, reflectance_effects
 
 Array = NDArray[np.float64]
 STEP = 1e-4
@@ -71,7 +70,7 @@ class ReflectanceProblem:
     def pool(self) -> tuple[Candidate, ...]:
         """All effects of the reflectance group."""
         found = []
-        for effect in all_effects().values():
+        for effect in reflectance_effects().values():
             if isinstance(effect, ReflectanceEffect):
                 parameters = effect.parameters(self._model, self._conditions, "")
                 # A diffuse weight of either sign is a separate valley.

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from processing import mueller
 from processing.geometry import rusinkiewicz
+from processing.polarization import mueller
 
 FloatArray = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from processing.computing.threads import for_ranges
 from processing.geometry.errors import GeometryError
-from processing.threads import for_ranges
 
 FloatArray = NDArray[np.float64]
 #: Rays that embree gets at a time.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from processing.compiling import njit
+from processing.computing.compiling import njit
 
 
 @njit(nogil=True, cache=True)

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from simulators.clock import Clock
-from simulators.emulator import Emulator
-from simulators.faults import FaultSchedule
-from simulators.serve import ServeOptions
+from simulators.serial.emulator import Emulator
+from simulators.serial.reply_faults import FaultSchedule
+from simulators.serial.serve import ServeOptions
 
 #: Half the width of the filter that stands on the bench for each wavelength.
 FILTER_NM = 15.0

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 from drivers.axes.elliptec import Config
 from simulators.clock import Clock
-from simulators.emulator import EmulatedAxis, Emulator
-from simulators.faults import FaultSchedule
-from simulators.serve import ServeOptions
+from simulators.serial.emulator import EmulatedAxis, Emulator
+from simulators.serial.reply_faults import FaultSchedule
+from simulators.serial.serve import ServeOptions
 
 PULSES_PER_TURN = 0x23000
 # A gap of this length inside a packet discards it.

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 from drivers.axes.esp301 import Config
 from simulators.clock import Clock
-from simulators.emulator import EmulatedAxis, Emulator
-from simulators.faults import FaultSchedule
-from simulators.serve import ServeOptions
+from simulators.serial.emulator import EmulatedAxis, Emulator
+from simulators.serial.reply_faults import FaultSchedule
+from simulators.serial.serve import ServeOptions
 
 ERROR_TEXTS = {
     0: "NO ERROR DETECTED",

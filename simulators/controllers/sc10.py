@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from simulators.clock import Clock
-from simulators.emulator import Emulator
-from simulators.faults import FaultSchedule
-from simulators.serve import ServeOptions
+from simulators.serial.emulator import Emulator
+from simulators.serial.reply_faults import FaultSchedule
+from simulators.serial.serve import ServeOptions
 
 PROMPT = b"> "
 

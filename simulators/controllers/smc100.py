@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 
 from drivers.axes.smc100 import Config
 from simulators.clock import Clock
-from simulators.emulator import EmulatedAxis, Emulator
-from simulators.faults import FaultSchedule
-from simulators.serve import ServeOptions
+from simulators.serial.emulator import EmulatedAxis, Emulator
+from simulators.serial.reply_faults import FaultSchedule
+from simulators.serial.serve import ServeOptions
 
 ERROR_TEXTS = {
     "@": "No error",

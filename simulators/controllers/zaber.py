@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 
 from drivers.axes.zaber import Config
 from simulators.clock import Clock
-from simulators.emulator import EmulatedAxis, Emulator
-from simulators.faults import FaultSchedule
-from simulators.serve import ServeOptions
+from simulators.serial.emulator import EmulatedAxis, Emulator
+from simulators.serial.reply_faults import FaultSchedule
+from simulators.serial.serve import ServeOptions
 
 # Velocity unit per microstep/s, and acceleration unit per microstep/s^2 (unverified).
 VELOCITY_UNIT = 1.6384

@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from drivers.agreeing import AgreeingReadings
+from drivers.agreed_reading import AgreeingReadings
 from drivers.errors import ReplyError
 
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from drivers.camera import CameraSettings
 from drivers.cameras import aravis
 from drivers.errors import CameraBusy, CameraError, CameraLost, FrameLost
-from simulators.gige_camera import ExposureInfo, GigeCamera
-from simulators.pixel_stamp import read_stamp, stamp
+from simulators.camera.gige_camera import ExposureInfo, GigeCamera
+from simulators.camera.pixel_stamp import read_stamp, stamp
 
 SIZE = (128, 64)
 

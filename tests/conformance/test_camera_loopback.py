@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from drivers.camera import CameraSettings
 from drivers.cameras import aravis
 from drivers.errors import CameraError, CameraNotFound, FrameLost, SettingRefused, UnknownPixelFormat
-from simulators import gige_features
-from simulators.gige_camera import ExposureInfo, GigeCamera
+from simulators.camera import gige_features
+from simulators.camera.gige_camera import ExposureInfo, GigeCamera
 
 Bench = Callable[..., tuple[GigeCamera, aravis.AravisCamera]]
 DARK = CameraSettings(exposure_s=1e-4)

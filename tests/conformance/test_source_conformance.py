@@ -19,9 +19,9 @@ from drivers.sources import dc4100, manual, sc10
 from simulators.clock import Clock
 from simulators.controllers.dc4100 import DC4100Emulator
 from simulators.controllers.sc10 import SC10Emulator
-from simulators.emulator import Emulator
-from simulators.faults import parse_fault
-from simulators.pty_port import PtyPort
+from simulators.serial.emulator import Emulator
+from simulators.serial.pty_port import PtyPort
+from simulators.serial.reply_faults import parse_fault
 
 
 @dataclass

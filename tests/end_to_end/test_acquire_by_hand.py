@@ -6,7 +6,7 @@ import cv2
 import pytest
 from ruamel.yaml import YAML
 
-from simulators.served_rig import serve
+from simulators.rig.served_rig import serve
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import threading
 import numpy as np
 import pytest
 
-from processing.capture import Capture
+from processing.storage.capture import Capture
 
 
 @pytest.fixture
@@ -71,7 +71,7 @@ def test_campaign_takes_everything_once(acquire, small_rig, campaign, tmp_path):
 
 
 def test_stopped_campaign_goes_on_with_the_state_it_stopped_at(acquire, small_rig, campaign, tmp_path, monkeypatch):
-    from acquisition.progress import ConsoleProgress
+    from acquisition.screen.progress import ConsoleProgress
     from acquisition.stop_request import StopRequest
 
     requests = []
@@ -104,7 +104,7 @@ def test_stopped_campaign_goes_on_with_the_state_it_stopped_at(acquire, small_ri
 
 def test_an_open_door_is_not_tried_again_unattended(acquire, small_rig, campaign, tmp_path, monkeypatch):
     """Retries are for devices: whether a run goes on by itself after an interlock is for the plan to say."""
-    from acquisition.interlocks import Interlocks
+    from acquisition.rig.interlocks import Interlocks
 
     looked = []
 
@@ -125,7 +125,7 @@ def test_an_open_door_is_not_tried_again_unattended(acquire, small_rig, campaign
 
 @pytest.mark.parametrize("goes_on", [False, True])
 def test_a_door_open_between_captures(acquire, small_rig, campaign, tmp_path, monkeypatch, goes_on):
-    from acquisition.campaign_run import CampaignRun
+    from acquisition.campaign.run import CampaignRun
 
     take, taken = CampaignRun._take, []
 

@@ -4,8 +4,8 @@ import h5py
 import numpy as np
 import pytest
 
-from processing.capture import Capture
-from simulators.pixel_stamp import read_stamp
+from processing.storage.capture import Capture
+from simulators.camera.pixel_stamp import read_stamp
 
 
 def _path(out: str):
@@ -157,7 +157,7 @@ def test_bracketed_capture_sees_dark_and_bright_pixels(acquire, small_rig, tmp_p
 
 
 def _m00(capture, *options):
-    from processing import cli
+    from processing.commands import application as cli
 
     with pytest.raises(SystemExit) as end:
         cli.main(["reduce", str(capture), *options])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from simulators.served_rig import serve
+from simulators.rig.served_rig import serve
 
 PORTS = {
     "rotators": {"kind": "zaber", "axes": 2, "homed": True},
@@ -79,7 +79,7 @@ def test_a_package_that_leaks_in_is_an_error(small_rig, tmp_path):
     (tmp_path / "leak").mkdir()
     (tmp_path / "leak" / "numpy").symlink_to(Path(np.__file__).parent)
     done = subprocess.run(
-        [sys.executable, "-m", "acquisition.cli", "doctor", "--frames", "1", "--rig", str(small_rig())],
+        [sys.executable, "-m", "acquisition.commands.application", "doctor", "--frames", "1", "--rig", small_rig()],
         env=os.environ | {"PYTHONPATH": str(tmp_path / "leak")}, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 1, done.stderr

@@ -4,9 +4,9 @@ import os
 
 import pytest
 
+from acquisition.capture.operator import Operator
+from acquisition.capture.plan import MeasurementPlan
 from acquisition.errors import AcquisitionError, Stopped
-from acquisition.operator import Operator
-from acquisition.plan import MeasurementPlan
 from acquisition.stop_request import StopRequest
 
 FIRST = MeasurementPlan()

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from processing.capture import Capture
-from simulators.pixel_stamp import read_stamp
-from simulators.serve import ServeOptions, axis_configs, served_kinds
+from processing.storage.capture import Capture
+from simulators.camera.pixel_stamp import read_stamp
+from simulators.serial.serve import ServeOptions, axis_configs, served_kinds
 
 #: Rotators turn freely, where the controller can be without limits; the second pair is for those that always have some.
 FREE = ((None, None), (-400.0, 2000.0))

@@ -10,10 +10,10 @@ import time
 import pytest
 from ruamel.yaml import YAML
 
-from acquisition.rig import Rig
-from acquisition.rig_config import load_rig
-from processing.capture import Capture
-from simulators.served_rig import serve
+from acquisition.rig.config import load_rig
+from acquisition.rig.rig import Rig
+from processing.storage.capture import Capture
+from simulators.rig.served_rig import serve
 
 #: Far enough that nothing arrives by itself while a test runs, at the emulators' speed.
 FAR_DEG = 30_000.0
@@ -51,7 +51,7 @@ def _moving(simulation):
 
 def test_a_running_capture_is_stopped_and_kept(acquire, served, tmp_path):
     simulation, rig = served
-    arguments = ("-m", "acquisition.cli", "--omega", 35, "--rig", rig, "--out", tmp_path / "captures")
+    arguments = ("-m", "acquisition.commands.application", "--omega", 35, "--rig", rig, "--out", tmp_path / "captures")
     with _program(*arguments) as running:
         # All axes are homed: the first approach or a state is under way.
         rotators = simulation.emulators["rotators"].axes
@@ -148,7 +148,7 @@ def test_homing_asks_first(acquire, served):
 
 def test_ctrl_c_stops_a_move(served):
     simulation, rig = served
-    with _program("-m", "acquisition.cli", "move", "psg", FAR_DEG, "--home", "--rig", rig) as running:
+    with _program("-m", "acquisition.commands.application", "move", "psg", FAR_DEG, "--home", "--rig", rig) as running:
         axis = simulation.emulators["rotators"].axes[0]
         _wait_until(lambda: axis.homed and axis.is_moving(), running)
         os.kill(running.pid, signal.SIGINT)

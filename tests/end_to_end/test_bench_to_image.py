@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processing.cli import main
-from processing.images import MuellerImage
-from processing.product import Product
-from simulators.scene import Scene
+from processing.commands.application import main
+from processing.storage.images import MuellerImage
+from processing.storage.product import Product
+from simulators.bench.scene import Scene
 
 
 def taken(out: str) -> Path:

@@ -7,12 +7,12 @@ from multiprocessing import get_context
 
 import pytest
 
-from processing.capture import Capture
-from processing.diagnosis.run import diagnose_captures
-from processing.instrument import InstrumentModel
+from processing.diagnosis.instrument.run import diagnose_captures
+from processing.instrument.model import InstrumentModel
+from processing.storage.capture import Capture
 from processing.yaml_file import parse_yaml
-from simulators.blind_judge import judge, table
-from simulators.blind_suite import make
+from simulators.blind.judge import judge, table
+from simulators.blind.suite import make
 
 COUNT, SEED = (30 if os.environ.get("CI") else 8), 1000
 

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
-from processing.campaign import BORDER_PX, PAPER, CampaignResult, find_captures, run_campaign
-from processing.campaign_tasks import CaptureTask, measure
+from processing.campaign.executors import executor
+from processing.campaign.run import BORDER_PX, PAPER, CampaignResult, find_captures, run_campaign
+from processing.campaign.tasks import CaptureTask, measure
 from processing.errors import ProcessError
-from processing.executors import executor
 from processing.geometry.viewing import ViewingGeometry
-from processing.instrument import InstrumentModel
-from processing.product import Product
+from processing.instrument.model import InstrumentModel
 from processing.reflectance.base import load_reflectance
-from processing.tables import ScatteringTable
-from simulators.bench import SimulatedBench
-from simulators.scene import Scene
-from simulators.virtual_capture import write_virtual_capture
+from processing.reflectance.tables import ScatteringTable
+from processing.storage.product import Product
+from simulators.bench.bench import SimulatedBench
+from simulators.bench.scene import Scene
+from simulators.bench.virtual_capture import write_virtual_capture
 
 ANGLES = (35.0, 60.0)
 
@@ -52,7 +52,7 @@ def here(folder: Path, configs: Path, tmp_path_factory: pytest.TempPathFactory) 
 @pytest.fixture
 def process(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
     """Runs `process` in this process; exit code, standard output, standard error."""
-    from processing.cli import main
+    from processing.commands.application import main
 
     def run(*arguments: object) -> tuple[int, str, str]:
         capsys.readouterr()

@@ -2,9 +2,9 @@
 
 import pytest
 
-from processing import compile_watch
-from processing.compiling import njit
-from processing.console import progress_bar
+from processing.commands.progress_bar import progress_bar
+from processing.computing import compile_watch
+from processing.computing.compiling import njit
 
 
 def test_a_compilation_is_told_once(capsys: pytest.CaptureFixture[str]) -> None:

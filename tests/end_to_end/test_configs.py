@@ -5,11 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from acquisition import campaign_run, schemas
-from acquisition.campaign import Campaign, captures
-from acquisition.job import prepare
-from acquisition.plan import MeasurementPlan
-from acquisition.rig_config import RigConfig, load_rig
+from acquisition.campaign import run as campaign_run
+from acquisition.campaign.plan import Campaign, captures
+from acquisition.capture.job import prepare
+from acquisition.capture.plan import MeasurementPlan
+from acquisition.commands import schemas
+from acquisition.rig.config import RigConfig, load_rig
 from processing.yaml_file import dump_yaml, parse_yaml
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -21,7 +22,7 @@ def _files(folder):
 
 @pytest.mark.parametrize("name", list(schemas.MODELS))
 def test_committed_schema_is_fresh(name):
-    assert schemas.path_of(name).read_text() == schemas.text_of(name), "run: python -m acquisition.schemas"
+    assert schemas.path_of(name).read_text() == schemas.text_of(name), "run: python -m acquisition.commands.schemas"
 
 
 @pytest.mark.parametrize("path", _files("rigs"), ids=lambda p: p.stem)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from processing.diagnosis import cli
+from processing.commands import diagnose as cli
 
 
 @pytest.fixture

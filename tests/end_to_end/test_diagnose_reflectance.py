@@ -6,19 +6,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processing.capture import Capture
-from processing.cli import main as process
-from processing.deviation import linear_diattenuation, magnitude, orientation_difference, rmsd
-from processing.diagnosis.cli import main as diagnose
-from processing.diagnosis.surface_judge import SurfaceDiagnosis
-from processing.diagnosis.surface_run import diagnose_object
+from processing.commands.application import main as process
+from processing.commands.diagnose import main as diagnose
+from processing.diagnosis.surface.judge import SurfaceDiagnosis
+from processing.diagnosis.surface.run import diagnose_object
 from processing.geometry.viewing import ViewingGeometry
-from processing.instrument import InstrumentModel
-from processing.product import Product
+from processing.instrument.model import InstrumentModel
+from processing.polarization.image_difference import linear_diattenuation, magnitude, orientation_difference, rmsd
 from processing.reflectance.base import load_reflectance
-from simulators import scene_faults
-from simulators.scene import Scene
-from simulators.sphere_suite import SphereFault, first_surface_of, take
+from processing.storage.capture import Capture
+from processing.storage.product import Product
+from simulators.bench.scene import Scene
+from simulators.blind import scene_faults
+from simulators.blind.sphere_suite import SphereFault, first_surface_of, take
 
 NM, OMEGA_DEG = 662.0, 35.0
 FIRST_SURFACE = "kind: first_surface\nname: red print, first surface alone\nconstants:\n  662: {n: 1.30, k: 0.08}\n"

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
-from processing.capture import Capture
-from processing.images import MuellerImage, StokesImage
-from processing.product import Product
-from simulators.scene import Scene
+from processing.storage.capture import Capture
+from processing.storage.images import MuellerImage, StokesImage
+from processing.storage.product import Product
+from simulators.bench.scene import Scene
 
 SHAPE = (96, 112)
 UNDECLARED = [
@@ -29,7 +29,7 @@ def campaign(tmp_path_factory, configs) -> Path:
     """Folder of a campaign taken by `acquire --campaign`: flats before the first and after the second capture."""
     from ruamel.yaml import YAML
 
-    from acquisition.cli import main
+    from acquisition.commands.application import main
 
     folder = tmp_path_factory.mktemp("flats")
     yaml, source = YAML(), configs / "rigs" / "simulated.yaml"
@@ -61,7 +61,7 @@ def campaign(tmp_path_factory, configs) -> Path:
 @pytest.fixture(scope="module")
 def products(campaign, configs) -> Path:
     """Folder of the products of `process campaign`."""
-    from processing.cli import main
+    from processing.commands.application import main
 
     files = [
         "--geometry",

@@ -4,7 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from simulators.served_rig import serve
+from simulators.rig.served_rig import serve
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from processing.capture import Capture
+from processing.storage.capture import Capture
 
 
 class Browser:
@@ -103,7 +103,18 @@ def running(small_rig, tmp_path):
     """A capture that takes a while, with its live page; yields process, address and folder."""
     rig = small_rig(clock_speed=1.5, rows=256, columns=320)
     child = subprocess.Popen(
-        [sys.executable, "-m", "acquisition.cli", "--omega", "35", "--rig", rig, "--out", tmp_path / "out", "--live"],
+        [
+            sys.executable,
+            "-m",
+            "acquisition.commands.application",
+            "--omega",
+            "35",
+            "--rig",
+            rig,
+            "--out",
+            tmp_path / "out",
+            "--live",
+        ],
         stderr=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -175,7 +186,7 @@ def test_actions_need_the_token_and_a_local_host(running):
 
 
 def test_a_browser_that_stops_reading_does_not_slow_the_capture(small_rig, acquire, tmp_path, monkeypatch):
-    from acquisition.live_view import LiveServer
+    from acquisition.screen.live_view import LiveServer
 
     stuck = []
     enter = LiveServer.__enter__

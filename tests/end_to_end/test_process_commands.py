@@ -9,10 +9,10 @@ import h5py
 import numpy as np
 import pytest
 
-from processing.cli import main
-from processing.images import MuellerImage
-from processing.instrument import InstrumentModel
-from processing.product import Product
+from processing.commands.application import main
+from processing.instrument.model import InstrumentModel
+from processing.storage.images import MuellerImage
+from processing.storage.product import Product
 
 Run = Callable[..., tuple[int, str, str]]
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processing.capture import Capture
-from processing.cli import main
-from processing.instrument import InstrumentModel
-from processing.product import Step
-from processing.reduce import reduce_mueller
+from processing.commands.application import main
+from processing.instrument.model import InstrumentModel
+from processing.reduction.mueller import reduce_mueller
+from processing.storage.capture import Capture
+from processing.storage.product import Step
 
 
 def run(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, str]:

@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processing import mueller, quantities
-from processing.axostep import RawFrames, read_mueller_file, write_rmmd
-from processing.cli import main
-from processing.cloude import coherency_eigenvalues
-from processing.decompositions.lu_chipman import lu_chipman
-from processing.instrument import InstrumentModel
-from processing.product import Product
-from processing.states import rotating_retarders
-from processing.triply_degenerate import mueller_matrix
+from processing.commands.application import main
+from processing.instrument.model import InstrumentModel
+from processing.instrument.states import rotating_retarders
+from processing.polarization import mueller, quantities
+from processing.polarization.cloude import coherency_eigenvalues
+from processing.polarization.decompositions.lu_chipman import lu_chipman
+from processing.polarization.triply_degenerate import mueller_matrix
+from processing.storage.axostep import RawFrames, read_mueller_file, write_rmmd
+from processing.storage.product import Product
 
 ROWS, COLUMNS = 40, 60
 Run = Callable[..., tuple[int, str, str]]
@@ -155,7 +155,7 @@ def test_raw_axostep_frames_are_imported_without_the_closing_repeat(
         *("--instrument", configs / "instruments/rgb950.yaml", "--out", tmp_path / "c.h5"),
     )
     assert code == 0, err
-    from processing.capture import Capture
+    from processing.storage.capture import Capture
 
     with Capture(tmp_path / "c.h5") as capture:
         for k in (0, 17, 39):

@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processing.capture import Capture
 from processing.errors import ProcessError
-from processing.images import MuellerImage
-from processing.instrument import InstrumentModel
-from processing.product import Product, Step
-from processing.reduce import reduce_mueller
-from processing.reduce_stokes import reduce_stokes
-from processing.xi0_image import xi0_of_mueller, xi0_of_stokes
-from simulators.scene import Scene
+from processing.instrument.model import InstrumentModel
+from processing.maps.xi0 import xi0_of_mueller, xi0_of_stokes
+from processing.reduction.mueller import reduce_mueller
+from processing.reduction.stokes import reduce_stokes
+from processing.storage.capture import Capture
+from processing.storage.images import MuellerImage
+from processing.storage.product import Product, Step
+from simulators.bench.scene import Scene
 
 GAIN, READ_NOISE, BLACK, SIZE = 2.6, 2.3, 64.0, 200
 OMEGA, WAVELENGTH = 35.0, 662.0

@@ -36,7 +36,7 @@ def spawn() -> Iterator[Callable[..., subprocess.Popen]]:
 
     def start(*arguments: object, **keywords: object) -> subprocess.Popen:
         child = subprocess.Popen(
-            [sys.executable, "-m", "acquisition.cli", *map(str, arguments)],
+            [sys.executable, "-m", "acquisition.commands.application", *map(str, arguments)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -112,8 +112,8 @@ def quick_rig(small_rig: Callable[..., Path]) -> Callable[..., Path]:
 @pytest.fixture
 def intact(configs: Path) -> Callable[[Path], int]:
     """Checks every state done of a capture: whole frame, true angles in its pixels; returns their number."""
-    from processing.capture import Capture
-    from simulators.pixel_stamp import read_stamp
+    from processing.storage.capture import Capture
+    from simulators.camera.pixel_stamp import read_stamp
 
     def check(path: Path) -> int:
         with Capture(path) as capture:
@@ -138,13 +138,13 @@ def run_with(quick_rig: Callable[..., Path], tmp_path: Path) -> Callable[..., tu
     `act(rig, state, retake)` is called before each exposure. Returns the error that ended the run, or None, and the
     file, partial or not.
     """
-    from acquisition import session
+    from acquisition.capture import session
+    from acquisition.capture.job import check_with_devices, prepare
+    from acquisition.capture.plan import MeasurementPlan
     from acquisition.errors import AcquisitionError
-    from acquisition.job import check_with_devices, prepare
-    from acquisition.observer import Observer
-    from acquisition.plan import MeasurementPlan
-    from acquisition.rig import Rig
-    from acquisition.rig_config import load_rig
+    from acquisition.rig.config import load_rig
+    from acquisition.rig.rig import Rig
+    from acquisition.screen.observer import Observer
     from acquisition.stop_request import StopRequest
     from drivers.errors import DeviceError
 

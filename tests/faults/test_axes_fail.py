@@ -5,7 +5,7 @@ import time
 import pytest
 
 from drivers.errors import DeviceError, MotionFailed
-from simulators.faults import Fault
+from simulators.serial.reply_faults import Fault
 
 
 def _at(state, *faults, port="rotators"):

@@ -9,15 +9,15 @@ import random
 import threading
 from collections import Counter
 
-from acquisition import campaign_run
-from acquisition.campaign import Campaign
-from acquisition.campaign_log import CampaignFolder
-from acquisition.campaign_run import CampaignRun
-from acquisition.observer import Observer
-from acquisition.operator import Operator
-from acquisition.rig_config import load_rig
+from acquisition.campaign import run as campaign_run
+from acquisition.campaign.log import CampaignFolder
+from acquisition.campaign.plan import Campaign
+from acquisition.campaign.run import CampaignRun
+from acquisition.capture.operator import Operator
+from acquisition.rig.config import load_rig
+from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
-from simulators.faults import Fault
+from simulators.serial.reply_faults import Fault
 
 FAULTS = int(os.environ.get("UMOV_FAULTS", "8"))
 FULL = FAULTS >= 100

@@ -3,8 +3,8 @@
 import threading
 import time
 
-from acquisition.observer import Observer
-from processing.capture import Capture
+from acquisition.screen.observer import Observer
+from processing.storage.capture import Capture
 
 
 def test_lost_frames_are_taken_again_and_logged(run_with, intact):

@@ -6,13 +6,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from acquisition.checks import check_devices
+from acquisition.capture.checks import check_devices
+from acquisition.capture.job import prepare
+from acquisition.capture.plan import MeasurementPlan
 from acquisition.errors import PlanRefused
-from acquisition.forbidden import find_forbidden
-from acquisition.job import prepare
-from acquisition.plan import MeasurementPlan
-from acquisition.rig import Rig
-from acquisition.rig_config import ForbiddenPose, load_rig
+from acquisition.rig.config import ForbiddenPose, load_rig
+from acquisition.rig.forbidden_poses import find_forbidden
+from acquisition.rig.rig import Rig
 from drivers.errors import LimitError
 
 LOW, HIGH = -90.0, 400.0

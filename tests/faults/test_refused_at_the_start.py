@@ -8,8 +8,8 @@ import sys
 import pytest
 
 from drivers.errors import DeviceError
-from processing.capture import Capture
-from simulators.served_rig import serve
+from processing.storage.capture import Capture
+from simulators.rig.served_rig import serve
 
 
 def test_disc_too_small_is_refused_before_any_motion(spawn, quick_rig, tmp_path):

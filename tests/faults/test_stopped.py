@@ -6,8 +6,8 @@ import time
 
 import pytest
 
-from processing.capture import Capture
-from simulators.served_rig import serve
+from processing.storage.capture import Capture
+from simulators.rig.served_rig import serve
 
 
 @pytest.fixture

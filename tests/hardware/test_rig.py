@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.rig import Rig
-from acquisition.rig_config import load_rig
+from acquisition.rig.config import load_rig
+from acquisition.rig.rig import Rig
 from drivers.camera import CameraSettings
 
 pytestmark = pytest.mark.hardware

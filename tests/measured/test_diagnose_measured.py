@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processing.capture import Capture
-from processing.diagnosis.capture_data import read_capture
-from processing.diagnosis.instrument_problem import InstrumentProblem
-from processing.diagnosis.judge import closure
-from processing.diagnosis.run import diagnose_captures
-from processing.diagnosis.space import Space
-from processing.diagnosis.write import extended
-from processing.importing import ImportRequest, import_capture, read_sample
-from processing.instrument import InstrumentModel
+from processing.diagnosis.instrument.capture_data import read_capture
+from processing.diagnosis.instrument.judge import closure
+from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.run import diagnose_captures
+from processing.diagnosis.instrument.write import extended
+from processing.diagnosis.search.space import Space
+from processing.instrument.model import InstrumentModel
+from processing.storage.capture import Capture
+from processing.storage.importing import ImportRequest, import_capture, read_sample
 
 pytestmark = pytest.mark.measured
 

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from processing import mueller
-from processing.diagnosis.fit import held_out, minimize
 from processing.diagnosis.reflectance_problem import FOLDS, ReflectanceProblem
-from processing.diagnosis.search import Search
-from processing.diagnosis.space import Space
+from processing.diagnosis.search.fit import held_out, minimize
+from processing.diagnosis.search.search import Search
+from processing.diagnosis.search.space import Space
 from processing.geometry.frames import ScatteringGeometry, change_frames
+from processing.polarization import mueller
 
 pytestmark = pytest.mark.measured
 

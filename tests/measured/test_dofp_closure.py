@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processing.capture import Capture
-from processing.images import StokesImage
-from processing.importing import ImportRequest, import_capture
-from processing.product import Product, Step
-from processing.reduce_stokes import reduce_stokes
+from processing.reduction.stokes import reduce_stokes
+from processing.storage.capture import Capture
+from processing.storage.images import StokesImage
+from processing.storage.importing import ImportRequest, import_capture
+from processing.storage.product import Product, Step
 
 pytestmark = pytest.mark.measured
 

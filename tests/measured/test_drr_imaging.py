@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import scipy.io
 
-from processing.calibrate import calibrate
-from processing.capture import Capture
-from processing.images import MuellerImage
-from processing.importing import ImportRequest, import_capture, read_sample
-from processing.instrument import InstrumentModel
-from processing.product import Step
-from processing.reduce import reduce_mueller
+from processing.calibration.train import calibrate
+from processing.instrument.model import InstrumentModel
+from processing.reduction.mueller import reduce_mueller
+from processing.storage.capture import Capture
+from processing.storage.images import MuellerImage
+from processing.storage.importing import ImportRequest, import_capture, read_sample
+from processing.storage.product import Step
 
 pytestmark = pytest.mark.measured
 

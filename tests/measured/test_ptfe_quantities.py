@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from processing import mueller, quantities
-from processing.cloude import coherency_eigenvalues
+from processing.polarization import mueller, quantities
+from processing.polarization.cloude import coherency_eigenvalues
 
 pytestmark = pytest.mark.measured
 

@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from processing import mueller
-from processing.cloude import xi0_and_dominant
 from processing.geometry.frames import ScatteringGeometry, change_frames
-from processing.material_fit import fit_intensities, fit_mueller
+from processing.polarization import mueller
+from processing.polarization.cloude import xi0_and_dominant
 from processing.reflectance import first_surface
+from processing.reflectance.material_fit import fit_intensities, fit_mueller
 
 pytestmark = pytest.mark.measured
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processing import gradients
-from processing.capture import Capture
-from processing.images import MuellerImage
-from processing.product import Step
-from processing.quantities import PAPER_PAIRS
-from processing.reduce import reduce_mueller
+from processing.polarization import gradients
+from processing.polarization.quantities import PAPER_PAIRS
+from processing.reduction.mueller import reduce_mueller
+from processing.storage.capture import Capture
+from processing.storage.images import MuellerImage
+from processing.storage.product import Step
 
 pytestmark = pytest.mark.measured
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from processing import mueller
-from processing.changes import Changes, Conditions
-from processing.effects.base import all_effects
-from processing.instrument import InstrumentModel
-from simulators.bench import FixedScene
-from simulators.bench import SimulatedBench as Bench
-from simulators.bench_faults import AnyBenchFault
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import all_effects
+from processing.instrument.model import InstrumentModel
+from processing.polarization import mueller
+from simulators.bench.bench import FixedScene
+from simulators.bench.bench import SimulatedBench as Bench
+from simulators.bench.faults import AnyBenchFault
 
 ANGLES = {"psg": np.linspace(0, 351, 24), "psa": 4.91 * np.linspace(0, 351, 24)}
 SIDE = 9

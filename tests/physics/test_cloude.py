@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from processing import mueller
-from processing.cloude import cloude, coherency_eigenvalues, xi0_and_dominant, xi0_of_dominant
-from processing.threads import for_ranges, thread_count
+from processing.computing.threads import for_ranges, thread_count
+from processing.polarization import mueller
+from processing.polarization.cloude import cloude, coherency_eigenvalues, xi0_and_dominant, xi0_of_dominant
 
 Array = NDArray[np.float64]
 

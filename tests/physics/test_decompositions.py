@@ -24,11 +24,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import expm, logm
 
-from processing import mueller, quantities
-from processing.cloude import coherency_eigenvalues
-from processing.decompositions.differential import differential
-from processing.decompositions.lu_chipman import depolarization_power, lu_chipman
-from processing.decompositions.symmetric import G, symmetric
+from processing.polarization import mueller, quantities
+from processing.polarization.cloude import coherency_eigenvalues
+from processing.polarization.decompositions.differential import differential
+from processing.polarization.decompositions.lu_chipman import depolarization_power, lu_chipman
+from processing.polarization.decompositions.symmetric import G, symmetric
 
 Array = NDArray[np.float64]
 

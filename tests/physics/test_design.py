@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from processing.cli import app
-from processing.design import (
+from processing.calibration.state_design import (
     Noise,
     equally_weighted_variance,
     optimize,
@@ -16,9 +15,10 @@ from processing.design import (
     score,
     two_retarders,
 )
+from processing.commands.application import app
 from processing.errors import ProcessError
-from processing.instrument import InstrumentModel
-from processing.states import rotating_retarders
+from processing.instrument.model import InstrumentModel
+from processing.instrument.states import rotating_retarders
 
 NOISE = Noise(electrons=20_000, read_noise_e=3)
 MODEL = InstrumentModel.load(Path(__file__).parents[2] / "configs/instruments/rgb950.yaml").at(662)

@@ -7,13 +7,13 @@ import h5py
 import numpy as np
 import pytest
 
-from processing.capture_schema import Sample
-from processing.diagnosis import cli
-from processing.diagnosis.result import Diagnosis
-from processing.diagnosis.run import diagnose_captures
-from processing.instrument import EffectParameter, InstrumentModel
-from simulators.blind_suite import declared_bench, state_angles
-from simulators.undeclared import Bench, Scene, digitize, expose, write_capture
+from processing.commands import diagnose as cli
+from processing.diagnosis.instrument.run import diagnose_captures
+from processing.diagnosis.search.result import Diagnosis
+from processing.instrument.model import EffectParameter, InstrumentModel
+from processing.storage.capture_schema import Sample
+from simulators.blind.suite import declared_bench, state_angles
+from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
 
 STATES = 40
 
@@ -242,11 +242,11 @@ def test_what_is_written_is_used_and_nothing_is_overwritten(configs, tmp_path, c
 
 
 def test_reduce_with_the_written_model_is_closer_to_the_truth(configs, tmp_path):
-    from processing.capture import Capture
-    from processing.diagnosis.write import write_instrument
-    from processing.images import MuellerImage
-    from processing.product import Step
-    from processing.reduce import reduce_mueller
+    from processing.diagnosis.instrument.write import write_instrument
+    from processing.reduction.mueller import reduce_mueller
+    from processing.storage.capture import Capture
+    from processing.storage.images import MuellerImage
+    from processing.storage.product import Step
 
     path = capture(tmp_path, configs, Bench(dg=np.deg2rad(129.0)), air=True)
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml")

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from processing.changes import Conditions
-from processing.diagnosis.capture_data import CaptureData
-from processing.diagnosis.moments import DERIVATIVES, FEATURES, moments_of
-from processing.diagnosis.projection import add_block, noise_information
-from processing.diagnosis.space import Sums
+from processing.diagnosis.instrument.capture_data import CaptureData
+from processing.diagnosis.instrument.moments import DERIVATIVES, FEATURES, moments_of
+from processing.diagnosis.instrument.projection import add_block, noise_information
+from processing.diagnosis.search.space import Sums
+from processing.instrument.changes import Conditions
 
 STATES, SIDE, SIGMA = 8, 240, 0.01
 

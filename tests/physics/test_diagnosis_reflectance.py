@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from processing.diagnosis.reflectance_problem import ReflectanceProblem
-from processing.diagnosis.search import Search
-from processing.diagnosis.space import Space
-from processing.instrument import InstrumentModel
-from processing.states import rotating_retarders
-from processing.xi0 import estimate
-from simulators.scene import Scene
+from processing.diagnosis.search.search import Search
+from processing.diagnosis.search.space import Space
+from processing.instrument.model import InstrumentModel
+from processing.instrument.states import rotating_retarders
+from processing.polarization.xi0 import estimate
+from simulators.bench.scene import Scene
 
 WAVELENGTH_NM, OMEGA_DEG = 662.0, 35.0
 

@@ -5,20 +5,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processing.capture import Capture
-from processing.diagnosis.fit import minimize
-from processing.diagnosis.space import Space
-from processing.diagnosis.surface_data import read_surface
-from processing.diagnosis.surface_errors import standard_errors
-from processing.diagnosis.surface_judge import SurfaceDiagnosis
-from processing.diagnosis.surface_problem import SurfaceProblem
-from processing.diagnosis.surface_run import diagnose_object
+from processing.diagnosis.search.fit import minimize
+from processing.diagnosis.search.space import Space
+from processing.diagnosis.surface.data import read_surface
+from processing.diagnosis.surface.judge import SurfaceDiagnosis
+from processing.diagnosis.surface.problem import SurfaceProblem
+from processing.diagnosis.surface.run import diagnose_object
+from processing.diagnosis.surface.standard_errors import standard_errors
 from processing.errors import ProcessError
-from processing.instrument import InstrumentModel
-from simulators import scene_faults
-from simulators.laws import Xi0Law
-from simulators.scene import Scene
-from simulators.sphere_suite import SphereFault, drawn, take
+from processing.instrument.model import InstrumentModel
+from processing.storage.capture import Capture
+from simulators.bench.scattering_laws import Xi0Law
+from simulators.bench.scene import Scene
+from simulators.blind import scene_faults
+from simulators.blind.sphere_suite import SphereFault, drawn, take
 
 NM, OMEGA_DEG = 662.0, 35.0
 

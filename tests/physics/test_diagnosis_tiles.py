@@ -5,18 +5,18 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
-from processing.capture import Capture
-from processing.capture_schema import Sample
-from processing.changes import Changes
-from processing.diagnosis.capture_data import read_capture
-from processing.diagnosis.moments import FEATURES, FOLDS_OF_TILES, moments_of
-from processing.diagnosis.projection import add_block
-from processing.diagnosis.space import Sums
-from processing.diagnosis.tile_sums import add_tiles, tile_columns
-from processing.effects.field_retardance import terms
-from processing.instrument import InstrumentModel
-from simulators.blind_suite import state_angles
-from simulators.undeclared import Bench, Scene, digitize, expose, write_capture
+from processing.diagnosis.instrument.capture_data import read_capture
+from processing.diagnosis.instrument.moments import FEATURES, FOLDS_OF_TILES, moments_of
+from processing.diagnosis.instrument.projection import add_block
+from processing.diagnosis.instrument.tile_sums import add_tiles, tile_columns
+from processing.diagnosis.search.space import Sums
+from processing.instrument.changes import Changes
+from processing.instrument.effects.field_retardance import terms
+from processing.instrument.model import InstrumentModel
+from processing.storage.capture import Capture
+from processing.storage.capture_schema import Sample
+from simulators.blind.suite import state_angles
+from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
 
 
 @pytest.fixture(scope="module")

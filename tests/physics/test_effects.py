@@ -1,19 +1,20 @@
 """Every effect of the folder: nothing at zero, units and bounds that make sense, a derivative that is one, a cause."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from processing.changes import Changes, Conditions
-from processing.diagnosis.candidate import Candidate
-from processing.diagnosis.capture_data import CaptureData
-from processing.diagnosis.instrument_problem import InstrumentProblem
-from processing.diagnosis.space import Space
-from processing.effects._reflectance import ReflectanceEffect
-from processing.effects.base import EffectError, all_effects, apply_to, changes_of
-from processing.instrument import AppliedEffect, EffectParameter, InstrumentModel
-from processing.reflectance_changes import ReflectanceChanges
+from processing.diagnosis.instrument.capture_data import CaptureData
+from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.space import Space
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import EffectError, all_effects, apply_to, changes_of
+from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
+from processing.reflectance.changes import ReflectanceChanges
+from processing.reflectance.effects.base import ReflectanceEffect, reflectance_effects
 
 ISSUE = {
     "psg_retardance",
@@ -51,17 +52,17 @@ ISSUE = {
     "illumination_azimuth",
     "interreflection",
 }
-INSTRUMENT_KINDS = [k for k, e in all_effects().items() if e.group != "reflectance"]
-REFLECTANCE_KINDS = [k for k, e in all_effects().items() if e.group == "reflectance"]
+INSTRUMENT_KINDS = list(all_effects())
+REFLECTANCE_KINDS = list(reflectance_effects())
 
 
 def test_the_list_is_complete():
-    assert set(all_effects()) >= ISSUE
+    assert all_effects().keys() | reflectance_effects().keys() >= ISSUE
 
 
-@pytest.mark.parametrize("kind", all_effects())
-def test_says_what_causes_and_what_mends_it(kind):
-    text = __import__(f"processing.effects.{kind}", fromlist=["x"]).__doc__ or ""
+@pytest.mark.parametrize("effect", [*all_effects().values(), *reflectance_effects().values()], ids=lambda e: e.kind)
+def test_says_what_causes_and_what_mends_it(effect):
+    text = sys.modules[type(effect).__module__].__doc__ or ""
     assert "Cause" in text
     assert "Mend" in text
 
@@ -146,7 +147,7 @@ def test_derivative_is_the_slope_of_the_excess(kind, configs):
 
 @pytest.mark.parametrize("kind", REFLECTANCE_KINDS)
 def test_reflectance_effects_do_nothing_at_zero_and_something_elsewhere(kind, configs):
-    from simulators.scene import Scene
+    from simulators.bench.scene import Scene
 
     scene = Scene.load(configs / "scenes/red_sphere.yaml")
     geometry = scene.truth(35, 662, 24, 24).geometry.points

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from processing.errors import NotDetermined
-from processing.field_matrix import TOLERANCE, FieldMatrix
-from processing.instrument import InstrumentModel
-from processing.states import rotating_retarders
+from processing.instrument.model import InstrumentModel
+from processing.instrument.states import rotating_retarders
+from processing.reduction.solvers.field_matrix import TOLERANCE, FieldMatrix
 
 
 def test_pseudo_inverse_with_two_retardance_maps(configs: Path) -> None:

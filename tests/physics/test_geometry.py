@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from processing import mueller
 from processing.geometry import rusinkiewicz
 from processing.geometry.flat import Flat
 from processing.geometry.frames import ScatteringGeometry, change_frames, unit
 from processing.geometry.pinhole import PinholeCamera
 from processing.geometry.sphere import Sphere
 from processing.geometry.viewing import ViewingGeometry
+from processing.polarization import mueller
 
 #: The lab's sphere (trap 19).
 LAB = ViewingGeometry(

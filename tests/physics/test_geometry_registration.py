@@ -14,8 +14,8 @@ from processing.geometry.pinhole import PinholeCamera
 from processing.geometry.pose import refine_pose
 from processing.geometry.sphere import Sphere
 from processing.geometry.viewing import ViewingGeometry
-from simulators.meshes import write_bumpy_body
-from simulators.scene import Scene
+from simulators.bench.meshes import write_bumpy_body
+from simulators.bench.scene import Scene
 
 CAMERA = PinholeCamera(rows=200, columns=220, pixel_mm=0.0353, focal_length_mm=60, distance_mm=262.7)
 
@@ -189,7 +189,7 @@ def test_too_few_boards_are_said():
 
 
 def test_camera_pose_command_writes_a_camera_file(tmp_path, capsys):
-    from processing.cli import main
+    from processing.commands.application import main
     from processing.yaml_file import load_yaml
 
     images, _, _ = board_views(7)

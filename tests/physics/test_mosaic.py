@@ -7,12 +7,12 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from processing.mosaic.fused import bilinear_stokes
-from processing.mosaic.layout import MosaicError, MosaicLayout
-from processing.mosaic.methods import METHODS, REACH, demosaic
-from processing.mosaic.noise import stokes_covariance
-from processing.mosaic.oriented import directions
-from processing.reduce_stokes import DEFAULT_METHOD
+from processing.reduction.mosaic.fused import bilinear_stokes
+from processing.reduction.mosaic.layout import MosaicError, MosaicLayout
+from processing.reduction.mosaic.methods import METHODS, REACH, demosaic
+from processing.reduction.mosaic.noise import stokes_covariance
+from processing.reduction.mosaic.oriented import directions
+from processing.reduction.stokes import DEFAULT_METHOD
 
 NAMES = ("0", "45", "90", "135")
 LAYOUT = MosaicLayout.of((("90", "45"), ("135", "0")), NAMES)

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processing.capture import Capture
+from processing.calibration.mosaic import correct, fit_response, read_response
 from processing.errors import NotDetermined, ProcessError
-from processing.instrument import InstrumentModel
-from processing.mosaic.calibration import correct, fit_response, read_response
-from processing.mosaic.layout import MosaicError, MosaicLayout
-from processing.mosaic.methods import demosaic
-from processing.product import Step
+from processing.instrument.model import InstrumentModel
+from processing.reduction.mosaic.layout import MosaicError, MosaicLayout
+from processing.reduction.mosaic.methods import demosaic
+from processing.storage.capture import Capture
+from processing.storage.product import Step
 from processing.yaml_file import parse_yaml
 
 NAMES = ("0", "45", "90", "135")

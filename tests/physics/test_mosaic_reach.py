@@ -1,8 +1,9 @@
 """The border that campaigns leave out is as wide as the default demosaicing reaches."""
 
-from processing import campaign, material_fit_images
-from processing.mosaic.methods import REACH
-from processing.reduce_stokes import DEFAULT_METHOD
+from processing.campaign import run as campaign
+from processing.maps import material_fit as material_fit_images
+from processing.reduction.mosaic.methods import REACH
+from processing.reduction.stokes import DEFAULT_METHOD
 
 
 def test_campaigns_leave_out_what_demosaicing_mixes() -> None:

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from processing import gradients, mueller
-from processing.instrument import InstrumentModel
-from processing.propagation import Derived, numeric_gradient, standard_error
-from processing.quantities import PAPER_PAIRS
-from processing.states import rotating_retarders
+from processing.instrument.model import InstrumentModel
+from processing.instrument.states import rotating_retarders
+from processing.polarization import gradients, mueller
+from processing.polarization.propagation import Derived, numeric_gradient, standard_error
+from processing.polarization.quantities import PAPER_PAIRS
 
 Array = NDArray[np.float64]
 Group = Callable[[Array], dict[str, Derived]]

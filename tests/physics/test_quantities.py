@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from processing import mueller, quantities, triply_degenerate
-from processing.cloude import coherency_eigenvalues, xi0_and_dominant
-from processing.quantities import PAPER_PAIRS, STATES, between
+from processing.polarization import mueller, quantities, triply_degenerate
+from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
+from processing.polarization.quantities import PAPER_PAIRS, STATES, between
 
 Array = NDArray[np.float64]
 

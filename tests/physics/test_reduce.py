@@ -8,14 +8,14 @@ import h5py
 import numpy as np
 import pytest
 
-from processing import mueller
-from processing.capture import Capture, CaptureError
-from processing.correction import Correction, Mask
 from processing.errors import NotDetermined
-from processing.images import MuellerImage
-from processing.instrument import InstrumentModel
-from processing.product import Product, ProductError, Step
-from processing.reduce import reduce_mueller
+from processing.instrument.model import InstrumentModel
+from processing.polarization import mueller
+from processing.reduction.counts_to_signal import Correction, Mask
+from processing.reduction.mueller import reduce_mueller
+from processing.storage.capture import Capture, CaptureError
+from processing.storage.images import MuellerImage
+from processing.storage.product import Product, ProductError, Step
 
 GAIN, READ_NOISE, BLACK = 2.5, 4.0, 64.0
 STEP = Step("reduce", {"capture": "capture.h5"})
@@ -239,7 +239,7 @@ def test_read_back_angles_count_and_not_the_planned_ones(rgb950: InstrumentModel
 def test_interrupted_reduction_goes_on_and_equals_an_uninterrupted_one(
     rgb950: InstrumentModel, synthetic_capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("processing.reduce.BLOCK_PIXELS", 4 * 8)
+    monkeypatch.setattr("processing.reduction.mueller.BLOCK_PIXELS", 4 * 8)
     rng = np.random.default_rng(10)
     frames = noisy(rng, signals(rgb950, table(), scene(rng, (24, 8))))
     path = synthetic_capture(frames, table(), detector=detector())
@@ -296,9 +296,9 @@ import sys, time
 import subprocess
 import sys
 from pathlib import Path
-import processing.reduce as r
-from processing.capture import Capture
-from processing.product import Step
+import processing.reduction.mueller as r
+from processing.storage.capture import Capture
+from processing.storage.product import Step
 r.BLOCK_PIXELS = 4 * 8
 def slowly(done, total):
     print(done, flush=True)
@@ -328,7 +328,7 @@ def test_killed_reduction_leaves_a_partial_file_that_is_resumed(
     with h5py.File(out.with_name("killed.h5.partial")) as h5:
         done = int(h5["entry/rows_done"][()])
     assert 30 <= done < 160
-    monkeypatch.setattr("processing.reduce.BLOCK_PIXELS", 4 * 8)
+    monkeypatch.setattr("processing.reduction.mueller.BLOCK_PIXELS", 4 * 8)
     with Capture(path) as capture:
         reduce_mueller(capture, rgb950, out, (STEP,))
     whole = reduced(path, rgb950)

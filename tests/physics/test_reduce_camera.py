@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processing.camera_noise import bad_pixels, photon_transfer, read_camera, write_camera
-from processing.capture import Capture, CaptureError
-from processing.correction import Correction
+from processing.calibration.photon_transfer import bad_pixels, photon_transfer, read_camera, write_camera
 from processing.errors import NotDetermined, ProcessError
-from processing.product import Step
+from processing.reduction.counts_to_signal import Correction
+from processing.storage.capture import Capture, CaptureError
+from processing.storage.product import Step
 
 SHAPE = (120, 160)
 

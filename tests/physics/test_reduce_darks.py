@@ -3,22 +3,22 @@
 import numpy as np
 import pytest
 
-from processing.black import Black
-from processing.calibrate import calibrate
-from processing.capture import Capture, CaptureError
-from processing.correction import Correction
-from processing.images import MuellerImage
-from processing.instrument import InstrumentModel
-from processing.mosaic.layout import MosaicLayout
-from processing.mosaic.merge import merge
-from processing.noise import NoiseModel
-from processing.product import Product, Step
-from processing.reduce import Choice, reduce_mueller, sample_states
-from processing.reduce_stokes import reduce_stokes
-from processing.states import rotating_retarders
+from processing.calibration.train import calibrate
+from processing.instrument.model import InstrumentModel
+from processing.instrument.noise import NoiseModel
+from processing.instrument.states import rotating_retarders
+from processing.reduction.black import Black
+from processing.reduction.counts_to_signal import Correction
+from processing.reduction.mosaic.layout import MosaicLayout
+from processing.reduction.mosaic.merge import merge
+from processing.reduction.mueller import Choice, reduce_mueller, sample_states
+from processing.reduction.stokes import reduce_stokes
+from processing.storage.capture import Capture, CaptureError
+from processing.storage.images import MuellerImage
+from processing.storage.product import Product, Step
 from processing.yaml_file import dump_yaml
-from simulators.bench import DETECTOR, FixedScene, SimulatedBench
-from simulators.bench_effects import with_element
+from simulators.bench.bench import DETECTOR, FixedScene, SimulatedBench
+from simulators.bench.effects import with_element
 
 ANGLES = {"psg": np.arange(6.0)}
 ROLE = ("dark", "dark", "sample", "sample", "sample", "sample")

@@ -5,17 +5,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processing import mueller
-from processing.applied_effects import CountsCorrection
-from processing.capture import Capture
-from processing.changes import Conditions
-from processing.correction import BlockReader, Correction
-from processing.effects.base import all_effects, changes_of
-from processing.effects.field_retardance import terms
-from processing.images import MuellerImage
-from processing.instrument import AppliedEffect, EffectParameter, InstrumentModel
-from processing.product import Step
-from processing.reduce import reduce_mueller
+from processing.instrument.changes import Conditions
+from processing.instrument.effects.base import all_effects, changes_of
+from processing.instrument.effects.field_retardance import terms
+from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
+from processing.polarization import mueller
+from processing.reduction.counts_to_signal import BlockReader, Correction
+from processing.reduction.effects_of_capture import CountsCorrection
+from processing.reduction.mueller import reduce_mueller
+from processing.storage.capture import Capture
+from processing.storage.images import MuellerImage
+from processing.storage.product import Step
 
 SHAPE = (24, 30)
 FULL_SCALE = 4095.0

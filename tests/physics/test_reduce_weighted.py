@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from processing import mueller
-from processing.capture import Capture
 from processing.errors import ProcessError
-from processing.images import MuellerImage
-from processing.instrument import InstrumentModel
-from processing.physical import most_likely, nearest
-from processing.product import Product, Step
-from processing.reduce import Choice, reduce_mueller
-from processing.weighted import PACKED_COLUMN, PACKED_ROW
+from processing.instrument.model import InstrumentModel
+from processing.polarization import mueller
+from processing.polarization.physical import most_likely, nearest
+from processing.reduction.mueller import Choice, reduce_mueller
+from processing.reduction.solvers.weighted import PACKED_COLUMN, PACKED_ROW
+from processing.storage.capture import Capture
+from processing.storage.images import MuellerImage
+from processing.storage.product import Product, Step
 
 GAIN, READ, BLACK = 2.5, 3.0, 64.0
 DETECTOR = {"black_level_counts": BLACK, "gain_e_per_count": GAIN, "read_noise_e": READ, "bits": 16}

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processing import mueller
 from processing.geometry.frames import ScatteringGeometry, unit
+from processing.polarization import mueller
 from processing.reflectance import fresnel, polarized_diffuse
 from processing.reflectance.base import kinds, load_reflectance, normalized_mueller
 from processing.yaml_file import ConfigError

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from processing.cloude import xi0_and_dominant
 from processing.errors import NotDetermined
 from processing.geometry.frames import ScatteringGeometry
-from processing.instrument import InstrumentModel
-from processing.material_fit import NAMES, fit_intensities, fit_mueller
-from processing.states import rotating_retarders
-from simulators.scene import Scene
+from processing.instrument.model import InstrumentModel
+from processing.instrument.states import rotating_retarders
+from processing.polarization.cloude import xi0_and_dominant
+from processing.reflectance.material_fit import NAMES, fit_intensities, fit_mueller
+from simulators.bench.scene import Scene
 
 TRUE = np.array([1.3, 0.08, 0.17, 2.0])
 VERTICAL = np.array([1.0, -1, 0, 0]) / 2

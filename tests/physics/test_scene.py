@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import minimum_filter
 
-from processing import mueller
+from processing.polarization import mueller
 from processing.yaml_file import ConfigError
-from simulators.scene import Scene, SceneError
+from simulators.bench.scene import Scene, SceneError
 
 SIZE = 301
 
@@ -109,5 +109,5 @@ def test_the_shadowed_part_of_the_object_is_dark_before_a_bright_background(sphe
 
 def test_rows_in_blocks_equal_the_image_at_once(sphere, monkeypatch):
     whole = sphere.mueller_image(35, 662, 50, 40)
-    monkeypatch.setattr("simulators.scene.BLOCK_PIXELS", 120)
+    monkeypatch.setattr("simulators.bench.scene.BLOCK_PIXELS", 120)
     np.testing.assert_array_equal(sphere.mueller_image(35, 662, 50, 40), whole)

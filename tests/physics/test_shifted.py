@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from processing.diagnosis.moments import image_derivatives, shared_noise
-from processing.shifted import neighbour_noise, shifted_back
+from processing.diagnosis.instrument.moments import image_derivatives, shared_noise
+from processing.reduction.move_image import neighbour_noise, shifted_back
 
 
 def picture(x, y):

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from processing.geometry.rusinkiewicz import Angles
-from processing.table_axes import SHAPE, TableAxes
-from processing.tables import ScatteringTable, TableError
+from processing.reflectance.table_axes import SHAPE, TableAxes
+from processing.reflectance.tables import ScatteringTable, TableError
 
 
 def random_angles(count: int, seed: int = 0) -> Angles:

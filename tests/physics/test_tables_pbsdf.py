@@ -5,13 +5,12 @@ import struct
 import numpy as np
 import pytest
 
-from processing import pbsdf
 from processing.geometry.frames import ScatteringGeometry, cross, unit
 from processing.geometry.rusinkiewicz import Angles, directions
-from processing.reflectance import fresnel
+from processing.reflectance import fresnel, pbsdf
 from processing.reflectance.base import normalized_mueller
-from processing.tables import ScatteringTable, TableError
-from processing.tensor_file import TensorFileError, create_tensor_file, read_tensor_file
+from processing.reflectance.tables import ScatteringTable, TableError
+from processing.storage.tensor_file import TensorFileError, create_tensor_file, read_tensor_file
 
 
 def random_geometry(count: int, seed: int = 0) -> ScatteringGeometry:

@@ -7,8 +7,8 @@ import pytest
 
 from processing.geometry.frames import ScatteringGeometry, unit
 from processing.reflectance import first_surface
-from simulators.scene import Scene
-from simulators.traced_surface import TracedSurface, traced
+from simulators.bench.scene import Scene
+from simulators.bench.traced_surface import TracedSurface, traced
 
 
 @pytest.mark.parametrize("wavelength_nm", [451.0, 662.0])

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from processing import mueller, triply_degenerate
 from processing.geometry.frames import ScatteringGeometry
 from processing.geometry.rusinkiewicz import directions
-from processing.instrument import InstrumentModel
+from processing.instrument.model import InstrumentModel
+from processing.instrument.states import rotating_retarders
+from processing.polarization import mueller, triply_degenerate
+from processing.polarization.xi0 import estimate, xi0_and_m00
 from processing.reflectance.base import load_reflectance
-from processing.states import rotating_retarders
-from processing.xi0 import estimate, xi0_and_m00
 
 HORIZONTAL, VERTICAL = np.array([1.0, 1, 0, 0]) / 2, np.array([1.0, -1, 0, 0]) / 2
 

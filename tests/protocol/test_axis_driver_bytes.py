@@ -12,7 +12,7 @@ from drivers.apt_frames import apt_framer
 from drivers.axes import apt, elliptec, esp301, smc100, zaber
 from drivers.errors import CommandRejected, NotHomedError, ReplyError
 from drivers.serial_link import LONGEST_FRAME, LineRegistry, line_framer
-from simulators.pty_port import PtyPort
+from simulators.serial.pty_port import PtyPort
 
 
 class Script:

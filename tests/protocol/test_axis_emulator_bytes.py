@@ -3,8 +3,8 @@
 import pytest
 
 from simulators.clock import ManualClock
-from simulators.emulator import Emulator
-from simulators.serve import ServeOptions, served_kinds
+from simulators.serial.emulator import Emulator
+from simulators.serial.serve import ServeOptions, served_kinds
 
 
 def emulator(kind: str, **options: object) -> tuple[Emulator, ManualClock]:

@@ -10,7 +10,7 @@ import pytest
 from drivers.errors import CommandRejected
 from drivers.serial_link import LineRegistry
 from drivers.sources import dc4100
-from simulators.pty_port import PtyPort
+from simulators.serial.pty_port import PtyPort
 
 # Status 0xA80: no LED at channels 2, 3 and 4, so one LED is driven.
 OPENING = [

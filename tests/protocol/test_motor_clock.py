@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from simulators.clock import Clock, ManualClock, TrapezoidMotion
-from simulators.emulator import EmulatedAxis
-from simulators.faults import Fault, FaultSchedule, parse_fault
+from simulators.serial.emulator import EmulatedAxis
+from simulators.serial.reply_faults import Fault, FaultSchedule, parse_fault
 
 angles = st.floats(-1e4, 1e4)
 positive = st.floats(0.1, 1e3)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from drivers.errors import UnknownPixelFormat
 from drivers.pixel_formats import PIXEL_FORMATS, PixelFormat, pixel_format
-from simulators.pixel_stamp import read_stamp, stamp
+from simulators.camera.pixel_stamp import read_stamp, stamp
 
 
 @pytest.mark.parametrize(

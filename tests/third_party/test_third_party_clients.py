@@ -8,9 +8,9 @@ from unittest.mock import MagicMock
 import pytest
 
 from simulators.clock import Clock
-from simulators.emulator import Emulator
-from simulators.pty_port import PtyPort
-from simulators.serve import ServeOptions, served_kinds
+from simulators.serial.emulator import Emulator
+from simulators.serial.pty_port import PtyPort
+from simulators.serial.serve import ServeOptions, served_kinds
 
 # The warnings that these packages cause are theirs, not ours.
 pytestmark = [pytest.mark.third_party, pytest.mark.filterwarnings("ignore")]

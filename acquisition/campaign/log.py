@@ -1,0 +1,95 @@
+"""What a campaign leaves behind besides captures: a log in JSON lines, and an index of what was taken."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import filelock
+
+from acquisition.campaign.plan import Campaign
+from acquisition.errors import AcquisitionError
+from processing.yaml_file import dump_yaml
+
+LOG = "log.jsonl"
+INDEX = "index.json"
+PLAN = "campaign.yaml"
+
+
+class CampaignFolder:
+    """The folder of one campaign, held by one program at a time.
+
+    Raises
+    ------
+    AcquisitionError
+        The folder belongs to another campaign, or another program runs this one.
+    """
+
+    def __init__(self, folder: Path, campaign: Campaign) -> None:
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+        self._lock = filelock.FileLock(folder / ".lock")
+        try:
+            self._lock.acquire(timeout=0)
+        except filelock.Timeout:
+            raise AcquisitionError(f"another program runs the campaign in {folder}. End that one first.") from None
+        text = dump_yaml(campaign)
+        plan = folder / PLAN
+        if plan.exists() and plan.read_text(encoding="utf-8") != text:
+            self.close()
+            raise AcquisitionError(
+                f"{folder} holds another campaign: {plan} differs from the file given. "
+                "Give the same file, or another folder with --out."
+            )
+        if not plan.exists():
+            self._write_whole(plan, text)
+        self.index: dict[str, dict[str, Any]] = {}
+        if (folder / INDEX).exists():
+            self.index = json.loads((folder / INDEX).read_text(encoding="utf-8"))
+
+    def log(self, event: str, **details: Any) -> None:
+        """Add a line to the log; it is on the disc when this returns."""
+        line = {"time": datetime.datetime.now().astimezone().isoformat(timespec="milliseconds"), "event": event}
+        text = json.dumps(line | details, default=str) + "\n"
+        path = self.folder / LOG
+        with self._room_for(path), path.open("ab+") as file:
+            # A line that was cut off by a full disc must not spoil the next.
+            end = file.seek(0, os.SEEK_END)
+            if end and file.seek(end - 1) is not None and file.read(1) != b"\n":
+                text = "\n" + text
+            file.write(text.encode())
+            file.flush()
+            os.fsync(file.fileno())
+
+    def record(self, capture: str, **details: Any) -> None:
+        """Write what became of a capture into the index, which is whole at any instant."""
+        self.index[capture] = self.index.get(capture, {}) | details
+        self._write_whole(self.folder / INDEX, json.dumps(self.index, indent=1, default=str))
+
+    def _write_whole(self, path: Path, text: str) -> None:
+        new = path.with_name(path.name + ".new")
+        with self._room_for(path):
+            with new.open("w", encoding="utf-8") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(new, path)
+
+    @contextmanager
+    def _room_for(self, path: Path) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise AcquisitionError(
+                f"{path} cannot be written ({error.strerror}). The captures taken so far are whole. Make room, then "
+                "the same command goes on."
+            ) from error
+
+    def close(self) -> None:
+        """Let another program run the campaign."""
+        self._lock.release()

@@ -1,0 +1,150 @@
+"""A campaign: samples x wavelengths x modes x arm angles, as one frozen value, iterated into captures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
+
+from acquisition.capture.plan import Auto, AutoExposure, MeasurementPlan, Seconds, exposure_kind
+from processing.storage.capture_schema import Sample
+from processing.yaml_file import load_yaml
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+Angle = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class AngleSteps(_Part):
+    """Equal steps from `start` to `stop`, both included."""
+
+    start: Angle
+    stop: Angle
+    step: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+    def angles_deg(self) -> tuple[float, ...]:
+        """The angles, ascending."""
+        count = int((self.stop - self.start) / self.step + 1e-9) + 1
+        return tuple(round(self.start + k * self.step, 9) for k in range(count))
+
+    @model_validator(mode="after")
+    def _ascending(self) -> Self:
+        if self.stop < self.start:
+            raise ValueError(f"stop {self.stop:g} lies before start {self.start:g}")
+        return self
+
+
+class Reference(_Part):
+    """A capture of something known, taken first in each block and again after every `every` captures.
+
+    A block is what is taken of one sample at one wavelength in one mode. `role` flat marks it as a flat field.
+    """
+
+    sample: Sample
+    omega_deg: Angle
+    modes: tuple[str, ...]
+    every: int | None = Field(default=None, gt=0)
+    role: Literal["flat", "air", "sample"] | None = None
+
+
+class Campaign(_Part):
+    """What `acquire --campaign` takes. Relative paths are relative to the campaign file.
+
+    `plans` names the plan of each mode, whose sample, wavelength, angle and exposure the campaign replaces.
+    `exposure_s` is one value, or one for each wavelength in nm, or {kind: auto}. `retries` is how often a capture
+    that a device or the disc ended is gone on with unattended, axes opened anew and without asking whether they are
+    free: 0 where somebody should look first.
+    """
+
+    kind: Literal["campaign"] = "campaign"
+    name: str = Field(pattern=r"^[A-Za-z0-9_-]+$")
+    rig: Path | None = None
+    plans: dict[str, Path]
+    samples: tuple[Sample, ...] = Field(min_length=1)
+    wavelengths_nm: tuple[Annotated[float, Field(gt=0)], ...] = Field(min_length=1)
+    omega_deg: AngleSteps | tuple[Angle, ...]
+    exposure_s: (
+        Annotated[Seconds | Annotated[dict[float, float], Tag("by wavelength")] | Auto, Discriminator(exposure_kind)]
+        | None
+    ) = None
+    references: tuple[Reference, ...] = ()
+    retries: int = Field(default=0, ge=0, le=100)
+    retry_wait_s: float = Field(default=5.0, ge=0)
+    continue_after_interlock: bool = False
+
+    @classmethod
+    def load(cls, path: Path | str) -> Campaign:
+        """Read a campaign file; its paths become absolute. Raises ConfigError with file, line and key."""
+        campaign = load_yaml(path, cls)
+        folder = Path(path).resolve().parent
+        plans = {mode: folder / plan for mode, plan in campaign.plans.items()}
+        rig = folder / campaign.rig if campaign.rig is not None else None
+        return campaign.model_copy(update={"plans": plans, "rig": rig})
+
+    def angles_deg(self) -> tuple[float, ...]:
+        """Arm angles, ascending: the arm comes to each from the same side, and back only once a block."""
+        if isinstance(self.omega_deg, AngleSteps):
+            return self.omega_deg.angles_deg()
+        return tuple(sorted(self.omega_deg))
+
+
+class CampaignCapture(_Part):
+    """One capture of a campaign: its number from 1, its file name, its plan, and whether it is a reference."""
+
+    number: int
+    name: str
+    plan: MeasurementPlan
+    reference: bool = False
+
+
+def captures(campaign: Campaign) -> Iterator[CampaignCapture]:
+    """All captures in the order in which they are taken.
+
+    What needs a person changes least often: the sample outermost, then the wavelength, then the mode (another
+    camera); the arm turns innermost, always upwards.
+    """
+    number = 0
+    plans = {mode: MeasurementPlan.load(path) for mode, path in campaign.plans.items()}
+    for sample in campaign.samples:
+        for wavelength in campaign.wavelengths_nm:
+            for mode, plan in plans.items():
+                common = {
+                    "mode": mode,
+                    "wavelength_nm": wavelength,
+                    "exposure_s": _exposure(campaign, wavelength),
+                    "continue_after_interlock": campaign.continue_after_interlock,
+                }
+                for taken, omega in enumerate(campaign.angles_deg()):
+                    for reference in campaign.references:
+                        due = taken == 0 or (reference.every is not None and taken % reference.every == 0)
+                        if due and mode in reference.modes:
+                            number += 1
+                            chosen = plan.with_changes(
+                                **common,
+                                sample=reference.sample,
+                                omega_deg=reference.omega_deg,
+                                role=reference.role,
+                            )
+                            yield _capture(number, chosen, True)
+                    number += 1
+                    yield _capture(number, plan.with_changes(**common, sample=sample, omega_deg=omega), False)
+
+
+def _capture(number: int, plan: MeasurementPlan, reference: bool) -> CampaignCapture:
+    sample = "".join(c if c.isalnum() else "_" for c in plan.sample.name or plan.sample.kind)
+    name = f"{number:03d}_{sample}_{plan.mode}_{plan.wavelength_nm:g}nm_omega{plan.omega_deg:g}.h5"
+    return CampaignCapture(number=number, name=name, plan=plan, reference=reference)
+
+
+def _exposure(campaign: Campaign, wavelength_nm: float) -> float | AutoExposure | None:
+    if isinstance(campaign.exposure_s, dict):
+        for key, value in campaign.exposure_s.items():
+            if abs(key - wavelength_nm) < 0.5:
+                return value
+        return None
+    return campaign.exposure_s

@@ -1,0 +1,252 @@
+"""Runs a campaign: everything checked before the first motion, each capture gone on with where it stopped."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from acquisition.campaign.log import CampaignFolder
+from acquisition.campaign.plan import Campaign, CampaignCapture, captures
+from acquisition.capture import session
+from acquisition.capture.checks import Check, refuse_failed
+from acquisition.capture.estimate import capture_seconds, last_pose_deg
+from acquisition.capture.job import Job, Result, check_with_devices, existing, job_of
+from acquisition.capture.job import prepare as prepare_job
+from acquisition.capture.operator import Operator
+from acquisition.capture.writer import PARTIAL, bytes_needed, check_space
+from acquisition.errors import AcquisitionError, InterlockOpened, PlanRefused, Stopped
+from acquisition.rig.config import RigConfig
+from acquisition.rig.interlocks import LOOK_S
+from acquisition.rig.rig import Rig
+from acquisition.screen.observer import Observer
+from acquisition.stop_request import StopRequest
+from drivers.errors import DeviceError
+from processing.storage.capture import Capture, CaptureError
+
+#: Room for log and index, bytes.
+BOOKS = 4 << 20
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A capture of the campaign with its checked job, estimated seconds and bytes."""
+
+    capture: CampaignCapture
+    job: Job
+    seconds: float
+    size: int
+
+
+def prepare(campaign: Campaign, rig: RigConfig) -> list[tuple[CampaignCapture, Job]]:
+    """Check every capture as far as files tell. Raises PlanRefused with all that is wrong, each once."""
+    jobs = []
+    failures: dict[str, str] = {}
+    for capture in captures(campaign):
+        try:
+            jobs.append((capture, prepare_job(capture.plan, rig)))
+        except PlanRefused as refused:
+            for failure in refused.failures:
+                failures.setdefault(failure, capture.name)
+    if failures:
+        raise PlanRefused([f"{failure} (first in {name})" for failure, name in failures.items()])
+    return jobs
+
+
+def check_all(jobs: Sequence[tuple[CampaignCapture, Job]], rig: Rig, folder: Path) -> tuple[list[Planned], list[Check]]:
+    """Check every capture against the devices and the disc; nothing moves. Returns failures and passes alike."""
+    planned = []
+    pose: dict[str, float] = {}
+    seen: dict[tuple[str, str], Check] = {}
+    for capture, job in jobs:
+        for check in check_with_devices(job, rig, folder):
+            seen.setdefault((check.what, check.found), check)
+        settings = rig.require_camera().settings
+        size = bytes_needed(len(job.table), 1, (settings.height or 0, settings.width or 0))
+        planned.append(Planned(capture, job, capture_seconds(job, rig, pose), size))
+        pose = pose | last_pose_deg(job)
+    checks = list(seen.values())
+    missing = sum(p.size for p in planned if not (folder / p.capture.name).exists())
+    try:
+        check_space(existing(folder), missing + BOOKS)
+        checks.append(Check("disc for the campaign", True, f"{missing / 1e9:.2f} GB in {folder}"))
+    except AcquisitionError as error:
+        checks.append(Check("disc for the campaign", False, str(error)))
+    return planned, checks
+
+
+class CampaignRun:
+    """Takes what is missing of a campaign, capture by capture.
+
+    Parameters
+    ----------
+    folder : open; log and index go there beside the captures.
+    """
+
+    def __init__(
+        self,
+        campaign: Campaign,
+        rig: RigConfig,
+        folder: CampaignFolder,
+        operator: Operator,
+        stop: StopRequest,
+        observers: Sequence[Observer] = (),
+        home: bool = False,
+    ) -> None:
+        self.campaign = campaign
+        self.config = rig
+        self.folder = folder
+        self.operator = operator
+        self.stop = stop
+        self.observers = observers
+        self.home = home
+        self._rig: Rig | None = None
+
+    def run(self, jobs: Sequence[tuple[CampaignCapture, Job]]) -> bool:
+        """True if every capture is complete at the end, False if a stop was asked for.
+
+        Raises
+        ------
+        AcquisitionError, DeviceError
+            A capture failed more often than the campaign allows.
+        """
+        self.folder.log("campaign started", captures=len(jobs), rig=self.config.name, simulated=self.config.simulated)
+        try:
+            for number, (capture, job) in enumerate(jobs):
+                for observer in self.observers:
+                    observer.campaign_progress(number, len(jobs), capture.name)
+                if self._complete(capture):
+                    self._catch_up(capture)
+                    continue
+                result = self._take(capture, job)
+                if result is None or result.status == "aborted":
+                    self.folder.log("campaign stopped", at=capture.name)
+                    return False
+            self.folder.log("campaign complete")
+            return True
+        except KeyboardInterrupt:
+            self.folder.log("campaign stopped at once")
+            raise
+        finally:
+            self._close_rig()
+
+    def _take(self, capture: CampaignCapture, job: Job) -> Result | None:
+        failures = 0
+        while True:
+            if self.stop.requested:
+                return None
+            done = self._states_done(capture)
+            try:
+                rig = self._open_rig()
+                selects = rig.source is not None and rig.source.selects_wavelength
+                changed = self.operator.prepare(capture.plan, source_selects=selects)
+                self.folder.log("capture started", capture=capture.name, states_done=done, operator=changed)
+                self.folder.record(capture.name, status="running", reference=capture.reference)
+                self._wait_for_door(rig, capture)
+                result = self._take_once(capture, job, rig)
+            except Stopped:
+                return None
+            except (AcquisitionError, DeviceError) as error:
+                # A capture that got further was worth going on with: only tries without progress are counted.
+                failures = failures + 1 if self._states_done(capture) <= done else 1
+                self.folder.log("capture failed", capture=capture.name, error=str(error), tries=failures)
+                self.folder.record(capture.name, status="failed", error=str(error))
+                # An interlock is nothing to try again: whether the run goes on by itself is for the plan to say.
+                if failures > self.campaign.retries or isinstance(error, InterlockOpened):
+                    raise
+                self._close_rig()
+                for observer in self.observers:
+                    observer.warning(f"{error}; going on in {self.campaign.retry_wait_s:g} s")
+                self._pause(self.campaign.retry_wait_s)
+                continue
+            self.folder.log(
+                "capture ended", capture=capture.name, status=result.status, states=result.states_done,
+                saturated_fraction=result.saturated_fraction, ledger=result.ledger, messages=result.messages,
+            )  # fmt: skip
+            self._record_end(capture, result.status, result.states_done, result.path.name, result.saturated_fraction)
+            return result
+
+    def _wait_for_door(self, rig: Rig, capture: CampaignCapture) -> None:
+        """A door open between captures: wait, if the campaign goes on by itself. Raises InterlockOpened."""
+        if rig.source is None or not rig.source.interlock_open():
+            return
+        if not self.campaign.continue_after_interlock:
+            raise InterlockOpened(
+                f"the door is open before {capture.name}. Nothing was moved. Close it, then the same command goes on."
+            )
+        self.folder.log("waiting", capture=capture.name, why="the door is open")
+        for observer in self.observers:
+            observer.warning("the door is open; going on when it is closed")
+        while rig.source.interlock_open() and not self.stop.requested:
+            time.sleep(LOOK_S)
+
+    def _take_once(self, capture: CampaignCapture, job: Job, rig: Rig) -> Result:
+        final = self.folder.folder / capture.name
+        partial = final.with_name(final.name + PARTIAL)
+        if final.exists():
+            # Aborted by Ctrl-C: sealed, but with states missing.
+            partial = final
+        if partial.exists():
+            job = job_of(partial, self.config)
+            refuse_failed(check_with_devices(job, rig, final.parent))
+            return session.resume(job, rig, partial, self.stop, self.observers, self.home)
+        refuse_failed(check_with_devices(job, rig, final.parent))
+        return session.take(job, rig, final, self.stop, self.observers, self.home)
+
+    def _complete(self, capture: CampaignCapture) -> bool:
+        path = self.folder.folder / capture.name
+        if not path.exists():
+            return False
+        with Capture(path) as there:
+            return there.status == "complete"
+
+    def _catch_up(self, capture: CampaignCapture) -> None:
+        """Put a complete capture into the index, where a kill or a full disc has kept it out."""
+        if self.folder.index.get(capture.name, {}).get("status") == "complete":
+            return
+        with Capture(self.folder.folder / capture.name) as there:
+            saturated = float(there.column("saturated_fraction").max())
+            self._record_end(capture, "complete", len(there.done), capture.name, saturated)
+
+    def _record_end(self, capture: CampaignCapture, status: str, states: int, file: str, saturated: float) -> None:
+        plan = capture.plan
+        self.folder.record(
+            capture.name, status=status, states=states, file=file, reference=capture.reference, role=plan.role,
+            omega_deg=plan.omega_deg, wavelength_nm=plan.wavelength_nm, mode=plan.mode, sample=plan.sample.name,
+            saturated_fraction=saturated, error=None,
+        )  # fmt: skip
+
+    def _states_done(self, capture: CampaignCapture) -> int:
+        final = self.folder.folder / capture.name
+        for path in (final, final.with_name(final.name + PARTIAL)):
+            if path.exists():
+                try:
+                    with Capture(path) as there:
+                        return len(there.done)
+                except CaptureError:
+                    return 0
+        return 0
+
+    @property
+    def rig(self) -> Rig | None:
+        """The rig that is open now, for those who watch a simulated one."""
+        return self._rig
+
+    def _open_rig(self) -> Rig:
+        if self._rig is None:
+            rig = Rig(self.config, ask=self.operator.confirm)
+            rig.__enter__()
+            self._rig = rig
+        return self._rig
+
+    def _close_rig(self) -> None:
+        rig, self._rig = self._rig, None
+        failure = rig.close() if rig is not None else None
+        if failure is not None:
+            self.folder.log("closing the rig failed", error=str(failure))
+
+    def _pause(self, seconds: float) -> None:
+        end_s = time.monotonic() + seconds
+        while time.monotonic() < end_s and not self.stop.requested:
+            time.sleep(0.05)

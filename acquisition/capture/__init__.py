@@ -1,0 +1,1 @@
+"""One capture: plan, checks, runner, writer."""

@@ -1,0 +1,142 @@
+"""Everything that can be known to be wrong before anything moves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from acquisition.capture.plan import ARM, AutoExposure, MeasurementPlan
+from acquisition.errors import PlanRefused
+from acquisition.rig.config import RigConfig
+from acquisition.rig.forbidden_poses import describe, find_forbidden
+from acquisition.rig.rig import Rig
+from drivers.errors import LimitError
+from processing.instrument.model import InstrumentModel, WavelengthError, condition_number, rank
+from processing.instrument.states import StateTable
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing looked at: what, whether it is well, and in words what was found."""
+
+    what: str
+    passed: bool
+    found: str
+
+
+def refuse_failed(checks: Sequence[Check]) -> None:
+    """Raise PlanRefused with every check that failed; nothing has moved by then."""
+    failures = [f"{check.what}: {check.found}" for check in checks if not check.passed]
+    if failures:
+        raise PlanRefused(failures)
+
+
+def standing_pose_deg(plan: MeasurementPlan, rig: RigConfig) -> dict[str, float]:
+    """Angles of the axes that stand still during the capture: the arm and the mode's own pose.
+
+    Raises
+    ------
+    PlanRefused
+        The mode's pose is not given at the plan's wavelength.
+    """
+    pose = {}
+    for axis, angle in rig.modes[plan.mode].pose_deg.items():
+        if isinstance(angle, dict):
+            match = [v for k, v in angle.items() if abs(k - plan.wavelength_nm) < 0.5]
+            if not match:
+                known = ", ".join(f"{k:g}" for k in angle)
+                raise PlanRefused([f"pose of {axis}: the rig file has {known} nm, not {plan.wavelength_nm:g} nm"])
+            pose[axis] = match[0]
+        else:
+            pose[axis] = angle
+    if ARM in rig.axes:
+        pose[ARM] = plan.omega_deg
+    return pose
+
+
+def check_plan(plan: MeasurementPlan, rig: RigConfig) -> list[Check]:
+    """What the files alone tell: mode, wavelength, axes, exposure, forbidden poses."""
+    checks = [_member("mode", plan.mode, list(rig.modes))]
+    known = [f"{w:g}" for w in rig.wavelengths_nm]
+    checks.append(_member("wavelength_nm", f"{plan.wavelength_nm:g}", known))
+    if rig.simulator is not None:
+        checks.append(_member("sample", plan.sample.name or plan.sample.kind, sorted(rig.simulator.samples)))
+    missing = sorted(set(plan.states.angles_deg()) - set(rig.axes))
+    checks.append(
+        Check("axes", not missing, f"the rig has no axis {', '.join(missing)}" if missing else ", ".join(rig.axes))
+    )
+    if plan.sample.kind == "air" and abs(plan.omega_deg - 180) > 0.5:
+        checks.append(Check("sample", False, f"air needs omega 180 (straight through), not {plan.omega_deg:g}"))
+    if plan.darks and rig.source is None:
+        found = f"{plan.darks} dark states, but the rig has no source that shuts off the light. "
+        checks.append(Check("darks", False, found + "Set darks to 0, or give the rig `source: {kind: manual}`"))
+    low, high = rig.exposure_s
+    if not isinstance(plan.exposure_s, AutoExposure):
+        longest = plan.exposure_s * max(plan.bracket)
+        fits = low <= plan.exposure_s * min(plan.bracket) and longest <= high
+        checks.append(Check("exposure", fits, f"{plan.exposure_s:g} s; the rig allows {low:g} to {high:g} s"))
+    return checks
+
+
+def check_table(table: StateTable, rig: RigConfig, instrument: InstrumentModel) -> list[Check]:
+    """Forbidden poses of every state and step, and whether the states determine a Mueller matrix."""
+    poses = [{axis: float(column[k]) for axis, column in table.angles_deg.items()} for k in range(len(table))]
+    checks = [_forbidden(rig, poses)]
+    if instrument.mosaic is None and instrument.axes:
+        light = [k for k, role in enumerate(table.role) if role != "dark"]
+        lacking = [axis for axis in instrument.axes if axis not in table.angles_deg]
+        if lacking:
+            found = f"instrument {instrument.name!r} turns with {', '.join(lacking)}, the plan does not"
+            return [*checks, Check("instrument", False, found)]
+        w = instrument.rows({axis: table.angles_deg[axis][light] for axis in instrument.axes})
+        r = rank(w)
+        found = f"rank {r} of 16, condition number {condition_number(w):.2f}"
+        if r < 16:
+            found += ": these states do not determine a Mueller matrix. Change states, step_deg or ratio"
+        checks.append(Check("state table", r == 16, found))
+    return checks
+
+
+def _forbidden(rig: RigConfig, poses: Sequence[Mapping[str, float]]) -> Check:
+    before: Mapping[str, float] = poses[0]
+    for k, pose in enumerate(poses):
+        box = find_forbidden(rig.forbidden, before, pose)
+        if box is not None:
+            return Check("poses", False, f"state {k} meets a {describe(box)}")
+        before = pose
+    return Check("poses", True, f"{len(poses)} states outside {len(rig.forbidden)} forbidden ranges")
+
+
+def load_instrument(plan: MeasurementPlan, rig: RigConfig) -> InstrumentModel:
+    """The declared instrument of the plan's mode at its wavelength. Raises ConfigError, PlanRefused."""
+    try:
+        return InstrumentModel.load(rig.modes[plan.mode].instrument).at(plan.wavelength_nm)
+    except WavelengthError as error:
+        raise PlanRefused([str(error)]) from error
+
+
+def check_devices(table: StateTable, rig: Rig) -> list[Check]:
+    """Every target against the limits of the controllers, and the way from here; nothing moves."""
+    checks = []
+    for axis, column in table.angles_deg.items():
+        try:
+            for target in column:
+                rig.axes[axis].check(float(target))
+        except LimitError as error:
+            checks.append(Check(f"limits of {axis}", False, str(error)))
+        else:
+            ends = f"{column.min():g} to {column.max():g} deg"
+            checks.append(Check(f"limits of {axis}", True, ends))
+    first = {axis: float(column[0]) for axis, column in table.angles_deg.items()}
+    homed = {name: axis.read_position().deg for name, axis in rig.axes.items() if axis.is_homed()}
+    box = find_forbidden(rig.config.forbidden, homed, first)
+    found = describe(box) if box else "free from here to the first state"
+    checks.append(Check("first move", box is None, found))
+    if rig.source is not None and rig.source.interlock_open():
+        checks.append(Check("door", False, "the interlock circuit of the source is open; close it"))
+    return checks
+
+
+def _member(what: str, value: str, known: list[str]) -> Check:
+    there = value in known
+    return Check(what, there, value if there else f"{value!r} is not one of {', '.join(known)}")

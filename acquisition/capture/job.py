@@ -1,0 +1,136 @@
+"""A capture as a job: plan, rig, instrument and states that belong together and have been checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from acquisition.capture.checks import (
+    Check,
+    check_devices,
+    check_plan,
+    check_table,
+    load_instrument,
+    refuse_failed,
+    standing_pose_deg,
+)
+from acquisition.capture.plan import AutoExposure, MeasurementPlan
+from acquisition.capture.writer import bytes_needed, check_space
+from acquisition.errors import AcquisitionError
+from acquisition.rig.config import RigConfig
+from acquisition.rig.rig import Rig
+from processing.instrument.model import InstrumentModel
+from processing.instrument.states import StateTable
+from processing.storage.capture import Capture
+from processing.storage.capture_schema import Status
+from processing.yaml_file import parse_yaml
+
+
+@dataclass(frozen=True)
+class Job:
+    """A capture that passed the checks that need no device."""
+
+    plan: MeasurementPlan
+    rig: RigConfig
+    instrument: InstrumentModel
+    table: StateTable
+    checks: tuple[Check, ...]
+    seed: int | None = None
+    exposure_known: bool = True
+
+
+@dataclass(frozen=True)
+class Result:
+    """What became of a capture."""
+
+    path: Path
+    status: Status
+    states_done: int
+    states: int
+    ledger: dict[str, float] = field(default_factory=dict)
+    messages: tuple[str, ...] = ()
+    saturated_fraction: float = 0.0
+    worst_angle_deg: float = 0.0
+
+
+def prepare(plan: MeasurementPlan, rig: RigConfig) -> Job:
+    """Check a plan against a rig file; touches no device.
+
+    Where the plan leaves the exposure to be found, the table holds the one that the search starts with.
+
+    Raises
+    ------
+    PlanRefused
+        With everything that is wrong.
+    """
+    checks = check_plan(plan, rig)
+    refuse_failed(checks)
+    instrument = load_instrument(plan, rig)
+    chosen = plan.exposure_s if isinstance(plan.exposure_s, float) else plan.exposure_s.start_s
+    table = plan.state_table(standing_pose_deg(plan, rig), chosen)
+    checks += check_table(table, rig, instrument)
+    refuse_failed(checks)
+    seed = rig.simulator.seed if rig.simulator else None
+    return Job(plan, rig, instrument, table, tuple(checks), seed, not isinstance(plan.exposure_s, AutoExposure))
+
+
+def check_with_devices(job: Job, rig: Rig, folder: Path) -> list[Check]:
+    """Limits, door, exposure and disc, as the devices have them; nothing moves."""
+    checks = check_devices(job.table, rig)
+    for exposure_s in np.unique(job.table.exposure_s)[::-1]:
+        settings = rig.set_exposure(float(exposure_s), job.plan.repeats)
+        read_back_s = settings.exposure_s or float(exposure_s)
+        close = abs(read_back_s - exposure_s) <= max(0.02 * exposure_s, 5e-5)
+        checks.append(Check("camera exposure", close, f"asked {exposure_s:g} s, read back {read_back_s:g} s"))
+    rows, columns = frame_shape(rig)
+    needed = bytes_needed(len(job.table), 1, (rows, columns))
+    try:
+        check_space(existing(folder), needed)
+        checks.append(Check("disc", True, f"{needed / 1e6:.0f} MB in {folder}"))
+    except AcquisitionError as error:
+        checks.append(Check("disc", False, str(error)))
+    return checks
+
+
+def job_of(path: Path, rig: RigConfig | None = None) -> Job:
+    """The job that a partial, aborted or failed capture belongs to.
+
+    Parameters
+    ----------
+    rig : rig to use instead of the one stored in the file, for instance after a port has changed.
+
+    Raises
+    ------
+    CaptureError, AcquisitionError
+        Not a capture, or complete already.
+    """
+    with Capture(path) as capture:
+        if capture.status == "complete":
+            raise AcquisitionError(f"{path} is complete; there is nothing to go on with.")
+        header, exposure_s = capture.header, capture.planned_column("exposure_s")
+        targets = capture.planned_targets_deg()
+    plan = parse_yaml(header.plan_yaml, MeasurementPlan, source=f"{path}: plan")
+    stored = parse_yaml(header.rig_yaml, RigConfig, source=f"{path}: rig")
+    job = prepare(plan, rig or stored)
+    # The targets as they were: an endless axis may have begun some turns away from zero.
+    table = replace(job.table, angles_deg=targets)
+    if np.all(np.isfinite(exposure_s)):
+        return replace(job, table=replace(table, exposure_s=exposure_s), exposure_known=True)
+    return replace(job, table=table)
+
+
+def frame_shape(rig: Rig) -> tuple[int, int]:
+    """(rows, columns) of the frames that the camera is set to."""
+    settings = rig.require_camera().settings
+    if settings.height is None or settings.width is None:
+        raise AcquisitionError("the camera does not tell the size of its frames")
+    return settings.height, settings.width
+
+
+def existing(folder: Path) -> Path:
+    """The folder, or the nearest one above it that is there."""
+    while not folder.exists():
+        folder = folder.parent
+    return folder

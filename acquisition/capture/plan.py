@@ -1,0 +1,181 @@
+"""A measurement plan: one capture as a value, read from YAML, iterated into states."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
+
+from processing.instrument.states import (
+    RGB950_RATIO,
+    RGB950_STATES,
+    RGB950_STEP_DEG,
+    Role,
+    StateTable,
+    rotating_retarders,
+)
+from processing.storage.capture_schema import Sample
+from processing.yaml_file import ConfigError, load_yaml, message_of
+
+Mode = Literal["drr", "stokes"]
+
+#: The axis that sets Omega, where the rig has one.
+ARM = "arm"
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class RotatingRetarders(_Part):
+    """Equal steps of the generator retarder; the analyzer retarder turns `ratio` times as far."""
+
+    kind: Literal["rotating_retarders"] = "rotating_retarders"
+    states: int = Field(default=RGB950_STATES, gt=0, le=10_000)
+    step_deg: float = Field(default=RGB950_STEP_DEG, allow_inf_nan=False)
+    ratio: float = Field(default=RGB950_RATIO, allow_inf_nan=False)
+
+    def angles_deg(self) -> dict[str, NDArray[np.float64]]:
+        """Target angles of each axis (states,), degrees."""
+        return dict(rotating_retarders(1.0, self.states, self.step_deg, self.ratio).angles_deg)
+
+
+class FixedPose(_Part):
+    """Every frame in the same pose, the one that the rig file gives for the mode."""
+
+    kind: Literal["fixed"] = "fixed"
+    states: int = Field(default=8, gt=0, le=10_000)
+
+    def angles_deg(self) -> dict[str, NDArray[np.float64]]:
+        """No axis of its own."""
+        return {}
+
+
+class ListedStates(_Part):
+    """Any table: a list of angles for each axis, all of one length."""
+
+    kind: Literal["table"]
+    angles: dict[str, tuple[Annotated[float, Field(allow_inf_nan=False)], ...]]
+
+    @model_validator(mode="after")
+    def _one_length(self) -> Self:
+        lengths = {name: len(column) for name, column in self.angles.items()}
+        if len(set(lengths.values())) != 1 or 0 in lengths.values():
+            raise ValueError(f"every axis needs the same number of angles, at least one; got {lengths}")
+        return self
+
+    @property
+    def states(self) -> int:
+        """Number of states."""
+        return len(next(iter(self.angles.values())))
+
+    def angles_deg(self) -> dict[str, NDArray[np.float64]]:
+        """Target angles of each axis (states,), degrees."""
+        return {name: np.asarray(column, dtype=float) for name, column in self.angles.items()}
+
+
+States = Annotated[RotatingRetarders | FixedPose | ListedStates, Field(discriminator="kind")]
+
+
+class AutoExposure(_Part):
+    """Exposure found before the capture: the brightest states are probed first.
+
+    The `percentile` of the pixels of the brightest state comes to `target` of full scale; no state saturates.
+    """
+
+    kind: Literal["auto"] = "auto"
+    percentile: float = Field(default=99.9, gt=0, le=100)
+    target: float = Field(default=0.7, gt=0, lt=1)
+    start_s: float = Field(default=0.005, gt=0)
+    longest_s: float = Field(default=10.0, gt=0)
+
+
+def exposure_kind(value: Any) -> str:
+    """Which kind of exposure is meant, so that an error speaks of that one alone."""
+    if isinstance(value, AutoExposure) or (isinstance(value, dict) and "kind" in value):
+        return "auto"
+    return "by wavelength" if isinstance(value, dict) else "seconds"
+
+
+Seconds = Annotated[float, Tag("seconds")]
+Auto = Annotated[AutoExposure, Tag("auto")]
+
+
+class MeasurementPlan(_Part):
+    """One capture.
+
+    Darks come first: the shutter is closed, the axes stand in the pose of the first state. `repeats` frames are
+    averaged for each state. `bracket` lists factors on the exposure, for instance (1, 8): every pose is taken with
+    each, darks too, as states of their own; the reduction uses of each pixel what is not saturated.
+    """
+
+    kind: Literal["plan"] = "plan"
+    title: str = ""
+    mode: Mode = "drr"
+    wavelength_nm: float = Field(default=662, gt=0)
+    omega_deg: float = Field(default=35, allow_inf_nan=False)
+    sample: Sample = Sample(name="red_sphere")
+    illumination: Literal["horizontal", "vertical"] = "horizontal"
+    states: States = RotatingRetarders()
+    exposure_s: Annotated[Seconds | Auto, Discriminator(exposure_kind)] = 0.02
+    repeats: int = Field(default=1, ge=1, le=1000)
+    darks: int = Field(default=4, ge=0, le=1000)
+    repeat_first: bool = Field(default=False, description="take the first light state again at the end: a drift check")
+    bracket: tuple[Annotated[float, Field(gt=0)], ...] = Field(default=(1.0,), min_length=1)
+    role: Literal["flat", "air", "sample"] | None = Field(
+        default=None, description="of the light states; default air for the sample air, else sample"
+    )
+    continue_after_interlock: bool = False
+
+    @model_validator(mode="after")
+    def _exposure_is_positive(self) -> Self:
+        if isinstance(self.exposure_s, float) and not (0 < self.exposure_s < float("inf")):
+            raise ValueError(f"exposure_s must be a positive number of seconds, got {self.exposure_s:g}")
+        return self
+
+    @classmethod
+    def load(cls, path: Path | str) -> MeasurementPlan:
+        """Read a plan file. Raises ConfigError with file, line and key."""
+        return load_yaml(path, cls)
+
+    def with_changes(self, **changes: Any) -> MeasurementPlan:
+        """A copy with the values that are not None, validated again. Raises ConfigError."""
+        chosen = {name: value for name, value in changes.items() if value is not None}
+        try:
+            return MeasurementPlan.model_validate(self.model_dump() | chosen)
+        except ValidationError as error:
+            lines = [": ".join(filter(None, (".".join(map(str, e["loc"])), message_of(e)))) for e in error.errors()]
+            raise ConfigError("\n".join(lines)) from error
+
+    def state_table(self, pose_deg: Mapping[str, float], exposure_s: float) -> StateTable:
+        """Rows of the capture: darks in the first pose, then the sample states.
+
+        Parameters
+        ----------
+        pose_deg : angle of every axis that stands still during the capture (the arm, a Stokes pose).
+        exposure_s : exposure of every state in seconds, times the factors of the bracket.
+        """
+        turning = self.states.angles_deg()
+        if self.repeat_first:
+            turning = {name: np.append(column, column[0]) for name, column in turning.items()}
+        n, factors = self.states.states + self.repeat_first, len(self.bracket)
+        darks = self.darks * factors
+        columns = {name: np.full(n, float(angle)) for name, angle in pose_deg.items() if name not in turning} | turning
+        columns = {name: np.repeat(column, factors) for name, column in columns.items()}
+        dark: Role = "dark"
+        role: tuple[Role, ...] = (dark,) * darks + (self.role or _sample_role(self.sample),) * (n * factors)
+        exposures = exposure_s * np.tile(self.bracket, self.darks + n)
+        return StateTable(
+            angles_deg={k: np.concatenate([np.full(darks, column[0]), column]) for k, column in columns.items()},
+            exposure_s=exposures,
+            role=role,
+            repeats=np.full(len(role), self.repeats, dtype=np.int64),
+        )
+
+
+def _sample_role(sample: Sample) -> Role:
+    return "air" if sample.kind == "air" else "sample"

@@ -1,0 +1,323 @@
+"""Takes the states of one capture: move, settle, expose; while the next move runs, fetch and write.
+
+The next move starts as soon as the light of a state has been collected; its frame arrives, and the state before is
+written, while the axes turn. A frame that did not arrive whole puts its state back into the queue.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from acquisition.capture.auto_exposure import find_exposure
+from acquisition.capture.plan import AutoExposure
+from acquisition.capture.time_ledger import TimeLedger
+from acquisition.capture.writer import CaptureWriter, StateRecord
+from acquisition.errors import RunFailed
+from acquisition.rig.interlocks import Interlocks
+from acquisition.rig.rig import Rig
+from acquisition.screen.observer import Observer, StateReport
+from acquisition.stop_request import StopRequest
+from drivers.camera import Exposure, Frame
+from drivers.errors import FrameLost
+from drivers.motion import Position
+from processing.instrument.model import InstrumentModel
+from processing.instrument.states import StateTable
+from processing.storage.capture_schema import Detector
+
+log = logging.getLogger(__name__)
+
+#: Factor on the exposure after a saturated state.
+DARKER = 0.6
+#: A pixel below this part of full scale, above the black level, counts as near-black.
+NEAR_BLACK = 0.01
+
+
+class TooBright(RunFailed):
+    """A state saturated at an exposure that was found automatically: begin again with a shorter one."""
+
+
+@dataclass
+class _Exposed:
+    """A state whose light has been collected and whose frame is still on its way."""
+
+    state: int
+    exposure: Exposure
+    positions: dict[str, Position]
+    retake: int
+    exposure_s: float
+
+
+@dataclass
+class Messages:
+    """What the capture's closing record tells besides numbers; the oldest are kept."""
+
+    texts: list[str] = field(default_factory=list)
+    dropped: int = 0
+
+    def add(self, text: str) -> None:
+        """Note a message with its time."""
+        if len(self.texts) < 200:
+            self.texts.append(f"{time.strftime('%H:%M:%S')} {text[:500]}")
+        else:
+            self.dropped += 1
+
+
+class CaptureRunner:
+    """Runs the states that are not done yet and hands them to the writer.
+
+    Parameters
+    ----------
+    rig : open and homed.
+    table : rows of the capture.
+    writer : open partial file.
+    detector : for the black level and full scale of the statistics.
+    observers : told of everything; the simulated bench is one of them.
+    saturation_limit : fraction of saturated pixels from which a state raises TooBright; None never.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        table: StateTable,
+        writer: CaptureWriter,
+        detector: Detector,
+        stop: StopRequest,
+        observers: Sequence[Observer] = (),
+        continue_after_interlock: bool = False,
+        saturation_limit: float | None = None,
+    ) -> None:
+        self.rig = rig
+        self.table = table
+        self.writer = writer
+        self.detector = detector
+        self.stop = stop
+        self.observers = observers
+        self.ledger = TimeLedger()
+        self.messages = Messages()
+        self.interlocks = Interlocks(rig, self.warn, continue_after_interlock)
+        self._here: dict[str, float] = {}
+        self._light: bool | None = None
+        self._retakes: dict[int, int] = {}
+        self._pending: deque[int] = deque()
+        self._full_scale = rig.require_camera().full_scale
+        self._saturation_limit = saturation_limit
+
+    def run(self, pending: Iterable[int]) -> bool:
+        """Take these states; True if all are done, False if a stop was asked for.
+
+        Raises
+        ------
+        RunFailed
+            A state could not be taken in the allowed number of tries, or an interlock ended the run.
+        DeviceError, AcquisitionError
+            A device or the disc failed; every axis has been sent a stop.
+        """
+        self._pending = deque(pending)
+        self._here.clear()
+        self._retakes.clear()
+        exposed: _Exposed | None = None
+        try:
+            while self._pending and not self.stop.requested:
+                state = self._pending.popleft()
+                exposed = self._take(state, exposed)
+                if exposed is not None and not self._pending:
+                    # The last state has nothing to overlap with; a lost frame refills the queue.
+                    self._collect(exposed)
+                    exposed = None
+            if exposed is not None:
+                self._collect(exposed)
+        except TooBright:
+            self.rig.rest()
+            raise
+        except BaseException as error:
+            failure = self.rig.stop()
+            if failure is not None:
+                error.add_note(f"stopping the axes failed too: {failure}")
+            raise
+        return not self._pending
+
+    def tell(self, text: str) -> None:
+        """Tell the observers what the rig does now."""
+        for observer in self.observers:
+            observer.activity(text)
+
+    def find_exposure(self, instrument: InstrumentModel, sample: str, auto: AutoExposure) -> None:
+        """Probe the brightest states and take the exposure that they ask for. Moves the axes, lights the sample."""
+        self.tell("looking for the exposure")
+        with self.ledger.time("probing"):
+            found_s = find_exposure(self.rig, self.table, instrument, sample, auto, self.observers, self.warn)
+        self._light = None
+        self._scale_exposure(found_s / auto.start_s)
+
+    def start_darker(self, why: str) -> None:
+        """Forget the states taken and go on with a shorter exposure."""
+        self.warn(f"{why}; beginning again at {DARKER:g} of the exposure")
+        self.writer.forget()
+        self.ledger.states = 0
+        self._scale_exposure(DARKER)
+
+    def _scale_exposure(self, factor: float) -> None:
+        # Three digits: the camera sets no more, and a person can read them.
+        exposure_s = np.array([float(f"{factor * value:.3g}") for value in self.table.exposure_s])
+        self.table = replace(self.table, exposure_s=exposure_s)
+        self.writer.set_exposure(exposure_s)
+        self.messages.add(f"exposure {', '.join(f'{value:g}' for value in np.unique(exposure_s))} s")
+
+    def warn(self, text: str) -> None:
+        """Keep a warning for the closing record and tell the observers."""
+        log.warning("%s", text)
+        self.messages.add(text)
+        for observer in self.observers:
+            observer.warning(text)
+
+    # --- one state ---------------------------------------------------------------------------------------
+
+    def _take(self, state: int, before: _Exposed | None) -> _Exposed | None:
+        targets = {axis: float(column[state]) for axis, column in self.table.angles_deg.items()}
+        changed = {axis: target for axis, target in targets.items() if self._here.get(axis) != target}
+        # The longest move first: the others start while it is under way.
+        changed = dict(sorted(changed.items(), key=lambda item: -self._move_s(*item)))
+        motions = self.rig.start_moves(changed)
+        longest_s = max((motion.expected_s for motion in motions.values()), default=0.0) / self.rig.time_scale
+        if before is not None:
+            self._collect(before)
+        with self.ledger.time("moving"):
+            positions = self.rig.wait(motions)
+        self._here.update(changed)
+        self._set_light(self.table.role[state] != "dark")
+        settle_s = self.rig.config.settle_s if changed else 0.0
+        with self.ledger.time("settling"):
+            time.sleep(settle_s)
+        self.ledger.unavoidable_s += longest_s + settle_s
+        return self._expose(state, targets, positions)
+
+    def _move_s(self, axis: str, target_deg: float) -> float:
+        here_deg = self._here.get(axis)
+        return 0.0 if here_deg is None else self.rig.axes[axis].move_time_s(target_deg - here_deg)
+
+    def _expose(self, state: int, targets: Mapping[str, float], moved: dict[str, Position]) -> _Exposed | None:
+        retake = self._retakes.get(state, 0)
+        for observer in self.observers:
+            observer.exposing(state, retake)
+        camera = self.rig.require_camera()
+        with self.ledger.time("setting"):
+            asked_s = float(self.table.exposure_s[state])
+            settings = self.rig.set_exposure(asked_s, int(self.table.repeats[state]))
+        # Cameras set exposures in steps; what counts is the exposure that was.
+        exposure_s = settings.exposure_s or asked_s
+        start_s = time.monotonic()
+        with self.ledger.time("exposure"):
+            try:
+                exposure = camera.trigger()
+                # Axes that stood still are read while the light is collected: it costs no time.
+                still = {axis: self.rig.axes[axis].read_position() for axis in targets if axis not in moved}
+                exposure.wait_exposed()
+            except FrameLost as error:
+                self._again(state, error)
+                return None
+        light_s = exposure_s * float(self.table.repeats[state])
+        # The camera's own: until it says that the exposure has ended, beyond the exposure itself. The pause between
+        # two questions, a millisecond, is in it.
+        readout_s = max(0.0, time.monotonic() - start_s - light_s)
+        self.ledger.readout_s += readout_s
+        self.ledger.unavoidable_s += light_s + readout_s
+        positions = moved | still
+        self._require_on_target(state, targets, positions)
+        # Looked at after the exposure: it also tells of an interlock that was open before it.
+        blocked = self.interlocks.open_now()
+        if blocked is not None:
+            self._discard(state, f"{blocked} in state {state}")
+            return None
+        return _Exposed(state, exposure, {axis: positions[axis] for axis in targets}, retake, exposure_s)
+
+    def _collect(self, exposed: _Exposed) -> None:
+        with self.ledger.time("transfer"):
+            try:
+                frame = exposed.exposure.frame()
+            except FrameLost as error:
+                self._again(exposed.state, error)
+                return
+        report = self._report(exposed, frame)
+        # In a bracket the longer exposures are meant to saturate.
+        shortest = self.table.exposure_s[exposed.state] <= 1.001 * self.table.exposure_s.min()
+        if self._saturation_limit is not None and shortest and report.saturated_fraction > self._saturation_limit:
+            raise TooBright(
+                f"state {exposed.state}: {100 * report.saturated_fraction:.2f} % of the pixels are saturated"
+            )
+        blocked = self.interlocks.judge(report, meant_to_saturate=not shortest)
+        if blocked is not None:
+            self._discard(exposed.state, blocked)
+            return
+        columns = {
+            "exposure_s": exposed.exposure_s,
+            "host_time_s": frame.host_time_s,
+            "camera_time_ns": frame.camera_time_ns,
+            "frame_id": frame.frame_id,
+            "retakes": exposed.retake,
+            "saturated_fraction": report.saturated_fraction,
+            "near_black_fraction": report.near_black_fraction,
+            "monitor": report.monitor,
+        }
+        with self.ledger.time("writing"):
+            self.writer.put(StateRecord(exposed.state, frame.pixels, exposed.positions, columns))
+        self.ledger.states += 1
+        for observer in self.observers:
+            observer.state_done(report)
+
+    def _report(self, exposed: _Exposed, frame: Frame) -> StateReport:
+        state, black = exposed.state, self.detector.black_level_counts
+        dim = black + NEAR_BLACK * (self._full_scale - black)
+        return StateReport(
+            state=state,
+            role=self.table.role[state],
+            positions=exposed.positions,
+            exposure_s=exposed.exposure_s,
+            saturated_fraction=float(np.count_nonzero(frame.pixels >= self._full_scale)) / frame.pixels.size,
+            near_black_fraction=float(np.count_nonzero(frame.pixels < dim)) / frame.pixels.size,
+            monitor=(float(frame.pixels.mean()) - black) / exposed.exposure_s,
+            pixels=frame.pixels,
+        )
+
+    # --- what can be wrong with it -----------------------------------------------------------------------
+
+    def _again(self, state: int, error: FrameLost) -> None:
+        tries = self._retakes.get(state, 0) + 1
+        self._retakes[state] = tries
+        allowed = self.rig.config.retakes
+        if tries > allowed:
+            raise RunFailed(
+                f"state {state}: {tries} frames in a row were lost, the last: {error.came_back}. "
+                "Check cable, packet size and network load, then go on with --resume."
+            ) from error
+        self.warn(f"state {state}: frame lost ({error.came_back}), taken again, try {tries} of {allowed}")
+        self._pending.appendleft(state)
+
+    def _require_on_target(self, state: int, targets: Mapping[str, float], positions: Mapping[str, Position]) -> None:
+        for axis, target in targets.items():
+            off = positions[axis].deg - target
+            if abs(off) > self.rig.axes[axis].config.tolerance_deg:
+                raise RunFailed(
+                    f"state {state}: axis {axis} should stand at {target:.4f} deg and reads "
+                    f"{positions[axis].deg:.4f} deg after it had arrived. Something moved it; the state is not kept."
+                )
+
+    def _discard(self, state: int, why: str) -> None:
+        self._pending.appendleft(state)
+        with self.ledger.time("interlock"):
+            self.interlocks.hold(state, why, self.stop)
+        # The shutter may have fallen with the interlock.
+        self._light = None
+
+    def _set_light(self, on: bool) -> None:
+        source = self.rig.source
+        if source is None or self._light == on:
+            return
+        with self.ledger.time("shutter"):
+            source.set_light(on)
+        self._light = on

@@ -1,0 +1,248 @@
+"""One capture from job to sealed file: home, go to the pose, take the states, seal, whatever happens."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from acquisition.capture.header import capture_header, now, title_of
+from acquisition.capture.job import Job, Result, frame_shape
+from acquisition.capture.plan import ARM, AutoExposure
+from acquisition.capture.runner import CaptureRunner, TooBright
+from acquisition.capture.writer import PARTIAL, CaptureWriter
+from acquisition.cleanup import run_all
+from acquisition.errors import AcquisitionError, Stopped
+from acquisition.rig.continuous_rotation import unwound
+from acquisition.rig.rig import Rig
+from acquisition.screen.observer import Observer
+from acquisition.stop_request import StopRequest
+from drivers.errors import DeviceError
+from processing.instrument.model import InstrumentModel
+from processing.storage.capture import Capture
+from processing.storage.capture_schema import Status
+
+#: How often a capture with auto exposure begins again because a state saturated.
+DARKER_TRIES = 3
+
+
+def take(
+    job: Job,
+    rig: Rig,
+    path: Path,
+    stop: StopRequest,
+    observers: Sequence[Observer] = (),
+    home: bool = False,
+) -> Result:
+    """Take a new capture into `path`; the rig is open and `check_with_devices` has passed.
+
+    Raises
+    ------
+    AcquisitionError, DeviceError
+        The run failed; the message names the partial file, which `resume` goes on with.
+    """
+    _require_reference(rig, home)
+    place_sample(job, rig)
+    job = replace(job, table=unwound(job.table, rig))
+    header = capture_header(job.plan, job.rig, job.instrument, rig, job.seed)
+    writer = CaptureWriter.create(path, header, job.table, frame_shape(rig), now())
+    if not job.exposure_known:
+        writer.set_exposure(np.full(len(job.table), np.nan))
+    return _run(job, rig, writer, range(len(job.table)), stop, observers)
+
+
+def resume(
+    job: Job, rig: Rig, partial: Path, stop: StopRequest, observers: Sequence[Observer] = (), home: bool = False
+) -> Result:
+    """Go on with a capture: the first state not done, then the others. Raises as `take`."""
+    _require_reference(rig, home)
+    place_sample(job, rig)
+    with Capture(partial) as capture:
+        done = set(capture.done.tolist())
+        if capture.frame_shape != frame_shape(rig):
+            raise AcquisitionError(
+                f"{partial} has frames of {capture.frame_shape}, the camera gives {frame_shape(rig)}. "
+                "Go on with the camera and the settings that began it."
+            )
+    if not partial.name.endswith(PARTIAL):
+        partial = partial.rename(partial.with_name(partial.name + PARTIAL))
+    writer = CaptureWriter.reopen(partial)
+    pending = [k for k in range(len(job.table)) if k not in done]
+    return _run(job, rig, writer, pending, stop, observers)
+
+
+def place_sample(job: Job, rig: Rig) -> None:
+    """On a simulated rig, do what the operator does: sample, optics and filter."""
+    simulation, config = rig.simulation, job.rig.simulator
+    if simulation is None or config is None:
+        return
+    truth = config.truth.get(job.plan.mode)
+    instrument = InstrumentModel.load(truth) if truth else job.instrument
+    plan = job.plan
+    omega_deg = plan.omega_deg if ARM in job.rig.axes else None
+    simulation.prepare(plan.sample.name or plan.sample.kind, instrument, plan.wavelength_nm, omega_deg)
+
+
+class Announcer(Observer):
+    """Tells the simulated bench to which state the next exposure belongs."""
+
+    def __init__(self, announce: Callable[[int, int], None]) -> None:
+        self._announce = announce
+
+    def exposing(self, state: int, retake: int) -> None:
+        self._announce(state, retake)
+
+
+def _run(
+    job: Job,
+    rig: Rig,
+    writer: CaptureWriter,
+    pending: Sequence[int],
+    stop: StopRequest,
+    observers: Sequence[Observer],
+) -> Result:
+    watchers = list(observers)
+    if rig.simulation is not None:
+        watchers.append(Announcer(rig.simulation.announce))
+    auto = job.plan.exposure_s
+    runner = CaptureRunner(
+        rig,
+        job.table,
+        writer,
+        job.rig.detector,
+        stop,
+        watchers,
+        continue_after_interlock=job.plan.continue_after_interlock,
+        saturation_limit=1 - auto.percentile / 100 if isinstance(auto, AutoExposure) else None,
+    )
+    status: Status = "failed"
+    failure: BaseException | None = None
+    for observer in watchers:
+        observer.run_started(title_of(job.plan), job.table, len(pending), job.instrument.mosaic)
+    try:
+        _go_to_start(job, rig, runner)
+        if _take_states(job, runner, pending):
+            status = "complete"
+        else:
+            status = "aborted"
+            _park(rig, watchers)
+    except (KeyboardInterrupt, Stopped) as interrupt:
+        status, failure = "aborted", interrupt
+    except (AcquisitionError, DeviceError) as error:
+        failure = error
+    except BaseException:
+        writer.abandon()
+        raise
+    finally:
+        light = run_all([("shut off the light", _shut(rig))])
+        if light is not None:
+            runner.warn(f"the light could not be shut off: {light}")
+    closing = _closing(runner, rig, status, failure)
+    # A run that can go on keeps its partial name, but for the orderly end after one Ctrl-C.
+    path = writer.seal(status, closing, keep_partial=failure is not None)
+    for observer in watchers:
+        observer.run_ended(status, closing)
+    if failure is not None:
+        failure.add_note(f"States done so far are in {path}. Go on with: acquire --resume {path}")
+        raise failure
+    return _result(path, status, job, runner)
+
+
+def _take_states(job: Job, runner: CaptureRunner, pending: Sequence[int]) -> bool:
+    """Take the states, at an exposure that is found first where the plan says so."""
+    auto = job.plan.exposure_s
+    if isinstance(auto, AutoExposure) and not job.exposure_known:
+        runner.find_exposure(job.instrument, job.plan.sample.kind, auto)
+    for _ in range(DARKER_TRIES):
+        try:
+            return runner.run(pending)
+        except TooBright as error:
+            # Nothing of a rotation with a saturated state is kept: its states would not have one exposure.
+            pending = range(len(job.table))
+            runner.start_darker(str(error))
+    return runner.run(pending)
+
+
+def _require_reference(rig: Rig, home: bool) -> None:
+    """Refuse axes without a reference, unless homing was asked for, by option or rig file."""
+    unhomed = rig.unhomed()
+    if unhomed and not (home or rig.config.home_at_start):
+        raise AcquisitionError(
+            f"no reference position: {', '.join(unhomed)}. Nothing was moved. Look whether the way is free, then "
+            "home the axes with `acquire home` (or --home)."
+        )
+
+
+def _go_to_start(job: Job, rig: Rig, runner: CaptureRunner) -> None:
+    # A wavelength that the source does not have ends the run before anything turns.
+    if rig.source is not None and rig.source.selects_wavelength:
+        rig.source.select(job.plan.wavelength_nm)
+    unhomed = rig.unhomed()
+    if unhomed:
+        runner.tell(f"homing {', '.join(unhomed)}")
+        with runner.ledger.time("homing"):
+            rig.home(unhomed)
+    first = {axis: float(column[0]) for axis, column in job.table.angles_deg.items()}
+    # The arm goes first and alone: what stands on it and the sample are what it can hit.
+    for axes in ([ARM], [axis for axis in first if axis != ARM]):
+        targets = {axis: first[axis] for axis in axes if axis in first}
+        if targets:
+            runner.tell("moving " + ", ".join(f"{axis} to {angle:g}" for axis, angle in targets.items()))
+            with runner.ledger.time("approach"):
+                rig.move(targets)
+
+
+def _park(rig: Rig, observers: Sequence[Observer]) -> None:
+    if rig.config.park_deg:
+        for observer in observers:
+            observer.activity("parking")
+        rig.move(rig.config.park_deg)
+
+
+def _shut(rig: Rig) -> Callable[[], None]:
+    def shut() -> None:
+        if rig.source is not None:
+            rig.source.set_light(False)
+
+    return shut
+
+
+def _closing(runner: CaptureRunner, rig: Rig, status: str, failure: BaseException | None) -> dict[str, Any]:
+    closing: dict[str, Any] = {
+        "end_time": now(),
+        "status": status,
+        "ledger": runner.ledger.summary(),
+        "messages": runner.messages.texts,
+        "messages_dropped": runner.messages.dropped,
+        "interlocks": runner.interlocks.events,
+        "camera_settings": rig.require_camera().settings.model_dump(exclude_none=True),
+    }
+    if failure is not None:
+        closing["failure"] = str(failure) or type(failure).__name__
+    try:
+        closing["stream"] = asdict(rig.require_camera().statistics())
+    except DeviceError as error:
+        closing["stream"] = {"failure": str(error)}
+    return closing
+
+
+def _result(path: Path, status: Status, job: Job, runner: CaptureRunner) -> Result:
+    with Capture(path) as capture:
+        saturated = capture.column("saturated_fraction")
+        done = capture.done
+        off = [np.abs(capture.angles_deg[axis] - target[done]) for axis, target in job.table.angles_deg.items()]
+    worst = float(np.max(saturated, initial=0.0))
+    worst_angle = float(np.max(off, initial=0.0))
+    return Result(
+        path,
+        status,
+        len(done),
+        len(job.table),
+        runner.ledger.summary(),
+        tuple(runner.messages.texts),
+        worst,
+        worst_angle,
+    )

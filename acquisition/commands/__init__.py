@@ -1,0 +1,1 @@
+"""The commands of `acquire`, one module for each group."""

@@ -1,0 +1,125 @@
+"""The `acquire` command: captures and campaigns on a rig, and the rig by hand."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+import typer
+
+from acquisition.commands import by_hand as hand_commands
+
+if TYPE_CHECKING:
+    from acquisition.stop_request import StopRequest
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+DEFAULT_RIG = CONFIGS / "rigs" / "simulated.yaml"
+INTERRUPTED = 130
+
+app = typer.Typer(
+    name="acquire",
+    help="Take Mueller and Stokes captures.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+Omega = Annotated[float | None, typer.Option("--omega", help="angle between source and camera, degrees")]
+ModeName = Annotated[str | None, typer.Option("--mode", help="drr (Mueller image) or stokes (one generator state)")]
+Wavelength = Annotated[float | None, typer.Option("--wavelength", help="nm")]
+RigFile = Annotated[Path | None, typer.Option("--rig", help="rig file; without it the SIMULATED rig")]
+PlanFile = Annotated[Path | None, typer.Option("--plan", help="plan file; options override it")]
+
+
+@app.callback(invoke_without_command=True)
+def capture(
+    context: typer.Context,
+    omega: Omega = None,
+    mode: ModeName = None,
+    wavelength: Wavelength = None,
+    sample: Annotated[str | None, typer.Option(help="name of the sample; air and mirror are known samples")] = None,
+    exposure: Annotated[float | None, typer.Option(help="seconds")] = None,
+    rig: RigFile = None,
+    plan: PlanFile = None,
+    out: Annotated[Path, typer.Option(help="folder of the capture")] = Path("captures"),
+    seed: Annotated[int | None, typer.Option(help="of the simulated noise")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="check everything, move nothing")] = False,
+    home: Annotated[bool, typer.Option("--home", help="home axes that have no reference")] = False,
+    campaign: Annotated[Path | None, typer.Option(help="campaign file: run what is missing of it")] = None,
+    resume: Annotated[Path | None, typer.Option(help="go on with this partial capture")] = None,
+    live: Annotated[bool, typer.Option("--live", help="show the run on a local web page")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="answer every question with yes")] = False,
+) -> None:
+    """Take a capture: `acquire --omega 35`."""
+    if context.invoked_subcommand is not None:
+        return
+    if omega is None and plan is None and resume is None and campaign is None:
+        sources = (context.get_parameter_source(name) for name in context.params)
+        if any(source is not None and source.name == "COMMANDLINE" for source in sources):
+            typer.echo(
+                "error: nothing to measure: give --omega, --plan, --campaign or --resume (-h for help)", err=True
+            )
+        else:
+            typer.echo(context.get_help())
+        raise typer.Exit(2)
+    from acquisition.commands import single
+
+    options = single.Options(
+        omega, mode, wavelength, sample, exposure, rig, plan, out, seed, dry_run, home, resume, live, yes
+    )
+    if campaign is None:
+        raise typer.Exit(_stoppable(lambda stop: single.run(options, stop)))
+    from acquisition.commands import campaign as campaign_command
+
+    raise typer.Exit(_stoppable(lambda stop: campaign_command.run(options, campaign, stop)))
+
+
+hand_commands.register(app)
+
+
+def _stoppable(action: Callable[[StopRequest], int]) -> int:
+    from acquisition.stop_request import StopRequest
+
+    # Straight to the descriptor: the signal may come in the middle of a buffered write.
+    with StopRequest(tell=lambda text: os.write(2, f"\n{text}\n".encode())) as stop:
+        try:
+            return action(stop)
+        except KeyboardInterrupt as error:
+            # Typer would end the program without a word.
+            _report(error, INTERRUPTED, "stopped at once; every axis was sent a stop")
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Entry point of `acquire`; ends in SystemExit.
+
+    Exit codes: 0 done, 1 the run failed, 2 bad input, 130 interrupted.
+    """
+    from acquisition.errors import AcquisitionError, PlanRefused, Stopped
+    from drivers.errors import DeviceError
+    from processing.errors import ProcessError
+
+    try:
+        app(args=None if argv is None else list(argv))
+    except (PlanRefused, ProcessError) as error:
+        _report(error, 2)
+    except Stopped as error:
+        _report(error, INTERRUPTED)
+    except (AcquisitionError, DeviceError, OSError) as error:
+        _report(error, 1)
+    except KeyboardInterrupt as error:
+        _report(error, INTERRUPTED, "stopped at once; every axis was sent a stop")
+
+
+def _report(error: BaseException, code: int, text: str | None = None) -> NoReturn:
+    typer.echo(f"error: {text or error}", err=True)
+    for note in getattr(error, "__notes__", []):
+        typer.echo(note, err=True)
+    sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,94 @@
+"""`acquire --campaign FILE`: check the whole of it, then run what is missing."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from acquisition.campaign import run as campaign_run
+from acquisition.campaign.log import CampaignFolder
+from acquisition.campaign.plan import Campaign
+from acquisition.campaign.run import CampaignRun, Planned
+from acquisition.capture.checks import Check, refuse_failed
+from acquisition.capture.operator import Operator
+from acquisition.commands.application import DEFAULT_RIG, INTERRUPTED
+from acquisition.commands.single import Options, live_page, say_simulated, seeded, show_checks
+from acquisition.rig.config import load_rig
+from acquisition.rig.rig import Rig
+from acquisition.screen.observer import Observer
+from acquisition.screen.progress import ConsoleProgress
+from acquisition.stop_request import StopRequest
+
+
+def run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Observer] = ()) -> int:
+    """Run a campaign or, with --dry-run, only check it; returns the exit code."""
+    console = Console(stderr=True)
+    campaign = Campaign.load(file)
+    rig_config = seeded(load_rig(options.rig or campaign.rig or DEFAULT_RIG), options.seed)
+    jobs = campaign_run.prepare(campaign, rig_config)
+    folder = options.out / campaign.name
+    say_simulated(console, rig_config)
+    with Rig(rig_config) as rig, console.status(f"checking {len(jobs)} captures"):
+        planned, checks = campaign_run.check_all(jobs, rig, folder)
+    if options.dry_run:
+        _show(planned, checks, folder)
+        refuse_failed(checks)
+        return 0
+    refuse_failed(checks)
+    held = CampaignFolder(folder, campaign)
+    try:
+        operator = Operator(console.print, stop, options.yes, rig_config.simulated)
+        with live_page(options.live, rig_config, stop, console) as page:
+            watchers = [ConsoleProgress(console), *page, *observers]
+            done = CampaignRun(campaign, rig_config, held, operator, stop, watchers, options.home).run(jobs)
+        complete = sum(entry.get("status") == "complete" for entry in held.index.values())
+    finally:
+        held.close()
+    typer.echo(f"{complete} of {len(jobs)} captures complete in {folder}")
+    typer.echo(f"index {folder / 'index.json'}, log {folder / 'log.jsonl'}")
+    door = os.environ.get("UMOV_DOOR", "")
+    after = f"{door} process campaign {folder} --geometry FILE --material FILE".lstrip()
+    typer.echo(f"next: {after}" if done else "next: the same command goes on where it stopped")
+    return 0 if done else INTERRUPTED
+
+
+def _grouped(checks: Sequence[Check]) -> tuple[Check, ...]:
+    """What failed, and one line for each thing that passed, with its first and last finding."""
+    passed: dict[str, list[str]] = {}
+    for check in checks:
+        if check.passed:
+            passed.setdefault(check.what, []).append(check.found)
+    lines = [
+        Check(what, True, found[0] if len(found) == 1 else f"{found[0]} ... {found[-1]} ({len(found)} different)")
+        for what, found in passed.items()
+    ]
+    return (*(check for check in checks if not check.passed), *lines)
+
+
+def _show(planned: Sequence[Planned], checks: Sequence[Check], folder: Path) -> None:
+    console = Console(soft_wrap=True)
+    table = Table(box=None)
+    for heading in ("", "capture", "states", "s", "MB", ""):
+        table.add_column(heading, justify="left" if heading in ("", "capture") else "right")
+    for entry in planned:
+        there = (folder / entry.capture.name).exists()
+        table.add_row(
+            str(entry.capture.number),
+            entry.capture.name,
+            str(len(entry.job.table)),
+            f"{entry.seconds:.0f}",
+            f"{entry.size / 1e6:.0f}",
+            "there already" if there else "reference" if entry.capture.reference else "",
+        )
+    console.print(table)
+    show_checks(console, _grouped(checks))
+    seconds, size = sum(p.seconds for p in planned), sum(p.size for p in planned)
+    typer.echo(
+        f"{len(planned)} captures, about {seconds / 60:.0f} min without homing and operator, {size / 1e9:.2f} GB; "
+        "nothing was moved"
+    )

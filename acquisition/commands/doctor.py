@@ -1,0 +1,157 @@
+"""`acquire doctor`: what is there, what is not and why. Moves nothing, changes no light."""
+
+from __future__ import annotations
+
+import importlib
+import shutil
+import sys
+import sysconfig
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from acquisition.capture.header import versions
+from acquisition.cleanup import run_all
+from acquisition.errors import AcquisitionError
+from acquisition.rig.config import RigConfig
+from acquisition.rig.rig import Rig
+from drivers.camera import Camera, CameraIdentity, CameraSettings
+from drivers.errors import DeviceError, FrameLost
+from drivers.motion import MotionAxis
+from processing.errors import ProcessError
+from processing.instrument.model import InstrumentModel
+
+#: Frames of the packet-loss test, and their exposure.
+FRAMES = 50
+EXPOSURE_S = 0.001
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing looked at. `well` is None for plain information."""
+
+    what: str
+    well: bool | None
+    found: str
+
+
+def examine(config: RigConfig, folder: Path, frames: int = FRAMES) -> Iterator[Finding]:
+    """Look at everything that a measurement needs, one finding after another; no device's failure hides another's."""
+    yield Finding("versions", None, ", ".join(f"{name} {number}" for name, number in versions().items()))
+    yield Finding("umov", None, f"{Path(__file__).parents[2]}, run by {sys.executable}")
+    for name in ("numpy", "h5py"):
+        yield _guarded(name, lambda name=name: _origin(name))  # type: ignore[misc]
+    yield _guarded("aravis", _aravis)
+    free = shutil.disk_usage(folder).free
+    yield Finding("disc", free > 1e9, f"{free / 1e9:.1f} GB free in {folder.resolve()}")
+    for name, mode in config.modes.items():
+        yield _guarded(f"mode {name}", lambda mode=mode: _instrument(mode.instrument))  # type: ignore[misc]
+    rig = Rig(config)
+    try:
+        yield _guarded("emulators", rig.start_simulation) if config.simulator else Finding("rig", None, config.name)
+        for name in config.axes:
+            yield _guarded(f"axis {name}", lambda name=name: _axis(rig.open_axis(name)))  # type: ignore[misc]
+        if config.source is not None:
+            yield _guarded("source", lambda: _source(rig))
+        yield _guarded("camera", lambda: _camera(rig.open_camera(), config, frames))
+    finally:
+        failure = run_all([("close the rig", rig.close)])
+    if failure is not None:
+        yield Finding("closing", False, str(failure))
+
+
+def _guarded(what: str, look: Callable[[], str]) -> Finding:
+    try:
+        return Finding(what, True, look())
+    except (DeviceError, AcquisitionError, ProcessError, ImportError, ValueError) as error:
+        return Finding(what, False, str(error))
+
+
+def _origin(name: str) -> str:
+    """Where a package is imported from; it must be this environment, not the system that gi is borrowed from."""
+    folder = Path(str(importlib.import_module(name).__file__)).parent
+    own = {Path(sysconfig.get_path(part)) for part in ("purelib", "platlib")}
+    if not any(folder.is_relative_to(place) for place in own):
+        raise AcquisitionError(
+            f"it comes from {folder}, not from this environment. Unset PYTHONPATH; run ./lab, which shows only gi to it"
+        )
+    return str(folder)
+
+
+def _aravis() -> str:
+    from drivers.aravis_library import load_aravis
+
+    aravis, _ = load_aravis()
+    # The library itself is loaded with the first call.
+    aravis.get_n_interfaces()
+    import gi
+
+    # The bindings tell the version of the interface only; the file name of the library has all of it.
+    mapped = (line.split()[-1] for line in Path("/proc/self/maps").read_text().splitlines() if "libaravis" in line)
+    library = next(mapped, "its library is not to be seen")
+    return f"{Path(library).resolve()}; gi {gi.__version__} in {Path(str(gi.__file__)).resolve().parent}"
+
+
+def _instrument(path: Path) -> str:
+    model = InstrumentModel.load(path)
+    return f"{model.name} ({path.name})"
+
+
+def _axis(axis: MotionAxis) -> str:
+    who = axis.describe()
+    limits = axis.limits
+    ends = " to ".join("no limit" if end is None else f"{end:g}" for end in (limits.min_deg, limits.max_deg))
+    axis.check_fault()
+    homed = "homed" if axis.is_homed() else "NOT homed"
+    moving = ", MOVING" if axis.is_moving() else ""
+    position = f"at {axis.read_position().deg:.4f} deg, " if axis.is_homed() else ""
+    warnings = "".join(f", warning: {text}" for text in axis.warnings())
+    stop = "" if axis.can_stop_a_move else ", cannot be stopped once it moves"
+    name = f"{who.kind} {who.model}, serial {who.serial_number}, firmware {who.firmware}"
+    return f"{name}, {who.port}: {homed}{moving}, {position}limits {ends}{stop}{warnings}"
+
+
+def _source(rig: Rig) -> str:
+    source = rig.open_source()
+    state = "light on" if source.is_on() else "light off"
+    who = source.describe()
+    name = ", ".join(f"{key.replace('_', ' ')} {who[key]}" for key in who if key != "model")
+    if source.interlock_open():
+        raise AcquisitionError(f"{who['model']}, {name}: {state}, INTERLOCK OPEN. Close the door")
+    return f"{who['model']}, {name}: {state}, interlock closed"
+
+
+def _camera(camera: Camera, config: RigConfig, frames: int) -> str:
+    """Take frames and count those that were lost; the dark ones of a shut source serve as well."""
+    exposure_s = max(EXPOSURE_S, config.exposure_s[0])
+    camera.configure(CameraSettings(exposure_s=exposure_s, frame_average=1, trigger="software"))
+    who = camera.describe()
+    lost = 0
+    for _ in range(frames):
+        try:
+            camera.trigger().frame()
+        except FrameLost:
+            lost += 1
+    statistics = camera.statistics()
+    temperature = camera.temperature_c()
+    warm = "" if temperature is None else f", {temperature:.1f} C"
+    found = (
+        f"{who.library}: {who.vendor} {who.model}, serial {who.serial_number}, "
+        f"{who.sensor_width} x {who.sensor_height} {who.pixel_format} ({who.bits} bits), "
+        f"{_packets(who)}{warm}; "
+        f"{lost} of {frames} frames lost, {statistics.missing_packets} packets missing, "
+        f"{statistics.resent_packets} resent"
+    )
+    if lost:
+        raise AcquisitionError(found + ". Check cable, packet size and network load.")
+    if config.detector.bits is not None and camera.bits != config.detector.bits:
+        raise AcquisitionError(
+            f"{found}. The rig file says {config.detector.bits} bits under `detector`; correct that or `camera`"
+        )
+    return found
+
+
+def _packets(who: CameraIdentity) -> str:
+    if who.packet_size is None:
+        return "not on Ethernet"
+    return f"at {who.address}, packets of {who.packet_size} bytes, {who.interface} takes up to {who.interface_mtu}"

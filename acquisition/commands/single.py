@@ -1,0 +1,185 @@
+"""`acquire --omega 35` and `acquire --resume FILE`: one capture, from the options to the summary."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from acquisition.capture import session
+from acquisition.capture.checks import Check, refuse_failed
+from acquisition.capture.estimate import capture_seconds
+from acquisition.capture.header import default_name
+from acquisition.capture.job import Job, Result, check_with_devices, job_of, prepare
+from acquisition.capture.operator import Operator
+from acquisition.capture.plan import MeasurementPlan
+from acquisition.commands.application import CONFIGS, DEFAULT_RIG, INTERRUPTED
+from acquisition.rig.config import RigConfig, load_rig
+from acquisition.rig.rig import Rig
+from acquisition.screen.observer import Observer
+from acquisition.screen.progress import ConsoleProgress
+from acquisition.stop_request import StopRequest
+from processing.storage.capture_schema import Sample
+from processing.yaml_file import ConfigError
+
+
+@dataclass(frozen=True)
+class Options:
+    """The options of `acquire` without a subcommand."""
+
+    omega: float | None
+    mode: str | None
+    wavelength: float | None
+    sample: str | None
+    exposure: float | None
+    rig: Path | None
+    plan: Path | None
+    out: Path
+    seed: int | None
+    dry_run: bool
+    home: bool
+    resume: Path | None
+    live: bool
+    yes: bool
+
+
+def run(options: Options, stop: StopRequest) -> int:
+    """Take or go on with one capture; returns the exit code. Raises the errors that `main` prints."""
+    console = Console(stderr=True)
+    if options.resume is not None:
+        job = job_of(options.resume, load_rig(options.rig) if options.rig else None)
+        path = options.resume
+    else:
+        job = prepare(plan_of(options), rig_of(options))
+        path = options.out / default_name(job.plan)
+    say_simulated(console, job.rig)
+    operator = Operator(console.print, stop, options.yes, job.rig.simulated)
+    with Rig(job.rig, ask=operator.confirm) as rig:
+        checks = check_with_devices(job, rig, path.parent)
+        if options.dry_run:
+            show_checks(Console(), (*job.checks, *checks))
+            refuse_failed(checks)
+            Console().print(f"about {capture_seconds(job, rig):.0f} s; nothing was moved", markup=False)
+            return 0
+        refuse_failed(checks)
+        if stop.requested:
+            return INTERRUPTED
+        take = session.take if options.resume is None else session.resume
+        with live_page(options.live, job.rig, stop, console) as page:
+            result = take(job, rig, path, stop, [ConsoleProgress(console), *page], home=options.home)
+    summarize(job, result)
+    return INTERRUPTED if result.status == "aborted" else 0
+
+
+def plan_of(options: Options) -> MeasurementPlan:
+    """The plan file, or the default plan of the mode, with the options on top."""
+    path = options.plan or CONFIGS / "plans" / f"{options.mode or 'drr'}.yaml"
+    if options.plan is None and not path.exists():
+        known = ", ".join(sorted(p.stem for p in (CONFIGS / "plans").glob("*.yaml")))
+        raise ConfigError(f"--mode {options.mode}: there is no default plan of that name, only {known}. Give --plan.")
+    plan = MeasurementPlan.load(path)
+    sample = None if options.sample is None else sample_of(options.sample)
+    return plan.with_changes(
+        omega_deg=options.omega, wavelength_nm=options.wavelength, sample=sample, exposure_s=options.exposure
+    )
+
+
+def sample_of(name: str) -> Sample:
+    """A sample by its name; air and mirror are known ones."""
+    if name == "air":
+        return Sample(kind="air", name=name)
+    if name == "mirror":
+        return Sample(kind="mirror", name=name)
+    return Sample(name=name)
+
+
+def rig_of(options: Options) -> RigConfig:
+    """The rig file, or the simulated rig."""
+    return seeded(load_rig(options.rig or DEFAULT_RIG), options.seed)
+
+
+def seeded(rig: RigConfig, seed: int | None) -> RigConfig:
+    """The rig with another seed of its simulated noise. Raises ConfigError for a real rig."""
+    if seed is None:
+        return rig
+    if rig.simulator is None:
+        raise ConfigError(f"--seed {seed}: rig {rig.name!r} has no simulator, its noise has no seed")
+    return rig.model_copy(update={"simulator": rig.simulator.model_copy(update={"seed": seed})})
+
+
+@contextmanager
+def live_page(wanted: bool, rig: RigConfig, stop: StopRequest, console: Console) -> Iterator[list[Observer]]:
+    """The live page as a list of observers, empty where it is not wanted; prints its address."""
+    if not wanted:
+        yield []
+        return
+    from acquisition.screen.live_view import LiveServer, LiveState
+
+    state = LiveState(rig.simulated, rig.detector.black_level_counts, (1 << (rig.detector.bits or 16)) - 1)
+    with LiveServer(state, stop) as server:
+        console.print(f"live view: {server.url}", soft_wrap=True, highlight=False, markup=False)
+        yield [state]
+
+
+def say_simulated(console: Console, rig: RigConfig) -> None:
+    """Say on the console that nothing of this is a measurement."""
+    if rig.simulated:
+        console.print(f"SIMULATED: rig {rig.name!r}, emulated devices, no hardware", style="bold red", highlight=False)
+
+
+def show_checks(console: Console, checks: tuple[Check, ...]) -> None:
+    """One line for each check."""
+    table = Table(box=None, show_header=False)
+    for check in checks:
+        table.add_row("ok" if check.passed else "REFUSED", check.what, check.found)
+    console.print(table)
+
+
+def summarize(job: Job, result: Result) -> None:
+    """Draw the quick look and print one screen."""
+    from acquisition.screen.quicklook import draw
+
+    figure = draw(result.path)
+    plan, ledger = job.plan, result.ledger
+    darks = sum(role == "dark" for role in job.table.role)
+    parts = [f"{name.removesuffix('_s')} {ledger[name]:.1f}" for name in ledger if name.endswith("_s")]
+    what = f"{plan.mode}, {plan.wavelength_nm:g} nm, Omega {plan.omega_deg:g} deg, {plan.sample.name}"
+    lines = [
+        ("what", ("SIMULATED " if job.rig.simulated else "") + what),
+        ("states", f"{result.states_done} of {result.states} ({darks} dark), {result.status}"),
+        ("angles", f"read back at every state, at most {result.worst_angle_deg:.4f} deg from the target"),
+        ("saturation", f"worst state {100 * result.saturated_fraction:.3f} % of pixels"),
+        ("seconds", ", ".join(parts)),
+        *(("overhead", text) for text in _overhead(ledger)),
+        *(("note", message) for message in result.messages[-5:]),
+        ("figure", str(figure)),
+        ("capture", str(result.path)),
+        ("next", next_command(job, result)),
+    ]
+    for label, text in lines:
+        typer.echo(f"{label:<11} {text}")
+
+
+def _overhead(ledger: dict[str, float]) -> list[str]:
+    # Emulators of another program can run faster than the speeds that they declare.
+    if ledger.get("excess", -1.0) < 0:
+        return []
+    readout_ms = 1e3 * ledger["of_it_readout_s"] / max(ledger["states"], 1)
+    return [
+        f"{100 * ledger['excess']:.1f} % beyond the unavoidable {ledger['unavoidable_s']:.1f} s of moves, settling, "
+        f"exposure and the camera's own {readout_ms:.0f} ms a state"
+    ]
+
+
+def next_command(job: Job, result: Result) -> str:
+    """What to do with the file now, as the user started this program: `UMOV_DOOR` is set by ./lab."""
+    door = os.environ.get("UMOV_DOOR", "")
+    if result.status != "complete":
+        return f"{door} acquire --resume {result.path}".lstrip()
+    return f"{door} process reduce {result.path}".lstrip()

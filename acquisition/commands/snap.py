@@ -1,0 +1,83 @@
+"""One frame as things stand, for focusing and finding the sample."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from acquisition.errors import AcquisitionError
+from acquisition.rig.config import RigConfig
+from acquisition.rig.rig import Rig
+from processing.instrument.model import InstrumentModel
+from processing.yaml_file import ConfigError
+
+#: Kinds of files: one to look at, and those that hold the counts.
+PICTURE, COUNTS = ".png", (".tif", ".tiff", ".npy")
+
+
+def take_frame(
+    config: RigConfig, exposure_s: float, out: Path, light: bool, sample: str, wavelength_nm: float | None = None
+) -> str:
+    """Write one frame to `out` and describe it; light is on or off afterwards as it was found.
+
+    A frame of a simulated rig says so in its name: `frame.tif` becomes `frame.simulated.tif`.
+
+    Parameters
+    ----------
+    wavelength_nm : for a source that selects it, which keeps it; None leaves it as it is.
+
+    Raises
+    ------
+    ConfigError
+        Exposure or kind of file that there is not.
+    AcquisitionError, DeviceError
+        The file cannot be written, or a device failed.
+    """
+    low, high = config.exposure_s
+    if not low <= exposure_s <= high:
+        raise ConfigError(f"--exposure {exposure_s:g}: the rig allows {low:g} to {high:g} s")
+    if out.suffix.lower() not in (PICTURE, *COUNTS):
+        raise ConfigError(f"{out}: a frame is written as .png (8 bits, stretched), .tif or .npy (counts)")
+    if config.simulated:
+        out = out.with_name(f"{out.stem}.simulated{out.suffix}")
+    with Rig(config, ask=typer.confirm) as rig:
+        if rig.simulation is not None:
+            model = InstrumentModel.load(next(iter(config.modes.values())).instrument)
+            rig.simulation.prepare(sample, model, wavelength_nm or config.wavelengths_nm[0])
+        before = rig.source.is_on() if rig.source is not None else None
+        settings = rig.set_exposure(exposure_s, 1)
+        camera = rig.require_camera()
+        try:
+            if rig.source is not None:
+                if wavelength_nm is not None:
+                    rig.source.select(wavelength_nm)
+                rig.source.set_light(light)
+            pixels = camera.capture(1)[0].pixels
+        finally:
+            if rig.source is not None and before is not None:
+                rig.source.set_light(before)
+        black = config.detector.black_level_counts
+        full = camera.full_scale
+    _write(out, pixels, black)
+    saturated = 100 * float(np.count_nonzero(pixels >= full)) / pixels.size
+    kind = "SIMULATED " if config.simulated else ""
+    return (
+        f"{kind}{out}: {pixels.shape[0]} x {pixels.shape[1]}, {settings.exposure_s or exposure_s:g} s, "
+        f"mean {pixels.mean():.1f}, largest {pixels.max()} of {full} counts, {saturated:.3f} % saturated"
+    )
+
+
+def _write(out: Path, pixels: NDArray[np.uint16], black: float) -> None:
+    if out.suffix.lower() == ".npy":
+        np.save(out, pixels)
+        return
+    shown: NDArray[np.uint16] | NDArray[np.uint8] = pixels
+    if out.suffix.lower() == PICTURE:
+        top = max(float(np.percentile(pixels, 99.8)), black + 1)
+        shown = np.clip((pixels.astype(np.float32) - black) / (top - black) * 255, 0, 255).astype(np.uint8)
+    if not cv2.imwrite(str(out), shown):
+        raise AcquisitionError(f"{out} cannot be written. Is the folder there, and is there room?")

@@ -1,0 +1,308 @@
+"""The open rig: the only holder of live hardware. Opening it moves nothing and changes no light."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any, Self
+
+from acquisition.cleanup import Step, run_all
+from acquisition.errors import AcquisitionError
+from acquisition.rig.config import RigConfig
+from acquisition.rig.forbidden_poses import describe, find_forbidden
+from drivers.camera import Camera, CameraSettings
+from drivers.errors import LimitError, MotionFailed
+from drivers.motion import Motion, MotionAxis, Position
+from drivers.registry import open_axis
+from drivers.serial_link import LineRegistry
+from drivers.source import LightSource
+from drivers.sources.manual import Ask, ManualSource
+from simulators.rig.model import SCHEME
+from simulators.rig.rig import SimulatedRig
+
+log = logging.getLogger(__name__)
+
+#: Shortest pause between two looks at a moving axis.
+SHORTEST_LOOK_S = 0.002
+#: Longest wait for moves that were started and given up.
+REST_WITHIN_S = 60.0
+
+
+class Rig:
+    """Named axes, a camera and a light source, opened from a rig file; a context manager.
+
+    Attributes
+    ----------
+    axes : dict of name to MotionAxis
+    camera : Camera or None where it was not asked for
+    source : LightSource or None where the rig has none
+    simulation : SimulatedRig or None
+
+    Parameters
+    ----------
+    ask : shows the operator what a source without a cable needs and returns True when it is done.
+    """
+
+    def __init__(
+        self,
+        config: RigConfig,
+        *,
+        with_camera: bool = True,
+        ask: Ask | None = None,
+    ) -> None:
+        self.config = config
+        self.axes: dict[str, MotionAxis] = {}
+        self.camera: Camera | None = None
+        self.source: LightSource | None = None
+        self.simulation: SimulatedRig | None = None
+        self._asked: CameraSettings | None = None
+        self._read_back = CameraSettings()
+        self._with_camera = with_camera
+        self._ask = ask
+        self._lines = LineRegistry(config.wire_log)
+
+    def __enter__(self) -> Self:
+        try:
+            self._open()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        failure = self.close()
+        if failure is not None:
+            if error is None:
+                raise failure
+            error.add_note(f"closing the rig failed too: {failure}")
+
+    def _open(self) -> None:
+        if self.config.simulator is not None:
+            self.start_simulation()
+        for name in self.config.axes:
+            self.open_axis(name)
+        if self.config.source is not None:
+            self.open_source()
+        if self._with_camera:
+            self.open_camera()
+
+    def start_simulation(self) -> str:
+        """Start the emulators of a simulated rig; returns what was started."""
+        if self.config.simulator is None:
+            raise AcquisitionError(f"rig {self.config.name!r} has no `simulator` section")
+        self.simulation = SimulatedRig(self.config.simulator, with_camera=self._with_camera)
+        self.simulation.start()
+        return ", ".join(self.config.simulator.ports)
+
+    def open_axis(self, name: str) -> MotionAxis:
+        """Open one axis of the rig file; moves nothing."""
+        entry = self._at_port(self.config.axes[name])
+        if self.simulation is not None:
+            self.simulation.connect(name, entry.direction, entry.zero_deg)
+        self.axes[name] = open_axis(name, entry, self._lines)
+        return self.axes[name]
+
+    def open_source(self) -> LightSource:
+        """Open the light source; changes no light."""
+        if self.config.source is None:
+            raise AcquisitionError(f"rig {self.config.name!r} has no source")
+        entry = self._at_port(self.config.source)
+        source: LightSource = _driver("drivers.sources", entry.kind).open(entry, self._lines)
+        if isinstance(source, ManualSource):
+            source.ask = self._ask
+            if self.simulation is not None:
+                self.simulation.uncovered = source.is_on
+        self.source = source
+        return source
+
+    def open_camera(self) -> Camera:
+        """Open the camera; exposes nothing."""
+        entry = self.config.camera
+        if self.simulation is not None:
+            entry = entry.model_copy(update={"device": self.simulation.camera_device()})
+        camera: Camera = _driver("drivers.cameras", entry.kind).open("camera", entry)
+        self.camera = camera
+        return camera
+
+    def _at_port(self, entry: Any) -> Any:
+        # What is switched by hand has no port.
+        if not getattr(entry, "port", "").startswith(SCHEME):
+            return entry
+        if self.simulation is None:
+            raise AcquisitionError(
+                f"port {entry.port!r} is an emulator, but the rig file has no `simulator` section. "
+                "Give the device path."
+            )
+        return entry.model_copy(update={"port": self.simulation.port(entry.port.removeprefix(SCHEME))})
+
+    # --- motion ------------------------------------------------------------------------------------------
+
+    def homing_order(self) -> list[str]:
+        """Names of all axes: those of the rig file's `home_order` first."""
+        return [*self.config.home_order, *(name for name in self.axes if name not in self.config.home_order)]
+
+    def unhomed(self) -> list[str]:
+        """Names of the axes without a reference, in homing order."""
+        return [name for name in self.homing_order() if not self.axes[name].is_homed()]
+
+    def home(self, names: list[str]) -> None:
+        """Home the axes one after another. Raises MotionFailed; every axis has been sent a stop by then."""
+        for name in names:
+            self.wait({name: self.axes[name].home()})
+
+    def move(self, targets_deg: Mapping[str, float]) -> dict[str, Position]:
+        """Move axes at the same time and wait; returns the positions read back at rest.
+
+        An axis with backlash comes to its target from below, if its limits leave room for that.
+        """
+        below = {}
+        for name, slack in self.config.backlash_deg.items():
+            if name in targets_deg and targets_deg[name] < self.axes[name].read_position().deg - 1e-6:
+                below[name] = targets_deg[name] - slack
+        if below and self._allowed(below):
+            self.wait(self.start_moves(dict(targets_deg) | below))
+        return self.wait(self.start_moves(targets_deg))
+
+    def _allowed(self, targets_deg: Mapping[str, float]) -> bool:
+        try:
+            for name, target in targets_deg.items():
+                self.axes[name].check(target)
+            self._check_way(targets_deg)
+        except (LimitError, AcquisitionError):
+            return False
+        return True
+
+    def start_moves(self, targets_deg: Mapping[str, float]) -> dict[str, Motion]:
+        """Start axes at the same time; those that stand within a count of their target are started too."""
+        for name, target in targets_deg.items():
+            self.axes[name].check(target)
+        self._check_way(targets_deg)
+        motions: dict[str, Motion] = {}
+        try:
+            for name, target in targets_deg.items():
+                motions[name] = self.axes[name].start_move(target)
+        except BaseException:
+            self.stop()
+            raise
+        return motions
+
+    def _check_way(self, targets_deg: Mapping[str, float]) -> None:
+        boxes = [box for box in self.config.forbidden if box.ranges_deg.keys() & targets_deg.keys()]
+        if not boxes:
+            return
+        concerned = {axis for box in boxes for axis in box.ranges_deg if axis in self.axes}
+        # Where an axis without a reference stands is not known, whatever it reads.
+        here = {axis: self.axes[axis].read_position().deg for axis in concerned if self.axes[axis].is_homed()}
+        box = find_forbidden(boxes, here, here | dict(targets_deg))
+        if box is not None:
+            raise AcquisitionError(f"move to {dict(targets_deg)} meets a {describe(box)}. Nothing was moved.")
+
+    def wait(self, motions: Mapping[str, Motion]) -> dict[str, Position]:
+        """Wait for all motions and return the positions read back at rest.
+
+        Raises
+        ------
+        MotionFailed
+            As the first axis that failed has it; every axis has been sent a stop.
+        """
+        left = dict(motions)
+        positions: dict[str, Position] = {}
+        start_s = time.monotonic()
+        try:
+            while left:
+                for name, motion in list(left.items()):
+                    if motion.done():
+                        positions[name] = motion.wait()
+                        del left[name]
+                if left:
+                    time.sleep(self._next_look_s(left, time.monotonic() - start_s))
+        except MotionFailed as failure:
+            others = self.stop()
+            if others is not None:
+                failure.add_note(f"stopping the other axes failed too: {others}")
+            raise
+        except BaseException:
+            self.stop()
+            raise
+        return {name: positions[name] for name in motions}
+
+    def rest(self) -> None:
+        """Wait until no axis moves, for moves that nobody waits for any more."""
+        for axis in self.axes.values():
+            end_s = time.monotonic() + REST_WITHIN_S
+            while axis.is_moving():
+                if time.monotonic() > end_s:
+                    self.stop()
+                    raise AcquisitionError(f"axis {axis.name} still moves after {REST_WITHIN_S:g} s; it was stopped")
+                time.sleep(axis.config.poll_s)
+
+    def _next_look_s(self, left: Mapping[str, Motion], elapsed_s: float) -> float:
+        """Pause before the next look at moving axes: short around the time at which the last should arrive."""
+        slowest = max(left.values(), key=lambda motion: motion.expected_s)
+        off_s = abs(slowest.expected_s / self.time_scale - elapsed_s)
+        longest_s = min(self.axes[name].config.poll_s for name in left)
+        return min(max(off_s / 2, SHORTEST_LOOK_S), longest_s)
+
+    def stop(self) -> Exception | None:
+        """Send a stop to every axis, whatever the others answer; returns the first failure."""
+        return run_all([(f"stop axis {name}", axis.stop) for name, axis in self.axes.items()])
+
+    @property
+    def time_scale(self) -> float:
+        """Seconds of the devices for one second here: the emulators' clock may run fast."""
+        return 1.0 if self.simulation is None else self.simulation.clock.speed
+
+    # --- the rest ----------------------------------------------------------------------------------------
+
+    def set_exposure(self, exposure_s: float, repeats: int) -> CameraSettings:
+        """Set exposure and averaging, unless they are set so already; returns the settings as read back."""
+        asked = CameraSettings(exposure_s=exposure_s, frame_average=repeats, trigger="software")
+        if self._asked != asked:
+            self._asked = None
+            self._read_back = self.require_camera().configure(asked)
+            self._asked = asked
+        return self._read_back
+
+    def require_camera(self) -> Camera:
+        """The camera; AcquisitionError if the rig was opened without."""
+        if self.camera is None:
+            raise AcquisitionError("this rig was opened without its camera")
+        return self.camera
+
+    def describe(self) -> dict[str, Any]:
+        """Identities of all devices, for the capture file."""
+        from dataclasses import asdict
+
+        devices: dict[str, Any] = {name: asdict(axis.describe()) for name, axis in self.axes.items()}
+        if self.camera is not None:
+            devices["camera"] = asdict(self.camera.describe())
+        if self.source is not None:
+            devices["source"] = self.source.describe()
+        # The port as the rig file has it: a pseudo-terminal's number means nothing tomorrow.
+        for name, entry in (*self.config.axes.items(), ("source", self.config.source)):
+            if name in devices and (port := getattr(entry, "port", None)) is not None:
+                devices[name]["port"] = port
+        return devices
+
+    def close(self) -> Exception | None:
+        """Release every device; moves and stops nothing. Returns the first failure."""
+        steps: list[Step] = []
+        if self.camera is not None:
+            steps.append(("close the camera", self.camera.close))
+        if self.source is not None:
+            steps.append(("close the source", self.source.close))
+        steps += [(f"close axis {name}", axis.close) for name, axis in self.axes.items()]
+        steps.append(("close the ports", self._lines.close))
+        if self.simulation is not None:
+            steps.append(("end the emulators", self.simulation.stop))
+        return run_all(steps)
+
+
+def _driver(package: str, kind: str) -> Any:
+    import importlib
+
+    return importlib.import_module(f"{package}.{kind}")

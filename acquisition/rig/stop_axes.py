@@ -1,0 +1,149 @@
+"""`acquire stop`: every axis of a rig is sent a stop, also while another program measures on it.
+
+A program that measures holds its serial ports for itself, and two programs on one line would garble each other. So a
+running `acquire` is told to stop, with the two signals that a second Ctrl-C amounts to: it stops its axes within a
+second and keeps its partial file. Once it has let go of the ports, the stop is sent again from here and the axes are
+watched until they rest. Other programs are named and left alone: what they do with a signal is not known.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from acquisition.rig.config import RigConfig
+from drivers.errors import CommandRejected, DeviceError, PortBusy
+from drivers.motion import AxisConfig, MotionAxis
+from drivers.registry import open_axis
+from drivers.serial_link import LineRegistry, port_holders
+from simulators.rig.model import SCHEME
+
+#: Longest wait for a running `acquire` to seal its file and let go of the ports.
+LET_GO_S = 15.0
+#: Longest wait for rest after a stop; an Elliptec runs a started move to its end.
+REST_S = 5.0
+REST_UNSTOPPABLE_S = 30.0
+
+Tell = Callable[[str], None]
+
+
+def stop_axes(config: RigConfig, tell: Tell) -> bool:
+    """Stop every axis, each line for itself so that a silent one holds up no other; True if all came to rest.
+
+    Parameters
+    ----------
+    tell : prints a line, from several threads.
+    """
+    lines: dict[str, dict[str, AxisConfig]] = {}
+    for name, entry in config.axes.items():
+        lines.setdefault(os.path.realpath(entry.port), {})[name] = entry
+    told = _tell_running(list(lines), tell)
+    with LineRegistry() as registry, ThreadPoolExecutor(max(1, len(lines))) as threads:
+        stopped = threads.map(lambda port: _stop_line(port, lines[port], registry, told, tell), lines)
+        return all(list(stopped))
+
+
+def has_own_emulators(config: RigConfig) -> bool:
+    """True for a rig whose axes exist only inside the command that opened it."""
+    return any(entry.port.startswith(SCHEME) for entry in config.axes.values())
+
+
+def _tell_running(ports: list[str], tell: Tell) -> set[int]:
+    """Signal every running `acquire` that holds one of the ports; returns their process ids."""
+    holders = {pid: who for port in ports for pid, who in port_holders(port) if pid != os.getpid()}
+    told = set()
+    for pid, who in holders.items():
+        if not _is_acquire(pid):
+            tell(f"{who} holds a port of this rig; it is not acquire and gets no signal")
+            continue
+        try:
+            # Two different signals: a second one of the same kind could merge with the first.
+            os.kill(pid, signal.SIGINT)
+            os.kill(pid, signal.SIGTERM)
+        except ProcessLookupError:
+            continue
+        except PermissionError:
+            tell(f"{who} measures on this rig under another user: stop it there, with Ctrl-C twice")
+            continue
+        tell(f"{who} measures on this rig: told to stop at once, as by Ctrl-C twice")
+        told.add(pid)
+    return told
+
+
+def _is_acquire(pid: int) -> bool:
+    try:
+        words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
+    except OSError:
+        return False
+    return any(Path(word).name == "acquire" for word in words[:2]) or "acquisition.commands.application" in words[:3]
+
+
+def _stop_line(port: str, entries: Mapping[str, AxisConfig], lines: LineRegistry, told: set[int], tell: Tell) -> bool:
+    _wait_let_go(port, told)
+    axes = []
+    busy: dict[str, AxisConfig] = {}
+    for name, entry in entries.items():
+        try:
+            axes.append(_stop_axis(name, entry, lines))
+        except CommandRejected as error:
+            tell(f"{name}: answers no question now ({error.came_back}); asked again until it does")
+            busy[name] = entry
+        except DeviceError as error:
+            _tell_failed(name, error, tell)
+    # An Elliptec module refuses everything while it moves, and would not stop anyway.
+    for name, entry in busy.items():
+        try:
+            axes.append(_stop_when_free(name, entry, lines))
+        except DeviceError as error:
+            _tell_failed(name, error, tell)
+    rested = [_rests(axis, tell) for axis in axes]
+    return len(axes) == len(entries) and all(rested)
+
+
+def _stop_axis(name: str, entry: AxisConfig, lines: LineRegistry) -> MotionAxis:
+    axis = open_axis(name, entry, lines)
+    axis.stop()
+    return axis
+
+
+def _stop_when_free(name: str, entry: AxisConfig, lines: LineRegistry) -> MotionAxis:
+    end_s = time.monotonic() + REST_UNSTOPPABLE_S
+    while True:
+        try:
+            return _stop_axis(name, entry, lines)
+        except CommandRejected:
+            if time.monotonic() > end_s:
+                raise
+            time.sleep(0.1)
+
+
+def _tell_failed(name: str, error: DeviceError, tell: Tell) -> None:
+    why = "NOT STOPPED" if isinstance(error, PortBusy) else "not known whether it stopped"
+    tell(f"{name}: {why}. {error}. If it moves, switch its power off")
+
+
+def _wait_let_go(port: str, told: set[int]) -> None:
+    end_s = time.monotonic() + LET_GO_S
+    while time.monotonic() < end_s and any(pid in told for pid, _ in port_holders(port)):
+        time.sleep(0.05)
+
+
+def _rests(axis: MotionAxis, tell: Tell) -> bool:
+    note = "" if axis.can_stop_a_move else " (this kind runs a started move to its end)"
+    end_s = time.monotonic() + (REST_S if axis.can_stop_a_move else REST_UNSTOPPABLE_S)
+    try:
+        while axis.is_moving():
+            if time.monotonic() > end_s:
+                tell(f"{axis.name}: stop sent, STILL MOVING{note}. Switch its power off")
+                return False
+            time.sleep(axis.config.poll_s)
+        where = f"at {axis.read_position().deg:.4f} deg" if axis.is_homed() else "without a reference"
+    except DeviceError as error:
+        tell(f"{axis.name}: stop sent, then {error}")
+        return False
+    tell(f"{axis.name}: stop sent, at rest {where}{note}")
+    return True

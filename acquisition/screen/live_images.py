@@ -1,0 +1,88 @@
+"""Small pictures for the live page, made when a browser asks for them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from acquisition.screen.observer import Mosaic
+
+#: Longest side of a picture on the page.
+LARGEST = 480
+BINS = 64
+
+
+def last_frame_png(pixels: NDArray[np.uint16], black: float, full_scale: int) -> bytes:
+    """The frame, grey from black level to full scale (square root), saturated pixels red."""
+    thin = thinned(pixels)
+    grey = np.sqrt(np.clip((thin.astype(np.float32) - black) / (full_scale - black), 0, 1)) * 255
+    image = np.repeat(grey.astype(np.uint8)[..., np.newaxis], 3, axis=2)
+    # A saturated pixel must show even where thinning left it out.
+    image[_thin_largest(pixels)[: image.shape[0], : image.shape[1]] >= full_scale] = (40, 40, 255)
+    return _png(image)
+
+
+def modulation_png(frames: Sequence[NDArray[np.uint16]], black: float) -> bytes | None:
+    """(max - min) / (max + min) of each pixel of thinned frames; None with fewer than two."""
+    if len(frames) < 2:
+        return None
+    stack = np.stack(frames).astype(np.float32) - black
+    low, high = stack.min(axis=0), stack.max(axis=0)
+    return _map_png((high - low) / np.maximum(low + high, 1.0), high)
+
+
+def dolp_png(pixels: NDArray[np.uint16], mosaic: Mosaic, black: float) -> bytes:
+    """Degree of linear polarization of each super-pixel of a 0/45/90/135 mosaic."""
+    height, width = len(mosaic), len(mosaic[0])
+    rows, columns = pixels.shape[0] // height * height, pixels.shape[1] // width * width
+    channel = {
+        name: thinned(pixels[r:rows:height, c:columns:width]).astype(np.float32) - black
+        for r, line in enumerate(mosaic)
+        for c, name in enumerate(line)
+    }
+    s1, s2 = channel["0"] - channel["90"], channel["45"] - channel["135"]
+    s0 = sum(channel.values(), np.zeros_like(s1)) / 2
+    return _map_png(np.hypot(s1, s2) / np.maximum(s0, 1.0), s0)
+
+
+def _map_png(values: NDArray[np.floating], light: NDArray[np.floating]) -> bytes:
+    # Where there is hardly any light, noise alone would look like full polarization.
+    lit = light > 0.02 * float(np.percentile(light, 99.5))
+    shown = np.where(lit, np.clip(values, 0, 1), 0)
+    return _png(np.asarray(cv2.applyColorMap((shown * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS), dtype=np.uint8))
+
+
+def histogram(pixels: NDArray[np.uint16], full_scale: int) -> list[int]:
+    """Pixels in 64 equal steps of the full scale; the last one ends with the saturated ones."""
+    counts, _ = np.histogram(thinned(pixels), bins=BINS, range=(0, full_scale + 1))
+    return [int(n) for n in counts]
+
+
+def _step(pixels: NDArray[np.uint16]) -> int:
+    longest: int = max(pixels.shape)
+    return max(1, -(-longest // LARGEST))
+
+
+def thinned(pixels: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Every n-th pixel, so that the picture fits the page; a view."""
+    step = _step(pixels)
+    return pixels[::step, ::step]
+
+
+def _thin_largest(pixels: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    step = _step(pixels)
+    rows, columns = -(-pixels.shape[0] // step) * step, -(-pixels.shape[1] // step) * step
+    padded = np.zeros((rows, columns), dtype=pixels.dtype)
+    padded[: pixels.shape[0], : pixels.shape[1]] = pixels
+    blocks = padded.reshape(rows // step, step, columns // step, step)
+    return np.asarray(blocks.max(axis=(1, 3)))
+
+
+def _png(image: NDArray[np.uint8]) -> bytes:
+    done, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not done:
+        raise ValueError("the picture could not be encoded")
+    return data.tobytes()

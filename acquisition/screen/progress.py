@@ -1,0 +1,82 @@
+"""What the console shows while a capture runs: state, angles, time left; plain lines where it is no terminal."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from acquisition.screen.observer import Mosaic, Observer, StateReport
+from processing.instrument.states import StateTable
+
+#: Seconds between two lines where the output is a file or a pipe.
+LINE_EVERY_S = 5.0
+
+
+class ConsoleProgress(Observer):
+    """A progress bar on a terminal, a line now and then elsewhere."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._bar: Progress | None = None
+        self._task: Any = None
+        self._done = self._pending = 0
+        self._total = 0
+        self._start_s = self._line_s = time.monotonic()
+        self._warned: set[str] = set()
+
+    def run_started(self, title: str, table: StateTable, pending: int, mosaic: Mosaic | None) -> None:
+        self._done, self._total, self._pending = 0, len(table), pending
+        self._start_s = time.monotonic()
+        self._console.print(f"{title}: {pending} states" + (f" of {len(table)}" if pending < len(table) else ""))
+        if self._console.is_terminal:
+            self._bar = Progress(
+                TextColumn("{task.description}", markup=False),
+                BarColumn(bar_width=24),
+                MofNCompleteColumn(),
+                TimeRemainingColumn(compact=True),
+                TextColumn("left"),
+                console=self._console,
+                transient=True,
+            )
+            self._task = self._bar.add_task("starting", total=pending)
+            self._bar.start()
+
+    def activity(self, text: str) -> None:
+        if self._bar is not None:
+            self._bar.update(self._task, description=text)
+        else:
+            self._console.print(text, markup=False, soft_wrap=True)
+
+    def state_done(self, report: StateReport) -> None:
+        self._done += 1
+        angles = " ".join(f"{axis} {position.deg:8.3f}" for axis, position in report.positions.items())
+        text = f"state {report.state:3d} {report.role:6s} {angles}"
+        if report.role != "dark":
+            saturated, dim = 100 * report.saturated_fraction, 100 * report.near_black_fraction
+            text += f"  saturated {saturated:.2f} %, dark {dim:.0f} %"
+        if report.saturated_fraction > 0 and "saturated" not in self._warned:
+            self._warned.add("saturated")
+            self._print(f"warning: state {report.state}: {100 * report.saturated_fraction:.3f} % of pixels saturated")
+        if self._bar is not None:
+            self._bar.update(self._task, description=text, completed=self._done)
+        elif time.monotonic() - self._line_s > LINE_EVERY_S:
+            self._line_s = time.monotonic()
+            left_s = (self._line_s - self._start_s) / self._done * (self._pending - self._done)
+            self._console.print(
+                f"{text}  {self._done}/{self._pending}, {left_s:.0f} s left", markup=False, soft_wrap=True
+            )
+
+    def warning(self, text: str) -> None:
+        self._print(f"warning: {text}")
+
+    def run_ended(self, status: str, details: dict[str, Any]) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+    def _print(self, text: str) -> None:
+        console = self._console if self._bar is None else self._bar.console
+        console.print(text, markup=False, highlight=False, soft_wrap=True)

@@ -1,0 +1,269 @@
+"""Fit parameters of an instrument's trains to a capture of a known sample.
+
+The sample is known up to one throughput for each pixel, so the throughput is eliminated: for every trial of the
+parameters it has its least-squares value (variable projection), and only the train's parameters are searched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from io import StringIO
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from ruamel.yaml import YAML
+from scipy.optimize import least_squares
+
+from processing.errors import NotDetermined, ProcessError
+from processing.instrument.model import Element, InstrumentModel
+from processing.polarization import mueller
+from processing.reduction.counts_to_signal import Correction
+from processing.reduction.flat import FEW
+from processing.reduction.mueller import relative_exposure, sample_states
+from processing.storage.capture import Capture
+from processing.storage.capture_schema import Sample
+
+#: Fields of an element that can be fitted, with the size of a sensible step and the bounds.
+FITTABLE = {
+    "azimuth_deg": (1.0, -np.inf, np.inf),
+    "retardance_deg": (1.0, -np.inf, np.inf),
+    "extinction": (0.01, 0.0, 1.0),
+    "diattenuation": (0.01, -1.0, 1.0),
+    "t_max": (0.01, 0.0, np.inf),
+    "t_min": (0.01, 0.0, np.inf),
+    "ratio": (0.001, -np.inf, np.inf),
+}
+#: A residual above this part of the mean signal is no fit.
+POOR_FIT = 0.05
+#: Other starts turn at most this many azimuths by 45 degrees.
+MOST_TURNED = 5
+#: Parameter directions with a singular value below this, relative to the largest, are not determined.
+UNSEEN = 1e-7
+
+
+class CalibrationError(ProcessError):
+    """A calibration was asked for that cannot be made."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Result of a fit.
+
+    Attributes
+    ----------
+    names : of the free parameters, "element.field".
+    values, stderr : (K,), in the unit of each field (degrees for angles).
+    covariance : (K, K); scaled with the residual, because noise alone rarely explains it.
+    residual_over_mean : rms of the residual over the mean signal.
+    residual : (N, channels) relative to the mean signal.
+    model : the instrument model with the fitted values.
+    """
+
+    names: tuple[str, ...]
+    values: NDArray[np.float64]
+    stderr: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    residual_over_mean: float
+    residual: NDArray[np.float64]
+    model: InstrumentModel
+
+
+def known_mueller(sample: Sample) -> NDArray[np.float64]:
+    """Mueller matrix (4, 4) of a known sample, up to its throughput; CalibrationError for an unknown one."""
+    if sample.kind == "air":
+        return np.eye(4)
+    if sample.kind == "mirror":
+        return mueller.IDEAL_MIRROR
+    if sample.kind == "mueller" and sample.mueller is not None:
+        return np.asarray(sample.mueller, dtype=float).reshape(4, 4)
+    raise CalibrationError(
+        "the sample of this capture is not known, and retardances cannot be told from an unknown sample "
+        "(conventions.md, trap 8). Capture air or a mirror, or import with --sample."
+    )
+
+
+def region_means(capture: Capture, rows: slice, columns: slice) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Mean signal (N, channels) of a region, black subtracted, and the states of the sample that it belongs to.
+
+    States in which the region saturates are left out.
+    """
+    correction = Correction.of(capture)
+    black = correction.black
+    means_of_dark = black.means if black.means.shape[2] == 1 else black.means[:, :, rows, columns]
+    means, used = [], []
+    for k in sample_states(capture):
+        frame = capture.frames(int(k), rows)[:, :, columns]
+        if correction.saturation is None or np.mean(frame >= correction.saturation) <= FEW:
+            means.append(frame.mean(axis=(1, 2)))
+            used.append(int(k))
+    if not means:
+        raise CalibrationError(f"{capture.path}: the region is saturated in every state; take less exposure.")
+    if means[0].size == 0 or not np.all(np.isfinite(means)):
+        raise CalibrationError(f"{capture.path}: the region holds no pixels, or no numbers; choose another one.")
+    share = black.weights(capture.column("exposure_s")[used].astype(float))
+    return np.asarray(means) - np.asarray(share @ means_of_dark.mean(axis=(2, 3))), np.array(used)
+
+
+def fit_train(
+    model: InstrumentModel,
+    angles_deg: dict[str, NDArray[np.float64]],
+    signal: NDArray[np.float64],
+    sample: NDArray[np.float64],
+    free: Sequence[str],
+    exposure: NDArray[np.float64] | None = None,
+) -> Calibration:
+    """Fit the free parameters to signals of a known sample.
+
+    Parameters
+    ----------
+    model : resolved at the wavelength; its values are where the search starts.
+    angles_deg : axis name to (N,), as read back.
+    signal : (N, channels) counts above black, or (N, channels, pixels): one throughput for each pixel.
+    sample : (4, 4) up to a factor.
+    free : "element.field", fields as in FITTABLE.
+    exposure : (N,) relative, default 1.
+
+    Raises
+    ------
+    CalibrationError : an unknown parameter, or fewer data than parameters.
+    NotDetermined : the data leave a combination of parameters open; the message names them.
+    """
+    names = _checked(model, free)
+    data = signal.reshape(signal.shape[0] * signal.shape[1], -1)
+    if data.size <= len(names) + data.shape[1]:
+        raise CalibrationError(f"{data.size} intensities cannot fix {len(names)} parameters and the throughput")
+    start = np.array([_value(model, name) for name in names])
+    step = np.array([FITTABLE[name.rpartition(".")[2]][0] for name in names])
+    lower, upper = np.array([FITTABLE[name.rpartition(".")[2]][1:] for name in names]).T
+    weight = np.ones(signal.shape[0]) if exposure is None else exposure
+    scale = float(np.mean(data))
+
+    def residual(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        w = _with_values(model, names, x).rows(angles_deg) * weight[:, None, None]
+        shape = w.reshape(-1, 16) @ sample.reshape(16)
+        throughput = shape @ data / (shape @ shape)
+        return np.asarray((data - shape[:, None] * throughput).reshape(-1) / scale)
+
+    def search(x0: NDArray[np.float64]) -> Any:
+        inside = np.clip(x0, lower + 1e-9 * step, upper - 1e-9 * step)
+        return least_squares(residual, inside, x_scale=step, bounds=(lower, upper), xtol=1e-12, ftol=1e-12)
+
+    found = search(start)
+    if np.sqrt(np.mean(found.fun**2)) > POOR_FIT:
+        # Azimuths have several valleys; a residual like this is the bottom of a wrong one.
+        found = min([found, *(search(x0) for x0 in _other_starts(names, start))], key=lambda f: float(f.cost))
+    if not found.success:
+        raise NotDetermined(
+            f"the fit did not converge ({found.message}); start from an instrument file closer to the truth"
+        )
+    jacobian = found.jac * step
+    _, singular, vt = np.linalg.svd(jacobian, full_matrices=False)
+    if singular[-1] < UNSEEN * singular[0]:
+        parts = [names[k] for k in np.flatnonzero(np.abs(vt[-1]) > 0.1)]
+        raise NotDetermined(f"the data do not tell apart: {', '.join(parts)}. Hold one of them fixed.")
+    freedom = data.size - data.shape[1] - len(names)
+    variance = float(np.sum(found.fun**2)) / max(freedom, 1)
+    covariance = np.linalg.inv(jacobian.T @ jacobian) * variance * np.outer(step, step)
+    return Calibration(
+        names=names,
+        values=np.asarray(found.x),
+        stderr=np.sqrt(np.diag(covariance)),
+        covariance=covariance,
+        residual_over_mean=float(np.sqrt(np.mean(found.fun**2))),
+        residual=found.fun.reshape(*signal.shape[:2], -1).mean(axis=2),
+        model=_with_values(model, names, found.x),
+    )
+
+
+def calibrate(
+    capture: Capture, model: InstrumentModel, free: Sequence[str], rows: slice, columns: slice
+) -> Calibration:
+    """Fit to the region means of a capture of a known sample; see `fit_train`."""
+    sample = known_mueller(capture.header.sample)
+    signal, states = region_means(capture, rows, columns)
+    angles = {name: values[states] for name, values in capture.angles_deg.items()}
+    return fit_train(model, angles, signal, sample, free, relative_exposure(capture, states))
+
+
+def write_fitted(source: Path, target: Path, calibration: Calibration, wavelength_nm: float, note: str) -> None:
+    """Copy an instrument file with the fitted values put in; comments stay. Never overwrites.
+
+    Raises
+    ------
+    CalibrationError : `target` exists.
+    """
+    if target.exists():
+        raise CalibrationError(f"{target} exists; a calibration never replaces a file. Give another --write.")
+    yaml = YAML()
+    yaml.indent(mapping=2, sequence=4, offset=2)
+    yaml.width = 120
+    tree = yaml.load(source.read_text(encoding="utf-8"))
+    for name, value, stderr in zip(calibration.names, calibration.values, calibration.stderr, strict=True):
+        element, _, field = name.rpartition(".")
+        node = _node(tree, element)
+        digits = 1 - int(np.floor(np.log10(stderr))) if stderr > 0 else 6
+        number = round(float(value), max(digits, 0))
+        if isinstance(node.get(field), dict):
+            key = next((k for k in node[field] if abs(float(k) - wavelength_nm) < 0.5), wavelength_nm)
+            node[field][key] = number
+        else:
+            node[field] = number
+    tree["source"] = note
+    text = StringIO()
+    yaml.dump(tree, text)
+    with target.open("x", encoding="utf-8") as file:
+        file.write(text.getvalue())
+
+
+def _checked(model: InstrumentModel, free: Sequence[str]) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(name.strip() for name in free if name.strip()))
+    offered = [f"{e.name}.{field}" for e in model.elements() for field in FITTABLE if _fits(e, field)]
+    unknown = [name for name in names if name not in offered]
+    if unknown or not names:
+        asked = ", ".join(unknown) or "none given"
+        raise CalibrationError(f"free parameter: {asked}. This instrument has: {', '.join(offered)}.")
+    return names
+
+
+def _other_starts(names: Sequence[str], start: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    azimuths = [k for k, name in enumerate(names) if name.endswith(".azimuth_deg")][:MOST_TURNED]
+    starts = []
+    for turned in product((0.0, 45.0), repeat=len(azimuths)):
+        if any(turned):
+            x0 = start.copy()
+            x0[azimuths] += turned
+            starts.append(x0)
+    return starts
+
+
+def _fits(element: Element, field: str) -> bool:
+    return hasattr(element, field) and (field != "ratio" or element.axis is not None)
+
+
+def _value(model: InstrumentModel, name: str) -> float:
+    element, _, field = name.rpartition(".")
+    return float(next(getattr(e, field) for e in model.elements() if e.name == element))
+
+
+def _with_values(model: InstrumentModel, names: Sequence[str], values: NDArray[np.float64]) -> InstrumentModel:
+    new = {name.rpartition(".")[0]: {} for name in names}  # type: dict[str, dict[str, float]]
+    for name, value in zip(names, values, strict=True):
+        element, _, field = name.rpartition(".")
+        new[element][field] = float(value)
+
+    def swap(elements: Sequence[Any]) -> tuple[Any, ...]:
+        return tuple(e.model_copy(update=new[e.name]) if e.name in new else e for e in elements)
+
+    channels = tuple(c.model_copy(update={"elements": swap(c.elements)}) for c in model.channels)
+    update = {"generator": swap(model.generator), "analyzer": swap(model.analyzer), "channels": channels}
+    return model.model_copy(update=update)
+
+
+def _node(tree: Any, element: str) -> Any:
+    trains = [tree.get("generator") or [], tree.get("analyzer") or []]
+    trains += [c.get("elements") or [] for c in tree.get("channels") or []]
+    return next(node for train in trains for node in train if node.get("name") == element)

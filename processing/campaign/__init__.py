@@ -1,0 +1,1 @@
+"""Whole campaigns: which captures belong together, what is done with each, and where it runs."""

@@ -1,0 +1,281 @@
+"""A campaign: captures of one object at many arm angles, by a Mueller polarimeter and a linear Stokes camera.
+
+As in the paper's Sec. V: the Mueller captures give psi and |D| of the dominant process, compared with the model at
+the same pixels; xi0 of both instruments goes into tables over scattering geometry, which are compared on a virtual
+sphere as the Stokes camera sees it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.campaign.tasks import CaptureMeasure, CaptureTask, locate, measure, task_view
+from processing.errors import NotDetermined, ProcessError
+from processing.geometry.viewing import ViewingGeometry
+from processing.polarization.image_difference import rmsd
+from processing.reduction.flat import FlatCapture, flat_captures, nearest_flat
+from processing.reduction.mueller import Progress
+from processing.reflectance.tables import ScatteringTable
+from processing.storage.capture import Capture, CaptureError
+from processing.storage.product import is_product
+
+#: The default demosaicing reaches so far across the outline (`processing.reduction.mosaic.methods.REACH`).
+BORDER_PX = 4
+
+
+@dataclass(frozen=True)
+class PaperAverages:
+    """The paper's averages over fifteen arm angles (its conclusions; conventions.md, trap 17)."""
+
+    psi_deg: float
+    magnitude_percent: float
+    xi0_percent: float
+
+
+PAPER = {451: PaperAverages(7.49, 4.96, 11.11), 662: PaperAverages(14.29, 11.73, 4.24)}
+
+
+@dataclass(frozen=True)
+class Row:
+    """Deviations at one wavelength and arm angle; NaN where a capture is missing.
+
+    `psi_noise_deg`, `magnitude_noise_percent` and `xi0_noise_percent` are what the noise alone, first order, makes of
+    the deviation (xi0: of both instruments), `common` the fraction of the virtual sphere where both have a value,
+    `eigenvalue_deviation` the 99th percentile of the largest deviation of xi1..xi3 from their mean.
+    """
+
+    wavelength_nm: float
+    omega_deg: float
+    psi_deg: float = np.nan
+    magnitude_percent: float = np.nan
+    xi0_percent: float = np.nan
+    psi_noise_deg: float = np.nan
+    magnitude_noise_percent: float = np.nan
+    xi0_noise_percent: float = np.nan
+    common: float = np.nan
+    eigenvalue_deviation: float = np.nan
+
+
+@dataclass(frozen=True)
+class CampaignResult:
+    """All rows, in order of wavelength and angle, what was left out, and the flat of each capture that has one."""
+
+    rows: tuple[Row, ...]
+    simulated: bool
+    left_out: tuple[str, ...] = ()
+    flats: dict[str, str] = field(default_factory=dict)
+    tables: dict[tuple[str, float], Path] = field(default_factory=dict)
+
+    def average(self, wavelength_nm: float, quantity: str) -> float:
+        """Mean over the arm angles of a quantity of `Row`; NaN without any."""
+        values = [getattr(r, quantity) for r in self.rows if r.wavelength_nm == wavelength_nm]
+        finite = [v for v in values if np.isfinite(v)]
+        return float(np.mean(finite)) if finite else float("nan")
+
+
+def find_captures(
+    folder: Path, out: Path | None = None
+) -> tuple[list[tuple[Path, str, float, float]], bool, list[str]]:
+    """Captures under a folder as (path, "mueller" or "stokes", nm, omega), whether simulated, and files left out.
+
+    Flat fields are in neither list, nor is anything in `out`, the campaign's own results.
+
+    Raises
+    ------
+    ProcessError : no capture, or simulated and measured ones together.
+    """
+    found, kinds, left_out = [], {}, []
+    for path in sorted(folder.rglob("*.h5")):
+        if (out is not None and path.is_relative_to(out)) or is_product(path):
+            continue
+        try:
+            with Capture(path) as capture:
+                header, simulated, flat = capture.header, capture.simulated, FlatCapture.of(capture)
+        except CaptureError as error:
+            left_out.append(f"{path}: {error}")
+            continue
+        if flat is not None:
+            continue
+        if header.omega_deg is None or header.sample.kind in ("air", "mirror"):
+            left_out.append(f"{path}: no arm angle" if header.omega_deg is None else f"{path}: {header.sample.kind}")
+            continue
+        kinds[path] = simulated
+        kind = "stokes" if header.mosaic else "mueller"
+        found.append((path, kind, float(header.wavelength_nm), float(header.omega_deg)))
+    if not found:
+        raise ProcessError(f"{folder} holds no capture of an object with an arm angle. {' '.join(left_out[:3])}")
+    if len(set(kinds.values())) > 1:
+        simulated_one = next(p for p, s in kinds.items() if s)
+        measured_one = next(p for p, s in kinds.items() if not s)
+        raise ProcessError(
+            f"{folder} mixes simulated captures ({simulated_one.name}) and measured ones ({measured_one.name}); "
+            "they are never compared as one campaign. Put them into two folders."
+        )
+    return found, next(iter(kinds.values())), left_out
+
+
+def run_campaign(
+    folder: Path,
+    out: Path,
+    geometry: Path,
+    material: Path,
+    pool: Executor,
+    stokes_geometry: Path | None = None,
+    register: bool = False,
+    border_px: int = BORDER_PX,
+    progress: Progress | None = None,
+) -> CampaignResult:
+    """Reduce every capture of a folder and compare the two instruments and the model.
+
+    Each capture is divided by the flat field of its camera and wavelength that was taken nearest in time, if the
+    folder has one.
+
+    Parameters
+    ----------
+    out : folder for products and tables.
+    geometry, stokes_geometry : geometry files of the Mueller polarimeter and of the Stokes camera.
+    material : reflectance model.
+    pool : where the captures are worked on.
+    register : take centre and scale of the sphere from the images instead of from the geometry file.
+    border_px : pixels nearer than this to the outline do not count.
+
+    Raises
+    ------
+    ProcessError : see `find_captures`; two captures of the same kind, wavelength and angle.
+    """
+    captures, simulated, left_out = find_captures(folder, out)
+    out.mkdir(parents=True, exist_ok=True)
+    seen: dict[tuple[str, float, float], Path] = {}
+    for path, kind, nm, omega in captures:
+        twin = seen.setdefault((kind, nm, round(omega, 2)), path)
+        if twin != path:
+            raise ProcessError(f"{twin.name} and {path.name} are both {kind} captures at {nm:g} nm, {omega:g} degrees.")
+    other = stokes_geometry or geometry
+    flats = _flats(folder, [path for path, *_ in captures])
+    tasks = [
+        CaptureTask(
+            str(p),
+            kind,
+            str(out),
+            str(geometry if kind == "mueller" else other),
+            str(material),
+            border_px,
+            flat=str(flats.get(p, "")),
+        )
+        for p, kind, _, _ in captures
+    ]
+    if register:
+        tasks = _registered(tasks, pool)
+    views = {task.kind: task_view(task) for task in tasks}
+    futures = [pool.submit(measure, task) for task in tasks]
+    measures = []
+    for done, future in enumerate(futures, 1):
+        measures.append(future.result())
+        if progress:
+            progress(done, len(futures))
+    tables = _merged_tables(measures, out)
+    rows = tuple(_rows(measures, tables, views))
+    names = {path.name: flat.name for path, flat in flats.items()}
+    return CampaignResult(rows, simulated, tuple(left_out), names, tables)
+
+
+def _flats(folder: Path, paths: Sequence[Path]) -> dict[Path, Path]:
+    known = flat_captures(folder)
+    found = {}
+    for path in paths if known else ():
+        with Capture(path) as capture:
+            if (flat := nearest_flat(known, capture)) is not None:
+                found[path] = flat
+    return found
+
+
+def _registered(tasks: Sequence[CaptureTask], pool: Executor) -> list[CaptureTask]:
+    # Camera and sphere stand still while the arm turns: each instrument takes its best image, mostly a side view.
+    best: dict[str, tuple[float, str]] = {}
+    futures = [pool.submit(locate, task) for task in tasks]
+    for task, future in zip(tasks, futures, strict=True):
+        found = future.result()
+        if found is not None and (task.kind not in best or found < best[task.kind]):
+            best[task.kind] = found
+    lacking = sorted({t.kind for t in tasks} - set(best))
+    if lacking:
+        raise NotDetermined(f"no sphere could be found in any {' or '.join(lacking)} image; leave --register away.")
+    return [replace(task, view_json=best[task.kind][1]) for task in tasks]
+
+
+def _merged_tables(measures: Sequence[CaptureMeasure], out: Path) -> dict[tuple[str, float], Path]:
+    tables: dict[tuple[str, float], Path] = {}
+    for key in sorted({(m.kind, m.wavelength_nm) for m in measures}):
+        merged: ScatteringTable | None = None
+        for m in measures:
+            if (m.kind, m.wavelength_nm) == key:
+                table = ScatteringTable.load(m.table)
+                if merged is None:
+                    merged = table
+                else:
+                    merged.merge(table)
+        if merged is not None:
+            tables[key] = out / f"xi0_{key[0]}_{key[1]:g}nm.table.h5"
+            merged.save(tables[key])
+    return tables
+
+
+def _rows(
+    measures: Sequence[CaptureMeasure], tables: dict[tuple[str, float], Path], views: dict[str, ViewingGeometry]
+) -> list[Row]:
+    rows: list[Row] = []
+    for nm in sorted({m.wavelength_nm for m in measures}):
+        loaded = {k: ScatteringTable.load(tables[k, nm]) for k in ("mueller", "stokes") if (k, nm) in tables}
+        for omega in sorted({round(m.omega_deg, 2) for m in measures if m.wavelength_nm == nm}):
+            here = {m.kind: m for m in measures if (m.wavelength_nm, round(m.omega_deg, 2)) == (nm, omega)}
+            values: dict[str, Any] = {}
+            if "mueller" in here:
+                m = here["mueller"]
+                values |= {"psi_deg": m.psi_deg, "magnitude_percent": m.magnitude_percent}
+                values |= {"psi_noise_deg": m.psi_noise_deg, "magnitude_noise_percent": m.magnitude_noise_percent}
+                values["eigenvalue_deviation"] = m.eigenvalue_deviation
+            if "stokes" in here and len(loaded) == 2:
+                values |= compare_on_sphere(
+                    loaded["mueller"], loaded["stokes"], views["stokes"], omega, here["stokes"].shape
+                )
+            rows.append(Row(nm, omega, **values))
+    return rows
+
+
+def compare_on_sphere(
+    reference: ScatteringTable,
+    other: ScatteringTable,
+    view: ViewingGeometry,
+    omega_deg: float,
+    shape: tuple[int, int],
+) -> dict[str, float]:
+    """Deviation of two xi0 tables on a virtual object (paper Sec. V-B): `xi0_percent`, its noise part, `common`.
+
+    Both tables hold (xi0, variance of xi0). Raises NotDetermined when the object is not in the frame.
+    """
+    image = view.at(omega_deg, *shape)
+    if not image.mask.any():
+        raise NotDetermined(f"no pixel of the virtual object is lit at omega {omega_deg:g} degrees")
+    a, b = reference.lookup(image.points.angles), other.lookup(image.points.angles)
+    difference = b[0] - a[0]
+    both = np.isfinite(difference)
+    if not both.any():
+        return {"common": 0.0}
+    # A bin's mean of n pixels has a variance n times smaller than its pixels.
+    noise = a[1] / _counts(reference, image.points.angles) + b[1] / _counts(other, image.points.angles)
+    return {
+        "xi0_percent": 100 * rmsd(difference),
+        "xi0_noise_percent": 100 * float(np.sqrt(np.mean(noise[both]))),
+        "common": float(both.mean()),
+    }
+
+
+def _counts(table: ScatteringTable, angles: Any) -> NDArray[np.float64]:
+    return np.asarray(np.maximum(table.counts(angles), 1), dtype=float)

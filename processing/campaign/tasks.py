@@ -1,0 +1,222 @@
+"""What a campaign does with one capture, as a function that can run in another process or on another machine."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
+
+from processing.geometry.errors import OutlineNotFound
+from processing.geometry.frames import GeometryImage
+from processing.geometry.outline import find_sphere, registered
+from processing.geometry.viewing import ViewingGeometry
+from processing.maps.xi0 import estimate_from_stokes
+from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
+from processing.polarization.gradients import dominant
+from processing.polarization.image_difference import linear_diattenuation, magnitude, orientation_difference, rmsd
+from processing.reduction.counts_to_signal import Correction
+from processing.reduction.mueller import choose_model, reduce_mueller
+from processing.reduction.stokes import DEFAULT_METHOD, reduce_stokes
+from processing.reflectance.base import load_reflectance
+from processing.reflectance.tables import ScatteringTable
+from processing.storage.capture import Capture
+from processing.storage.images import MuellerImage, StokesImage
+from processing.storage.product import Product, Step, file_identity
+
+#: Standard error of the Mueller image's xi0 above which a pixel does not count: beyond it the largest eigenvalue is
+#: noise's choice, and biased upwards.
+MAX_STDERR = 0.1
+#: Pixels whose noise in psi and |D| is worked out: gradients of m0 take 2 kB a pixel.
+NOISE_PIXELS = 4000
+#: Standard deviation of an orientation that may be anything from 0 to 180 degrees.
+RANDOM_PSI_DEG = 180 / np.sqrt(12)
+
+
+@dataclass(frozen=True)
+class CaptureTask:
+    """One capture and what belongs to it; plain text, so that it travels."""
+
+    capture: str
+    kind: str
+    out: str
+    geometry: str
+    material: str
+    border_px: int
+    #: Geometry found in the images; empty: the one of the file.
+    view_json: str = ""
+    #: Capture of the flat field; empty: none.
+    flat: str = ""
+
+
+@dataclass(frozen=True)
+class CaptureMeasure:
+    """What one capture gives. psi, |D| and the eigenvalues only from a Mueller capture."""
+
+    kind: str
+    wavelength_nm: float
+    omega_deg: float
+    shape: tuple[int, int]
+    table: str
+    psi_deg: float
+    magnitude_percent: float
+    eigenvalue_deviation: float
+    pixels: int
+    #: What the noise alone makes of psi_deg and magnitude_percent.
+    psi_noise_deg: float = np.nan
+    magnitude_noise_percent: float = np.nan
+
+
+def measure(task: CaptureTask) -> CaptureMeasure:
+    """Reduce a capture (unless its product is newer) and measure it."""
+    product = reduced_product(task)
+    view = task_view(task)
+    return (_measure_mueller if task.kind == "mueller" else _measure_stokes)(task, product, view)
+
+
+def locate(task: CaptureTask) -> tuple[float, str] | None:
+    """Find the sphere in a capture's image: relative error of its radius and geometry as text; None if not found."""
+    product = reduced_product(task)
+    if task.kind == "mueller":
+        intensity: NDArray[np.floating] = MuellerImage.load(product).values[0, 0]
+    else:
+        intensity = StokesImage.load(product).values[0]
+    try:
+        circle = find_sphere(intensity)
+    except OutlineNotFound:
+        return None
+    view = registered(task_view(task), circle, *intensity.shape)
+    return circle.radius_stderr / circle.radius, view.model_dump_json()
+
+
+def task_view(task: CaptureTask) -> ViewingGeometry:
+    """The geometry that a task is to use."""
+    if task.view_json:
+        return ViewingGeometry.model_validate_json(task.view_json)
+    return ViewingGeometry.load(task.geometry)
+
+
+def reduced_product(task: CaptureTask) -> Path:
+    """The product of a capture in the task's folder, made now unless it is there, newer, and with the same flat."""
+    path, flat = Path(task.capture), Path(task.flat) if task.flat else None
+    target = Path(task.out) / f"{path.stem}.{task.kind}.h5"
+    if target.exists() and target.stat().st_mtime > path.stat().st_mtime and _flat_of(target) == task.flat:
+        return target
+    files = tuple(file_identity(p) for p in (path, flat) if p is not None)
+    step = Step("campaign", {"capture": path.name, "flat": task.flat}, files)
+    with ExitStack() as stack:
+        capture = stack.enter_context(Capture(path))
+        flats = [stack.enter_context(Capture(flat))] if flat else []
+        correction = Correction.of(capture, flat_from=flats)
+        model = choose_model(capture, None)
+        if task.kind == "stokes":
+            reduce_stokes(capture, model, target, (step,), DEFAULT_METHOD, correction, overwrite=True)
+        else:
+            reduce_mueller(capture, model, target, (step,), correction, overwrite=True)
+    return target
+
+
+def _flat_of(product: Path) -> str:
+    with Product(product) as there:
+        return str(there.steps[-1].arguments.get("flat", ""))
+
+
+def _measure_mueller(task: CaptureTask, product: Path, view: ViewingGeometry) -> CaptureMeasure:
+    image = MuellerImage.load(product)
+    m = image.matrices
+    geometry = view.at(float(image.header.omega_deg or 0.0), *image.mask.shape)
+    model = load_reflectance(task.material).mueller_jones(geometry.points, image.header.wavelength_nm)
+    inside = m[geometry.mask].astype(float)
+    xi0, m0 = xi0_and_dominant(inside)
+    eigenvalues = coherency_eigenvalues(inside)
+    # First order: d xi0 = <dM, m0 - 4 xi0 e00> / (4 m00).
+    gradient = np.zeros((*image.mask.shape, 16))
+    direction = np.asarray(m0).reshape(-1, 16).copy()
+    direction[:, 0] -= 4 * xi0
+    gradient[geometry.mask] = direction / (4 * inside[:, :1, 0])
+    stderr = np.sqrt(image.variance_of(gradient)[geometry.mask])
+    good = np.isfinite(xi0) & ~(stderr > MAX_STDERR) & _inner(geometry, task.border_px)
+    measured, modelled = linear_diattenuation(m0), linear_diattenuation(model)
+    psi = orientation_difference(modelled, measured)[good]
+    psi_noise, magnitude_noise = _noise_of_dominant(image, np.flatnonzero(geometry.mask)[good])
+    small = eigenvalues[:, 1:]
+    deviation = np.abs(small - small.mean(axis=-1, keepdims=True)).max(axis=-1)[good]
+    return CaptureMeasure(
+        kind="mueller",
+        wavelength_nm=image.header.wavelength_nm,
+        omega_deg=float(image.header.omega_deg or 0.0),
+        shape=(image.mask.shape[0], image.mask.shape[1]),
+        table=_table(task, geometry, xi0, stderr, good, image.header.wavelength_nm, image.simulated),
+        psi_deg=float(np.rad2deg(rmsd(psi))),
+        magnitude_percent=100 * rmsd((magnitude(modelled) - magnitude(measured))[good]),
+        eigenvalue_deviation=float(np.percentile(deviation, 99)) if good.any() else float("nan"),
+        pixels=int(good.sum()),
+        psi_noise_deg=psi_noise,
+        magnitude_noise_percent=100 * magnitude_noise,
+    )
+
+
+def _noise_of_dominant(image: MuellerImage, pixels: NDArray[np.int64]) -> tuple[float, float]:
+    """Root mean square of the standard errors of psi (degrees) and |D| of the dominant process, over some pixels.
+
+    First order; an orientation that is not known at all is off by RANDOM_PSI_DEG and not by more.
+    """
+    if not pixels.size:
+        return float("nan"), float("nan")
+    some = image.at(pixels[:: -(-pixels.size // NOISE_PIXELS)])
+    derived = dominant(some.matrices.astype(float))
+    stderr = []
+    for name in ("dominant_diattenuation_orientation_deg", "dominant_diattenuation_linear"):
+        stderr.append(np.sqrt(some.variance_of(derived[name].gradient)))
+    return rmsd(np.minimum(stderr[0], RANDOM_PSI_DEG)), rmsd(stderr[1])
+
+
+def _measure_stokes(task: CaptureTask, product: Path, view: ViewingGeometry) -> CaptureMeasure:
+    image = StokesImage.load(product)
+    header = image.header
+    geometry = view.at(float(header.omega_deg or 0.0), *image.mask.shape)
+    model = load_reflectance(task.material).mueller_jones(geometry.points, header.wavelength_nm)
+    found = estimate_from_stokes(image, np.asarray(geometry.fill(model), dtype=float))
+    inside = geometry.mask
+    xi0, stderr = found.xi0[inside], found.xi0_stderr[inside]
+    good = found.valid[inside] & _inner(geometry, task.border_px)
+    return CaptureMeasure(
+        kind="stokes",
+        wavelength_nm=header.wavelength_nm,
+        omega_deg=float(header.omega_deg or 0.0),
+        shape=(image.mask.shape[0], image.mask.shape[1]),
+        table=_table(task, geometry, xi0, stderr, good, header.wavelength_nm, image.simulated),
+        psi_deg=float("nan"),
+        magnitude_percent=float("nan"),
+        eigenvalue_deviation=float("nan"),
+        pixels=int(good.sum()),
+    )
+
+
+def _inner(geometry: GeometryImage, border_px: int) -> NDArray[np.bool_]:
+    # Pixels (N,) at least so far from the outline: nearer ones mix object and background, in a mosaic most of all.
+    mask = geometry.mask
+    if border_px > 0:
+        mask = binary_erosion(mask, iterations=border_px)
+    return np.asarray(mask[geometry.mask])
+
+
+def _table(
+    task: CaptureTask,
+    geometry: GeometryImage,
+    xi0: NDArray[np.floating],
+    stderr: NDArray[np.floating],
+    good: NDArray[np.bool_],
+    wavelength_nm: float,
+    simulated: bool,
+) -> str:
+    table = ScatteringTable(("xi0", "xi0_variance"), wavelength_nm, simulated=simulated)
+    spread = np.where(np.isfinite(stderr), stderr, 0.0) ** 2
+    values = np.where(good, np.stack([xi0, spread]).astype(float), np.nan)
+    table.add(geometry.points.angles, values, simulated)
+    path = Path(task.out) / f"{Path(task.capture).stem}.xi0.table.h5"
+    table.save(path)
+    return str(path)

@@ -1,0 +1,63 @@
+"""The `process` command: everything from a capture file onwards."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import typer
+
+from processing.commands import (
+    axostep,
+    calibrate,
+    camera,
+    campaign,
+    design,
+    geometry,
+    importing,
+    quantities,
+    reduce,
+    reflectance,
+    report,
+    tables,
+    xi0,
+)
+from processing.commands.command_line import run
+
+app = typer.Typer(
+    name="process",
+    help="Captures to Mueller and Stokes images, reflectance, coherency eigenvalues and reports.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+# One line a module that brings commands. It must not import anything heavy at its top: `--help` is fast.
+axostep.register(app)
+calibrate.register(app)
+camera.register(app)
+importing.register(app)
+quantities.register(app)
+reduce.register(app)
+report.register(app)
+campaign.register(app)
+design.register(app)
+geometry.register(app)
+reflectance.register(app)
+tables.register(app)
+xi0.register(app)
+
+
+@app.callback()
+def _process() -> None:
+    # A callback keeps `process NAME` a group of commands even while there is only one of them.
+    pass
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Entry point of `process`; ends in SystemExit."""
+    run(app, argv)
+
+
+if __name__ == "__main__":
+    main()

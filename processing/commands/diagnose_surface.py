@@ -1,0 +1,67 @@
+"""`diagnose --reflectance`: the dominant process of a material in place of an unknown sample."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import typer
+
+from processing.diagnosis.surface.judge import SurfaceDiagnosis
+from processing.errors import ProcessError
+
+
+def diagnose_reflectance(
+    captures: Sequence[Path],
+    instrument: Path,
+    reflectance: Path | None,
+    geometry: Path | None,
+    write: Path | None,
+    json: Path | None,
+    report: Path | None,
+) -> None:
+    """Diagnose, print a summary and write what was asked for. Raises ProcessError."""
+    if reflectance is None or geometry is None:
+        raise ProcessError("a triply degenerate sample needs both --reflectance MATERIAL and --geometry GEOMETRY.")
+    from processing.commands.diagnose import show
+    from processing.diagnosis.surface.run import diagnose_object
+    from processing.diagnosis.surface.write import targets, write_surface
+    from processing.geometry.viewing import ViewingGeometry
+    from processing.instrument.model import InstrumentModel
+    from processing.reflectance.base import load_reflectance
+
+    for target in targets(write) if write is not None else ():
+        if target.exists():
+            raise ProcessError(f"{target} exists and is not replaced. Give another --write.")
+    model, material, view = (
+        InstrumentModel.load(instrument),
+        load_reflectance(reflectance),
+        ViewingGeometry.load(geometry),
+    )
+    judged, problem = diagnose_object(captures, model, material, view, lambda line: typer.echo(line, err=True))
+    show(judged.diagnosis)
+    _show_surface(judged.diagnosis)
+    if json is not None:
+        json.write_text(judged.diagnosis.model_dump_json(indent=2) + "\n", encoding="utf-8")
+        typer.echo(str(json))
+    if report is not None:
+        from processing.diagnosis.surface.report import write_surface_report
+
+        write_surface_report(report, judged, problem)
+        typer.echo(str(report))
+    if write is not None:
+        for path in write_surface(write, judged.diagnosis, material, view, model):
+            typer.echo(str(path))
+
+
+def _show_surface(d: SurfaceDiagnosis) -> None:
+    typer.echo(f"  {d.material}: " + ", ".join(f"{name} = {value:.4g}" for name, value in d.constants.items()))
+    rows = zip(d.captures, d.quantities_before, d.quantities_after, d.xi0_change, strict=True)
+    for capture, before, after, change in rows:
+        typer.echo(f"  {capture.name}: median xi0 {before.xi0:.4f} -> {after.xi0:.4f}, rms change {change:.4f}")
+        if before.psi_deg is not None and after.psi_deg is not None:
+            typer.echo(
+                f"    modelled against measured dominant process: psi {before.psi_deg:.1f} -> {after.psi_deg:.1f} "
+                f"degrees, |D| {before.magnitude_percent:.1f} -> {after.magnitude_percent:.1f} % (noise alone: "
+                f"{after.psi_noise_deg:.1f} degrees, {after.magnitude_noise_percent:.1f} %)"
+            )

@@ -1,0 +1,1 @@
+"""How numbers are computed, whatever they mean: threads, chunks, compiled loops."""

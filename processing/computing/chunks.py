@@ -1,0 +1,65 @@
+"""Feed planar images of any real type to compiled loops that know float64 chunks only.
+
+Each further type or layout of a big loop costs seconds of compilation, so only the two copies are compiled for each.
+They are compiled at all because numpy's converting copies cost as much as the arithmetic in between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.computing.compiling import njit
+from processing.computing.threads import for_ranges
+
+#: Pixels that a compiled loop gets at a time: small enough for the second-level cache.
+CHUNK = 2048
+
+_jit = njit(cache=True, nogil=True)
+
+
+def for_chunks(kernel: Callable[..., object], source: NDArray[Any], *outputs: NDArray[Any]) -> None:
+    """Call `kernel(chunk, count, *results)` for chunks of a planar image and store what it writes, on all cores.
+
+    Parameters
+    ----------
+    kernel : compiled function; reads chunk (rows, CHUNK), of which `count` pixels are valid, and fills the results.
+        Chunk and results are float64 and C-ordered, whatever the arrays are.
+    source : (rows, pixels).
+    outputs : (..., pixels) each; the kernel gets one (..., CHUNK) for each.
+    """
+    flat = [out.reshape(-1, out.shape[-1]) for out in outputs]
+    if not all(np.shares_memory(f, out) for f, out in zip(flat, outputs, strict=True) if out.size):
+        raise ValueError("the leading axes of an output must be contiguous")
+
+    def loop(start: int, stop: int) -> None:
+        chunk = np.zeros((source.shape[0], CHUNK))
+        results = [np.zeros((*out.shape[:-1], CHUNK)) for out in outputs]
+        rows = [result.reshape(-1, CHUNK) for result in results]
+        for first in range(start, stop, CHUNK):
+            count = min(CHUNK, stop - first)
+            _fetch(source, first, count, chunk)
+            kernel(chunk, count, *results)
+            for out, result in zip(flat, rows, strict=True):
+                _store(result, count, out, first)
+
+    for_ranges(source.shape[1], loop)
+
+
+@_jit
+def _fetch(source, first, count, chunk):  # type: ignore[no-untyped-def]
+    for k in range(source.shape[0]):
+        row = source[k, first : first + count]
+        for j in range(count):
+            chunk[k, j] = row[j]
+
+
+@_jit
+def _store(chunk, count, out, first):  # type: ignore[no-untyped-def]
+    for k in range(out.shape[0]):
+        row = out[k, first : first + count]
+        for j in range(count):
+            row[j] = chunk[k, j]

@@ -1,1 +1,0 @@
-"""Decompositions of Mueller matrices: Lu-Chipman, symmetric, differential. Cloude's is `processing.cloude`."""

@@ -1,0 +1,1 @@
+"""Measured intensities against the model of an instrument, the sample unknown or known."""

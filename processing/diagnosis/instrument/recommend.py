@@ -1,0 +1,128 @@
+"""Which further capture would tell apart what these captures cannot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.fit import Fit
+from processing.diagnosis.search.space import Space
+from processing.polarization import mueller
+
+Array = NDArray[np.float64]
+
+#: Samples that a lab has at hand, in the order of the trouble they make.
+SAMPLES: dict[str, NDArray[np.float64]] = {
+    "air (Omega = 180 degrees, nothing at the centre)": np.eye(4),
+    "a linear polarizer at 0 degrees in the sample's place": mueller.polarizer(0.0),
+    "a linear polarizer at 45 degrees in the sample's place": mueller.polarizer(np.pi / 4),
+    "a mirror": mueller.IDEAL_MIRROR,
+    "a depolarizing white target (integrating sphere)": mueller.IDEAL_DEPOLARIZER,
+}
+#: Sine of the angle between two signatures from which on a capture tells them apart.
+APART = 0.3
+#: Signature, relative to the signal for a typical size, below which a capture does not see an effect.
+VISIBLE = 1e-4
+
+
+def recommended(
+    problem: InstrumentProblem,
+    space: Space,
+    fit: Fit,
+    sets: Sequence[Sequence[Candidate]],
+    unseen: Sequence[Candidate],
+) -> str:
+    """What to capture next: for every set that cannot be told apart, else to show what is unseen."""
+    return " ".join(dict.fromkeys(_capture(problem, space, fit, rivals, unseen) for rivals in sets or ((),)))
+
+
+def _capture(
+    problem: InstrumentProblem, space: Space, fit: Fit, rivals: Sequence[Candidate], unseen: Sequence[Candidate]
+) -> str:
+    """One sentence: the capture that separates the rivals, or shows the unseen, or that none of the usual does."""
+    rows_side = [c for c in rivals if not c.effect.corrects_counts and c.effect.group != "reflectance"]
+    have = [c.sample for c in problem.captures]
+    best, power = "", 0.0
+    for name, sample in SAMPLES.items():
+        if any(h is not None and np.allclose(h / np.abs(h).max(), sample.reshape(16) / sample.max()) for h in have):
+            continue
+        value = _power(problem, space, fit, sample, rows_side, unseen)
+        # A simpler sample is preferred unless another one tells clearly more.
+        if value > power + 0.15:
+            best, power = name, value
+    if any(c.effect.corrects_counts for c in rivals):
+        return (
+            "A series of exposure times on an unpolarized, evenly lit target tells detector effects from optics; "
+            "dark frames tell an offset."
+        )
+    if best and power >= APART:
+        return f"Capture {best} with the same states."
+    if any(c.effect.per_state for c in rivals):
+        return "Repeat the capture: what comes back is the mechanics, what does not is the source; or record a monitor."
+    if rivals:
+        return (
+            "No usual sample separates them with these states; another state table, or a second detector channel, may."
+        )
+    return "None needed." if not unseen else f"Capture {best or next(iter(SAMPLES))} to see what is unobservable here."
+
+
+def _power(
+    problem: InstrumentProblem,
+    space: Space,
+    fit: Fit,
+    sample: Array,
+    rivals: Sequence[Candidate],
+    unseen: Sequence[Candidate],
+) -> float:
+    signatures = [_signature(problem, space, fit, sample.reshape(16), c) for c in rivals]
+    value = 1.0
+    for i, first in enumerate(signatures):
+        for second in signatures[i + 1 :]:
+            value = min(value, _sine(first, second))
+    if rivals:
+        return value if len(rivals) > 1 else 1.0
+    seen = [np.linalg.norm(_signature(problem, space, fit, sample.reshape(16), c)) > VISIBLE for c in unseen]
+    return float(np.mean(seen)) if seen else 0.0
+
+
+def _signature(problem: InstrumentProblem, space: Space, fit: Fit, sample: Array, candidate: Candidate) -> Array:
+    """Change (L, parameters) of the relative signal for typical sizes, the throughput projected out."""
+    data = problem.captures[candidate.capture or 0]
+    capture = candidate.capture or 0
+    both = Space((*space.candidates, candidate)) if candidate not in space.candidates else space
+    zero = np.concatenate([fit.values, np.zeros(both.size - space.size)])
+    part = both.slices[both.candidates.index(candidate)]
+
+    def signal(values: Array) -> Array:
+        changes = problem.changes(capture, both, values)
+        w = problem.model.rows(data.conditions.angles_deg, changes).reshape(-1, 16)
+        return np.asarray(w @ sample)
+
+    start = signal(zero)
+    scale = np.linalg.norm(start)
+    if scale == 0:
+        return np.zeros((start.size, candidate.size))
+    columns = []
+    for j in range(candidate.size):
+        moved = zero.copy()
+        moved[part.start + j] += 1e-3 * candidate.typical[j]
+        d = (signal(moved) - start) / 1e-3
+        columns.append(d - start * (start @ d) / scale**2)
+    return np.stack(columns, axis=1) / scale
+
+
+def _sine(first: Array, second: Array) -> float:
+    """Part of the smaller signature that the other cannot mimic; 0 if either is not seen."""
+    out = 1.0
+    for a, b in ((first, second), (second, first)):
+        norm = np.linalg.norm(a)
+        if norm < VISIBLE:
+            return 0.0
+        u, size, _ = np.linalg.svd(b, full_matrices=False)
+        u = u[:, size > 1e-9 * max(size[0], 1e-300)]
+        out = min(out, float(np.linalg.norm(a - u @ (u.T @ a)) / norm))
+    return out

@@ -1,0 +1,40 @@
+"""Diagnose capture files against an instrument model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from processing.diagnosis.instrument.capture_data import CaptureData, read_capture
+from processing.diagnosis.instrument.judge import Judged, diagnose
+from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.search.search import Say
+from processing.instrument.model import InstrumentModel
+from processing.storage.capture import Capture, CaptureError
+
+
+def diagnose_captures(
+    captures: Sequence[Path], model: InstrumentModel, say: Say = lambda line: None
+) -> tuple[Judged, InstrumentProblem]:
+    """Diagnose capture files jointly.
+
+    Parameters
+    ----------
+    captures : of one instrument at one wavelength; what is known of each sample is in the file.
+    model : as loaded from its file.
+
+    Raises
+    ------
+    CaptureError : a file cannot be used, or the captures do not belong together.
+    """
+    data: list[CaptureData] = []
+    for path in captures:
+        say(f"reading {path.name}")
+        with Capture(path) as capture:
+            data.append(read_capture(capture, model.at(capture.header.wavelength_nm)))
+    wavelengths = {c.wavelength_nm for c in data}
+    if len(wavelengths) != 1:
+        found = ", ".join(f"{w:g}" for w in sorted(wavelengths))
+        raise CaptureError(f"the captures are at {found} nm; effects differ with wavelength. Give one wavelength.")
+    problem = InstrumentProblem(model.at(wavelengths.pop()), data)
+    return diagnose(problem, say), problem

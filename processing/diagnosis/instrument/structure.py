@@ -1,0 +1,262 @@
+"""Is anything but noise left over, and what does it look like: tests of the residual, and a description in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.diagnosis.instrument.moments import MARGIN, inside
+from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.projection import add_response
+from processing.diagnosis.instrument.tile_sums import tile_columns
+from processing.diagnosis.search.fit import Fit
+from processing.diagnosis.search.space import Space
+from processing.instrument.changes import Changes
+from processing.instrument.effects.field_retardance import terms
+from processing.reduction.move_image import neighbour_noise
+
+Array = NDArray[np.float64]
+
+#: Standard deviations beyond which a test says "structure".
+LIMIT = 5.0
+HARMONICS = 4
+
+
+@dataclass(frozen=True)
+class Residual:
+    """What one capture leaves over.
+
+    Attributes
+    ----------
+    image : (L, rows, columns) residual in units of the noise; NaN where a pixel is not used.
+    per_state : (L,) rms over the pixels; mean : (L,) mean over the pixels.
+    tests : name to standard deviations from what noise gives.
+    harmonics : axis to amplitudes (HARMONICS,) of the state means, in units of the noise of one intensity.
+    correlates : name to correlation of the rms map or of the residual with it.
+    leading : (L,) leading component over the states, with its share of the sum of squares.
+    left : chi-square of the structure, as the test that finds most of it beyond two standard deviations has it.
+    """
+
+    image: NDArray[np.float32]
+    per_state: Array
+    mean: Array
+    tests: dict[str, float]
+    harmonics: dict[str, Array]
+    correlates: dict[str, float]
+    leading: Array
+    leading_share: float
+    left: float = 0.0
+
+    @property
+    def worst(self) -> tuple[str, float]:
+        """The test that is furthest off."""
+        name = max(self.tests, key=lambda k: self.tests[k])
+        return name, self.tests[name]
+
+
+@dataclass(frozen=True)
+class Images:
+    """What the tests look at, each (L, rows, columns); NaN or zero where a pixel is not used.
+
+    Attributes
+    ----------
+    residual : in units of the noise.
+    around : the fit near by, in counts over full scale; expected : variance of the residual of a smooth pattern.
+    good : (rows, columns) pixels that are used.
+    """
+
+    residual: NDArray[np.float32]
+    around: NDArray[np.float32]
+    expected: NDArray[np.float32]
+    good: NDArray[np.bool_]
+
+
+def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -> Residual:
+    """Residual of a capture at the values of a fit, pixel by pixel, and its tests."""
+    problem, values = problem.near(space, fit.values)
+    data, moments = problem.captures[capture], problem.moments[capture]
+    changes = problem.changes(capture, space, values)
+    a = problem.columns(capture, changes) * moments.sigma[:, None]
+    rows = a.shape[0]
+    height, width = data.signal.shape[2:]
+    used = (data.usable & ~data.clipped if changes.drop_clipped else data.usable) & inside(height, width)
+    counts = data.signal.reshape(rows, height, width).astype(np.float64)
+    y = add_response(counts, problem.coefficients(capture, changes), problem.columns(capture, changes))
+    variance = data.variance().reshape(rows, height, width)
+    level, mean_variance = moments.sigma, variance.mean(axis=0)
+    free = np.zeros((rows, height, width), dtype=np.float32)
+    signal = np.zeros((rows, height, width), dtype=np.float32)
+    for mask, columns in _parts(problem, capture, changes, a, np.ones_like(used)):
+        q = _basis(columns / level[:, None] * moments.counts[:, None])
+        signal[:, mask] = (q @ (q.T @ (y[:, mask] / level[:, None]))) * level[:, None]
+        free[:, mask] = (1 - np.sum(q * q, axis=1))[:, None]
+    scale = level[:, None] * np.sqrt(mean_variance[used])
+    r = np.full((rows, height, width), np.nan, dtype=np.float32)
+    r[:, used] = (y - signal)[:, used] / scale
+    # Of a row that does not count nothing is left, and no noise is expected.
+    r[~moments.counts], free[~moments.counts] = np.where(used, 0.0, np.nan), 0.0
+    around = _around(signal)
+    signal[:, ~used], free[:, ~used] = 0.0, 0.0
+    noise = variance / level[:, None, None] ** 2 / np.maximum(mean_variance, 1e-300)
+    expected = (free * noise).astype(np.float32)
+    good = np.asarray(np.isfinite(r).all(axis=0))
+    images = Images(r, around, expected, good)
+    alike = np.array([neighbour_noise(x, y) for x, y in data.row_moved_px])
+    tests, left = _tests(images, moments.left, alike, a.shape[1], moments.spread, data.noise_known)
+    n, channels = data.signal.shape[:2]
+    mean = r[:, good].mean(axis=1) if good.any() else np.zeros(rows)
+    states = mean.reshape(n, channels).mean(axis=1)
+    harmonics = {
+        axis: np.array([2 * abs(np.mean(states * np.exp(1j * h * np.deg2rad(v)))) for h in range(1, HARMONICS + 1)])
+        for axis, v in data.conditions.angles_deg.items()
+    }
+    flat = r[:, good]
+    moment = flat @ flat.T / max(flat.shape[1], 1)
+    value, vector = np.linalg.eigh(moment.astype(np.float64))
+    return Residual(
+        image=r,
+        per_state=np.sqrt(np.mean(flat**2, axis=1)) if good.any() else np.zeros(rows),
+        mean=mean,
+        tests=tests,
+        harmonics=harmonics,
+        correlates=_correlates(r, signal, good),
+        leading=vector[:, -1],
+        leading_share=float(value[-1] / max(value.sum(), 1e-300)),
+        left=left,
+    )
+
+
+def _around(signal: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The fit of four pixels around each.
+
+    A pixel's own fit shares noise with its residual, since the states of a pixel are not equally noisy: with some
+    100 000 pixels that shows.
+    """
+    wide = np.pad(signal, ((0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN)), mode="edge")
+    last = 2 * MARGIN
+    corners = (
+        wide[:, y : wide.shape[1] - last + y, x : wide.shape[2] - last + x] for y in (0, last) for x in (0, last)
+    )
+    return np.asarray(sum(corners) / 4, dtype=np.float32)
+
+
+def _parts(
+    problem: InstrumentProblem, capture: int, changes: Changes, a: Array, used: NDArray[np.bool_]
+) -> list[tuple[NDArray[np.bool_], Array]]:
+    moments = problem.moments[capture]
+    tiles = moments.tiles
+    if not changes.field_retardance_rad or tiles is None:
+        return [(used, a)]
+    columns = tile_columns(problem.model, problem.captures[capture], moments, changes) * moments.sigma[:, None]
+    return [(used & (tiles.index == t), columns[t]) for t in range(tiles.x.size)]
+
+
+def _basis(a: Array) -> Array:
+    u, size, _ = np.linalg.svd(a, full_matrices=False)
+    return np.asarray(u[:, size > 1e-8 * size[0]])
+
+
+def _tests(
+    images: Images,
+    shown: Array,
+    alike: Array,
+    columns: int,
+    spread: float,
+    noise_known: bool,
+) -> tuple[dict[str, float], float]:
+    """Chi-square of each test over its standard deviation, and the largest that is certainly left.
+
+    `shown` (L,) is the part of the noise that single pixels show, `alike` (L, 2) what neighbours down and across share
+    of it.
+    """
+    r, expected, good = images.residual, images.expected, images.good
+    count = int(good.sum())
+    if count < 30 or not noise_known:
+        return {}, 0.0
+    flat, wanted = r[:, good].astype(np.float64), expected[:, good].astype(np.float64)
+    # Of smooth patterns moved frames keep all the noise, of single pixels only a part.
+    freedom = shown @ wanted.sum(axis=1)
+    # Name to chi-square beyond noise, and its standard deviation with nothing but noise.
+    found = {"sum of squares": (np.sum(flat**2) - freedom, np.sqrt(2 * freedom * spread))}
+    # Linear in the signal: every pixel's residual against the leading components of the fitted signal near by.
+    s = images.around[:, good].astype(np.float64)
+    _, size, vt = np.linalg.svd(s @ s.T)
+    keep = min(columns, int(np.sum(size > 1e-10 * size[0])))
+    weights = (vt[:keep] @ s) / np.sqrt(np.maximum(size[:keep], 1e-300))[:, None]
+    linear = flat @ weights.T
+    null = wanted @ (weights.T**2)
+    found["linear in the signal"] = (np.sum(linear**2) - null.sum(), np.sqrt(2 * null.sum() * spread))
+    # Brightness: against the square of the signal, its linear part taken away.
+    square = s**2
+    square -= (square @ weights.T) @ weights
+    norm = np.sqrt(np.sum(square**2, axis=1, keepdims=True)) + 1e-300
+    along = np.sum(flat * square / norm, axis=1)
+    expectation = np.sum(wanted * (square / norm) ** 2, axis=1)
+    found["brightness"] = (
+        np.sum(along**2) - expectation.sum(),
+        np.sqrt(2 * np.sum(expectation**2) * spread + 1e-300),
+    )
+    # Neighbours: noise of two pixels is independent, or as alike as moving the frames has made it.
+    for k, name in enumerate(("neighbours, rows", "neighbours, columns")):
+        if r.shape[k + 1] > 2:
+            first, second = np.delete(r, -1, k + 1), np.delete(r, 0, k + 1)
+            both = np.isfinite(first).all(axis=0) & np.isfinite(second).all(axis=0)
+            product = (first * second)[:, both].astype(np.float64)
+            if product.size > 100:
+                null = alike[:, k] @ np.delete(expected, -1, k + 1)[:, both].sum(axis=1, dtype=np.float64)
+                found[name] = (product.sum() - null, np.sqrt(np.sum(product**2)))
+    # Tiles: mean residual of every row over patches of the image.
+    found["patches"] = _patches(r, expected, spread)
+    left = max(chi2 - 2 * deviation for chi2, deviation in found.values())
+    return {k: float(chi2 / deviation) for k, (chi2, deviation) in found.items()}, max(float(left), 0.0)
+
+
+def _patches(r: NDArray[np.float32], expected: NDArray[np.float32], spread: float) -> tuple[float, float]:
+    side = max(r.shape[1] // 8, 1)
+    h, w = r.shape[1] // side * side, r.shape[2] // side * side
+    shape = (r.shape[0], h // side, side, w // side, side)
+    total = np.nansum(r[:, :h, :w].reshape(shape), axis=(2, 4), dtype=np.float64)
+    null = np.where(np.isfinite(r[:, :h, :w]), expected[:, :h, :w], 0).reshape(shape).sum(axis=(2, 4), dtype=np.float64)
+    pixels = side**2
+    deviation = np.sqrt(2 * np.sum(null**2) * spread + 1e-300)
+    return float((np.sum(total**2) - null.sum()) / pixels), float(deviation / pixels)
+
+
+def _correlates(r: NDArray[np.float32], signal: NDArray[np.float32], good: NDArray[np.bool_]) -> dict[str, float]:
+    if good.sum() < 30 or min(r.shape[1:]) < 3:
+        return {}
+    loud = np.sqrt(np.mean(np.nan_to_num(r) ** 2, axis=0))
+    mean = signal.mean(axis=0)
+    gy, gx = np.gradient(mean)
+    ys, xs = np.mgrid[-1 : 1 : r.shape[1] * 1j, -1 : 1 : r.shape[2] * 1j]
+    maps = {"brightness": mean, "gradient of the image": np.hypot(gx, gy)}
+    maps |= dict(zip(("x", "y", "x2", "xy", "y2"), terms(xs, ys), strict=True))
+    out = {}
+    for name, image in maps.items():
+        x, y = loud[good], image[good]
+        if x.std() > 0 and y.std() > 0:
+            out[name] = float(np.corrcoef(x, y)[0, 1])
+    return out
+
+
+def description(found: Residual, threshold: float = LIMIT) -> list[str]:
+    """Sentences about what is left over; empty if nothing is."""
+    lines = []
+    for name, value in sorted(found.tests.items(), key=lambda item: -item[1]):
+        if value > threshold:
+            lines.append(f"{name}: {value:.0f} standard deviations above noise")
+    if not lines:
+        return []
+    order = np.argsort(-np.abs(found.mean))[:3]
+    lines.append("states that are furthest off on average: " + ", ".join(str(int(k)) for k in order))
+    if found.leading_share > 0:
+        lines.append(f"the leading component over the states holds {100 * found.leading_share:.0f} % of what is left")
+    for axis, amplitudes in found.harmonics.items():
+        h = int(np.argmax(amplitudes))
+        lines.append(f"strongest harmonic of {axis}: {h + 1} a turn, {amplitudes[h]:.2g} of the noise of one intensity")
+    if found.correlates:
+        name = max(found.correlates, key=lambda k: abs(found.correlates[k]))
+        lines.append(f"its map goes with {name} (correlation {found.correlates[name]:+.2f})")
+    return lines

@@ -1,0 +1,127 @@
+"""Tiles of the image against a matrix of their own each: what an effect needs that varies over the image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.diagnosis.instrument.capture_data import CaptureData
+from processing.diagnosis.instrument.moments import DERIVATIVES, FEATURES, Moments, Tiles, tile_products
+from processing.diagnosis.instrument.projection import RANK
+from processing.diagnosis.search.space import Sums
+from processing.instrument.changes import Changes
+from processing.instrument.model import InstrumentModel
+from processing.reduction.effects_of_capture import extra_retardance, with_extra
+
+Array = NDArray[np.float64]
+#: A retarder's Mueller matrix is linear in 1, cosine and sine of its retardance: three values tell all.
+THIRDS = (0.0, 2 * np.pi / 3, 4 * np.pi / 3)
+
+
+def tile_columns(model: InstrumentModel, data: CaptureData, moments: Moments, changes: Changes) -> Array:
+    """A (tiles, L, K) where a retardance varies over the image, rows in units of their noise."""
+    tiles = moments.tiles
+    if tiles is None:
+        raise ValueError("a capture that holds out states has no tiles")
+    extra = extra_retardance(changes, tiles.x, tiles.y)
+    rows = data.values_per_pixel
+    out = np.zeros((tiles.x.size, rows, 16))
+    for nodes in product(THIRDS, repeat=len(extra)):
+        weight = np.prod((1 + 2 * np.cos(extra - np.array(nodes)[:, None])) / 3, axis=0)
+        w = model.rows(data.conditions.angles_deg, with_extra(changes, np.array(nodes))).reshape(rows, 16)
+        out += weight[:, None, None] * w
+    a = out if data.sample is None else (out @ data.sample)[..., None]
+    return np.asarray(a * (data.row_exposure / moments.sigma)[:, None])
+
+
+def add_tiles(
+    data: CaptureData, moments: Moments, tiles: Tiles, a: Array, c: Array, da: Array, dc: Array, out: Sums
+) -> None:
+    """Add what tiles say of a (tiles, L, K) and coefficients c (F, L), with their derivatives by each value."""
+    used = np.flatnonzero(np.any(c, axis=1) | np.any(dc, axis=(0, 2)))
+    s, noise = tile_products(data, tiles, used.tolist())
+    use = moments.counts
+    if not use.all():
+        every = np.flatnonzero(np.tile(use, used.size))
+        s, noise = s[:, every][:, :, every], noise[:, use]
+        a, c, da, dc = a[:, use], c[:, use], da[:, :, use], dc[:, :, use]
+    sigma = moments.sigma[use]
+    scale = np.tile(1 / sigma, used.size)
+    around = used >= len(FEATURES) - DERIVATIVES
+    all_tiles = _Tiled(s * scale[:, None] * scale, noise / (sigma**2)[:, None, None], a, c[used], around)
+    squares = np.diagonal(all_tiles.ry @ all_tiles.outside, axis1=1, axis2=2)
+    free = np.diagonal(all_tiles.outside, axis1=1, axis2=2)
+    np.add.at(out.excess, tiles.fold, squares.sum(axis=1) - all_tiles.expected)
+    np.add.at(out.freedom, tiles.fold, all_tiles.expected)
+    np.add.at(out.square, tiles.fold, squares @ sigma**2 * moments.relative)
+    np.add.at(out.count, tiles.fold, free @ moments.left[use] * tiles.pixels)
+    if len(da):
+        folds = [tiles.fold == f for f in range(len(out.excess))]
+        gradient, curvature = all_tiles.slopes(da, dc[:, used], folds)
+        out.gradient += gradient
+        out.curvature += curvature
+
+
+class _Tiled:
+    """As `add_block` with all tiles at once, from the second moments of the features z of the counts: y = B z.
+
+    Attributes
+    ----------
+    outside : (T, L, L) projection P; ry : (T, L, L) products of residual and y; expected : (T,) squares of noise alone.
+    """
+
+    def __init__(self, s: Array, noise: Array, a: Array, c: Array, around: NDArray[np.bool_]) -> None:
+        """s (T, F L, F L), noise (T, L, F, F), a (T, L, K), c (F, L); `around` (F,) features that are derivatives."""
+        self._s = s
+        count, rows = a.shape[:2]
+        u, size, vt = np.linalg.svd(a, full_matrices=False)
+        keep = size > RANK * size[:, :1]
+        q = u * keep[:, None, :]
+        # A+, turned over.
+        self._back = q * np.where(keep, 1 / np.maximum(size, 1e-300), 0.0)[:, None, :] @ vt
+        hat = q @ q.transpose(0, 2, 1)
+        self.outside = np.eye(rows) - hat
+        # What takes each feature to the rows: derivatives are those of the fitted image.
+        self._takes = np.where(around[:, None], hat[:, :, None], np.eye(rows)[:, None])
+        self._b = self._onto(c)
+        zy = s @ self._b.transpose(0, 2, 1)
+        self._rz = self.outside @ zy.transpose(0, 2, 1)
+        self._yy = self._b @ zy
+        self.ry = self.outside @ self._yy
+        residual = (self.outside @ self._b).reshape(self._takes.shape)
+        # Mean product of the residual's noise with that of each feature.
+        self._mean = np.einsum("tlfk,tkfh->tlhk", residual, noise)
+        self.expected = np.sum(self._mean * residual, axis=(1, 2, 3))
+        self._mean = self._mean.reshape(count, rows, -1)
+
+    def _onto(self, c: Array) -> Array:
+        """B (T, L, F L) of coefficients c (F, L)."""
+        return np.asarray((c.T[:, :, None] * self._takes).reshape(*self.outside.shape[:2], -1))
+
+    def slopes(self, da: Array, dc: Array, folds: Sequence[NDArray[np.bool_]]) -> tuple[Array, Array]:
+        """Half gradient (folds, K) and curvature (folds, K, K) of the excess, from dr = -P dA A+ y + P dB z."""
+        da = self.outside @ da
+        noise = self._mean @ self._b.transpose(0, 2, 1)
+        slope = np.einsum("ktli,tli->kt", da, (noise - self.ry) @ self._back)
+        counted = {int(j): self._onto(dc[j]) for j in np.flatnonzero(np.any(dc, axis=(1, 2)))}
+        for j, db in counted.items():
+            slope[j] += np.sum(db * (self._rz - self._mean), axis=(1, 2))
+        gradient = np.stack([slope[:, mine].sum(axis=1) for mine in folds])
+        ds = da @ (self._back.transpose(0, 2, 1) @ self._yy @ self._back)
+        curvature = np.stack([_flat(ds[:, mine]) @ _flat(da[:, mine]).T for mine in folds])
+        for j, db in counted.items():
+            es = self.outside @ db @ self._s
+            across = np.einsum("ktli,tli->kt", da, es @ self._b.transpose(0, 2, 1) @ self._back)
+            for f, mine in enumerate(folds):
+                curvature[f, j] -= across[:, mine].sum(axis=1)
+                curvature[f, :, j] -= across[:, mine].sum(axis=1)
+                for i, other in counted.items():
+                    curvature[f, i, j] += np.sum(es[mine] * other[mine])
+        return gradient, curvature
+
+
+def _flat(x: Array) -> Array:
+    return x.reshape(len(x), -1)

@@ -1,0 +1,1 @@
+"""The search over effects that a model may lack, whatever the model is of."""

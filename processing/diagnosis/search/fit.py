@@ -1,0 +1,203 @@
+"""Fit active effects to the captures, score a candidate without fitting it, and cross-fit it on held-out data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.diagnosis.search.problem import Problem
+from processing.diagnosis.search.space import Space, Sums
+
+Array = NDArray[np.float64]
+
+#: The prior that keeps unseen parameters still is this many times wider than a typical size.
+PRIOR_WIDTH = 10.0
+STEPS = 15
+#: Times that corrections of counts are expanded anew in one fit.
+EXPANSIONS = 2
+#: The fit ends when a step promises less than this in chi-square, or this fraction of the excess.
+LEAST_GAIN = 0.01
+LEAST_RELATIVE = 1e-7
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Values at the minimum, the sums there, and the excess summed over the folds used."""
+
+    values: Array
+    sums: Sums
+    excess: float
+
+
+def prior(space: Space) -> Array:
+    """Curvature (K,) of the weak prior about zero."""
+    return np.asarray(1.0 / (PRIOR_WIDTH * space.joined("typical")) ** 2)
+
+
+def minimize(
+    problem: Problem,
+    space: Space,
+    start: Array,
+    folds: Sequence[int] | None = None,
+    free: NDArray[np.bool_] | None = None,
+    steps: int = STEPS,
+    expansions: int = EXPANSIONS,
+) -> Fit:
+    """Least squares by Levenberg-Marquardt with bounds, on the data of the folds given; `free` (K,) may hold some.
+
+    Corrections of counts are expanded about the start, and at most `expansions` times anew about where the fit ended.
+    """
+    if folds is None and expansions:
+        problem.relinearize(space, start)
+    fit = _descend(problem, space, start, folds, free, steps)
+    if folds is None:
+        for _ in range(expansions):
+            if not problem.relinearize(space, fit.values):
+                break
+            fit = _descend(problem, space, fit.values, folds, free, steps)
+    return fit
+
+
+def _descend(
+    problem: Problem,
+    space: Space,
+    start: Array,
+    folds: Sequence[int] | None,
+    free: NDArray[np.bool_] | None,
+    steps: int,
+) -> Fit:
+    use = list(range(problem.folds) if folds is None else folds)
+    weak = prior(space)
+    lower, upper = space.joined("lower"), space.joined("upper")
+    free = (np.ones(space.size, dtype=bool) if free is None else free) & ~space.fixed
+    x = np.clip(start, lower, upper)
+    sums = problem.sums(space, x)
+    cost = sums.excess[use].sum() + weak @ x**2
+    damping = 1e-6
+    for _ in range(steps):
+        g = sums.gradient[use].sum(axis=0) + weak * x
+        h = sums.curvature[use].sum(axis=0) + np.diag(weak)
+        move = free & ~((x <= lower) & (g > 0)) & ~((x >= upper) & (g < 0))
+        if not move.any():
+            break
+        gm, hm = g[move], h[np.ix_(move, move)]
+        if damping <= 1e-6 and _promise(gm, hm) < LEAST_GAIN + LEAST_RELATIVE * abs(cost):
+            break
+        while True:
+            step = np.zeros_like(x)
+            step[move] = -np.linalg.solve(hm + damping * np.diag(np.diag(hm)), gm)
+            tried = np.clip(x + step, lower, upper)
+            new = problem.sums(space, tried)
+            new_cost = new.excess[use].sum() + weak @ tried**2
+            if new_cost <= cost or damping > 1e6:
+                break
+            damping = max(damping * 10, 1e-4)
+        if new_cost > cost:
+            break
+        gain = cost - new_cost
+        x, sums, cost = tried, new, new_cost
+        damping = max(damping / 10, 1e-9)
+        if gain < LEAST_GAIN + LEAST_RELATIVE * abs(cost):
+            break
+    return Fit(x, sums, float(sums.excess[use].sum()))
+
+
+def _promise(g: Array, h: Array) -> float:
+    return float(g @ np.linalg.solve(h, g))
+
+
+def score(sums: Sums, active: int, new: slice, weak: Array) -> tuple[float, Array]:
+    """What one Gauss-Newton step of some parameters promises, the first `active` ones refitted with them.
+
+    Returns
+    -------
+    gain in chi-square, and the information (k, k) about the new parameters that the active ones leave.
+    """
+    g = sums.gradient.sum(axis=0)
+    h = sums.curvature.sum(axis=0)
+    left, right = h[new, new], g[new]
+    if active:
+        old = h[:active, :active] + np.diag(weak[:active])
+        inverse = np.linalg.solve(old, np.column_stack([h[:active, new], g[:active]]))
+        left = left - h[new, :active] @ inverse[:, :-1]
+        right = right - h[new, :active] @ inverse[:, -1]
+    left = (left + left.T) / 2
+    return float(right @ np.linalg.solve(left + np.diag(weak[new]), right)), left
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """How well every fold is predicted by a fit to the others; see `Sums`."""
+
+    excess: float
+    freedom: float
+    square: float
+    count: float
+
+    @property
+    def chi2_reduced(self) -> float:
+        """Sum of squares in units of the noise for each degree of freedom."""
+        return (self.excess + self.freedom) / self.freedom
+
+    @property
+    def rms(self) -> float:
+        """Root mean square residual over the mean signal, for each degree of freedom."""
+        return float(np.sqrt(self.square / self.count))
+
+
+def held_out(problem: Problem, space: Space, full: Fit) -> HeldOut:
+    """Predict every fold from a fit to the other folds.
+
+    Values that belong to one state alone cannot come from other states: where states are held out they are fitted to
+    the state itself, and each takes away a degree of freedom (and counts one more, as fitted noise would gain).
+    """
+    by_state = problem.holds_out_states
+    local = np.zeros(space.size, dtype=bool)
+    for candidate, part in zip(space.candidates, space.slices, strict=True):
+        local[part] = candidate.effect.per_state and by_state
+    total = np.zeros(4)
+    for fold in range(problem.folds):
+        others = [f for f in range(problem.folds) if f != fold]
+        if problem.far_from_linear:
+            values = minimize(problem, space, full.values, others, steps=6).values
+        else:
+            values = _one_step(full, space, others)
+        if local.any():
+            start = np.where(local, full.values, values)
+            fit = minimize(problem, space, start, [fold], free=local, steps=3)
+            total[3] -= local.sum() / problem.folds
+            if problem.noise_known:
+                total[0] += 2 * local.sum() / problem.folds
+            sums = fit.sums
+        else:
+            sums = problem.sums(space, values, derivatives=False)
+        total += (sums.excess[fold], sums.freedom[fold], sums.square[fold], sums.count[fold])
+    return HeldOut(*(float(t) for t in total))
+
+
+def _one_step(full: Fit, space: Space, folds: Sequence[int]) -> Array:
+    """Minimum for some of the folds, one Gauss-Newton step from the minimum for all: they are close."""
+    if not space.size:
+        return full.values
+    weak = prior(space)
+    g = full.sums.gradient[folds].sum(axis=0) + weak * full.values
+    h = full.sums.curvature[folds].sum(axis=0) + np.diag(weak)
+    lower, upper = space.joined("lower"), space.joined("upper")
+    step = np.where(space.fixed, 0.0, np.linalg.solve(h, g))
+    return np.asarray(np.clip(full.values - step, lower, upper))
+
+
+def covariance(space: Space, fit: Fit, noise_only: Array) -> tuple[Array, Array]:
+    """Covariance (K, K) of the values of a fit, for noise of one; and the inverse (K, K) of the gradient's slope.
+
+    The part `noise_only` (K, K) of the curvature comes from noise in the derivatives: it adds to the scatter of the
+    gradient, not to its slope.
+    """
+    weak = np.diag(prior(space))
+    raw = fit.sums.curvature.sum(axis=0) + weak
+    told = raw - noise_only
+    bread = np.linalg.inv(told if space.size and np.linalg.eigvalsh(told).min() > 0 else raw)
+    return bread @ raw @ bread, bread

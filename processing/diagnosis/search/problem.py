@@ -1,0 +1,55 @@
+"""What the search asks of measured data and a model."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.space import Space, Sums
+
+Array = NDArray[np.float64]
+
+
+class Problem(Protocol):
+    """What the search needs of measured data and a model.
+
+    Attributes
+    ----------
+    folds : parts that are held out in turn; `holds_out_states` says that the parts are states.
+    noise_known : the excess is in units of a known noise.
+    spread : see `Moments`.
+    far_from_linear : fits to parts of the data are further apart than one Gauss-Newton step can tell.
+    """
+
+    folds: int
+    noise_known: bool
+    holds_out_states: bool
+    far_from_linear: bool
+    spread: float
+
+    def sums(self, space: Space, values: Array, *, derivatives: bool = True) -> Sums:
+        """Excess, and with `derivatives` its half gradient and curvature, of every fold."""
+        ...
+
+    def pool(self) -> tuple[Candidate, ...]:
+        """Every effect at every place."""
+        ...
+
+    def nominal(self) -> tuple[Candidate, ...]:
+        """Values that are always fitted, because the model gives them as nominal only."""
+        ...
+
+    def powers(self) -> list[tuple[int, Array]]:
+        """Rows that the unknowns leave over, and the power of each component of the signal, for each capture."""
+        ...
+
+    def relinearize(self, space: Space, values: Array) -> bool:
+        """Take these values as the point that corrections are expanded about; False if one as close is known."""
+        ...
+
+    def adopt_noise(self, space: Space, values: Array) -> bool:
+        """Take the noise from the light that these values tell, for all that follows; False if that is as before."""
+        ...

@@ -1,0 +1,120 @@
+"""What `diagnose` says, as it is written to JSON."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from processing.instrument.model import AppliedEffect, EffectParameter
+
+Verdict = Literal["consistent", "explained", "partly_explained", "unexplained"]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Error(_Part):
+    """Residual on data that the fit has not seen, for each degree of freedom; `held_out` says which data."""
+
+    rms_percent: float
+    chi2_reduced: float
+    held_out: str
+
+
+class FoundEffect(_Part):
+    """One effect with its values, the chi-square it explains on held-out data, and what else it could be.
+
+    `confident` is False for a correction that explains less than what is left over: its name may be wrong.
+    """
+
+    kind: str
+    element: str | None
+    parameters: dict[str, EffectParameter]
+    evidence: float
+    indistinguishable_from: tuple[str, ...]
+    scope: Literal["instrument", "capture"]
+    capture: str | None = None
+    removal_chance: float
+    confident: bool
+
+
+class Ranked(_Part):
+    """A candidate of the first round: chi-square gain on held-out data, and the residual it would leave."""
+
+    candidate: str
+    evidence: float
+    rms_percent: float
+
+
+class Empirical(_Part):
+    """A correction that takes structure away without saying what it is. Not an explanation."""
+
+    kind: str
+    rms_percent_in_sample: float
+    values: tuple[float, ...]
+    unit: str
+    would_also_fit: tuple[str, ...]
+    note: str = "empirical: it describes what is left over in these captures and names no cause"
+
+
+class Unexplained(_Part):
+    """What is left over, in words, and an empirical correction if one helps."""
+
+    description: tuple[str, ...]
+    tried: tuple[str, ...]
+    empirical: Empirical | None
+
+
+class CaptureReport(_Part):
+    """One capture: what is known of it, and how far its residual is from noise, before and after."""
+
+    name: str
+    sample: str
+    simulated: bool
+    noise: str
+    binned: int
+    clipped_fraction: float
+    dark_fraction: float = 0.0
+    cut_off: tuple[int, ...] = ()
+    tests_before: dict[str, float]
+    tests_after: dict[str, float]
+    closure_before_percent: float | None = None
+    closure_after_percent: float | None = None
+
+
+class Diagnosis(_Part):
+    """Result of `diagnose`."""
+
+    verdict: Verdict
+    error_before: Error
+    error_after: Error
+    noise_floor_percent: float | None
+    effects: tuple[FoundEffect, ...]
+    unobservable: tuple[str, ...]
+    recommendation: str
+    unexplained: Unexplained | None
+    calibrated: dict[str, EffectParameter]
+    ranking: tuple[Ranked, ...]
+    captures: tuple[CaptureReport, ...]
+    instrument: str
+    wavelength_nm: float
+    simulated: bool
+
+    def applied(self) -> tuple[AppliedEffect, ...]:
+        """The effects as an instrument file stores them."""
+        names = tuple(c.name for c in self.captures)
+        return tuple(
+            AppliedEffect(
+                kind=e.kind,
+                element=e.element,
+                parameters=e.parameters,
+                evidence=e.evidence,
+                captures=names if e.capture is None else (e.capture,),
+                scope=e.scope,
+                wavelength_nm=self.wavelength_nm,
+                indistinguishable_from=e.indistinguishable_from,
+            )
+            for e in self.effects
+        )

@@ -1,0 +1,1 @@
+"""Measured intensities against the model of a surface, the instrument known."""

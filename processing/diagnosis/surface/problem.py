@@ -1,0 +1,287 @@
+"""Intensities of an object against the triply degenerate model: excess over the noise, its gradient and curvature.
+
+At every pixel I = alpha_0 W m0 + alpha_ID W mID (paper Sec. IV) with m0 from the reflectance model. xi0 and M00, that
+is both coefficients, are free at every pixel and projected out, exactly as a free Mueller matrix is in
+`InstrumentProblem`: what is left tests the dominant process alone. Derivatives as there (Kaufman).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.space import Space, Sums
+from processing.diagnosis.surface.data import FEWEST_PIXELS, FOLDS, SurfaceData
+from processing.errors import ProcessError
+from processing.instrument.changes import Changes
+from processing.instrument.effects.base import Parameter, apply_to
+from processing.instrument.model import InstrumentModel
+from processing.reflectance.changes import ReflectanceChanges
+from processing.reflectance.effects.base import ReflectanceEffect, reflectance_effects
+
+Array = NDArray[np.float64]
+STEP = 1e-4
+#: Smooth patterns over an object that a misfit can have: up to second order in the position.
+PATTERNS = 6
+#: Part of the modelled light that has to be polarized before it counts as a second column.
+LEAST_MODULATION = 1e-6
+#: Varies over the image, which the projection of this module does not do.
+NOT_HERE = ("field_retardance",)
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """One capture at one set of values, all in units of the noise.
+
+    Attributes
+    ----------
+    e, f : (P, L) unit vectors that the two coefficients span; f is zero where the model modulates nothing.
+    hold : (P,) 0 to 1, how little the second coefficient is free: see `SurfaceProblem.pixels`.
+    residual, free : (P, L), and the part of each row's noise that is left in it.
+    alpha_0, alpha_id : (P,); strength : (P,) length of the second column.
+    most : (P,) the alpha_0 of a pixel whose light is m0's alone.
+    """
+
+    e: Array
+    f: Array
+    hold: Array
+    residual: Array
+    free: Array
+    alpha_0: Array
+    alpha_id: Array
+    strength: Array
+    most: Array
+    columns: Array
+    flat: Array
+    extra: Array
+
+    def outside(self, v: Array) -> Array:
+        """What the two coefficients cannot take up of v (P, L)."""
+        out = v - self.e * np.sum(self.e * v, axis=1, keepdims=True)
+        along = np.sum(self.f * out, axis=1) * (1 - np.sqrt(self.hold))
+        return np.asarray(out - self.f * along[:, None])
+
+
+class SurfaceProblem:
+    """Captures of one object with one instrument against instrument and reflectance model."""
+
+    holds_out_states = False
+    far_from_linear = True
+    noise_known = True
+    spread = 1.0
+    folds = FOLDS
+    held_out = "every tile of the object is predicted by a fit to the other tiles (2 parts, like a chessboard)"
+
+    def __init__(self, model: InstrumentModel, captures: Sequence[SurfaceData]) -> None:
+        self.model, self.captures = model, tuple(captures)
+        self.shape = captures[0].view.view.shape.kind
+        self.captures = self._polarized()
+        captures = self.captures
+        self.sigma: list[Array] = [np.sqrt(c.variance) for c in captures]
+        # Weights from the fitted signals: from the noisy ones they would go with the noise.
+        empty, none = Space(()), np.zeros(0)
+        first = [self.pixels(k, empty, none) for k in range(len(captures))]
+        fitted = [c.y - p.residual * s for c, p, s in zip(captures, first, self.sigma, strict=True)]
+        for c, p in zip(captures, first, strict=True):
+            c.view.learn_polarized(p.alpha_0, p.strength**2)
+        self.sigma = [np.sqrt(c.slope * np.maximum(u, 0) + c.floor) for c, u in zip(self.captures, fitted, strict=True)]
+        self.noise = [c.variance / s**2 for c, s in zip(self.captures, self.sigma, strict=True)]
+
+    def _polarized(self) -> tuple[SurfaceData, ...]:
+        """The captures with the pixels that can speak; those without enough of them are left out."""
+        out = []
+        for k, data in enumerate(self.captures):
+            w = self.rows(k, self.changes(k, Space(()), np.zeros(0))[0])
+            here = data.kept(data.polarized(w[:, 0]))
+            if len(here.y) >= FEWEST_PIXELS:
+                out.append(here)
+        if not out:
+            raise ProcessError(
+                "no polarization stands out of the noise of these captures, so they say nothing about the dominant "
+                "process. Take them with more light, more frames, or another polarization of the source."
+            )
+        return tuple(out)
+
+    def nominal(self) -> tuple[Candidate, ...]:
+        """Nothing is nominal."""
+        return ()
+
+    def pool(self) -> tuple[Candidate, ...]:
+        """The effects of the reflectance, and those of the optics: with m0 known, an unknown xi0 hides few of them."""
+        conditions = self.captures[0].conditions
+        out = []
+        for effect in reflectance_effects().values():
+            if isinstance(effect, ReflectanceEffect):
+                places = effect.places_on(self.shape)
+            elif effect.group in ("optics", "mosaic") and not effect.corrects_counts and effect.kind not in NOT_HERE:
+                places = effect.places(self.model, conditions)
+            else:
+                continue
+            for place in places:
+                parameters = effect.parameters(self.model, conditions, place)
+                out.append(Candidate(effect, place, self._physical(effect.kind, parameters)))
+        return tuple(out)
+
+    def _physical(self, kind: str, parameters: tuple[Parameter, ...]) -> tuple[Parameter, ...]:
+        """Bounds that keep k and a of the material from becoming negative."""
+        view = self.captures[0].view
+        lowest = {"polarized_diffuse": {"a": -view.a - 1e-9}, "refractive_index": {"k": -view.index.imag - 1e-9}}
+        mine = lowest.get(kind, {})
+        return tuple(replace(p, lower=max(p.lower, mine[p.name])) if p.name in mine else p for p in parameters)
+
+    def powers(self) -> list[tuple[int, Array]]:
+        """Rows that the unknowns leave over, and equal power of the smooth patterns that a misfit can have."""
+        out = []
+        for k in range(len(self.captures)):
+            w = self.rows(k, self.changes(k, Space(()), np.zeros(0))[0])
+            out.append((max(int(np.linalg.matrix_rank(w, rtol=1e-8)) - 2, 1), np.ones(PATTERNS)))
+        return out
+
+    def changes(self, capture: int, space: Space, values: Array) -> tuple[Changes, ReflectanceChanges]:
+        """Changes of the instrument, with its own effects, and of the reflectance."""
+        data = self.captures[capture]
+        optics, surface = Changes(data.conditions), ReflectanceChanges()
+        for applied in self.model.effects:
+            if applied.scope == "instrument" or data.name in applied.captures:
+                apply_to(optics, self.model, applied)
+        for candidate, part in zip(space.candidates, space.slices, strict=True):
+            effect = candidate.effect
+            if isinstance(effect, ReflectanceEffect):
+                effect.bend_at(surface, candidate.place, values[part])
+            else:
+                effect.apply(optics, self.model, candidate.place, values[part])
+        return optics, surface
+
+    def rows(self, capture: int, changes: Changes) -> Array:
+        """W (L, 16) of a capture."""
+        data = self.captures[capture]
+        return self.model.rows(data.conditions.angles_deg, changes).reshape(-1, 16) * data.exposure[:, None]
+
+    def _columns(self, k: int, space: Space, values: Array) -> tuple[Array, Array, Array]:
+        """Both columns and the light from elsewhere, each (P, L), in units of the noise."""
+        optics, surface = self.changes(k, space, values)
+        w, data = self.rows(k, optics), self.captures[k]
+        columns = data.view.dominant(surface).reshape(-1, 16) @ w.T / self.sigma[k]
+        extra = data.view.extra(surface)
+        light = np.zeros_like(columns) if extra is None else extra.reshape(-1, 16) @ w.T / self.sigma[k]
+        return columns, w[:, 0] / self.sigma[k], light
+
+    def pixels(self, k: int, space: Space, values: Array) -> Pixels:
+        """Projection and residual of one capture.
+
+        Where the modelled light is hardly polarized, or p-polarized near the Brewster angle (traps 6 and 11), noise
+        would be met by any amount of alpha_0. So alpha_0 is q M with M the pixel's light, and q is within 1 of its mean
+        over the tile, as xi0 from 0 to 1 allows. Elsewhere, where the light is seen at all, this holds nothing.
+        """
+        columns, flat, light = self._columns(k, space, values)
+        data = self.captures[k]
+        y = data.y / self.sigma[k] - light
+        length = np.sqrt(np.sum(flat**2, axis=1))
+        e = flat / length[:, None]
+        f = columns - e * np.sum(e * columns, axis=1, keepdims=True)
+        strength = np.sqrt(np.sum(f**2, axis=1))
+        modulates = strength > LEAST_MODULATION * np.sqrt(np.sum(columns**2, axis=1))
+        f = np.where(modulates[:, None], f / np.maximum(strength, 1e-300)[:, None], 0.0)
+        level, modulation = np.sum(e * y, axis=1), np.sum(f * y, axis=1)
+        # Mean of q over each tile, from the same weighted squares.
+        most = np.maximum(level, 0.0) / length
+        full = np.where(modulates, strength * most, 0.0)
+        hold, weight = _held(full, data.tile)
+        q = np.bincount(data.tile, hold * full * modulation)[data.tile] / weight
+        alpha_0 = hold * most * (full * modulation + q)
+        alpha_id = (level - alpha_0 * np.sum(e * columns, axis=1)) / length
+        along = modulation - np.sqrt(hold) * (modulation - full * q)
+        return Pixels(
+            e=e,
+            f=f,
+            hold=hold,
+            residual=y - e * level[:, None] - f * along[:, None],
+            free=1 - e**2 - f**2 * (1 - _left(full, data.tile))[:, None],
+            alpha_0=alpha_0,
+            alpha_id=alpha_id,
+            strength=strength,
+            most=most,
+            columns=columns,
+            flat=flat,
+            extra=light,
+        )
+
+    def relinearize(self, space: Space, values: Array) -> bool:
+        """Nothing is expanded here."""
+        return False
+
+    def adopt_noise(self, space: Space, values: Array) -> bool:
+        """The noise does not depend on the effects."""
+        return False
+
+    def sums(self, space: Space, values: Array, *, derivatives: bool = True) -> Sums:
+        """Excess, and with `derivatives` its half gradient and curvature, of every fold."""
+        out = Sums.empty(self.folds, space.size if derivatives else 0)
+        for k, data in enumerate(self.captures):
+            here = self.pixels(k, space, values)
+            expected = np.sum(here.free * self.noise[k], axis=1)
+            np.add.at(out.excess, data.fold, np.sum(here.residual**2, axis=1) - expected)
+            np.add.at(out.freedom, data.fold, expected)
+            square = np.sum((here.residual * self.sigma[k]) ** 2, axis=1) / float(np.mean(data.y)) ** 2
+            np.add.at(out.square, data.fold, square)
+            np.add.at(out.count, data.fold, here.free.sum(axis=1))
+            if not derivatives or not space.size:
+                continue
+            d, less = self.derivatives(k, space, values, here)
+            for fold in range(self.folds):
+                mine = d[:, data.fold == fold].reshape(space.size, -1)
+                out.gradient[fold] += mine @ here.residual[data.fold == fold].reshape(-1)
+                out.gradient[fold] -= less[:, data.fold == fold].sum(axis=1) / 2
+                out.curvature[fold] += mine @ mine.T
+        return out
+
+    def derivatives(self, k: int, space: Space, values: Array, here: Pixels) -> tuple[Array, Array]:
+        """Derivatives (K, P, L) of the residual by every value, and (K, P) of the noise that is expected in it."""
+        d, less = np.empty((space.size, *here.residual.shape)), np.empty((space.size, len(here.most)))
+        typical, tile = space.joined("typical"), self.captures[k].tile
+        before, noise = _left(here.strength * here.most, tile), self.noise[k].mean(axis=1)
+        for j in range(space.size):
+            moved, step = values.copy(), STEP * typical[j]
+            moved[j] += step
+            columns, flat, light = self._columns(k, space, moved)
+            change = (columns - here.columns) * here.alpha_0[:, None] + (flat - here.flat) * here.alpha_id[:, None]
+            d[j] = -here.outside(change + light - here.extra) / step
+            strength = np.sqrt(
+                np.sum((columns - here.e * np.sum(here.e * columns, axis=1, keepdims=True)) ** 2, axis=1)
+            )
+            less[j] = noise * (_left(strength * here.most, tile) - before) / step
+        return d, less
+
+    def noise_information(self, space: Space, values: Array) -> Array:
+        """Part (K, K) of the curvature that comes from the noise of alpha_0 and tells nothing about the values."""
+        out = np.zeros((space.size, space.size))
+        typical = space.joined("typical")
+        for k in range(len(self.captures)):
+            here = self.pixels(k, space, values)
+            d = np.zeros((space.size, *here.residual.shape))
+            for j in range(space.size):
+                moved = values.copy()
+                moved[j] += STEP * typical[j]
+                columns, _, _ = self._columns(k, space, moved)
+                d[j] = here.outside(columns - here.columns) / (STEP * typical[j])
+            free = (1 - here.hold) / np.where(here.strength > 0, here.strength, np.inf)
+            d *= free[:, None]
+            flat = d.reshape(space.size, -1)
+            out += flat @ flat.T
+        return out
+
+
+def _held(full: Array, tile: NDArray[np.int64]) -> tuple[Array, Array]:
+    """How little q is free at pixels (P,), and the weight behind its mean over the tile (P,)."""
+    hold = 1 / (1 + full**2)
+    return hold, np.asarray(np.bincount(tile, hold * full**2)[tile] + 1e-300)
+
+
+def _left(full: Array, tile: NDArray[np.int64]) -> Array:
+    """Part (P,) of the noise along the second column that is left over once q and its mean are fitted."""
+    hold, weight = _held(full, tile)
+    return np.asarray(hold * (1 - hold * full**2 / weight))

@@ -1,0 +1,71 @@
+"""What a model of the reflectance makes of a capture: psi and |D| of the dominant process, and xi0."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
+
+from processing.diagnosis.search.space import Space
+from processing.diagnosis.surface.problem import SurfaceProblem
+from processing.polarization.cloude import xi0_and_dominant
+from processing.polarization.image_difference import linear_diattenuation, magnitude, orientation_difference, rmsd
+
+Array = NDArray[np.float64]
+#: Signal of the polarized light over its noise from which on a pixel's xi0 is shown.
+LEAST_SIGNAL = 20.0
+
+
+class Quantities(BaseModel):
+    """What the model says, one capture.
+
+    `psi_deg` and `magnitude_percent` are root mean square differences between the modelled and the measured dominant
+    process (a full Mueller capture only), the `noise` ones what they would be if the model were right: its intensities
+    with noise drawn. `xi0` is the median, `unphysical` the part of the pixels whose xi0 is outside [1/4, 1].
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    psi_deg: float | None
+    magnitude_percent: float | None
+    psi_noise_deg: float | None
+    magnitude_noise_percent: float | None
+    xi0: float
+    unphysical: float
+
+
+def quantities(problem: SurfaceProblem, k: int, space: Space, values: Array) -> tuple[Quantities, Array]:
+    """What the model with these values says of a capture, and xi0 of its pixels (P,)."""
+    here, data = problem.pixels(k, space, values), problem.captures[k]
+    total = here.alpha_0 + here.alpha_id
+    with np.errstate(divide="ignore", invalid="ignore"):
+        xi0 = (here.alpha_0 + here.alpha_id / 4) / total
+        # Where the model modulates little, xi0 is noise.
+        xi0[here.strength * total < LEAST_SIGNAL] = np.nan
+    good = xi0[np.isfinite(xi0)]
+    ideal = data.y - here.residual * problem.sigma[k]
+    drawn = np.random.default_rng(0).normal(ideal, problem.sigma[k])
+    measured, expected = (dominant_errors(problem, k, space, values, y) for y in (data.y, drawn))
+    said = Quantities(
+        psi_deg=None if measured is None else rmsd(measured[0]),
+        magnitude_percent=None if measured is None else rmsd(measured[1]),
+        psi_noise_deg=None if expected is None else rmsd(expected[0]),
+        magnitude_noise_percent=None if expected is None else rmsd(expected[1]),
+        xi0=float(np.median(good)) if good.size else float("nan"),
+        unphysical=float(np.mean((good < 0.25) | (good > 1))) if good.size else float("nan"),
+    )
+    return said, xi0
+
+
+def dominant_errors(
+    problem: SurfaceProblem, k: int, space: Space, values: Array, y: Array
+) -> tuple[Array, Array] | None:
+    """Modelled less measured psi (degrees) and |D| (percent) of each pixel (P,); None if W has not rank 16."""
+    optics, surface = problem.changes(k, space, values)
+    w = problem.rows(k, optics)
+    if np.linalg.matrix_rank(w, rtol=1e-8) < 16:
+        return None
+    _, m0 = xi0_and_dominant((y @ np.linalg.pinv(w).T).reshape(-1, 4, 4))
+    measured, modelled = (linear_diattenuation(m) for m in (m0, problem.captures[k].view.dominant(surface)))
+    psi = np.rad2deg(orientation_difference(modelled, measured))
+    return np.asarray(psi, dtype=float), np.asarray(100 * (magnitude(modelled) - magnitude(measured)), dtype=float)

@@ -1,0 +1,59 @@
+"""Standard errors of what was found in the reflectance, where the model is far from linear."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.diagnosis.search.fit import Fit, covariance, minimize
+from processing.diagnosis.search.space import Space
+from processing.diagnosis.surface.problem import SurfaceProblem
+from processing.diagnosis.surface.search import bent
+
+Array = NDArray[np.float64]
+
+#: The excess is looked at this many errors from the minimum; errors grow at most by the factor.
+AT, WIDEST = 3.0, 32.0
+
+
+def standard_errors(problem: SurfaceProblem, space: Space, fit: Fit, spread: float) -> Array:
+    """Standard errors (K,) of the values; `spread` scales the noise where structure is left over.
+
+    The noise of alpha_0 adds to the scatter of the gradient, not to the slope. A valley may be bent, and wider than its
+    curvature at the bottom says: an error is a third of the way to where the excess, with all other values fitted anew,
+    has risen by what the curvature promises for three.
+    """
+    if not space.size:
+        return np.zeros(0)
+    both, bread = covariance(space, fit, problem.noise_information(space, fit.values))
+    error = np.sqrt(np.maximum(np.diag(both), 0.0))
+    wide = np.ones(space.size)
+    for j in np.flatnonzero(bent(space)):
+        step = AT * error[j]
+        wide[j] = _wide(problem, space, fit, int(j), step, step**2 / max(bread[j, j], 1e-300))
+    return np.asarray(error * wide * np.sqrt(spread))
+
+
+def _wide(problem: SurfaceProblem, space: Space, fit: Fit, j: int, step: float, promised: float) -> float:
+    """Factor on a step of value j that makes the excess rise as promised, on the flatter side."""
+    lower, upper = space.joined("lower")[j], space.joined("upper")[j]
+    others = np.arange(space.size) != j
+    # A value that stands at its bound may not want to leave it by itself.
+    edges = np.minimum(fit.values - space.joined("lower"), space.joined("upper") - fit.values)
+    inner = np.where(edges > 1e-6 * space.joined("typical"), fit.values, 0.0)
+    last, wide = 0.0, 1.0
+    while True:
+        ends = [x for x in fit.values[j] + wide * step * np.array([1.0, -1.0]) if lower <= x <= upper]
+        if not ends:
+            return wide
+        lowest = np.inf
+        for end in ends:
+            start = inner.copy()
+            start[j] = end
+            lowest = min(lowest, minimize(problem, space, start, free=others, steps=5).excess)
+        rise = lowest - fit.excess
+        if rise >= promised or wide >= WIDEST:
+            low = wide / 2 if wide > 1 else 0.0
+            part = (promised - last) / max(rise - last, promised - last, 1e-300)
+            return max(1.0, low + (wide - low) * part)
+        last, wide = rise, 2 * wide

@@ -1,0 +1,86 @@
+"""Write what `diagnose --reflectance` found: a material, a geometry, an instrument file, each only if it changed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from processing.diagnosis.instrument.write import WriteError, extended
+from processing.diagnosis.surface.judge import SurfaceDiagnosis
+from processing.geometry.sphere import Sphere
+from processing.geometry.viewing import ViewingGeometry
+from processing.instrument.model import InstrumentModel
+from processing.reflectance import first_surface, polarized_diffuse
+from processing.yaml_file import dump_yaml
+
+MATERIAL = ("polarized_diffuse", "refractive_index")
+GEOMETRY = ("registration", "arm_zero")
+#: No file of `process` holds these.
+NOWHERE = ("interreflection", "volume_scattering")
+
+
+def corrected_material(
+    material: first_surface.Model | polarized_diffuse.Model, diagnosis: SurfaceDiagnosis
+) -> polarized_diffuse.Model:
+    """The material with the constants found at the diagnosis' wavelength; those at others stay as they are."""
+    known: dict[float, polarized_diffuse.Constants] = {}
+    for nm, c in material.constants.items():
+        a, b = (c.a, c.b) if isinstance(c, polarized_diffuse.Constants) else (0.0, 2.0)
+        known[nm] = polarized_diffuse.Constants(n=c.n, k=c.k, a=a, b=b)
+    key = next((nm for nm in known if abs(nm - diagnosis.wavelength_nm) < 0.5), diagnosis.wavelength_nm)
+    known[key] = polarized_diffuse.Constants(**diagnosis.constants)
+    names = ", ".join(c.name for c in diagnosis.captures)
+    source = f"diagnose, {diagnosis.wavelength_nm:g} nm, from {names}"
+    return polarized_diffuse.Model(name=f"{material.name}, corrected", source=source, constants=known)
+
+
+def corrected_geometry(view: ViewingGeometry, diagnosis: SurfaceDiagnosis) -> ViewingGeometry:
+    """The geometry with the sphere and the arm's zero where they were found."""
+    for effect in diagnosis.effects:
+        values = {name: float(p.value) for name, p in effect.parameters.items() if not isinstance(p.value, tuple)}
+        if effect.kind == "arm_zero":
+            view = view.model_copy(update={"arm_zero_deg": view.arm_zero_deg + values["arm"]})
+        if effect.kind == "registration" and isinstance(view.shape, Sphere):
+            x, y, z = view.shape.centre_mm
+            radius = view.shape.radius_mm * (1 + values["scale"])
+            shape = Sphere(radius_mm=radius, centre_mm=(x + values["x"], y + values["y"], z))
+            view = view.model_copy(update={"shape": shape})
+    return view
+
+
+def targets(path: Path) -> tuple[Path, Path, Path]:
+    """Files for the material, the geometry and the instrument."""
+    return path, path.with_suffix(".geometry.yaml"), path.with_suffix(".instrument.yaml")
+
+
+def write_surface(
+    path: Path, diagnosis: SurfaceDiagnosis, material: Any, view: ViewingGeometry, instrument: InstrumentModel
+) -> list[Path]:
+    """Write the files that the effects found change; returns them.
+
+    Raises
+    ------
+    WriteError : one of the files exists, or nothing was found that a file could hold.
+    """
+    kinds = {e.kind for e in diagnosis.effects}
+    of_instrument = tuple(e for e in diagnosis.effects if e.kind not in (*MATERIAL, *GEOMETRY, *NOWHERE))
+    models: list[tuple[Path, BaseModel]] = []
+    for_material, for_geometry, for_instrument = targets(path)
+    if kinds & set(MATERIAL):
+        models.append((for_material, corrected_material(material, diagnosis)))
+    if kinds & set(GEOMETRY):
+        models.append((for_geometry, corrected_geometry(view, diagnosis)))
+    if of_instrument:
+        models.append((for_instrument, extended(instrument, diagnosis.model_copy(update={"effects": of_instrument}))))
+    if not models:
+        found = f" {', '.join(sorted(kinds))} has no place in a file: mend it at the bench." if kinds else ""
+        raise WriteError(f"nothing was found that could go into {path}; it was not written.{found}")
+    for target, _ in models:
+        if target.exists():
+            raise WriteError(f"{target} exists; diagnose never replaces a file. Give another --write.")
+    for target, model in models:
+        with target.open("x", encoding="utf-8") as file:
+            file.write(f"# Written by `diagnose --reflectance`: {diagnosis.verdict}.\n{dump_yaml(model)}")
+    return [target for target, _ in models]

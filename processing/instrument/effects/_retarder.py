@@ -1,0 +1,42 @@
+"""What the effects of one retarder of one train share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import Array, Effect, Parameter, retarders
+from processing.instrument.model import InstrumentModel
+
+
+class RetarderEffect(Effect):
+    """One number of each retarder of a train."""
+
+    group = "optics"
+    train: ClassVar[Literal["generator", "analyzer"]]
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        return retarders(model, self.train)
+
+
+class Retardance(RetarderEffect):
+    """The retardance differs from the model's."""
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return (Parameter("retardance", "degree", -40, 40, 1.0),)
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        changes.retardance_rad[place] = changes.retardance_rad[place] + np.deg2rad(values[0])
+
+
+class Azimuth(RetarderEffect):
+    """The fast axis stands elsewhere than in the model."""
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return (Parameter("azimuth", "degree", -45, 45, 1.0),)
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        changes.azimuth_rad[place] = changes.azimuth_rad[place] + np.deg2rad(values[0])

@@ -1,0 +1,20 @@
+"""Transmission that depends on how far an element has turned."""
+
+from __future__ import annotations
+
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import Array, Effect, Parameter, turns
+from processing.instrument.model import InstrumentModel
+
+
+class Transmission(Effect):
+    """Relative change of transmission, once and twice per turn of the element."""
+
+    group = "optics"
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return tuple(Parameter(n, "1", -0.3, 0.3, 0.01) for n in ("cos_1", "sin_1", "cos_2", "sin_2"))
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        factor = 1 + sum(v * wave for v, wave in zip(values, turns(model, changes.conditions, place), strict=True))
+        changes.gain = changes.gain * factor[:, None]

@@ -1,0 +1,38 @@
+"""The analyzer's polarizer stands elsewhere than the model says.
+
+Cause: the polarizer was turned in its cell, or the camera and analyzer were remounted together.
+With an unknown sample it cannot be told from an azimuth error of the analyzer's retarder (trap 8).
+Mend: calibrate on air; look through crossed polarizers and note the dark position.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import Array, Effect, Parameter
+from processing.instrument.model import InstrumentModel, Polarizer
+
+
+def polarizers(model: InstrumentModel) -> tuple[str, ...]:
+    """Polarizers of the analyzer and of its channels."""
+    elements = (*model.analyzer, *(e for c in model.channels for e in c.elements))
+    return tuple(e.name for e in elements if isinstance(e, Polarizer))
+
+
+class This(Effect):
+    """All polarizers behind the sample are turned together, in degrees."""
+
+    group = "optics"
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        return ("",) if polarizers(model) and model.mosaic is None else ()
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return (Parameter("azimuth", "degree", -45, 45, 1.0),)
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        for name in polarizers(model):
+            changes.azimuth_rad[name] = changes.azimuth_rad[name] + np.deg2rad(values[0])

@@ -1,0 +1,31 @@
+"""Each state's angle of one axis is off by its own amount.
+
+Cause: poor repeatability, read-back taken while still moving, missed settling.
+Mend: read the position after the stage is idle, allow it to settle, calibrate with an encoder on the shaft.
+With one known sample, one channel and one throughput it can explain anything, so it is never named there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import Array, Effect, Parameter, moving_axes, turned_by
+from processing.instrument.model import InstrumentModel
+
+
+class This(Effect):
+    """Angle error of each state in degrees."""
+
+    group = "motion"
+    scope = "capture"
+    per_state = True
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        return moving_axes(model, conditions)
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return tuple(Parameter(f"state_{k}", "degree", -10, 10, 0.3) for k in range(conditions.states))
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        changes.turn_axis(place, values, turned_by(model, place))

@@ -1,0 +1,27 @@
+"""The polarizers of the channels do not stand at their nominal azimuths.
+
+Cause: lithography of the micropolarizers turned against the pixel grid, a Wollaston prism or a camera mounted askew.
+Mend: turn a polarizer before the camera and fit each channel's azimuth.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects._channel import ChannelEffect, polarizer_of
+from processing.instrument.effects.base import Array, Parameter
+from processing.instrument.model import InstrumentModel
+
+
+class This(ChannelEffect):
+    """Azimuth error of each channel's polarizer in degrees."""
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return tuple(Parameter(f"channel_{c.name}", "degree", -20, 20, 1.0) for c in model.channels)
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        for k, value in enumerate(values):
+            name = polarizer_of(model, k)
+            if name is not None:
+                changes.azimuth_rad[name] = changes.azimuth_rad[name] + np.deg2rad(value)

@@ -1,0 +1,38 @@
+"""A constant is left in the counts after the dark was subtracted, or too much was subtracted.
+
+Cause: no dark frames, dark frames at another exposure, gain or temperature, a black level that moved.
+Under an unknown sample it looks like depolarization and cannot be told from stray light of a uniform image (trap 8).
+Mend: take dark states with the same exposure before and after; fix the black level in the camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import Array, Effect, Parameter
+from processing.instrument.model import InstrumentModel
+
+
+class This(Effect):
+    """Counts that are left over in every pixel and state."""
+
+    group = "detector"
+    corrects_counts = True
+    pointwise = True
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        return ("",)
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        top = conditions.full_scale
+        return (Parameter("offset", "count", -0.1 * top, 0.1 * top, 0.002 * top),)
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        full_scale = changes.conditions.full_scale
+        changes.response["one"] = changes.response["one"] - values[0] / full_scale
+
+    def undo(self, signal: Array, conditions: Conditions, values: Array) -> tuple[Array, Array]:
+        return signal - values[0] / conditions.full_scale, np.ones_like(signal)

@@ -1,0 +1,33 @@
+"""The light that reaches the generator's retarder is elliptical instead of linear.
+
+Cause: stress in a window or prism behind the polarizer, a polarizer before a birefringent fibre or liquid light guide.
+Mend: put the polarizer last before the retarder; look for stress between crossed polarizers; loosen the mount.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import Array, Effect, Parameter
+from processing.instrument.model import InstrumentModel, Polarizer
+from processing.polarization import mueller
+
+
+class This(Effect):
+    """Ellipticity angle in degrees behind the generator's polarizer."""
+
+    group = "optics"
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        return tuple(e.name for e in model.generator if isinstance(e, Polarizer)) if len(model.generator) > 1 else ()
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return (Parameter("ellipticity", "degree", -20, 20, 1.0),)
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        polarizer = next(e for e in model.generator if e.name == place)
+        azimuth = np.deg2rad(float(polarizer.azimuth_deg)) if not isinstance(polarizer.azimuth_deg, dict) else 0.0
+        changes.follow(place, mueller.retarder(azimuth + np.pi / 4, 2 * np.deg2rad(values[0])))

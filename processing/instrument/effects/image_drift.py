@@ -1,0 +1,31 @@
+"""The image moves steadily over the detector during the capture.
+
+Cause: the mount of camera or sample warms up or sags.
+Mend: let the bench settle, stiffen it, register the frames on a fixed mark.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import Array, Effect, Parameter
+from processing.instrument.model import InstrumentModel
+
+
+class This(Effect):
+    """Pixels from the first to the last state, x to the right and y down."""
+
+    group = "detector"
+    corrects_counts = True
+    moves_image = True
+    scope = "capture"
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        return ("",) if conditions.states > 1 else ()
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return tuple(Parameter(n, "pixel", -5, 5, 0.2) for n in ("x", "y"))
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        changes.shift_px = changes.shift_px + changes.conditions.elapsed[:, None] * values

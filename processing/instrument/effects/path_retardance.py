@@ -1,0 +1,33 @@
+"""Between generator and analyzer there is linear retardance that the model, or the stated sample, does not have.
+
+Cause: a window, beam splitter or lens under stress; a mirror that is met at an angle; strain in the cell.
+An unknown sample takes it up altogether: it is seen with air, a mirror or another known sample only.
+Mend: look between crossed polarizers for the strained part; put the element's Mueller matrix into the train.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import Array, Effect, Parameter
+from processing.instrument.model import InstrumentModel
+from processing.polarization import mueller
+
+
+class This(Effect):
+    """Two components of a linear retardance in degrees: fast axis at 0, and at 45 degrees."""
+
+    group = "optics"
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        return ("",) if len(model.generator) > 1 else ()
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return tuple(Parameter(n, "degree", -40, 40, 1.0) for n in ("at_0", "at_45"))
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        size, azimuth = np.hypot(*values), np.arctan2(values[1], values[0]) / 2
+        changes.follow(model.generator[-1].name, mueller.retarder(azimuth, np.deg2rad(size)))

@@ -1,0 +1,13 @@
+"""The fast axis of the analyzer's retarder stands elsewhere than the model says.
+
+Cause: the mount's zero moved (homed anew, belt or set screw slipped between sessions), the element was taken out.
+Mend: home the axis, then calibrate its zero on air; mark the element's orientation in its cell.
+"""
+
+from processing.instrument.effects._retarder import Azimuth
+
+
+class This(Azimuth):
+    """Azimuth error in degrees."""
+
+    train = "analyzer"

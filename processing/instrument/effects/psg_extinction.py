@@ -1,0 +1,14 @@
+"""The generator's polarizer leaks: its extinction (T_min over T_max) is larger than the model's.
+
+Cause: a film polarizer outside its band, an uncoated or dirty prism, a beam wider than the acceptance angle.
+With an unknown sample it cannot be seen at all (trap 8).
+Mend: measure the polarizer between crossed partners at this wavelength; use a crystal polarizer.
+"""
+
+from processing.instrument.effects._extinction import Extinction
+
+
+class This(Extinction):
+    """Extinction error, a ratio of intensities."""
+
+    train = "generator"

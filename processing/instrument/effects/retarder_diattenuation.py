@@ -1,0 +1,28 @@
+"""A retarder transmits its two axes unequally.
+
+Cause: Fresnel losses of a tilted or uncoated plate, a dichroic polymer, dust along one axis.
+Mend: tilt the plate back to normal incidence; measure both transmissions and put them into the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import Array, Effect, Parameter
+from processing.instrument.model import InstrumentModel, Retarder
+
+
+class This(Effect):
+    """(T_fast - T_slow) / (T_fast + T_slow) of the retarder."""
+
+    group = "optics"
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        return tuple(e.name for e in model.elements() if isinstance(e, Retarder))
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return (Parameter("diattenuation", "1", -0.3, 0.3, 0.01),)
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        changes.diattenuation[place] = changes.diattenuation[place] + values[0]

@@ -1,0 +1,33 @@
+"""An axis turns further, or less far, than its reading: a wrong scale, or the opposite sense.
+
+Cause: counts per degree of another stage model, a gear or belt ratio typed wrongly, a mount seen from behind. A
+published case: acquisition turned the analyzer by -4.91 times the generator's angle, reduction used +4.9 (trap 18).
+Mend: turn ten turns and look at the mark; correct the counts per degree or the sign in the rig file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import Array, Effect, Parameter, moving_axes, turned_by
+from processing.instrument.model import InstrumentModel
+
+#: relative = -2 turns the other way by as much as was asked.
+REVERSED = -2.0
+
+
+class This(Effect):
+    """(true turn - turn read) / turn read; -2 is the opposite sense."""
+
+    group = "motion"
+    starts = (0.0, REVERSED)
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        return moving_axes(model, conditions)
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return (Parameter("relative", "1", -2.1, 0.1, 0.001),)
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        changes.turn_axis(place, values[0] * changes.conditions.angles_deg[place], turned_by(model, place))

@@ -1,0 +1,43 @@
+"""From one state on, an axis stands off by a fixed angle.
+
+Cause: lost steps (stall, too much acceleration), a set screw that let go, somebody touched the mount.
+Mend: lower speed and acceleration, tighten, home and repeat the capture from that state.
+The state is searched for: its place is written AXIS@STATE, the first state that is off (counted from 0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import Array, Effect, Parameter, moving_axes, turned_by
+from processing.instrument.model import InstrumentModel
+
+#: Positions tried along a capture; with more states the nearest of these is named.
+POSITIONS = 64
+
+
+class This(Effect):
+    """Angle error in degrees from the state on."""
+
+    group = "motion"
+    scope = "capture"
+
+    def first_state(self, place: str) -> int:
+        return int(place.rpartition("@")[2])
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        n = conditions.states
+        # A slip at the first state is an azimuth error.
+        tried = np.unique(np.round(np.linspace(1, n - 1, min(POSITIONS, max(n - 1, 0)))).astype(int))
+        return tuple(f"{axis}@{k}" for axis in moving_axes(model, conditions) for k in tried)
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return (Parameter("slip", "degree", -45, 45, 1.0),)
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        axis, _, first = place.rpartition("@")
+        after = np.arange(changes.conditions.states) >= int(first)
+        changes.turn_axis(axis, values[0] * after, turned_by(model, axis))

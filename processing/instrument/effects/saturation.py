@@ -1,0 +1,31 @@
+"""Pixels are clipped at the top of the range in some states.
+
+Cause: too long an exposure for the brightest state, a glint.
+Mend: shorten the exposure or bracket it. What was clipped
+cannot be brought back: the correction leaves those pixels out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import Array, Effect, Parameter
+from processing.instrument.model import InstrumentModel
+
+
+class This(Effect):
+    """1: pixels with a clipped state are left out; the level is found from the counts, not fitted."""
+
+    group = "detector"
+    scope = "capture"
+    switch = True
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        return ("",)
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return (Parameter("left_out", "1", 0, 1, 1.0),)
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        changes.drop_clipped = changes.drop_clipped or bool(values[0] > 0.5)

@@ -1,0 +1,31 @@
+"""The source grows brighter or fainter during the capture, steadily or ever more slowly.
+
+Cause: warming up (which slows down: the curvature), ageing, a thermal drift of the fibre coupling.
+Mend: warm up for an hour, monitor the source with a second detector and divide, close the loop on its power.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import Array, Effect, Parameter
+from processing.instrument.model import InstrumentModel
+
+
+class This(Effect):
+    """Relative change of the source from the first to the last state, and its departure from a straight line."""
+
+    group = "source"
+    scope = "capture"
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        return ("",) if conditions.states > 1 else ()
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return (Parameter("fraction", "1", -0.9, 0.9, 0.02), Parameter("curvature", "1", -0.9, 0.9, 0.02))
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        t = changes.conditions.elapsed
+        # The curvature is how far the middle lies below the line between the ends.
+        changes.gain = changes.gain * (1 + values[0] * t + values[1] * (4 * t**2 - 1))[:, None]

@@ -1,0 +1,29 @@
+"""Light reaches the detector without passing the polarization optics, the same in every state.
+
+Cause: a reflection past the analyzer, room light, a leaking housing, veiling glare of the lens.
+A constant is within the column space of W: an unknown sample takes it up (trap 8).
+Mend: baffle; measure with the beam blocked before the generator and subtract that as dark.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import Array, Effect, Parameter
+from processing.instrument.model import InstrumentModel
+
+
+class This(Effect):
+    """Stray light over the mean signal that the same throughput gives without polarization."""
+
+    group = "optics"
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        return ("",) if model.axes else ()
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return (Parameter("fraction", "1", -0.05, 1.0, 0.01),)
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        changes.stray += float(values[0])

@@ -1,0 +1,43 @@
+"""The stored counts are a power of the light: counts / full scale = (light / full scale)^(1 / gamma).
+
+Cause: a camera or file format with gamma correction (8-bit pictures usually have one), a "contrast" setting.
+Mend: turn gamma off, store raw counts; else invert the curve before anything else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import Array, Effect, Parameter
+from processing.instrument.model import InstrumentModel
+
+#: Signal over full scale below which the curve is taken as straight.
+TINY = 1e-6
+
+
+class This(Effect):
+    """gamma - 1; light = full scale * (counts / full scale)^gamma."""
+
+    group = "mosaic"
+    corrects_counts = True
+    pointwise = True
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        return ("",)
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return (Parameter("gamma_minus_1", "1", -0.5, 1.5, 0.03),)
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        e = values[0]
+        # y^(1 + e) = y (1 + e ln y + e^2/2 ln^2 y + ...), y = counts over full scale.
+        for name, factor in (("log", e), ("log_square", e * e / 2), ("log_cube", e**3 / 6)):
+            changes.response[name] = changes.response[name] + factor
+
+    def undo(self, signal: Array, conditions: Conditions, values: Array) -> tuple[Array, Array]:
+        # Noise takes dark pixels below zero, where a power is not defined: straight there.
+        power = np.maximum(signal, TINY) ** values[0]
+        return signal * power, (1 + values[0]) * power

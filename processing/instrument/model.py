@@ -1,0 +1,334 @@
+"""Instrument models: two optical trains, a detector, and one row of W for each state and channel.
+
+Any rotating-element polarimeter is a YAML file: a generator train and an analyzer train of elements, each
+fixed or turned by a named axis, and one or more detector channels (conventions.md, "Instrument").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from processing.errors import ProcessError
+from processing.instrument.changes import Changes, Conditions
+from processing.polarization import mueller
+from processing.yaml_file import load_yaml
+
+Row = NDArray[np.float64]
+
+#: A number, or one number for each wavelength in nm.
+Dispersive = float | dict[float, float]
+
+
+class WavelengthError(ProcessError):
+    """The instrument model has no value for the wavelength asked for."""
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Element(_Part):
+    """One optical element, fixed or turned: azimuth = azimuth_deg + ratio * angle of `axis`."""
+
+    name: str
+    azimuth_deg: Dispersive = 0.0
+    axis: str | None = None
+    ratio: float = 1.0
+
+    @model_validator(mode="after")
+    def _ratio_needs_axis(self) -> Self:
+        if self.axis is None and self.ratio != 1.0:
+            raise ValueError(f"element {self.name!r} has a ratio but no axis that turns it")
+        return self
+
+    def azimuth_rad(self, angles_deg: Mapping[str, ArrayLike], states: int) -> Row:
+        """Azimuth (states,) in radians; angles_deg holds the angle of each axis for each state."""
+        azimuth = np.full(states, _number(self.azimuth_deg))
+        if self.axis is not None:
+            if self.axis not in angles_deg:
+                known = ", ".join(sorted(angles_deg)) or "none"
+                raise KeyError(f"element {self.name!r} turns with axis {self.axis!r}; the states have: {known}")
+            azimuth = azimuth + self.ratio * np.asarray(angles_deg[self.axis], dtype=float)
+        return np.asarray(np.deg2rad(azimuth))
+
+    def mueller(self, azimuth_rad: Row, changes: Changes | None = None) -> Row:
+        """Mueller matrices (states, 4, 4) of the element at each azimuth, with what effects change in it."""
+        raise NotImplementedError
+
+
+class Polarizer(Element):
+    """Linear polarizer; `extinction` is the intensity leak T_min/T_max."""
+
+    kind: Literal["polarizer"]
+    extinction: Dispersive = 0.0
+
+    def mueller(self, azimuth_rad: Row, changes: Changes | None = None) -> Row:
+        extinction = _number(self.extinction) + (changes.extinction[self.name] if changes else 0.0)
+        return mueller.polarizer(azimuth_rad, extinction)
+
+
+class Retarder(Element):
+    """Linear retarder with its fast axis at the azimuth; `diattenuation` (T_f - T_s)/(T_f + T_s) is along it."""
+
+    kind: Literal["retarder"]
+    retardance_deg: Dispersive
+    diattenuation: Dispersive = 0.0
+
+    def mueller(self, azimuth_rad: Row, changes: Changes | None = None) -> Row:
+        retardance = np.deg2rad(_number(self.retardance_deg)) + (changes.retardance_rad[self.name] if changes else 0.0)
+        plain = mueller.retarder(azimuth_rad, retardance)
+        d = _number(self.diattenuation) + (changes.diattenuation[self.name] if changes else 0.0)
+        if np.all(d == 0.0):
+            return plain
+        return mueller.diattenuator(azimuth_rad, 1 + d, 1 - d) @ plain
+
+
+class Diattenuator(Element):
+    """Linear diattenuator with intensity transmissions `t_max` along the azimuth and `t_min` across it."""
+
+    kind: Literal["diattenuator"]
+    t_max: Dispersive = 1.0
+    t_min: Dispersive
+
+    def mueller(self, azimuth_rad: Row, changes: Changes | None = None) -> Row:
+        return mueller.diattenuator(azimuth_rad, _number(self.t_max), _number(self.t_min))
+
+
+AnyElement = Annotated[Polarizer | Retarder | Diattenuator, Field(discriminator="kind")]
+
+
+class Channel(_Part):
+    """One detector channel: the elements that only its light passes, after the common analyzer train."""
+
+    name: str
+    elements: tuple[AnyElement, ...] = ()
+    gain: float = Field(default=1.0, gt=0)
+
+
+class AppliedEffect(_Part):
+    """One effect that `diagnose` found and added: what, where, how large, on which evidence."""
+
+    kind: str
+    element: str | None = None
+    parameters: dict[str, EffectParameter]
+    evidence: float | None = None
+    captures: tuple[str, ...] = ()
+    scope: Literal["instrument", "capture"] = "instrument"
+    wavelength_nm: float | None = None
+    indistinguishable_from: tuple[str, ...] = ()
+
+
+class EffectParameter(_Part):
+    """A fitted value with its standard error (None: it has none, `note` says why)."""
+
+    value: float | tuple[float, ...]
+    stderr: float | tuple[float, ...] | None = None
+    unit: str
+    note: str | None = None
+
+    @property
+    def told(self) -> str:
+        """The value to the last of two digits of its standard error; the range of many values."""
+        if isinstance(self.value, tuple):
+            return f"{len(self.value)} values, {min(self.value):.4g} to {max(self.value):.4g}"
+        if not isinstance(self.stderr, float) or not 0 < self.stderr < np.inf:
+            return f"{self.value:.5g}"
+        digits = max(0, 1 - int(np.floor(np.log10(self.stderr))))
+        return f"{self.value:.{digits}f} ± {self.stderr:.{digits}f}"
+
+
+class InstrumentModel(_Part):
+    """Generator train, analyzer train and detector channels, in the order in which the light passes them.
+
+    `mosaic`, for a division-of-focal-plane sensor, lays out the channel names over the super-pixel, row by
+    row from the top left, e.g. (("90", "45"), ("135", "0")).
+    `calibrate` names values ("element.field") that are only nominal: `diagnose` fits them to captures of known samples.
+    An effect of scope "capture" holds for the captures that it names and for no other.
+    """
+
+    kind: Literal["instrument"] = "instrument"
+    name: str
+    source: str | None = None
+    wavelengths_nm: tuple[float, ...] | None = None
+    generator: tuple[AnyElement, ...]
+    analyzer: tuple[AnyElement, ...]
+    channels: tuple[Channel, ...] = (Channel(name="camera"),)
+    mosaic: tuple[tuple[str, ...], ...] | None = None
+    calibrate: tuple[str, ...] = ()
+    effects: tuple[AppliedEffect, ...] = ()
+
+    @model_validator(mode="after")
+    def _names_are_unique(self) -> Self:
+        names = [e.name for e in self.elements()]
+        twice = sorted({n for n in names if names.count(n) > 1})
+        if twice:
+            raise ValueError(f"element names must be unique; used twice: {', '.join(twice)}")
+        channels = [c.name for c in self.channels]
+        if len(set(channels)) != len(channels):
+            raise ValueError("channel names must be unique")
+        if self.mosaic is not None and sorted(n for row in self.mosaic for n in row) != sorted(channels):
+            raise ValueError("the mosaic must name each channel exactly once")
+        return self
+
+    @classmethod
+    def load(cls, path: Path | str) -> InstrumentModel:
+        """Read an instrument file. Raises ConfigError with file, line and key."""
+        return load_yaml(path, cls)
+
+    @property
+    def pitch(self) -> int:
+        """Pixels of the sensor from one pixel to the next behind the same polarizer; 1 without a mosaic."""
+        return len(self.mosaic) if self.mosaic else 1
+
+    def elements(self) -> tuple[AnyElement, ...]:
+        """All elements: generator, analyzer, then those of the channels."""
+        return (*self.generator, *self.analyzer, *(e for c in self.channels for e in c.elements))
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Names of the axes that turn elements, sorted."""
+        return tuple(sorted({e.axis for e in self.elements() if e.axis is not None}))
+
+    def at(self, wavelength_nm: float) -> InstrumentModel:
+        """The model with every dispersive value resolved at one wavelength.
+
+        Raises
+        ------
+        WavelengthError
+            A value, or the whole model, is not given at this wavelength. Nothing is interpolated.
+        """
+        if self.wavelengths_nm is not None and not _listed(wavelength_nm, self.wavelengths_nm):
+            raise WavelengthError(
+                f"instrument {self.name!r} is given at {_listing(self.wavelengths_nm)} nm; "
+                f"asked for {wavelength_nm:g} nm. Use an instrument file that has it."
+            )
+        resolved = _resolve(self.model_dump(), wavelength_nm, self.name)
+        # An effect was found at one wavelength and is not carried over to another.
+        resolved["effects"] = [
+            e for e in resolved["effects"] if e["wavelength_nm"] is None or _listed(wavelength_nm, [e["wavelength_nm"]])
+        ]
+        return InstrumentModel.model_validate(resolved | {"wavelengths_nm": (wavelength_nm,)})
+
+    def generator_states(self, angles_deg: Mapping[str, ArrayLike], changes: Changes | None = None) -> Row:
+        """Stokes vectors g (states, 4): first column of the generator train's Mueller matrix."""
+        n = _state_count(angles_deg)
+        stokes = np.zeros((n, 4))
+        stokes[:, 0] = 1.0
+        for element in self.generator:
+            stokes = np.einsum("nij,nj->ni", _matrices(element, angles_deg, n, changes), stokes)
+        return stokes
+
+    def analyzer_states(self, angles_deg: Mapping[str, ArrayLike], changes: Changes | None = None) -> Row:
+        """Analyzer vectors a (states, channels, 4): first row of each channel's train."""
+        n = _state_count(angles_deg)
+        common = [_matrices(e, angles_deg, n, changes) for e in self.analyzer]
+        out = np.empty((n, len(self.channels), 4))
+        for k, channel in enumerate(self.channels):
+            own = [_matrices(e, angles_deg, n, changes) for e in channel.elements]
+            row = np.zeros((n, 4))
+            row[:, 0] = channel.gain
+            for matrix in reversed(common + own):
+                row = np.einsum("ni,nij->nj", row, matrix)
+            out[:, k] = row
+        return out
+
+    def rows(self, angles_deg: Mapping[str, ArrayLike], changes: Changes | None = None) -> Row:
+        """Measurement matrix W (states, channels, 16): row = kron(a, g), so that P = W . vec(M), row-major.
+
+        The model must be resolved at a wavelength (`at`). Angles are those read back, in degrees. `changes` is
+        what effects do to this capture; without it the instrument's own effects apply, those that belong to
+        one capture alone left out (`processing.instrument.effects.base.capture_changes` has them).
+        """
+        if changes is None and self.effects:
+            from processing.instrument.effects.base import changes_of
+
+            names = tuple(c.name for c in self.channels)
+            arrays = {k: np.asarray(v, dtype=float).reshape(-1) for k, v in angles_deg.items()}
+            changes = changes_of(self, Conditions.of(arrays, names))
+        g = self.generator_states(angles_deg, changes)
+        a = self.analyzer_states(angles_deg, changes)
+        w = np.asarray((a[..., :, None] * g[:, None, None, :]).reshape(*a.shape[:2], 16))
+        return w if changes is None else _detected(w, changes)
+
+
+def condition_number(w: ArrayLike) -> float:
+    """Ratio of the largest to the smallest singular value of W (any leading shape, 16)."""
+    s = np.linalg.svd(np.asarray(w, dtype=float).reshape(-1, 16), compute_uv=False)
+    return float(s[0] / s[-1]) if s.size == 16 and s[-1] > 0 else float("inf")
+
+
+def rank(w: ArrayLike) -> int:
+    """Numerical rank of W, relative tolerance 1e-8."""
+    return int(np.linalg.matrix_rank(np.asarray(w, dtype=float).reshape(-1, 16), rtol=1e-8))
+
+
+def _matrices(element: Element, angles_deg: Mapping[str, ArrayLike], states: int, changes: Changes | None) -> Row:
+    azimuth = element.azimuth_rad(angles_deg, states)
+    if changes is None:
+        return element.mueller(azimuth)
+    azimuth = azimuth + changes.azimuth_rad[element.name]
+    key = changes.key(element.name, azimuth) if changes.built is not None else None
+    if changes.built is not None and key in changes.built:
+        matrix = changes.built[key]
+    else:
+        matrix = element.mueller(azimuth, changes)
+        if changes.built is not None and key is not None:
+            changes.built[key] = matrix
+    return changes.after[element.name] @ matrix if element.name in changes.after else matrix
+
+
+def _detected(w: Row, changes: Changes) -> Row:
+    if changes.stray:
+        # Light that no element modulates: the same for every state, as strong as the fraction of the mean signal.
+        w = w.copy()
+        w[..., 0] += changes.stray * float(np.mean(w[..., 0]))
+    if changes.mixing is not None:
+        w = np.einsum("ck,nkj->ncj", changes.mixing, w)
+    return np.asarray(w * changes.gain[..., None])
+
+
+def _state_count(angles_deg: Mapping[str, ArrayLike]) -> int:
+    counts = {np.size(v) for v in angles_deg.values()} or {1}
+    if len(counts) != 1:
+        raise ValueError(f"every axis needs one angle a state; got {sorted(counts)}")
+    return counts.pop()
+
+
+def _number(value: Dispersive) -> float:
+    if isinstance(value, dict):
+        raise WavelengthError("the instrument model has values for several wavelengths: choose one with .at()")
+    return float(value)
+
+
+def _listed(wavelength_nm: float, known: Sequence[float]) -> bool:
+    return any(abs(wavelength_nm - k) < 0.5 for k in known)
+
+
+def _listing(values: Sequence[float]) -> str:
+    return ", ".join(f"{v:g}" for v in values)
+
+
+def _resolve(node: Any, wavelength_nm: float, name: str) -> Any:
+    # A mapping with numeric keys can only be a dispersive value.
+    if isinstance(node, dict):
+        if node and all(isinstance(k, float | int) for k in node):
+            for key, value in node.items():
+                if abs(key - wavelength_nm) < 0.5:
+                    return value
+            raise WavelengthError(
+                f"instrument {name!r} has a value given at {_listing(list(node))} nm but not at {wavelength_nm:g} nm"
+            )
+        return {k: _resolve(v, wavelength_nm, name) for k, v in node.items()}
+    if isinstance(node, list | tuple):
+        return [_resolve(v, wavelength_nm, name) for v in node]
+    return node
+
+
+AppliedEffect.model_rebuild()
+InstrumentModel.model_rebuild()

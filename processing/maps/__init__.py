@@ -1,0 +1,1 @@
+"""Product in, product out: quantities, xi0, tables, material constants, extrapolation."""

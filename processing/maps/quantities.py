@@ -1,0 +1,205 @@
+"""Every derived map of a Mueller image, with its standard error, as a product file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.errors import ProcessError
+from processing.polarization import gradients
+from processing.polarization.cloude import Floats
+from processing.polarization.decompositions.differential import differential
+from processing.polarization.decompositions.lu_chipman import lu_chipman
+from processing.polarization.decompositions.symmetric import symmetric
+from processing.polarization.propagation import Derived
+from processing.polarization.quantities import PAPER_PAIRS, State
+from processing.reduction.mueller import Progress
+from processing.storage.images import MuellerImage
+from processing.storage.product import LIT_ERRORS, Plane, Product, ProductWriter, Step
+
+#: Pixels of a block: gradients take 128 bytes a pixel and quantity.
+BLOCK_PIXELS = 1 << 14
+
+#: Decompositions that are computed only where asked for, because they take seconds for a megapixel.
+EXTRA = ("symmetric", "differential")
+
+_AXES = "degrees from horizontal, 0 to 180"
+_MAPS: dict[str, Plane] = {
+    "coherency_eigenvalues": Plane(
+        (4,), "", "coherency eigenvalues over their sum, descending; negative ones are noise"
+    ),
+    "eigenvalue_deviation": Plane((3,), "", "xi1, xi2, xi3 minus their mean: 0 where the TD model holds"),
+    "td_missed": Plane((), "", "fraction of the light in the wrong process of the TD model: sum of |deviation| / 2"),
+    "entropy": Plane((), "", "entropy of the eigenvalues, base 4; NaN where one is negative"),
+    "depolarization_index": Plane((), "", "depolarization index: 1 pure, 0 ideal depolarizer"),
+    "diattenuation": Plane((), "", "magnitude of the diattenuation of M"),
+    "diattenuation_linear": Plane((), "", "linear diattenuation of M"),
+    "diattenuation_circular": Plane((), "", "circular diattenuation m03 / m00"),
+    "diattenuation_orientation_deg": Plane((), "degree", f"azimuth of the diattenuation of M, {_AXES}"),
+    "polarizance": Plane((), "", "magnitude of the polarizance of M: degree of polarization under unpolarized light"),
+    "polarizance_linear": Plane((), "", "linear polarizance of M: DoLP under unpolarized light"),
+    "polarizance_circular": Plane((), "", "circular polarizance m30 / m00"),
+    "polarizance_orientation_deg": Plane((), "degree", f"azimuth of the polarizance of M, AoLP, {_AXES}"),
+    "dominant_mueller_jones": Plane((4, 4), "", "Mueller-Jones matrix m0 of the largest eigenvalue, m00 = 1"),
+    "dominant_diattenuation_linear": Plane((), "", "linear diattenuation |D| of the dominant process"),
+    "dominant_diattenuation_circular": Plane((), "", "circular diattenuation of the dominant process"),
+    "dominant_diattenuation_orientation_deg": Plane((), "degree", f"azimuth psi of the dominant process, {_AXES}"),
+    "dominant_polarizance_linear": Plane((), "", "linear polarizance of the dominant process"),
+    "dominant_polarizance_circular": Plane((), "", "circular polarizance of the dominant process"),
+    "dominant_polarizance_orientation_deg": Plane((), "degree", f"azimuth of its polarizance, {_AXES}"),
+    "retardance_deg": Plane((), "degree", "Lu-Chipman retardance, 0 to 180 degrees"),
+    "retardance_linear_deg": Plane((), "degree", "linear part of the Lu-Chipman retardance vector"),
+    "retardance_fast_axis_deg": Plane((), "degree", f"fast axis of the linear part, {_AXES}"),
+    "retardance_circular_deg": Plane((), "degree", "circular part; positive: right circular is fast"),
+    "depolarization_power": Plane((), "", "Lu-Chipman depolarization power"),
+}
+_SYMMETRIC = {
+    f"symmetric_d{k}": Plane((), "", f"element {k} of the symmetric decomposition's depolarizer over element 0")
+    for k in (1, 2, 3)
+}
+_DIFFERENTIAL = {
+    "differential_retardance_deg": Plane((), "degree", "retardance of the differential decomposition"),
+    "differential_retardance_linear_deg": Plane((), "degree", "its linear part"),
+    "differential_retardance_fast_axis_deg": Plane((), "degree", f"fast axis of the linear part, {_AXES}"),
+    "differential_retardance_circular_deg": Plane((), "degree", "its circular part; positive: right circular is fast"),
+    "differential_diattenuation_linear": Plane((), "", "linear diattenuation exponent, ln(T_max / T_min) / 2"),
+} | {f"differential_depolarization_{k}": Plane((), "", f"depolarization exponent of S{k}") for k in (1, 2, 3)}
+
+_GROUPS: tuple[Callable[[Floats], dict[str, Derived]], ...] = (
+    gradients.coherency,
+    gradients.depolarization_index,
+    gradients.diattenuation,
+    gradients.polarizance,
+    gradients.dominant,
+    gradients.lu_chipman_quantities,
+)
+
+
+def quantities_of_mueller(
+    source: Path,
+    out: Path,
+    step: Step,
+    extra: Sequence[str] = (),
+    pairs: Mapping[str, tuple[State, State]] = PAPER_PAIRS,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Write the derived maps of a Mueller product; returns the facts that the new product holds.
+
+    Parameters
+    ----------
+    extra : any of `EXTRA`.
+    pairs : generator and analyzer state by the name of the map.
+
+    Raises
+    ------
+    ProductError : the source is no Mueller product.
+    ProcessError : an extra decomposition is unknown.
+    """
+    unknown = sorted(set(extra) - set(EXTRA))
+    if unknown:
+        raise ProcessError(f"unknown decomposition {unknown[0]!r}; there are: {', '.join(EXTRA)}")
+    maps = _planes(extra, pairs)
+    planes = dict(maps)
+    for name, plane in maps.items():
+        if plane.dtype is np.float32:
+            planes[f"{name}_errors"] = Plane(plane.leading, plane.units, f"standard errors of {name}, first order")
+    with Product(source) as product:
+        product.require("mueller")
+        steps = (*product.steps, step)
+        with ProductWriter(out, "quantities", product.header, product.shape, planes, steps, overwrite) as writer:
+            for rows in product.row_blocks(BLOCK_PIXELS):
+                if rows.stop > writer.rows_done:
+                    writer.write(rows, **_block(MuellerImage.of(product, rows), extra, pairs))
+                if progress:
+                    progress(rows.stop, product.shape[0])
+            facts = _facts(writer, maps)
+            writer.seal(facts)
+    return facts
+
+
+def _planes(extra: Sequence[str], pairs: Mapping[str, tuple[State, State]]) -> dict[str, Plane]:
+    found = dict(_MAPS)
+    for name, (generator, analyzer) in pairs.items():
+        found[name] = Plane((), "", f"light from a {generator} generator through a {analyzer} analyzer, over m00")
+    defined = ["lu_chipman", *extra]
+    if "symmetric" in extra:
+        found |= _SYMMETRIC
+    if "differential" in extra:
+        found |= _DIFFERENTIAL
+    for name in defined:
+        found[f"{name}_defined"] = Plane((), "", f"1 = the {name.replace('_', '-')} decomposition exists", np.uint8)
+    found["lit"] = Plane((), "", f"1 = m00 is above {LIT_ERRORS:g} of its standard errors", np.uint8)
+    found["negative_determinant"] = Plane((), "", "1 = det M < 0: Lu-Chipman's depolarizer is negative there", np.uint8)
+    return found
+
+
+def _block(
+    image: MuellerImage, extra: Sequence[str], pairs: Mapping[str, tuple[State, State]]
+) -> dict[str, NDArray[Any]]:
+    m = image.matrices.astype(float)
+    # Where there is no light an eigenvalue solver only works on noise, slowly.
+    lit = np.where((image.values[0, 0] > LIT_ERRORS * np.nan_to_num(image.errors[0, 0]))[..., None, None], m, np.nan)
+    derived: dict[str, Derived] = {}
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for group in _GROUPS:
+            derived |= group(m)
+        derived |= gradients.pairs(m, pairs)
+        if "symmetric" in extra:
+            derived |= gradients.symmetric_quantities(lit)
+        if "differential" in extra:
+            derived |= gradients.differential_quantities(lit)
+        found: dict[str, NDArray[Any]] = {}
+        for name, (value, gradient) in derived.items():
+            found[name] = value.astype(np.float32)
+            each = gradient.reshape(-1, *m.shape[:2], 16)
+            errors = [np.sqrt(image.variance_of(g)) for g in each]
+            found[f"{name}_errors"] = np.stack(errors).reshape(value.shape).astype(np.float32)
+    found["lit"] = np.isfinite(lit[..., 0, 0]).astype(np.uint8)
+    polar = lu_chipman(m)
+    found["lu_chipman_defined"] = polar.defined.astype(np.uint8)
+    found["negative_determinant"] = polar.negative_determinant.astype(np.uint8)
+    if "symmetric" in extra:
+        found["symmetric_defined"] = symmetric(lit).defined.astype(np.uint8)
+    if "differential" in extra:
+        found["differential_defined"] = differential(lit).defined.astype(np.uint8)
+    return found
+
+
+def _facts(writer: ProductWriter, maps: Mapping[str, Plane]) -> dict[str, Any]:
+    xi, xi_errors = writer.get("coherency_eigenvalues"), writer.get("coherency_eigenvalues_errors")
+    known = writer.get("lit") > 0
+    facts: dict[str, Any] = {"pixels": int(known.size), "pixels_with_light": int(known.sum()), "warnings": []}
+    if not known.any():
+        facts["warnings"].append(
+            f"no pixel has m00 above {LIT_ERRORS:g} of its standard errors: there is nothing but noise"
+        )
+        return facts
+    names = ("depolarization_index", "entropy", "td_missed", "diattenuation_linear", "polarizance_linear")
+    facts["median_xi0"], facts["median_xi0_error"] = _median(xi[0][known]), _median(xi_errors[0][known])
+    for name in names:
+        facts[f"median_{name}"] = _median(writer.get(name)[known])
+        facts[f"median_{name}_error"] = _median(writer.get(f"{name}_errors")[known])
+    for name in maps:
+        if name.endswith("_defined") or name == "negative_determinant":
+            facts[f"pixels_{name}"] = int(np.sum(writer.get(name)[known]))
+    if not np.isfinite(xi_errors[:, known]).any():
+        facts["warnings"].append("the product holds no standard errors, so neither do the maps")
+        return facts
+    unphysical = (xi[3] < -3 * xi_errors[3]) & known
+    facts["pixels_unphysical_beyond_3_errors"] = int(unphysical.sum())
+    if unphysical.sum() > 0.01 * known.sum():
+        facts["warnings"].append(
+            f"{100 * unphysical.sum() / known.sum():.1f} % of the lit pixels have a negative eigenvalue beyond three "
+            "of its errors: noise does not make that, an instrument error does. Run `diagnose`."
+        )
+    return facts
+
+
+def _median(values: NDArray[Any]) -> float | None:
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size else None

@@ -1,0 +1,66 @@
+"""Fill tables over scattering geometry from products: Mueller matrices, or xi0."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from processing.errors import ProcessError
+from processing.geometry.viewing import ViewingGeometry
+from processing.reduction.mueller import Progress
+from processing.reflectance.pbsdf import MUELLER, to_renderer_frames
+from processing.reflectance.table_axes import Layout
+from processing.reflectance.tables import ScatteringTable
+from processing.storage.product import Product
+
+
+def tabulate(
+    sources: Sequence[Path],
+    geometry_file: Path,
+    layout: Layout,
+    table: ScatteringTable | None = None,
+    progress: Progress | None = None,
+) -> ScatteringTable:
+    """Add the images of products to a table; a new one is made if none is given.
+
+    Mueller matrices are turned into the renderer's axes pixel by pixel, so that pixels of one bin are alike.
+    xi0 products add their valid pixels, with the variance of each, so that tables can be compared with their noise.
+
+    Raises
+    ------
+    ProcessError : products of another kind or wavelength, without an arm angle, or simulated and measured mixed.
+    """
+    view = ViewingGeometry.load(geometry_file)
+    for done, source in enumerate(sources, 1):
+        with Product(source) as product:
+            product.require("mueller", "xi0")
+            header, simulated, kind = product.header, product.simulated, product.kind
+            if header.omega_deg is None:
+                raise ProcessError(f"{source}: the capture does not say its arm angle; it belongs to no bin.")
+            if table is None:
+                names, frames = (MUELLER, "renderer") if kind == "mueller" else (("xi0", "xi0_variance"), "")
+                table = ScatteringTable(names, header.wavelength_nm, layout, simulated, frames)
+            if abs(table.wavelength_nm - header.wavelength_nm) > 0.5:
+                raise ProcessError(
+                    f"{source} is at {header.wavelength_nm:g} nm, the table at {table.wavelength_nm:g} nm; "
+                    "make one table for each wavelength."
+                )
+            for rows in product.row_blocks():
+                image = view.at(header.omega_deg, *product.shape, block=rows)
+                if not image.mask.any():
+                    continue
+                if kind == "mueller":
+                    m = np.moveaxis(product.get("mueller", rows), (0, 1), (-2, -1))[image.mask]
+                    values = to_renderer_frames(m, image.points).reshape(-1, 16).T
+                else:
+                    valid = product.get("valid", rows)[image.mask] > 0
+                    xi0, error = (product.get(name, rows)[image.mask] for name in ("xi0", "xi0_errors"))
+                    values = np.where(valid, np.stack([xi0, np.nan_to_num(error) ** 2]), np.nan)
+                table.add(image.points.angles, values, simulated)
+        if progress:
+            progress(done, len(sources))
+    if table is None:
+        raise ProcessError("no product was given; there is nothing to tabulate.")
+    return table

@@ -1,0 +1,1 @@
+"""From counts to Mueller and Stokes images."""

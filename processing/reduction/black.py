@@ -1,0 +1,208 @@
+"""The black of every exposure: dark states of that exposure, or offset plus dark current through those of others.
+
+A dark state's mean belongs to its own exposure. Where darks of an exposure are missing and there are two or more
+others, black(t) = offset + dark current x t is fitted to them, pixel by pixel (least squares, weighted by their
+numbers); its error is propagated. With one other exposure only, its mean is taken as it is, and a warning says so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from processing.instrument.noise import NoiseModel
+from processing.storage.capture import Capture
+
+Array = NDArray[np.float64]
+
+#: Exposures closer than this part of themselves are one exposure: cameras set them in steps.
+SAME_EXPOSURE = 1e-3
+#: A dark current below half a count over the exposures concerned hides in the rounding.
+UNSEEN_COUNTS = 0.5
+#: Excess of the darks' noise over the noise model that is believed, in standard errors.
+BELIEVED = 3.0
+
+
+@dataclass(frozen=True)
+class Black:
+    """Black by exposure; with D exposures of dark states.
+
+    Attributes
+    ----------
+    means : (D, channels, rows, columns) float32, counts; mean of the darks of each exposure. (1, 1, 1, 1) for a
+        level that is only declared.
+    exposure_s : (D,) ascending; NaN where exposures are not known.
+    states, frames : (D,) dark states and frames (states times repeats) of each exposure; 0 for a declared level.
+    scatter : (D,) variance of the dark states about their mean, counts^2, and its standard error; NaN for one state.
+    """
+
+    means: NDArray[np.float32]
+    exposure_s: Array
+    states: Array
+    frames: Array
+    scatter: Array
+    scatter_stderr: Array
+
+    @classmethod
+    def level(cls, counts: float) -> Black:
+        """A black level without dark states."""
+        none, unknown = np.zeros(1), np.full(1, np.nan)
+        return cls(np.full((1, 1, 1, 1), counts, np.float32), unknown, none, none, unknown, unknown)
+
+    @classmethod
+    def of(cls, capture: Capture) -> Black | None:
+        """From the dark states of a capture; None without any."""
+        dark = capture.states_with("dark")
+        if dark.size == 0:
+            return None
+        exposure = capture.column("exposure_s")[dark].astype(float)
+        repeats = np.maximum(capture.column("repeats")[dark].astype(float), 1)
+        means, found = [], []
+        for group in _groups(exposure):
+            mean, scatter, stderr = _mean_of(capture, dark[group])
+            means.append(mean)
+            found.append([exposure[group].mean(), len(group), repeats[group].sum(), scatter, stderr])
+        exposure_s, states, frames, scatter, stderr = np.array(found, dtype=float).T
+        return cls(np.stack(means), exposure_s, states, frames, scatter, stderr)
+
+    @property
+    def measured(self) -> bool:
+        """Whether there are dark states, not just a declared level."""
+        return bool(self.states.any())
+
+    def matches(self, exposure_s: ArrayLike) -> NDArray[np.bool_]:
+        """Whether there are darks of each exposure (N,); where exposures are not known, one black serves all."""
+        exposure = np.atleast_1d(np.asarray(exposure_s, dtype=float))
+        if np.isnan(self.exposure_s).any():
+            return np.ones(len(exposure), dtype=bool)
+        near = np.abs(exposure[:, None] - self.exposure_s) <= SAME_EXPOSURE * self.exposure_s
+        return np.asarray(near.any(axis=1) | np.isnan(exposure))
+
+    def weights(self, exposure_s: ArrayLike) -> Array:
+        """Black of each exposure (N,) as a weighted sum of `means`: (N, D)."""
+        exposure = np.atleast_1d(np.asarray(exposure_s, dtype=float))
+        if len(self.exposure_s) == 1:
+            return np.ones((len(exposure), 1))
+        number = self.frames / self.frames.sum()
+        out = np.broadcast_to(number, (len(exposure), len(number))).copy()
+        known = ~np.isnan(exposure)
+        line = np.stack([np.ones_like(self.exposure_s), self.exposure_s], axis=1)
+        fit = np.linalg.solve((line.T * number) @ line, line.T * number)
+        out[known] = np.stack([np.ones(known.sum()), exposure[known]], axis=1) @ fit
+        near = np.abs(exposure[:, None] - self.exposure_s)
+        exact = known & self.matches(exposure)
+        out[exact] = np.eye(len(number))[np.argmin(near[exact], axis=1)]
+        return out
+
+    def at(self, exposure_s: float) -> NDArray[np.float32]:
+        """Black (channels, rows, columns) of one exposure; (1, 1, 1) for a declared level."""
+        return np.asarray(np.tensordot(self.weights(exposure_s)[0], self.means, axes=1), dtype=np.float32)
+
+    def mean_variance(self, noise: NoiseModel | None) -> Array:
+        """Variance (D,), counts^2, of each of `means`; 0 for a declared level and without a noise model."""
+        if noise is None or not self.measured:
+            return np.zeros(len(self.exposure_s))
+        repeats = self.frames / self.states
+        return noise.averaged_floor(repeats, self._excess(noise)) / self.states
+
+    def excess(self, noise: NoiseModel | None, exposure_s: ArrayLike) -> Array:
+        """What a frame's variance without light has above `noise`, counts^2, at each exposure (N,).
+
+        That is the shot noise of the dark current. It is taken from the scatter of the dark states, which needs no
+        black level; 0 where it is within its error.
+        """
+        if noise is None:
+            return np.zeros(len(np.atleast_1d(np.asarray(exposure_s))))
+        return np.maximum(self.weights(exposure_s) @ self._excess(noise), 0.0)
+
+    def _excess(self, noise: NoiseModel) -> Array:
+        repeats = np.maximum(self.frames, 1) / np.maximum(self.states, 1)
+        over = self.scatter - noise.averaged_floor(repeats)
+        with np.errstate(invalid="ignore"):
+            return np.where(over > BELIEVED * self.scatter_stderr, over * repeats, 0.0)
+
+    def in_words(self, exposure_s: ArrayLike) -> str:
+        """What is subtracted from states of these exposures."""
+        if not self.measured:
+            level = float(self.means.ravel()[0])
+            return f"black level {level:g} counts from the header" if level else "no black was subtracted"
+        light = np.unique(np.asarray(exposure_s, dtype=float))
+        matched = self.matches(light)
+        total = f"{self.frames.sum():g} dark frame(s)"
+        if len(self.exposure_s) == 1:
+            return f"mean of {total}"
+        own = f"mean of the dark frames of each exposure ({_each(self.exposure_s, self.frames)})"
+        if matched.all():
+            return own
+        line = f"offset + dark current x exposure, fitted to {total} at {_seconds(self.exposure_s)}"
+        if not matched.any():
+            return line
+        return f"{own}; at {_seconds(light[~matched])}: {line}"
+
+    def warnings(self, exposure_s: ArrayLike) -> list[str]:
+        """What the user should know about exposures (N,) without darks of their own."""
+        light = np.unique(np.asarray(exposure_s, dtype=float))
+        other = light[~self.matches(light)]
+        if not self.measured or other.size == 0:
+            return []
+        if len(self.exposure_s) == 1:
+            dark_s = float(self.exposure_s[0])
+            return [
+                f"the dark states were exposed {dark_s:g} s, other states differ from that by up to "
+                f"{np.max(np.abs(other - dark_s)):g} s: their dark current is not taken out. "
+                "Take darks at the exposures of the sample."
+            ]
+        low, high = float(self.exposure_s[0]), float(self.exposure_s[-1])
+        beyond = other[(other < low * (1 - SAME_EXPOSURE)) | (other > high * (1 + SAME_EXPOSURE))]
+        current = float(np.abs(self.means[-1].mean() - self.means[0].mean()) / (high - low))
+        reach = max(low - beyond.min(initial=low), beyond.max(initial=high) - high)
+        if current * reach < UNSEEN_COUNTS:
+            return []
+        return [
+            f"the black of {_seconds(beyond)} is extrapolated from darks of {low:g} to {high:g} s, by "
+            f"{current * reach:.2g} counts of dark current. Take darks at the exposures of the sample."
+        ]
+
+
+def _groups(exposure: Array) -> list[NDArray[np.int64]]:
+    """Positions of equal exposures, ascending; all in one group where some are not known."""
+    if np.isnan(exposure).any():
+        return [np.arange(len(exposure))]
+    order = np.argsort(exposure, kind="stable")
+    steps = np.diff(exposure[order]) > SAME_EXPOSURE * exposure[order][:-1]
+    return np.split(order, np.flatnonzero(steps) + 1)
+
+
+def _mean_of(capture: Capture, states: NDArray[np.int64]) -> tuple[NDArray[np.float32], float, float]:
+    """Mean frame of dark states, the variance of a state about it (counts^2), and that variance's standard error."""
+    n = len(states)
+    mean = np.zeros((capture.channels, *capture.frame_shape))
+    for k in states:
+        mean += capture.frames(int(k))
+    mean /= n
+    if n == 1:
+        return mean.astype(np.float32), float("nan"), float("nan")
+    each = []
+    for k in states:
+        # In blocks of rows: the whole image in floating numbers would be the largest thing in memory.
+        sums = np.zeros(3)
+        for rows in capture.row_blocks():
+            left = (capture.frames(int(k), rows) - mean[:, rows]).ravel()
+            left = left[np.isfinite(left)]
+            sums += [left.size, left.sum(), left @ left]
+        # A black level that moves as a whole is not noise of the pixels.
+        each.append((sums[2] - sums[1] ** 2 / sums[0]) / sums[0] if sums[0] else float("nan"))
+    scatter = float(np.mean(each)) * n / (n - 1)
+    return mean.astype(np.float32), scatter, scatter * float(np.sqrt(2 / ((n - 1) * mean.size)))
+
+
+def _seconds(exposure_s: Array) -> str:
+    shown = ", ".join(f"{value:g}" for value in exposure_s[:6])
+    return shown + (" ..." if len(exposure_s) > 6 else "") + " s"
+
+
+def _each(exposure_s: Array, frames: Array) -> str:
+    shown = ", ".join(f"{n:g} at {t:g} s" for t, n in zip(exposure_s[:6], frames[:6], strict=True))
+    return shown + (" ..." if len(exposure_s) > 6 else "")

@@ -1,0 +1,119 @@
+"""What an instrument file's effects (found by `diagnose`) mean for one capture that is about to be reduced."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from copy import copy
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.instrument.changes import Changes, Conditions, elapsed
+from processing.instrument.model import InstrumentModel
+from processing.storage.capture import Capture
+
+#: Signals below this part of full scale have the logarithm of this.
+_TINY = np.float32(1e-6)
+
+
+@dataclass(frozen=True)
+class CountsCorrection:
+    """Correction of the signal u = counts above black over full scale: u + sum of coefficient times feature(u).
+
+    Attributes
+    ----------
+    full_scale : counts above black.
+    response : feature to coefficient, one number or one for each intensity (states, channels).
+    shift_px : (states, 2), by how much the image moved to the right and down; it is moved back.
+    pitch : pixels from one pixel to the next of its kind: 2 on a polarization mosaic, whose kinds are moved one by one.
+    """
+
+    full_scale: float
+    response: dict[str, NDArray[np.float64]]
+    shift_px: NDArray[np.float64]
+    pitch: int = 1
+
+    @property
+    def moves(self) -> bool:
+        """Whether any state's image has moved."""
+        return bool(np.any(self.shift_px))
+
+    def apply(self, signal: NDArray[np.float32]) -> None:
+        """Correct signals (states, channels, pixels) in counts above black, in place."""
+        if not self.response:
+            return
+        u = signal / np.float32(self.full_scale)
+        added = np.zeros_like(u)
+        for name, coefficient in self.response.items():
+            c = np.asarray(coefficient, dtype=np.float32)
+            added += (c.reshape(*c.shape, 1) if c.ndim == 2 else c) * _feature(name, u)
+        signal += added * np.float32(self.full_scale)
+
+
+def capture_name(capture: Capture) -> str:
+    """Identity of a capture in the list of captures of an effect."""
+    return f"{capture.header.title} ({capture.path.name})"
+
+
+def full_scale(capture: Capture, states: NDArray[np.int64]) -> float:
+    """Top of the range above black, counts; for floating frames, their largest value."""
+    detector = capture.header.detector
+    if capture.integer_counts and detector.bits:
+        return float(2**detector.bits - 1) - detector.black_level_counts
+    return float(max(np.nanmax(capture.frames(int(k))) for k in states)) - detector.black_level_counts
+
+
+def capture_changes(capture: Capture, model: InstrumentModel, states: NDArray[np.int64]) -> Changes | None:
+    """What the model's effects change in some states of a capture; None for a model without effects.
+
+    Effects that belong to single captures (a slip, a drift) count only for those.
+    """
+    if not model.effects:
+        return None
+    from processing.instrument.effects.base import changes_of
+
+    angles = {name: value[states] for name, value in capture.angles_deg.items()}
+    channels = tuple(c.name for c in model.channels)
+    when = elapsed(capture.column("host_time_s")[states], len(states))
+    conditions = Conditions(angles, len(states), channels, when, full_scale(capture, states))
+    return changes_of(model, conditions, capture_name(capture))
+
+
+def extra_retardance(changes: Changes, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Retardance (elements, pixels), radians, that varies over the image, in the order of `field_retardance_rad`.
+
+    x, y (pixels,) run from -1 to 1, to the right and down.
+    """
+    from processing.instrument.effects.field_retardance import terms
+
+    parts = [coefficients @ terms(x, y) for coefficients in changes.field_retardance_rad.values()]
+    return np.stack(parts) if parts else np.zeros((0, np.size(x)))
+
+
+def with_extra(changes: Changes, extra: NDArray[np.float64]) -> Changes:
+    """The changes at a place with these extra retardances (elements,)."""
+    here = defaultdict(lambda: np.zeros(()), changes.retardance_rad)
+    for element, value in zip(changes.field_retardance_rad, extra, strict=True):
+        here[element] = here[element] + float(value)
+    out = copy(changes)
+    out.retardance_rad = here
+    return out
+
+
+def counts_correction(changes: Changes | None, model: InstrumentModel) -> CountsCorrection | None:
+    """The part of the changes that acts on the counts; None if there is none."""
+    if changes is None or not (changes.response or np.any(changes.shift_px)):
+        return None
+    response = {name: np.asarray(value, dtype=float) for name, value in changes.response.items() if np.any(value)}
+    return CountsCorrection(changes.conditions.full_scale, response, changes.shift_px, model.pitch)
+
+
+def _feature(name: str, u: NDArray[np.float32]) -> NDArray[np.float32] | np.float32:
+    if name == "one":
+        return np.float32(1.0)
+    powers = {"square": 2, "cube": 3, "fourth": 4}
+    if name in powers:
+        return np.asarray(u ** powers[name])
+    log = np.log(np.maximum(u, _TINY))
+    return np.asarray(u * log ** {"log": 1, "log_square": 2, "log_cube": 3}[name])

@@ -1,0 +1,90 @@
+"""Noise of demosaiced Stokes images: how much of each channel's variance arrives in S, for each method.
+
+S at a pixel is a weighted sum of raw pixels around it. The weights depend on where in the super-pixel it lies, so
+the covariance is, for each of the four positions, a sum over the channels of (3 x 3 matrix) x (variance of that
+channel's raw pixels there). The matrices come from sending unit impulses through the method itself.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.reduction.mosaic import oriented
+from processing.reduction.mosaic.layout import MosaicLayout
+from processing.reduction.mosaic.methods import METHODS, demosaic
+
+#: Frame on which impulses are followed, and the level under them.
+_SIZE, _LEVEL = 32, 1000.0
+#: A step small against the level: the methods that are not linear are linearized about an even scene.
+_STEP = 1.0
+#: Rows whose covariance is worked out at a time; an even number.
+ROWS = 128
+
+
+@lru_cache(maxsize=32)
+def noise_gain(layout: MosaicLayout, method: str, solve: tuple[tuple[float, ...], ...]) -> NDArray[np.float64]:
+    """Covariance of S for unit variance of one channel: (2, 2, channels, 3, 3), first two axes the pixel's position.
+
+    Parameters
+    ----------
+    solve : (3, channels) matrix from channel intensities to (S0, S1, S2), as nested tuples.
+
+    For `superpixel` all positions are alike.
+    """
+    matrix = np.asarray(solve)
+    out = np.zeros((2, 2, len(layout.channels), 3, 3))
+    flat = np.full((_SIZE, _SIZE), _LEVEL, np.float32)
+    still = demosaic(flat, layout, method)
+    middle = _SIZE // 2
+    for channel, (r, c) in enumerate(layout.offsets):
+        poked = flat.copy()
+        poked[middle + r, middle + c] += _STEP
+        moved = np.einsum("sc,crk->srk", matrix, (demosaic(poked, layout, method) - still) / _STEP)
+        if still.shape[1] == _SIZE // 2:
+            out[:, :, channel] = np.einsum("sxy,txy->st", moved, moved)
+            continue
+        for i in range(2):
+            for j in range(2):
+                part = moved[:, i::2, j::2]
+                out[i, j, channel] = np.einsum("sxy,txy->st", part, part)
+    return out
+
+
+def stokes_covariance(
+    variance: NDArray[np.float32],
+    layout: MosaicLayout,
+    method: str,
+    solve: NDArray[np.float64],
+    frame: NDArray[np.float32] | None = None,
+) -> NDArray[np.float32]:
+    """Covariance (6, rows, columns) of (S0, S1, S2): 00, 11, 22, 01, 02, 12.
+
+    Parameters
+    ----------
+    variance : (channels, rows, columns), counts^2, of a raw pixel of each channel at the level found there.
+    frame : the mosaic frame; the kernels of the method "oriented" depend on it. None: no edges.
+    """
+    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    out = np.empty((6, *variance.shape[1:]), np.float32)
+    if method == "oriented" and frame is not None:
+        direction = oriented.directions(frame, layout)
+        every = oriented.noise_gain(layout, solve)
+        packed = np.stack([every[..., a, b] for a, b in pairs]).astype(np.float32)
+        # Few rows at a time: the weights of all pixels together would be larger than the image many times over.
+        for first in range(0, variance.shape[1], ROWS):
+            for i in range(2):
+                for j in range(2):
+                    part = np.s_[first + i : first + ROWS : 2, j::2]
+                    weights = packed[:, direction[part], i, j]
+                    out[:, *part] = np.einsum("kxyc,cxy->kxy", weights, variance[:, *part])
+        return out
+    gain = noise_gain(layout, method, tuple(tuple(float(v) for v in row) for row in solve))
+    step = 1 if METHODS[method] is METHODS["superpixel"] else 2
+    for i in range(step):
+        for j in range(step):
+            weights = np.array([gain[i, j, :, a, b] for a, b in pairs], dtype=np.float32)
+            out[:, i::step, j::step] = np.tensordot(weights, variance[:, i::step, j::step], axes=1)
+    return out

@@ -1,0 +1,268 @@
+"""Reduce a capture to a Mueller image: black, flat, exposure, one inversion for all pixels, standard errors.
+
+W is built from the angles read back. Row blocks keep memory constant; the product can be resumed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.errors import ProcessError
+from processing.instrument.changes import Changes
+from processing.instrument.model import InstrumentModel
+from processing.instrument.noise import NoiseModel
+from processing.polarization.physical import nearest
+from processing.reduction.counts_to_signal import BlockReader, Correction, Mask
+from processing.reduction.effects_of_capture import capture_changes, counts_correction, extra_retardance, with_extra
+from processing.reduction.facts import mueller_facts
+from processing.reduction.solvers.field import Field, FieldSolver
+from processing.reduction.solvers.inversion import ELEMENTS, Inversion
+from processing.reduction.solvers.plain import MuellerSolver
+from processing.storage.capture import Capture, CaptureError
+from processing.storage.product import Plane, ProductWriter, Step
+
+if TYPE_CHECKING:
+    from processing.reduction.solvers.weighted import WeightedSolver
+
+    Solver = MuellerSolver | WeightedSolver | FieldSolver
+
+#: Called with (rows done, rows in all).
+Progress = Callable[[int, int], None]
+
+BLOCK_PIXELS = 1 << 18
+
+PLANES = {
+    "mueller": Plane((4, 4), "count", "Mueller matrix, row-major, not normalized"),
+    "mueller_errors": Plane((4, 4), "count", "standard errors of mueller"),
+    "residual_rms": Plane((), "count", "root mean square over the states of intensity minus fit"),
+    "pixel_mask": Plane((), "", f"0 = good; bits: {Mask.meaning()}", np.uint8),
+}
+
+CHI_SQUARE = Plane((), "", "squared residual over what the noise model expects; 1 if the model is complete")
+COVARIANCE = Plane(
+    (ELEMENTS * (ELEMENTS + 1) // 2,),
+    "count2",
+    "covariance of mueller, lower triangle row by row: 00, 10, 11, 20, 21, 22, ...",
+)
+PHYSICAL = {
+    "nearest": Plane((4, 4), "count", "physical Mueller matrix nearest to mueller (Frobenius norm)"),
+    "likelihood": Plane((4, 4), "count", "physical Mueller matrix of highest likelihood"),
+}
+
+
+@dataclass(frozen=True)
+class Choice:
+    """How to reduce.
+
+    Attributes
+    ----------
+    weighted : weigh each intensity by its noise, pixel by pixel; else equal weights.
+    covariance : store the full 16 x 16 covariance of each pixel (needs `weighted`).
+    physical : "nearest", "likelihood" (needs `weighted`) or None: a physical estimate beside the plain one.
+    noise : of the camera, where it is known better than by the capture's header.
+    """
+
+    weighted: bool = False
+    covariance: bool = False
+    physical: str | None = None
+    noise: NoiseModel | None = None
+
+    def __post_init__(self) -> None:
+        if self.physical not in (None, *PHYSICAL):
+            raise ProcessError(f"physical estimate {self.physical!r} is none of {', '.join(PHYSICAL)}")
+        if not self.weighted and (self.covariance or self.physical == "likelihood"):
+            raise ProcessError("a stored covariance and the most likely physical matrix need the weighted estimate")
+
+    def solver(self, plain: MuellerSolver, field: Field | None = None) -> Solver:
+        """The solver that the choice asks for; `field` where W varies over the image."""
+        if field is not None:
+            if self.weighted:
+                raise ProcessError("--weighted is not available for an instrument with field_retardance; leave it out")
+            return FieldSolver(plain, field)
+        if not self.weighted:
+            return plain
+        # Imported here: its compiled loops make every start half a second longer.
+        from processing.reduction.solvers.weighted import WeightedSolver
+
+        return WeightedSolver(plain, self.covariance, self.physical == "likelihood")
+
+    def planes(self, known_noise: bool) -> dict[str, Plane]:
+        """Datasets of the product."""
+        planes = dict(PLANES)
+        if known_noise:
+            planes["reduced_chi_square"] = CHI_SQUARE
+        if self.covariance:
+            planes["mueller_covariance"] = COVARIANCE
+        if self.physical:
+            planes["mueller_physical"] = PHYSICAL[self.physical]
+        return planes
+
+
+def sample_states(capture: Capture) -> NDArray[np.int64]:
+    """Positions of the states that look at the sample, or at air where a capture has no others."""
+    states = capture.states_with("sample")
+    if states.size == 0:
+        states = capture.states_with("air")
+    if states.size == 0:
+        raise CaptureError(f"{capture.path} has no state of the sample that is done; there is nothing to reduce.")
+    return states
+
+
+def measurement_matrix(
+    capture: Capture, model: InstrumentModel, states: NDArray[np.int64], changes: Changes | None = None
+) -> NDArray[np.float64]:
+    """W (states, channels, 16) from the read-back angles, rows scaled with the exposure (longest = 1).
+
+    `changes` is what the model's effects do to this capture (`applied_effects.capture_changes`).
+    """
+    angles = {name: value[states] for name, value in capture.angles_deg.items()}
+    missing = [axis for axis in model.axes if axis not in angles]
+    if missing:
+        have = ", ".join(sorted(angles)) or "none"
+        raise CaptureError(
+            f"{capture.path}: instrument {model.name!r} turns {', '.join(missing)}, but the capture has angles of: "
+            f"{have}. Use the instrument file that belongs to the capture."
+        )
+    w = model.rows(angles, changes)
+    bad = ~np.all(np.isfinite(w.reshape(len(states), -1)), axis=1)
+    if np.any(bad):
+        raise CaptureError(
+            f"{capture.path}: no read-back angle in state(s) {_some(states[bad])}; they cannot be reduced."
+        )
+    return w * relative_exposure(capture, states)[:, None, None]
+
+
+def field_of(
+    capture: Capture, model: InstrumentModel, states: NDArray[np.int64], changes: Changes | None
+) -> Field | None:
+    """W where retardances vary over the image; None where W is the same everywhere."""
+    if changes is None or not changes.field_retardance_rad:
+        return None
+
+    def matrix(extra: NDArray[np.float64]) -> NDArray[np.float64]:
+        return measurement_matrix(capture, model, states, with_extra(changes, extra)).reshape(-1, 16)
+
+    return Field(matrix, lambda x, y: extra_retardance(changes, x, y))
+
+
+def relative_exposure(capture: Capture, states: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Exposure of each state over the longest one; 1 where the capture does not know exposures."""
+    exposure = capture.column("exposure_s")[states].astype(float)
+    if not np.any(np.isfinite(exposure)):
+        return np.ones(len(states))
+    if not np.all(np.isfinite(exposure)) or np.any(exposure <= 0):
+        raise CaptureError(
+            f"{capture.path}: exposure_s is given for some states only, or not positive; give it for all or none."
+        )
+    return np.asarray(exposure / exposure.max())
+
+
+def choose_model(capture: Capture, instrument: Path | None) -> InstrumentModel:
+    """The instrument model at the capture's wavelength: from a file, else the one in the capture."""
+    if instrument is not None:
+        return InstrumentModel.load(instrument).at(capture.header.wavelength_nm)
+    if capture.instrument is None:
+        raise CaptureError(f"{capture.path} holds no instrument model. Give one with --instrument FILE.")
+    return capture.instrument
+
+
+def reduce_mueller(
+    capture: Capture,
+    model: InstrumentModel,
+    out: Path,
+    steps: tuple[Step, ...],
+    correction: Correction | None = None,
+    choice: Choice | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Write the Mueller image of a capture; returns the facts that the product holds.
+
+    Parameters
+    ----------
+    model : resolved at the capture's wavelength.
+    correction : black, flat and masks; default: what the capture itself offers.
+    choice : weighting, covariance, physical estimate, noise; default: plain.
+
+    Raises
+    ------
+    NotDetermined : W has a rank below 16.
+    CaptureError : angles or frames are missing or not finite.
+    """
+    states = sample_states(capture)
+    changes = capture_changes(capture, model, states)
+    w = measurement_matrix(capture, model, states, changes)
+    inversion = Inversion.of(w.reshape(-1, 16), what=f"{capture.path}: ")
+    correction = correction or Correction.of(capture)
+    reader = BlockReader(capture, states, correction, counts_correction(changes, model))
+    choice = choice or Choice()
+    noise = choice.noise or NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
+    solver = choice.solver(MuellerSolver(inversion, reader, noise), field_of(capture, model, states, changes))
+    planes = choice.planes(known_noise=noise is not None)
+    with ProductWriter(out, "mueller", capture.header, capture.frame_shape, planes, steps, overwrite) as product:
+        product.array("measurement_matrix", w, "", "W (state, channel, 16): intensity = W . vec(M), row-major")
+        _store_noise(product, noise, solver)
+        # HDF5 lets the interpreter go while it writes: one block is stored while the next is solved.
+        with ThreadPoolExecutor(1) as storing:
+            stored: Future[None] | None = None
+            for rows in capture.row_blocks(BLOCK_PIXELS):
+                if rows.stop > product.rows_done:
+                    block = _block(solver, rows, planes)
+                    if stored:
+                        stored.result()
+                    stored = storing.submit(product.write, rows, **block)
+                if progress:
+                    progress(rows.stop, capture.frame_shape[0])
+            if stored:
+                stored.result()
+        try:
+            facts = mueller_facts(inversion, noise, correction, product, len(states), choice.weighted)
+        except CaptureError as error:
+            raise CaptureError(f"{capture.path}: {error}{_without_numbers(capture, states)}") from error
+        if choice.physical:
+            facts["physical_estimate"] = f"{choice.physical}, as mueller_physical beside the plain one"
+        product.seal(facts)
+    return facts
+
+
+def _store_noise(product: ProductWriter, noise: NoiseModel | None, solver: Solver) -> None:
+    # variance of intensity n = slope[n] * signal + floor[n]; NaN: estimated from the residual.
+    nothing = np.full(len(solver.repeats), np.nan)
+    slope = noise.slope / solver.repeats if noise else nothing
+    product.array("noise_slope", slope, "count", "shot noise: variance a signal count, for each row of W")
+    floor = solver.intensity_floor if noise else nothing
+    product.array("noise_floor", floor, "count2", "variance without light, for each row of W")
+
+
+def _block(solver: Solver, rows: slice, planes: Mapping[str, Plane]) -> dict[str, NDArray[Any]]:
+    frames = solver.reader.read(rows)
+    found = solver.solve(frames)
+    mask = found["pixel_mask"]
+    lost = (mask & np.uint8(Mask.NOT_FINITE | Mask.BAD | Mask.NOT_DETERMINED)) != 0
+    for name, values in found.items():
+        if lost.any() and name != "pixel_mask":
+            values[..., lost] = np.nan
+    shape = (rows.stop - rows.start, solver.reader.capture.frame_shape[1])
+    if "mueller_physical" in planes and "mueller_physical" not in found:
+        found["mueller_physical"] = nearest(found["mueller"])
+    return {name: found[name].reshape(*plane.leading, *shape) for name, plane in planes.items()}
+
+
+def _without_numbers(capture: Capture, states: NDArray[np.int64]) -> str:
+    """Which states have frames without a single number, as the end of a message."""
+    empty = np.array([k for k in states if not np.isfinite(capture.frames(int(k))).any()], dtype=np.int64)
+    if not empty.size:
+        return ""
+    return f" State(s) {_some(empty)} hold no number at all: take them again, or import without them."
+
+
+def _some(values: NDArray[np.int64]) -> str:
+    shown = ", ".join(str(v) for v in values[:5])
+    return shown + (" ..." if len(values) > 5 else "")

@@ -1,0 +1,1 @@
+"""Inversion of intensities into Mueller elements: plain, weighted, with a matrix that varies over the image."""

@@ -1,0 +1,129 @@
+"""Least-squares inversion of intensities into Mueller elements, one matrix for all pixels.
+
+The data are planes: frames (N, pixels) of any real type, result (16, pixels) float32. A tile of pixels is
+converted to float32 and multiplied by BLAS while it is in the cache; tiles are spread over Python threads. BLAS
+itself must run one thread (the commands set OPENBLAS_NUM_THREADS=1), or its threads and ours fight for the cores.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.computing.threads import for_ranges
+from processing.errors import NotDetermined
+from processing.instrument.model import condition_number, rank
+
+#: Pixels in a tile: 40 float32 rows of it stay in a core's second-level cache.
+TILE = 4096
+
+ELEMENTS = 16
+
+
+@dataclass(frozen=True)
+class Inversion:
+    """Pseudo-inverse of W and what belongs to it.
+
+    Attributes
+    ----------
+    w : (N, K) measurement matrix, K = 16 for Mueller, 3 for linear Stokes.
+    pinv : (K, N) pseudo-inverse.
+    null : (N - K, N) orthonormal rows that see only what W cannot explain: the residual, without forming the fit.
+    condition_number : largest over smallest singular value.
+    """
+
+    w: NDArray[np.float64]
+    pinv: NDArray[np.float64]
+    null: NDArray[np.float64]
+    condition_number: float
+
+    @classmethod
+    def of(cls, w: NDArray[np.float64], what: str = "") -> Inversion:
+        """Invert a measurement matrix (N, 16).
+
+        Raises
+        ------
+        NotDetermined
+            W has a rank below 16; the message names the rank and the elements of M that the states cannot see.
+        """
+        found = rank(w)
+        if found < w.shape[1]:
+            raise NotDetermined(_missing(w, found, what))
+        u, _, _ = np.linalg.svd(w, full_matrices=True)
+        return cls(
+            w,
+            np.asarray(np.linalg.pinv(w), dtype=float),
+            np.array(u[:, w.shape[1] :].T, dtype=float),
+            condition_number(w),
+        )
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """States minus unknowns."""
+        return int(self.null.shape[0])
+
+    @property
+    def unit_covariance(self) -> NDArray[np.float64]:
+        """Covariance (K, K) for unit variance of every intensity."""
+        return np.asarray(self.pinv @ self.pinv.T)
+
+
+def multiply_tiles(
+    matrix: NDArray[np.float32],
+    frames: NDArray[np.generic],
+    out: NDArray[np.float32],
+    offset: NDArray[np.float32] | float = 0.0,
+) -> None:
+    """out = matrix @ (frames - offset), tile by tile on all cores.
+
+    Parameters
+    ----------
+    matrix : (K, N) float32.
+    frames : (N, pixels), any real type.
+    out : (K, pixels) float32, overwritten; reuse it, because first touch of new memory is slow.
+    offset : a number, or (pixels,) in counts, subtracted from every frame.
+    """
+    states, pixels = frames.shape
+
+    def loop(start: int, stop: int) -> None:
+        tile = np.empty((states, TILE), dtype=np.float32)
+        for a in range(start, stop, TILE):
+            b = min(a + TILE, stop)
+            part = tile[:, : b - a]
+            np.copyto(part, frames[:, a:b], casting="unsafe")
+            if isinstance(offset, np.ndarray):
+                part -= offset[a:b]
+            elif offset:
+                part -= np.float32(offset)
+            np.matmul(matrix, part, out=out[:, a:b])
+
+    for_ranges(pixels, loop, align=TILE, smallest=TILE)
+
+
+def mueller_planes(
+    inversion: Inversion,
+    frames: NDArray[np.generic],
+    out: NDArray[np.float32] | None = None,
+    offset: NDArray[np.float32] | float = 0.0,
+) -> NDArray[np.float32]:
+    """Mueller elements (16, pixels) float32 of frames (N, pixels); `offset` is the black in counts."""
+    if out is None:
+        out = np.empty((inversion.pinv.shape[0], frames.shape[1]), dtype=np.float32)
+    multiply_tiles(inversion.pinv.astype(np.float32), frames, out, offset)
+    return out
+
+
+def _missing(w: NDArray[np.float64], found: int, what: str) -> str:
+    # An element of M is not determined if its unit vector leaves the row space of W.
+    _, _, vt = np.linalg.svd(w, full_matrices=False)
+    row_space = vt[:found]
+    outside = 1.0 - np.sum(row_space**2, axis=0)
+    lost = [f"m{k // 4}{k % 4}" for k in np.flatnonzero(outside > 1e-6)]
+    need = w.shape[1]
+    return (
+        f"{what}the measurement matrix W has rank {found}, and {need} are needed: {w.shape[0]} intensities a pixel "
+        f"do not determine {', '.join(lost)} (each alone or in combination). Take states at more, or at less "
+        "regular, angles: an analyzer ratio of 4.91 with 40 states gives rank 16, a ratio of exactly 5 only 12."
+    )

@@ -1,0 +1,182 @@
+"""Solve row blocks for Mueller elements with their standard errors and the residual, in one matrix product a tile."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.computing.threads import for_ranges
+from processing.instrument.noise import NoiseModel
+from processing.reduction.counts_to_signal import BlockReader, Mask
+from processing.reduction.solvers.inversion import TILE, Inversion
+
+#: Saturated pixels solved at a time, each with its own matrix.
+REPAIR_BATCH = 4096
+#: A pixel's remaining states must leave W a condition number below this.
+WORST_CONDITION = 1e3
+#: In the dark the signal is noise about 0: a variance may come out below that of no light, down to this part of it.
+LEAST = 0.5
+
+
+class MuellerSolver:
+    """What is the same for all row blocks: the stacked matrix that one product with a tile needs.
+
+    Its rows: pseudo-inverse (16), residual (N - 16), and, with a noise model, squares of the pseudo-inverse (16) and
+    of the residual rows, summed (1): applied to the signal these give the variances that shot noise makes.
+    """
+
+    def __init__(self, inversion: Inversion, reader: BlockReader, noise: NoiseModel | None) -> None:
+        self.inversion, self.reader, self.noise = inversion, reader, noise
+        channels = reader.capture.channels
+        squares = np.concatenate([inversion.pinv**2, np.sum(inversion.null**2, axis=0, keepdims=True)])
+        self.repeats = np.repeat(reader.repeats, channels)
+        stack = [inversion.pinv, inversion.null, *([squares / self.repeats] if noise else [])]
+        self.stack = np.concatenate(stack).astype(np.float32)
+        self.first_square = inversion.w.shape[0]
+        black = reader.correction.black
+        excess = np.repeat(black.excess(noise, reader.exposure_s), channels)
+        #: Variance without light of each intensity (N,), counts^2.
+        self.intensity_floor = noise.averaged_floor(self.repeats, excess) if noise else np.zeros(inversion.w.shape[0])
+        self.floor = (squares * self.intensity_floor).reshape(17, -1, channels).sum(axis=1).astype(np.float32)
+        # The black is the same in all states of one exposure of a channel, so its error is common to them.
+        self.black_variance = black.mean_variance(noise)
+        seen = np.concatenate([inversion.pinv, inversion.null]).reshape(-1, len(reader.repeats), channels)
+        drive = np.einsum("knc,nd->kcd", seen, reader.black_weights) ** 2 @ self.black_variance
+        self.black = np.concatenate([drive[:16], drive[16:].sum(axis=0, keepdims=True)]).astype(np.float32)
+        self.unit_sigma = np.sqrt(np.diag(inversion.unit_covariance)).astype(np.float32)
+
+    def solve(self, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        """Mueller elements, errors, residual and mask of frames (N, channels, pixels) that the reader just read."""
+        found = self.estimate(frames)
+        repair = np.flatnonzero(found["pixel_mask"] & np.uint8(Mask.SATURATED))
+        if repair.size:
+            solve_without_saturated(self, frames, repair, found)
+        return found
+
+    def estimate(self, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        """As `solve`, with saturated intensities taken as they are (but flagged)."""
+        pixels = frames.shape[2]
+        out: dict[str, NDArray[Any]] = {
+            "mueller": np.empty((16, pixels), np.float32),
+            "mueller_errors": np.empty((16, pixels), np.float32),
+            "residual_rms": np.empty(pixels, np.float32),
+            "pixel_mask": np.zeros(pixels, np.uint8),
+            "reduced_chi_square": np.full(pixels, np.nan, np.float32),
+        }
+        for_ranges(pixels, lambda a, b: self._range(frames, a, b, out), align=TILE, smallest=TILE)
+        return out
+
+    def _range(self, frames: NDArray[Any], start: int, stop: int, out: dict[str, NDArray[Any]]) -> None:
+        n, dof = self.first_square, self.inversion.degrees_of_freedom
+        tile = np.empty((*frames.shape[:2], TILE), np.float32)
+        product = np.empty((len(self.stack), TILE), np.float32)
+        for a in range(start, stop, TILE):
+            b = min(a + TILE, stop)
+            part, result = tile[..., : b - a], product[:, : b - a]
+            gain = self.reader.load(frames, a, b, part, out["pixel_mask"])
+            np.matmul(self.stack, part.reshape(n, b - a), out=result)
+            out["mueller"][:, a:b] = result[:16]
+            rss = np.einsum("np,np->p", result[16:n], result[16:n])
+            out["residual_rms"][a:b] = np.sqrt(rss / n)
+            if self.noise is None:
+                sigma = np.sqrt(rss / dof) if dof else np.full(b - a, np.nan, np.float32)
+                out["mueller_errors"][:, a:b] = self.unit_sigma[:, None] * sigma
+                continue
+            variance = self._variance(part, gain, result[n:], self.noise)
+            np.sqrt(variance[:16], out=out["mueller_errors"][:, a:b])
+            if dof:
+                out["reduced_chi_square"][a:b] = rss / variance[16]
+
+    def _variance(
+        self,
+        signal: NDArray[np.float32],
+        gain: NDArray[np.float32] | None,
+        shot: NDArray[np.float32],
+        noise: NoiseModel,
+    ) -> NDArray[np.float32]:
+        """Variances (17, pixels), counts^2: of the 16 elements, and of the whole residual."""
+        constant = self.floor + self.black
+        if gain is None:
+            shot *= np.float32(noise.slope)
+            shot += constant.sum(axis=1, keepdims=True)
+            return np.asarray(np.maximum(shot, LEAST * constant.sum(axis=1, keepdims=True), out=shot))
+        # Divided by the flat, signal and noise scale together: shot variance with the gain, the rest with its square.
+        np.matmul(self.stack[self.first_square :], (signal * gain).reshape(self.first_square, -1), out=shot)
+        dark = constant.astype(np.float32) @ gain**2
+        return np.asarray(np.maximum(noise.slope * shot + dark, LEAST * dark))
+
+
+def solve_without_saturated(
+    solver: MuellerSolver, frames: NDArray[Any], pixels: NDArray[np.int64], found: dict[str, NDArray[Any]]
+) -> None:
+    """Solve saturated pixels again, each from the intensities that are not saturated; results go into `found`.
+
+    A pixel whose remaining states are too few is flagged Mask.NOT_DETERMINED.
+    """
+    level = solver.reader.correction.saturation
+    w = solver.inversion.w
+    n, dof = w.shape
+    for part in np.array_split(pixels, -(-len(pixels) // REPAIR_BATCH)):
+        raw = frames[:, :, part]
+        signal = np.empty(raw.shape, np.float32)
+        gain = solver.reader.signal(raw, part, signal)
+        keep = (raw < level).reshape(n, -1).T.astype(float)
+        normal = np.einsum("pn,ni,nj->pij", keep, w, w, optimize=True)
+        eigenvalues = np.linalg.eigvalsh(normal)
+        ill = eigenvalues[:, 0] < WORST_CONDITION**-2 * eigenvalues[:, -1]
+        normal[ill] = np.eye(dof)
+        solve = np.linalg.solve(normal, w.T * keep[:, None, :])
+        y = signal.reshape(n, -1).T.astype(float)
+        m = np.einsum("pin,pn->pi", solve, y)
+        residual = (y - m @ w.T) * keep
+        free = np.maximum(keep.sum(axis=1) - dof, 0)
+        rss = np.sum(residual**2, axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if solver.noise is None:
+                found["mueller_errors"][:, part] = np.sqrt(np.einsum("pin,pin->ip", solve, solve) * (rss / free))
+            else:
+                unit = np.ones((frames.shape[1], len(part)), np.float32) if gain is None else gain
+                scale = np.asarray(np.broadcast_to(unit[None], raw.shape).reshape(n, -1).T, dtype=float)
+                errors, expected = _expected(solver, solve, keep, y, scale)
+                found["mueller_errors"][:, part] = errors
+                found["reduced_chi_square"][part] = np.where(free > 0, rss / expected, np.nan)
+        found["mueller"][:, part] = m.T
+        found["residual_rms"][part] = np.sqrt(rss / keep.sum(axis=1))
+        found["pixel_mask"][part[ill]] |= np.uint8(Mask.NOT_DETERMINED)
+
+
+def _expected(
+    solver: MuellerSolver,
+    solve: NDArray[np.float64],
+    keep: NDArray[np.float64],
+    y: NDArray[np.float64],
+    scale: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Standard errors (16, pixels) and expected sum of squared residuals (pixels,) of fits to the states kept.
+
+    solve (pixels, 16, N) is each pixel's least-squares matrix, 0 where a state is left out; y and keep (pixels, N);
+    scale (pixels, N) is 1 / flat. The residual of least squares is a projection, so noise of variance v leaves the
+    sum over the states of v times its diagonal.
+    """
+    w, n = solver.inversion.w, solver.inversion.w.shape[0]
+    slope = solver.noise.slope / solver.repeats if solver.noise else np.zeros(n)
+    dark = solver.intensity_floor * scale**2
+    diagonal = keep - np.einsum("ni,pin->pn", w, solve)
+
+    def total(variance: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.stack([*np.einsum("pin,pn->ip", solve**2, variance), np.einsum("pn,pn->p", diagonal, variance)])
+
+    least = total(dark)
+    channels = solver.black.shape[1]
+    for channel in range(channels):
+        for weight, variance in zip(solver.reader.black_weights.T, solver.black_variance, strict=True):
+            common = np.zeros(n)
+            common[channel::channels] = weight
+            pushed = common * scale * keep
+            moved = np.einsum("pin,pn->pi", solve, pushed)
+            left = (pushed - moved @ w.T) * keep
+            least += variance * np.stack([*moved.T**2, np.sum(left**2, axis=1)])
+    found = np.maximum(total(slope * y * scale) + least, LEAST * least)
+    return np.sqrt(found[:16]), found[16]

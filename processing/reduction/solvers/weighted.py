@@ -1,0 +1,158 @@
+"""Noise-weighted inversion: every intensity counts as much as its noise allows, with the full covariance of a pixel.
+
+The weights come from the plain fit, not from the noisy counts (those would bias the estimate): variance =
+slope * fitted signal + floor. Saturated intensities have weight 0, in the fit that the weights come from as well.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.computing.threads import for_ranges
+from processing.errors import ProcessError
+from processing.instrument.noise import NoiseModel
+from processing.polarization.physical import most_likely
+from processing.reduction.counts_to_signal import Mask
+from processing.reduction.solvers.plain import LEAST, MuellerSolver
+from processing.reduction.solvers.weighted_kernels import ELEMENTS, PACKED, solve_range
+
+TILE = 2048
+
+#: Row and column of each packed element.
+PACKED_ROW, PACKED_COLUMN = np.tril_indices(ELEMENTS)
+_DIAGONAL = np.flatnonzero(PACKED_ROW == PACKED_COLUMN)
+
+
+class WeightedSolver:
+    """Weighted least squares for row blocks; the same interface as MuellerSolver.
+
+    Parameters
+    ----------
+    plain : the unweighted solver of the same capture.
+    covariance : also return "mueller_covariance" (136, pixels), lower triangle row by row.
+    likelihood : also return "mueller_physical" (16, pixels), the most likely physical Mueller matrix.
+
+    Raises
+    ------
+    ProcessError : the noise of the camera is not known.
+    """
+
+    def __init__(self, plain: MuellerSolver, covariance: bool = False, likelihood: bool = False) -> None:
+        if plain.noise is None:
+            raise ProcessError(
+                "weights need the camera's noise, and this capture does not know its gain. "
+                "Give --camera FILE (made by `process camera`), or import with --gain-e-per-count."
+            )
+        self.plain, self.reader, self.inversion = plain, plain.reader, plain.inversion
+        self.noise: NoiseModel = plain.noise
+        self.repeats = plain.repeats
+        self.covariance, self.likelihood = covariance, likelihood
+        w = plain.inversion.w.astype(np.float32)
+        self._w, self._wt = w, np.ascontiguousarray(w.T)
+        self._pairs = np.ascontiguousarray((w[:, PACKED_ROW] * w[:, PACKED_COLUMN]).T)
+        self.intensity_floor = plain.intensity_floor
+        self._floor = self.intensity_floor.astype(np.float32)[:, None]
+        self._slope = (self.noise.slope / self.repeats).astype(np.float32)[:, None]
+
+    def solve(self, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        """Mueller elements, errors, residual, reduced chi-square and mask of frames (N, channels, pixels)."""
+        found = self.plain.estimate(frames)
+        pixels = frames.shape[2]
+        if self.covariance:
+            found["mueller_covariance"] = np.empty((PACKED, pixels), np.float32)
+        if self.likelihood:
+            found["mueller_physical"] = np.empty((ELEMENTS, pixels), np.float32)
+        for_ranges(pixels, lambda a, b: self._range(frames, a, b, found), align=TILE, smallest=TILE)
+        return found
+
+    def _range(self, frames: NDArray[Any], start: int, stop: int, found: dict[str, NDArray[Any]]) -> None:
+        n, channels = self._w.shape[0], frames.shape[1]
+        for a in range(start, stop, TILE):
+            b = min(a + TILE, stop)
+            raw = frames[:, :, a:b]
+            signal = np.empty(raw.shape, np.float32)
+            gain = self.reader.signal(raw, slice(a, b), signal)
+            self._refit_saturated(raw, signal, found, slice(a, b))
+            weight = self._weights(raw, found["mueller"][:, a:b], gain)
+            residual = signal.reshape(n, b - a) - self._w @ found["mueller"][:, a:b]
+            normal = self._pairs @ weight
+            right = self._wt @ (weight * residual)
+            step, covariance = np.empty((ELEMENTS, b - a), np.float32), np.empty((PACKED, b - a), np.float32)
+            solve_range(normal, right, step, covariance, 0, b - a)
+            residual -= self._w @ step
+            kept = (weight > 0).sum(axis=0)
+            chi_square = np.einsum("np,np->p", weight, residual**2)
+            squares = np.einsum("np,np->p", weight > 0, residual**2)
+            found["mueller"][:, a:b] += step
+            expected = kept - ELEMENTS + self._add_black(covariance, weight.reshape(-1, channels, b - a), gain)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                found["reduced_chi_square"][a:b] = np.where(kept > ELEMENTS, chi_square / expected, np.nan)
+                found["residual_rms"][a:b] = np.sqrt(squares / kept)
+            found["mueller_errors"][:, a:b] = np.sqrt(covariance[_DIAGONAL])
+            lost = np.isnan(step[0]) & ((found["pixel_mask"][a:b] & np.uint8(Mask.SATURATED)) != 0)
+            found["pixel_mask"][a:b][lost] |= np.uint8(Mask.NOT_DETERMINED)
+            if self.covariance:
+                found["mueller_covariance"][:, a:b] = covariance
+            if self.likelihood:
+                found["mueller_physical"][:, a:b] = most_likely(found["mueller"][:, a:b], normal)
+
+    def _weights(
+        self, raw: NDArray[Any], elements: NDArray[np.float32], gain: NDArray[np.float32] | None
+    ) -> NDArray[np.float32]:
+        """1 / variance (N, pixels); 0 for saturated intensities."""
+        fitted = self._w @ elements
+        if gain is None:
+            variance = np.maximum(self._slope * fitted + self._floor, LEAST * self._floor)
+        else:
+            per_state = np.broadcast_to(gain[None], raw.shape).reshape(fitted.shape)
+            floor = self._floor * per_state
+            variance = np.maximum(self._slope * fitted + floor, LEAST * floor) * per_state
+        weight = 1.0 / variance
+        level = self.reader.correction.saturation
+        if level is not None:
+            weight[raw.reshape(weight.shape) >= level] = 0.0
+        return np.asarray(weight, dtype=np.float32)
+
+    def _refit_saturated(
+        self, raw: NDArray[Any], signal: NDArray[np.float32], found: dict[str, NDArray[Any]], pixels: slice
+    ) -> None:
+        """Put the plain fit without saturated intensities into `found`, for the pixels that have any."""
+        level = self.reader.correction.saturation
+        some = np.flatnonzero(found["pixel_mask"][pixels] & np.uint8(Mask.SATURATED))
+        if level is None or not some.size:
+            return
+        n = self._w.shape[0]
+        keep = (raw[:, :, some] < level).reshape(n, -1).astype(np.float32)
+        right = self._wt @ (keep * signal[:, :, some].reshape(n, -1))
+        fit, covariance = np.empty((ELEMENTS, some.size), np.float32), np.empty((PACKED, some.size), np.float32)
+        solve_range(self._pairs @ keep, right, fit, covariance, 0, some.size)
+        found["mueller"][:, pixels.start + some] = np.where(np.isnan(fit), 0.0, fit)
+
+    def _add_black(
+        self, covariance: NDArray[np.float32], weight: NDArray[np.float32], gain: NDArray[np.float32] | None
+    ) -> NDArray[np.float32] | float:
+        """Add what the error of the darks, common to all states of an exposure of a channel, does to M.
+
+        Returns what it adds to the expected weighted sum of squared residuals (pixels,).
+        """
+        if not self.plain.black_variance.any():
+            return 0.0
+        states, channels, pixels = weight.shape
+        w = self._w.reshape(states, channels, ELEMENTS)
+        full = np.empty((ELEMENTS, ELEMENTS, pixels), np.float32)
+        full[PACKED_ROW, PACKED_COLUMN] = covariance
+        full[PACKED_COLUMN, PACKED_ROW] = covariance
+        left = np.zeros(pixels, np.float32)
+        for channel in range(channels):
+            scale = 1.0 if gain is None else gain[channel]
+            for share, variance in zip(self.reader.black_weights.T, self.plain.black_variance, strict=True):
+                pushed = share.astype(np.float32)[:, None] * weight[:, channel]
+                drive = w[:, channel].T @ pushed
+                moved = np.einsum("ijp,jp->ip", full, drive)
+                unit = np.float32(variance) * scale**2
+                covariance += unit * moved[PACKED_ROW] * moved[PACKED_COLUMN]
+                left += unit * (share.astype(np.float32) @ pushed - np.einsum("ip,ip->p", drive, moved))
+        return left

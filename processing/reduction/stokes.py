@@ -1,0 +1,258 @@
+"""Reduce the frames of a polarization mosaic to a linear Stokes image: S0, S1, S2, DoLP, AoLP with standard errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.calibration.mosaic import correct
+from processing.errors import NotDetermined
+from processing.instrument.changes import Changes
+from processing.instrument.model import InstrumentModel
+from processing.instrument.noise import NoiseModel
+from processing.reduction.counts_to_signal import Correction, Mask
+from processing.reduction.effects_of_capture import capture_changes, counts_correction
+from processing.reduction.facts import in_words
+from processing.reduction.mosaic.layout import MosaicLayout
+from processing.reduction.mosaic.merge import MergedFrame, merge
+from processing.reduction.mosaic.methods import demosaic
+from processing.reduction.mosaic.noise import stokes_covariance
+from processing.reduction.mueller import Progress, sample_states
+from processing.storage.capture import Capture, CaptureError
+from processing.storage.product import LIT_ERRORS, Plane, ProductWriter, Step
+
+#: The method that docs/mosaic.md found best.
+DEFAULT_METHOD = "oriented"
+LINEAR = 3
+
+_COVARIANCE = "covariance of (s0, s1, s2): 00, 11, 22, 01, 02, 12"
+PLANES = {
+    "s0": Plane((), "count", "S0, total intensity"),
+    "s1": Plane((), "count", "S1 = I(0) - I(90)"),
+    "s2": Plane((), "count", "S2 = I(45) - I(135)"),
+    "s0_errors": Plane((), "count", "standard errors of s0"),
+    "s1_errors": Plane((), "count", "standard errors of s1"),
+    "s2_errors": Plane((), "count", "standard errors of s2"),
+    "stokes_covariance": Plane((6,), "count2", _COVARIANCE),
+    "dolp": Plane((), "", "degree of linear polarization, sqrt(S1^2 + S2^2)/S0; noise biases it upwards near 0"),
+    "dolp_errors": Plane((), "", "standard errors of dolp, first order"),
+    "aolp_deg": Plane((), "degree", "angle of linear polarization, 0 to 180, from +x of the analyzer frame"),
+    "aolp_deg_errors": Plane((), "degree", "standard errors of aolp_deg, first order; meaningless where dolp is noise"),
+    "closure": Plane((), "count", "what the model cannot explain of the four channels: I0 + I90 - I45 - I135 if ideal"),
+    "pixel_mask": Plane((), "", f"0 = good; bits: {Mask.meaning()}", np.uint8),
+}
+
+#: Without light there is no degree and no angle of polarization; S itself is a measurement all the same.
+RATIOS = ("dolp", "dolp_errors", "aolp_deg", "aolp_deg_errors")
+
+
+def channel_rows(
+    capture: Capture, model: InstrumentModel, states: NDArray[np.int64], changes: Changes | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rows of W (4, 16), and analyzer rows (4, 3) for (S0, S1, S2), the same in all states.
+
+    Raises
+    ------
+    CaptureError : the states differ in their generator or analyzer, so their frames cannot be averaged.
+    NotDetermined : the channels do not determine a linear Stokes vector.
+    """
+    angles = {name: values[states] for name, values in capture.angles_deg.items()} if model.axes else {}
+    if changes is None:
+        rows = model.rows(angles)
+        light = model.generator_states(angles)
+    else:
+        every = angles or {"": np.zeros(len(states))}
+        rows, light = model.rows(every, changes), model.generator_states(every, changes)
+    if np.ptp(model.rows(angles), axis=0).max(initial=0.0) > 1e-6:
+        raise CaptureError(
+            f"{capture.path}: the {len(states)} states of this mosaic capture have different angles, and one Stokes "
+            "image comes from frames that are alike. Capture one generator state, or split the capture."
+        )
+    # The mean frame belongs to the mean row. rows = kron(a, g), also with what effects do to the channels.
+    mean = np.asarray(rows.mean(axis=0))
+    analyzers = (mean.reshape(-1, 4, 4) @ light[0] / (light[0] @ light[0]))[:, :LINEAR]
+    rank = int(np.linalg.matrix_rank(analyzers))
+    if rank < LINEAR:
+        raise NotDetermined(f"{capture.path}: the mosaic's analyzers have rank {rank}; a linear Stokes vector needs 3.")
+    return mean, np.asarray(analyzers)
+
+
+def reduce_stokes(
+    capture: Capture,
+    model: InstrumentModel,
+    out: Path,
+    steps: tuple[Step, ...],
+    method: str = DEFAULT_METHOD,
+    correction: Correction | None = None,
+    noise: NoiseModel | None = None,
+    response: NDArray[np.float32] | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Write the Stokes image of a mosaic capture; returns the facts that the product holds.
+
+    Several states with the same angles are averaged first. `response` (3, rows, columns) holds the analysis vectors of
+    the raw pixels, where they were calibrated; else the channels' ideal ones.
+
+    Raises
+    ------
+    CaptureError, NotDetermined : see `channel_rows`.
+    MosaicError : the frame does not hold whole super-pixels.
+    """
+    mosaic = capture.header.mosaic or model.mosaic
+    if mosaic is None:
+        raise CaptureError(f"{capture.path} is not a mosaic capture; it reduces to a Mueller image.")
+    layout = MosaicLayout.of(mosaic, [c.name for c in model.channels])
+    states = sample_states(capture)
+    changes = capture_changes(capture, model, states)
+    model_rows, analyzers = channel_rows(capture, model, states, changes)
+    correction = correction or Correction.of(capture)
+    noise = noise or NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
+    merged = merge(capture, states, correction, noise, counts_correction(changes, model), progress)
+    frame = merged.signal
+    if response is not None:
+        frame = correct(frame, response, layout, analyzers)
+    channels = demosaic(frame, layout, method)
+    found = stokes(channels, analyzers, layout, method, merged, frame)
+    found["pixel_mask"] = _spread(merged.mask, channels.shape[1:])
+    lost = (found["pixel_mask"] & ~np.uint8(Mask.SATURATED)) != 0
+    dark = ~(found["s0"] > 0)
+    for name, values in found.items():
+        if name != "pixel_mask":
+            values[..., lost | dark if name in RATIOS else lost] = np.nan
+    rows, columns = channels.shape[1:]
+    facts = _facts(found, analyzers, noise, correction, method, len(states))
+    with ProductWriter(out, "stokes", capture.header, (rows, columns), PLANES, steps, overwrite) as product:
+        product.array("measurement_matrix", model_rows, "", "W (channel, 16): intensity = W . vec(M), row-major")
+        product.array("analyzers", analyzers, "", "rows (channel, 3): intensity = row . (S0, S1, S2)")
+        product.write(slice(0, rows), **found)
+        product.seal(facts)
+    return facts
+
+
+def stokes(
+    channels: NDArray[np.float32],
+    analyzers: NDArray[np.float64],
+    layout: MosaicLayout,
+    method: str,
+    merged: MergedFrame,
+    frame: NDArray[np.float32] | None = None,
+) -> dict[str, NDArray[Any]]:
+    """Stokes planes and their errors from demosaiced channels (4, rows, columns); names as in PLANES.
+
+    `frame` is the mosaic frame that they come from. Without a noise model the variance of a raw pixel is estimated
+    from the closure, one number for the whole image.
+    """
+    solve = np.asarray(np.linalg.pinv(analyzers), dtype=float)
+    null = np.linalg.svd(analyzers)[0][:, LINEAR]
+    # Scaled so that ideal analyzers give I0 + I90 - I45 - I135.
+    null = null / np.abs(null).max() * np.sign(null[0])
+    s0, s1, s2 = np.tensordot(solve.astype(np.float32), channels, axes=1)
+    closure = np.tensordot(null.astype(np.float32), channels, axes=1)
+    if merged.shot is None or merged.floor is None:
+        spread = 1.4826 * np.nanmedian(np.abs(closure - np.nanmedian(closure))) / np.linalg.norm(null)
+        variance = np.full_like(channels, spread**2)
+    else:
+        shot, floor = _by_channel(merged.shot, layout, channels), _by_channel(merged.floor, layout, channels)
+        light = np.maximum(channels, 0.0)
+        variance = shot * light + floor
+        if merged.relative is not None:
+            variance += _by_channel(merged.relative, layout, channels) * light**2
+    covariance = stokes_covariance(variance, layout, method, solve, frame)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        linear = np.hypot(s1, s2)
+        dolp = linear / s0
+        aolp = np.mod(0.5 * np.arctan2(s2, s1), np.pi)
+        c00, c11, c22, c01, c02, c12 = covariance
+        u, v = s1 / linear, s2 / linear
+        along = u * u * c11 + v * v * c22 + 2 * u * v * c12
+        across = v * v * c11 + u * u * c22 - 2 * u * v * c12
+        cross = u * c01 + v * c02
+        dolp_variance = (along - 2 * dolp * cross + dolp**2 * c00) / s0**2
+        dolp_errors, aolp_errors = np.sqrt(np.maximum(dolp_variance, 0.0)), 0.5 * np.sqrt(across) / linear
+    found = {
+        "s0": s0,
+        "s1": s1,
+        "s2": s2,
+        "s0_errors": np.sqrt(c00),
+        "s1_errors": np.sqrt(c11),
+        "s2_errors": np.sqrt(c22),
+    }
+    found |= {"stokes_covariance": covariance, "dolp": dolp, "dolp_errors": dolp_errors, "closure": closure}
+    found |= {"aolp_deg": np.rad2deg(aolp), "aolp_deg_errors": np.rad2deg(aolp_errors)}
+    return {name: np.asarray(values, dtype=np.float32) for name, values in found.items()}
+
+
+def _by_channel(raw: NDArray[np.float32], layout: MosaicLayout, channels: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Values of raw pixels (rows, columns) for each channel's image: those of its own pixel in the super-pixel."""
+    if raw.size == 1:
+        return raw[None]
+    cell = np.stack([layout.samples(raw, k) for k in range(len(layout.channels))])
+    step = channels.shape[1] // cell.shape[1]
+    return np.asarray(cell if step == 1 else cell.repeat(step, axis=1).repeat(step, axis=2), dtype=np.float32)
+
+
+def _spread(mask: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """Flags of raw pixels, carried to every pixel whose value a bilinear method takes from them."""
+    if shape[0] < mask.shape[0]:
+        return np.asarray(mask[0::2, 0::2] | mask[0::2, 1::2] | mask[1::2, 0::2] | mask[1::2, 1::2])
+    if not mask.any():
+        return mask
+    import cv2
+
+    out = np.zeros_like(mask)
+    for flag in Mask:
+        bit = np.uint8(flag)
+        out |= cv2.dilate((mask & bit), np.ones((3, 3), np.uint8)) & bit
+    return out
+
+
+def _facts(
+    found: dict[str, NDArray[Any]],
+    analyzers: NDArray[np.float64],
+    noise: NoiseModel | None,
+    correction: Correction,
+    method: str,
+    states: int,
+) -> dict[str, Any]:
+    mask, warnings = found["pixel_mask"], list(correction.warnings)
+    counts = {flag.name.lower(): int(np.sum((mask & np.uint8(flag)) != 0)) for flag in Mask if flag.name}
+    good = (mask & ~np.uint8(Mask.SATURATED)) == 0
+    if not good.any():
+        raise CaptureError(f"no pixel could be reduced: {in_words(counts)} of {mask.size} pixels. Nothing was written.")
+    if any(counts.values()):
+        warnings.append(f"of {mask.size} pixels: {in_words(counts)} (pixel_mask says where)")
+    if noise is None:
+        warnings.append("the gain is not known: one noise for the whole image, estimated from the channels' closure")
+    # Medians of a ninth of the pixels are plenty.
+    some = good.copy()
+    if good[::3, ::3].sum() > 1000:
+        some[:] = False
+        some[::3, ::3] = good[::3, ::3]
+    lit = some & (found["s0"] > LIT_ERRORS * found["s0_errors"])
+    closure = found["closure"][lit] / found["s0"][lit]
+    return {
+        "states": states,
+        "method": method,
+        "condition_number": condition_number_linear(analyzers),
+        "black": correction.source,
+        "flat": correction.flat.source if correction.flat else "none",
+        "noise": noise.source if noise else "estimated from the closure",
+        "median_closure_over_s0": float(np.median(closure)) if lit.any() else float("nan"),
+        "rms_closure_over_s0": float(np.sqrt(np.mean(closure**2))) if lit.any() else float("nan"),
+        "median_dolp": float(np.median(found["dolp"][lit])) if lit.any() else float("nan"),
+        "median_dolp_error": float(np.median(found["dolp_errors"][lit])) if lit.any() else float("nan"),
+        "pixels": mask.size,
+        "pixels_with_light": int(np.sum(found["s0"] > LIT_ERRORS * found["s0_errors"])),
+        "masked": counts,
+        "warnings": warnings,
+    }
+
+
+def condition_number_linear(analyzers: NDArray[np.float64]) -> float:
+    """Condition number of the analyzer matrix (channels, 3)."""
+    singular = np.linalg.svd(analyzers, compute_uv=False)
+    return float(singular[0] / singular[-1])

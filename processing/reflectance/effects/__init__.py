@@ -1,0 +1,1 @@
+"""What the model of a surface can lack: one module an effect."""

@@ -1,0 +1,35 @@
+"""The polarization of the illumination is turned against the axes that the model takes.
+
+Cause: polarizer of the source not horizontal, arm or source rolled about the beam.
+Mend: level the source's polarizer against the camera's with the arm at 180 degrees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import Array, Parameter
+from processing.instrument.model import InstrumentModel
+from processing.polarization import mueller
+from processing.reflectance.changes import ReflectanceChanges
+from processing.reflectance.effects.base import ReflectanceEffect
+
+
+class This(ReflectanceEffect):
+    """Degrees by which the generator azimuth is off."""
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return (Parameter("azimuth", "degree", -20, 20, 1.0),)
+
+    def bend(self, changes: ReflectanceChanges, values: Array) -> None:
+        changes.generator_rad += float(np.deg2rad(values[0]))
+
+    # What was found with a known reflectance goes into an instrument file, so it can act there as well.
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        return ("",)
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        changes.follow(model.generator[-1].name, mueller.rotation(np.deg2rad(values[0])))

@@ -1,0 +1,176 @@
+"""Tables to and from the renderer Mitsuba's `.pbsdf`, the format in which the paper's lab publishes.
+
+A `.pbsdf` holds M[phi_d, theta_d, theta_h, wavelength, 4, 4], theta_h quadratic (trap 14), as a BRDF in 1/sr:
+the cosine of the angle of incidence is divided out. Each matrix refers to the axis s of the facet for both beams
+(trap 15): `to_renderer_frames` turns every pixel by its own angles. Directions below the surface are NaN there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import distance_transform_edt
+
+from processing.geometry.frames import ScatteringGeometry, change_frames
+from processing.geometry.rusinkiewicz import Angles
+from processing.reflectance.table_axes import SHAPE, TableAxes
+from processing.reflectance.tables import ScatteringTable, TableError
+from processing.storage.tensor_file import create_tensor_file, read_tensor_file
+
+FloatArray = NDArray[np.float64]
+
+MUELLER = tuple(f"m{i}{j}" for i in range(4) for j in range(4))
+#: The renderer's reader takes exactly this many wavelengths.
+RENDERER_WAVELENGTHS = 5
+
+
+def to_renderer_frames(m: ArrayLike, geometry: ScatteringGeometry) -> FloatArray:
+    """Mueller matrices (N, 4, 4) in the geometry's axes, referred to s for both beams."""
+    return change_frames(m, geometry, geometry.half)
+
+
+def export(
+    tables: Sequence[ScatteringTable],
+    path: Path | str,
+    white_m00: float = 1.0,
+    empty: Literal["nearest", "nan"] = "nearest",
+    pad_wavelengths: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> float:
+    """Write a `.pbsdf` of Mueller tables; returns the fraction of visible bins that no sample filled.
+
+    Parameters
+    ----------
+    tables : one for each wavelength, of m00..m33 in "renderer" frames and layout.
+    white_m00 : M00 that a perfect white surface has at normal incidence in these units; BRDF = M/(white pi cos).
+        Without a radiometric calibration only the polarization is right, not the absolute reflectance.
+    empty : what goes into visible bins without samples: the nearest filled bin's value, or NaN (black).
+    pad_wavelengths : repeat the outer wavelengths up to the 5 that the renderer reads.
+    progress : called with wavelengths written and in all.
+
+    Raises
+    ------
+    TableError : a table has another layout, other quantities or other frames, or is empty.
+    """
+    ordered = sorted(tables, key=lambda t: t.wavelength_nm)
+    for table in ordered:
+        _check(table)
+    wavelengths = [round(t.wavelength_nm) for t in ordered]
+    slots = list(range(len(ordered)))
+    while pad_wavelengths and len(slots) < RENDERER_WAVELENGTHS:
+        # Outwards, by turns, one nanometre steps: interpolation between equal values changes nothing.
+        if len(slots) % 2:
+            slots, wavelengths = [*slots, slots[-1]], [*wavelengths, wavelengths[-1] + 50]
+        else:
+            slots, wavelengths = [slots[0], *slots], [wavelengths[0] - 50, *wavelengths]
+    axes = TableAxes("renderer")
+    shape = (SHAPE[2], SHAPE[1], SHAPE[0], len(slots), 4, 4)
+    fields = create_tensor_file(
+        Path(path),
+        {
+            "theta_h": ((1, SHAPE[0]), np.float32),
+            "theta_d": ((1, SHAPE[1]), np.float32),
+            "phi_d": ((1, SHAPE[2]), np.float32),
+            "wvls": ((len(slots),), np.uint16),
+            "M": (shape, np.float32),
+        },
+    )
+    fields["theta_h"][0] = np.deg2rad(axes.theta_h_deg)
+    fields["theta_d"][0] = np.deg2rad(axes.theta_d_deg)
+    fields["phi_d"][0] = np.deg2rad(axes.phi_d_deg)
+    fields["wvls"][...] = wavelengths
+    missing, written = 0.0, 0
+    for k, table in enumerate(ordered):
+        block, gaps = _dense(table, white_m00, empty)
+        missing = max(missing, gaps)
+        for slot, source in enumerate(slots):
+            if source == k:
+                fields["M"][..., slot, :, :] = block
+                written += 1
+                if progress:
+                    progress(written, len(slots))
+    for field in fields.values():
+        field.flush()  # type: ignore[attr-defined]
+    return missing
+
+
+def load(path: Path | str, white_m00: float = 1.0, only_nm: float | None = None) -> dict[int, ScatteringTable]:
+    """Tables by wavelength (nm) of a `.pbsdf`, one sample a bin; NaN bins stay empty.
+
+    Raises
+    ------
+    TableError : it is no pBRDF, or has other axes than 91 x 91 x 361 in the renderer's layout.
+    """
+    fields = read_tensor_file(Path(path))
+    lacking = {"theta_h", "theta_d", "phi_d", "wvls", "M"} - set(fields)
+    if lacking:
+        raise TableError(f"{path} lacks {', '.join(sorted(lacking))}: it is no pBRDF.")
+    axes = TableAxes("renderer")
+    stored = (fields["theta_h"], fields["theta_d"], fields["phi_d"])
+    for values, wanted, name in zip(
+        stored, (axes.theta_h_deg, axes.theta_d_deg, axes.phi_d_deg), ("theta_h", "theta_d", "phi_d"), strict=True
+    ):
+        if values.size != wanted.size or not np.allclose(np.rad2deg(values.reshape(-1)), wanted, atol=0.02):
+            raise TableError(f"{path}: its {name} axis is not the 91 x 91 x 361 layout that the renderer's files have")
+    angles, cos_i, _ = _grid()
+    tables = {}
+    for k, wavelength in enumerate(fields["wvls"].reshape(-1)):
+        if only_nm is not None and abs(only_nm - wavelength) > 0.5:
+            continue
+        m = np.moveaxis(fields["M"][..., k, :, :].reshape(*SHAPE[::-1], 16), -1, 0).transpose(0, 3, 2, 1)
+        values = m[..., :-1] * (white_m00 * np.pi * np.maximum(cos_i, 0.0))[..., :-1]
+        seen = (cos_i > 0)[..., :-1] & np.isfinite(values).all(axis=0)
+        table = ScatteringTable(MUELLER, float(wavelength), "renderer", frames="renderer")
+        table.add(Angles(*(a[..., :-1][seen] for a in angles)), values[:, seen])
+        tables[int(wavelength)] = table
+    return tables
+
+
+def _check(table: ScatteringTable) -> None:
+    wanted = (MUELLER, "renderer", "renderer")
+    if (table.quantities, table.axes.layout, table.frames) != wanted:
+        raise TableError(
+            f"a .pbsdf needs a table of m00..m33 in renderer frames and layout; this one holds "
+            f"{table.quantities[0]}.. in {table.frames or 'no'} frames, layout {table.axes.layout!r}"
+        )
+    if table.bins.size == 0:
+        raise TableError(f"the table at {table.wavelength_nm:g} nm is empty: nothing to export")
+
+
+def _grid() -> tuple[Angles, FloatArray, FloatArray]:
+    # Bin centres (theta_h, theta_d, phi_d) and the cosines at them.
+    axes = TableAxes("renderer")
+    grid = np.meshgrid(
+        *(np.deg2rad(a) for a in (axes.theta_h_deg, axes.theta_d_deg, axes.phi_d_deg)), indexing="ij", sparse=True
+    )
+    th, td, ph = np.broadcast_arrays(*grid)
+    along = np.cos(grid[0]) * np.cos(grid[1])
+    across = np.sin(grid[0]) * np.sin(grid[1]) * np.cos(grid[2])
+    return Angles(th, td, ph), along - across, along + across
+
+
+def _dense(table: ScatteringTable, white_m00: float, empty: str) -> tuple[NDArray[np.float32], float]:
+    _, cos_i, cos_o = _grid()
+    visible = (cos_i > 0) & (cos_o > 0)
+    row = np.full(SHAPE, -1, dtype=np.int32)
+    row.reshape(-1)[table.bins] = np.arange(table.bins.size, dtype=np.int32)
+    row[..., -1] = row[..., 0]  # -180 and +180 degrees are one direction
+    filled = row >= 0
+    gaps = float(1 - (filled & visible).sum() / visible.sum())
+    if empty == "nearest":
+        # Once round phi_d on either side, so that the distance is cyclic.
+        around = np.concatenate([row[..., :-1]] * 2 + [row], axis=2)[..., 180 : 180 + 361 + 360]
+        index = distance_transform_edt(around < 0, return_distances=False, return_indices=True)
+        row = around[tuple(index)][..., 180 : 180 + 361]
+    scale = np.zeros(SHAPE, dtype=np.float32)
+    np.divide(1.0, white_m00 * np.pi * cos_i, out=scale, where=visible, casting="unsafe")
+    scale[~visible | (row < 0)] = np.nan
+    mean = table.mean.astype(np.float32)
+    out = np.empty((*SHAPE[::-1], 16), dtype=np.float32)
+    for q in range(16):
+        out[..., q] = (mean[q][row] * scale).transpose(2, 1, 0)
+    return out.reshape(*SHAPE[::-1], 4, 4), gaps

@@ -1,0 +1,274 @@
+"""Tables over scattering geometry: mean, variance and count a bin, from any number of images.
+
+Sparse in memory and on disc: a capture of a sphere fills few of the three million bins.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from processing.computing.compiling import njit
+from processing.computing.threads import for_ranges
+from processing.errors import ProcessError
+from processing.geometry.rusinkiewicz import Angles
+from processing.reflectance.table_axes import SHAPE, Layout, TableAxes
+
+FloatArray = NDArray[np.float64]
+
+SCHEMA_VERSION = 1
+
+
+class TableError(ProcessError):
+    """A table cannot be made, read or merged as asked."""
+
+
+class ScatteringTable:
+    """Mean, variance and count of quantities over (theta_h, theta_d, phi_d) at one wavelength.
+
+    Parameters
+    ----------
+    quantities : names, e.g. ("xi0",) or ("m00", ..., "m33").
+    wavelength_nm : of the light.
+    layout : "degree" or "renderer", see `TableAxes`.
+    simulated : whether the values come from a simulation; a table never mixes the two.
+    frames : axes to which Mueller elements refer: "instrument", "renderer" or "" for scalars.
+    """
+
+    def __init__(
+        self,
+        quantities: tuple[str, ...],
+        wavelength_nm: float,
+        layout: Layout = "degree",
+        simulated: bool = False,
+        frames: str = "",
+    ) -> None:
+        self.quantities = quantities
+        self.wavelength_nm = float(wavelength_nm)
+        self.axes = TableAxes(layout)
+        self.simulated = simulated
+        self.frames = frames
+        self._row = np.full(SHAPE[0] * SHAPE[1] * SHAPE[2], -1, dtype=np.int32)
+        self.bins = np.empty(0, dtype=np.int32)
+        self.count = np.empty(0, dtype=np.int64)
+        # Bins of the pixels of the last image, filled again by the next: the first touch of new memory is slow.
+        self._scratch: NDArray[np.int32] | None = None
+        # Sums and sums of squares, (quantities, bins): double, so that a variance keeps its digits.
+        self._sum = np.empty((len(quantities), 0))
+        self._square = np.empty((len(quantities), 0))
+
+    def add(self, angles: Angles, values: ArrayLike, simulated: bool | None = None) -> None:
+        """Add samples: angles (...) in radians and values (quantities, ...); a sample with any NaN is left out.
+
+        Raises
+        ------
+        TableError
+            `simulated` differs from the table's, or shapes do not fit.
+        """
+        if simulated is not None and simulated != self.simulated:
+            raise TableError(
+                f"the table holds {_kind(self.simulated)} values and was given {_kind(simulated)} ones; "
+                "the two are never mixed. Make one table for each."
+            )
+        v = np.asarray(values)
+        shape = np.shape(angles.theta_h)
+        if v.shape != (len(self.quantities), *shape):
+            raise TableError(f"expected values of shape {(len(self.quantities), *shape)}, got {v.shape}")
+        v = np.ascontiguousarray(v.reshape(len(v), -1))
+        if v.dtype not in (np.float32, np.float64):
+            v = v.astype(np.float64)
+        rows = self._scratch = self.axes.bins(angles, self._scratch).reshape(-1)
+        sums = np.empty(len(v))
+        for_ranges(len(v), lambda start, stop: _plane_sums(v, sums, start, stop), align=1, smallest=1)
+        if not np.all(np.isfinite(sums)):
+            _drop_unknown(rows, v)
+        self._claim(rows)
+        groups = (len(v) + 3) // 4
+        total, square, count = self._sum, self._square, self.count
+        for_ranges(
+            groups, lambda start, stop: _accumulate(rows, v, total, square, count, start, stop), align=1, smallest=1
+        )
+
+    @property
+    def mean(self) -> FloatArray:
+        """(quantities, bins)."""
+        return np.asarray(self._sum / self.count)
+
+    @property
+    def variance(self) -> FloatArray:
+        """(quantities, bins), of the samples in each bin; NaN with one sample."""
+        spread = np.maximum(self._square - self._sum**2 / self.count, 0.0)
+        return np.where(self.count > 1, spread / np.maximum(self.count - 1, 1), np.nan)
+
+    def lookup(self, angles: Angles, min_count: int = 1) -> FloatArray:
+        """Mean (quantities, ...) at directions (...) in radians, of the nearest bin; NaN with too few samples."""
+        bins = self.axes.bins(angles)
+        rows = np.where(bins >= 0, self._row[bins], -1)
+        if self.bins.size == 0:
+            return np.full((len(self.quantities), *rows.shape), np.nan)
+        known = (rows >= 0) & (self.count[rows] >= min_count)
+        return np.where(known, self.mean[:, rows], np.nan)
+
+    def counts(self, angles: Angles) -> NDArray[np.int64]:
+        """Number of samples (...) of the bin of each direction."""
+        bins = self.axes.bins(angles)
+        rows = np.where(bins >= 0, self._row[bins], -1)
+        return np.where(rows >= 0, self.count[rows], 0) if self.bins.size else np.zeros(rows.shape, dtype=np.int64)
+
+    def merge(self, other: ScatteringTable) -> None:
+        """Add all samples of another table of the same quantities, wavelength and layout. Raises TableError."""
+        mine = (self.quantities, self.wavelength_nm, self.axes, self.simulated, self.frames)
+        theirs = (other.quantities, other.wavelength_nm, other.axes, other.simulated, other.frames)
+        if mine != theirs:
+            raise TableError(f"tables differ and cannot be merged: {mine} and {theirs}")
+        rows = other.bins.copy()
+        self._claim(rows)
+        self.count[rows] += other.count
+        self._sum[:, rows] += other._sum
+        self._square[:, rows] += other._square
+
+    def _claim(self, bins: NDArray[np.int32]) -> None:
+        # Replaces each bin by its row, and gives a row to the new ones.
+        found = np.empty(bins.size, dtype=np.int32)
+        new = _claim_rows(bins, self._row, self.bins.size, found)
+        if new:
+            grown = np.zeros((len(self.quantities), new))
+            self.bins = np.concatenate([self.bins, found[:new]])
+            self.count = np.concatenate([self.count, np.zeros(new, dtype=np.int64)])
+            self._sum, self._square = np.hstack([self._sum, grown]), np.hstack([self._square, grown])
+
+    def save(self, path: Path | str) -> None:
+        """Write the filled bins and the axes to HDF5. Sums are kept in double, so a table may go on growing."""
+        path = Path(path)
+        partial = path.with_name(path.name + ".partial")
+        with h5py.File(partial, "w") as h5:
+            h5.attrs["umov_table"] = SCHEMA_VERSION
+            h5.attrs["wavelength_nm"] = self.wavelength_nm
+            h5.attrs["layout"] = self.axes.layout
+            h5.attrs["simulated"] = self.simulated
+            h5.attrs["frames"] = self.frames
+            h5.attrs["quantities"] = list(self.quantities)
+            for name in ("theta_h_deg", "theta_d_deg", "phi_d_deg"):
+                h5[name] = getattr(self.axes, name)
+            options: dict[str, Any] = {"compression": "gzip", "shuffle": True} if self.bins.size else {}
+            h5.create_dataset("bin", data=self.bins, **options)
+            h5.create_dataset("count", data=self.count, **options)
+            h5.create_dataset("sum", data=self._sum, **options)
+            h5.create_dataset("sum_of_squares", data=self._square, **options)
+        partial.replace(path)
+
+    @classmethod
+    def load(cls, path: Path | str) -> ScatteringTable:
+        """Read a table. Raises TableError when the file is none, or its axes are not those of its layout."""
+        try:
+            with h5py.File(path, "r") as h5:
+                if "umov_table" not in h5.attrs:
+                    raise TableError(f"{path} is no scattering table. `process table` makes one.")
+                a = h5.attrs
+                table = cls(
+                    tuple(str(q) for q in a["quantities"]),
+                    float(a["wavelength_nm"]),
+                    a["layout"],
+                    bool(a["simulated"]),
+                    str(a["frames"]),
+                )
+                if not np.allclose(h5["theta_h_deg"][...], table.axes.theta_h_deg):
+                    raise TableError(f"{path}: its theta_h axis is not that of layout {a['layout']!r}")
+                table.bins, table.count = h5["bin"][...], h5["count"][...]
+                table._sum, table._square = h5["sum"][...], h5["sum_of_squares"][...]
+        except (OSError, KeyError) as error:
+            raise TableError(f"{path} cannot be read as a scattering table ({error})") from error
+        table._row[table.bins] = np.arange(table.bins.size, dtype=np.int32)
+        return table
+
+
+def is_table(path: Path | str) -> bool:
+    """Whether a file is a table that `ScatteringTable.save` wrote."""
+    try:
+        with h5py.File(path, "r") as h5:
+            return "umov_table" in h5.attrs
+    except OSError:
+        return False
+
+
+def _kind(simulated: bool) -> str:
+    return "simulated" if simulated else "measured"
+
+
+@njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
+def _plane_sums(values, out, start, stop):  # type: ignore[no-untyped-def]
+    # Finite when every value is: far quicker than to look at each pixel.
+    for c in range(start, stop):
+        total = values.dtype.type(0)
+        for n in range(values.shape[1]):
+            total += values[c, n]
+        out[c] = total
+
+
+@njit(nogil=True, cache=True)
+def _drop_unknown(rows, values):  # type: ignore[no-untyped-def]
+    for n in range(rows.size):
+        total = 0.0
+        for c in range(values.shape[0]):
+            total += values[c, n]
+        if not np.isfinite(total):
+            rows[n] = -1
+
+
+@njit(cache=True)
+def _claim_rows(bins, row_of_bin, used, found):  # type: ignore[no-untyped-def]
+    # Replaces each bin by its row in the sparse arrays; new bins get the next rows.
+    new = 0
+    for n in range(bins.size):
+        b = bins[n]
+        if b < 0:
+            continue
+        r = row_of_bin[b]
+        if r < 0:
+            r = used + new
+            row_of_bin[b] = r
+            found[new] = b
+            new += 1
+        bins[n] = r
+    return new
+
+
+@njit(nogil=True, cache=True, fastmath={"contract"})
+def _accumulate(rows, values, total, square, count, start, stop):  # type: ignore[no-untyped-def]
+    # Four quantities a thread: no two threads write to one place, and the eight sums do not wait for each
+    # other. A run of pixels in one bin, the rule in an image, stays in registers.
+    quantities = values.shape[0]
+    for group in range(start, stop):
+        first = 4 * group
+        c1, c2, c3 = min(first + 1, quantities - 1), min(first + 2, quantities - 1), min(first + 3, quantities - 1)
+        v0, v1, v2, v3 = values[first], values[c1], values[c2], values[c3]
+        last, k = -1, 0
+        s0 = s1 = s2 = s3 = q0 = q1 = q2 = q3 = 0.0
+        for n in range(rows.size + 1):
+            r = rows[n] if n < rows.size else -1
+            if r != last:
+                if last >= 0:
+                    total[first, last] += s0
+                    square[first, last] += q0
+                    if c1 == first + 1:
+                        total[c1, last] += s1
+                        square[c1, last] += q1
+                    if c2 == first + 2:
+                        total[c2, last] += s2
+                        square[c2, last] += q2
+                    if c3 == first + 3:
+                        total[c3, last] += s3
+                        square[c3, last] += q3
+                    if group == 0:
+                        count[last] += k
+                last, k = r, 0
+                s0 = s1 = s2 = s3 = q0 = q1 = q2 = q3 = 0.0
+            if r >= 0:
+                a, b, c, d = np.float64(v0[n]), np.float64(v1[n]), np.float64(v2[n]), np.float64(v3[n])
+                s0, s1, s2, s3 = s0 + a, s1 + b, s2 + c, s3 + d
+                q0, q1, q2, q3 = q0 + a * a, q1 + b * b, q2 + c * c, q3 + d * d
+                k += 1

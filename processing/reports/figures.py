@@ -1,0 +1,225 @@
+"""Figures of products: Mueller images as 4 x 4 panels, Stokes images, single maps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.errors import ProcessError
+from processing.storage.product import LIT_ERRORS, Product
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Longest side of a panel in pixels; larger images are thinned before drawing, which changes no file.
+PANEL_PIXELS = 600
+SIMULATED = "SIMULATED"
+PAGE_DPI = 100
+#: A standard error of xi0 above this is no knowledge of it: valid values lie between 0.25 and 1.
+UNKNOWN_XI0 = 0.1
+#: Orientation is drawn in grey where its standard error is above this: it is not known there.
+WORST_ORIENTATION_DEG = 20.0
+#: Keywords of `imshow` for orientations.
+CYCLIC = {"cmap": "twilight", "vmin": 0, "vmax": 180}
+
+
+def draw_product(path: Path, figure: Path) -> None:
+    """Draw a product into a PNG, SVG or PDF file, by its kind.
+
+    Raises
+    ------
+    ProcessError : there is no figure for that kind, or the file's ending is unknown.
+    """
+    with Product(path) as product:
+        drawn = product_figure(product)
+    try:
+        drawn.savefig(figure, dpi=150)
+    except (ValueError, OSError) as error:
+        raise ProcessError(f"figure {figure} cannot be written: {error}") from error
+
+
+def product_figure(product: Product) -> Figure:
+    """Matplotlib figure of a product; raises ProcessError for a kind without one."""
+    if product.kind in ("mueller", "extrapolated"):
+        elements = thin(product.get("mueller"))
+        lit = _lit(elements[0, 0], thin(product.get("mueller_errors")[0, 0]))
+        title = _title(product) if product.kind == "mueller" else f"extrapolated: {_title(product)}"
+        return mueller_figure(elements, lit, title, product.simulated)
+    if product.kind == "stokes":
+        names = ("s0", "dolp", "dolp_errors", "aolp_deg", "aolp_deg_errors")
+        maps = {name: thin(product.get(name)) for name in names}
+        dark = ~_lit(maps["s0"], thin(product.get("s0_errors")))
+        for name in names[1:]:
+            maps[name][dark] = np.nan
+        return stokes_figure(maps, _title(product), product.simulated)
+    if product.kind == "xi0":
+        xi0, errors, valid = (thin(product.get(name)) for name in ("xi0", "xi0_errors", "valid"))
+        shown = np.where(valid > 0, xi0, np.nan)
+        limit = max(_percentile(errors[valid > 0], 95), 1e-6)
+        known = np.where(errors <= UNKNOWN_XI0, errors, np.nan)
+        label = f"standard error of $\\xi_0$ (grey: > {UNKNOWN_XI0:g})"
+        panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = [
+            ("$\\xi_0$ where valid", shown, {"cmap": "viridis", "vmin": 0.25, "vmax": _percentile(shown, 99.8)}),
+            (
+                label,
+                known,
+                {"cmap": "magma", "vmin": 0, "vmax": limit},
+            ),
+            ("valid", valid, {"cmap": "gray", "vmin": 0, "vmax": 1}),
+        ]
+        return map_figure(panels, _title(product), product.simulated)
+    if product.kind == "quantities":
+        from processing.reports.quantities_figures import quantities_figure
+
+        return quantities_figure(product, _title(product))
+    if product.kind == "camera":
+        return photon_transfer_figure(product)
+    raise ProcessError(f"{product.path}: there is no figure of the {product.kind} kind.")
+
+
+def mueller_figure(elements: NDArray[Any], lit: NDArray[np.bool_], title: str, simulated: bool) -> Figure:
+    """4 x 4 panels of M / m00 (4, 4, rows, columns), one diverging scale symmetric about zero, one colour bar.
+
+    Pixels that are not `lit` (rows, columns) have no M / m00 to show and stay grey. The scale is the largest
+    magnitude apart from m00 (99.5 % of the pixels), at most 1; the m00 panel shows m00 over its own 99.5 % so that
+    the object can be recognised, and is drawn in grey.
+    """
+    from matplotlib.figure import Figure
+
+    m00 = elements[0, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        normalized = np.where(lit, elements / m00, np.nan)
+    rest = np.abs(normalized.reshape(16, *m00.shape)[1:])
+    limit = float(np.clip(_percentile(rest, 99.5), 1e-6, 1.0))
+    figure = Figure(figsize=(9.5, 8.6 * max(0.45, m00.shape[0] / max(m00.shape[1], 1)) + 0.8), layout="constrained")
+    panels = figure.subplots(4, 4)
+    shown: Any = None
+    for i in range(4):
+        for j in range(4):
+            panel = panels[i, j]
+            panel.set_xticks([])
+            panel.set_yticks([])
+            panel.set_facecolor("0.85")
+            panel.set_title(f"$m_{{{i}{j}}}$", fontsize=9, pad=2)
+            if i == j == 0:
+                panel.imshow(m00, cmap="gray", vmin=0, vmax=max(_percentile(m00, 99.5), 1e-30))
+                continue
+            shown = panel.imshow(normalized[i, j], cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
+    label = "$m_{ij}/m_{00}$, instrument frames (first panel: $m_{00}$; plain grey: too dark)"
+    figure.colorbar(shown, ax=panels, shrink=0.8, label=label)
+    _entitle(figure, title, simulated)
+    return figure
+
+
+def stokes_figure(maps: dict[str, NDArray[Any]], title: str, simulated: bool) -> Figure:
+    """S0 (grey), degree of linear polarization with its standard error, and its angle on a cyclic colour map."""
+    angle = np.where(maps["aolp_deg_errors"] > WORST_ORIENTATION_DEG, np.nan, maps["aolp_deg"])
+    panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = [
+        ("$S_0$ / counts", maps["s0"], {"cmap": "gray", "vmin": 0}),
+        ("degree of linear polarization", maps["dolp"], {"cmap": "viridis", "vmin": 0}),
+        ("its standard error", maps["dolp_errors"], {"cmap": "magma", "vmin": 0}),
+        ("angle of linear polarization, PSA frame / degrees", angle, CYCLIC),
+    ]
+    return grid_figure(panels, title, simulated)
+
+
+def map_figure(panels: Sequence[tuple[str, NDArray[Any], dict[str, Any]]], title: str, simulated: bool) -> Figure:
+    """Maps side by side; each is (label, values (rows, columns), keywords of imshow such as cmap, vmin, vmax)."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(0.6 + 4.3 * len(panels), 4.2), layout="constrained")
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axis, (label, values, keywords) in zip(axes, panels, strict=True):
+        _map(figure, axis, values, label, **keywords)
+    _entitle(figure, title, simulated)
+    return figure
+
+
+def grid_figure(
+    panels: Sequence[tuple[str, NDArray[Any], dict[str, Any]]], title: str, simulated: bool, columns: int = 4
+) -> Figure:
+    """Maps in rows of `columns`, as in `map_figure`; where no `vmax` is given it is the 99.5th percentile."""
+    from matplotlib.figure import Figure
+
+    shape = panels[0][1].shape
+    rows = -(-len(panels) // columns)
+    high = 0.5 + 3.6 * max(0.4, shape[0] / max(shape[1], 1))
+    figure = Figure(figsize=(4.25 * min(columns, len(panels)), 0.6 + rows * high), layout="constrained")
+    axes = figure.subplots(rows, min(columns, len(panels)), squeeze=False)
+    for axis in axes.flat[len(panels) :]:
+        axis.set_axis_off()
+    for axis, (label, values, keywords) in zip(axes.flat, panels, strict=False):
+        _map(figure, axis, values, label, **({"vmax": max(_percentile(values, 99.5), 1e-30)} | keywords))
+    _entitle(figure, title, simulated)
+    return figure
+
+
+def photon_transfer_figure(product: Product) -> Figure:
+    """Variance against signal with the fitted line, and what is left over."""
+    from matplotlib.figure import Figure
+
+    signal, variance, stderr = product.array("photon_transfer")
+    fitted = product.facts["slope"] * signal + product.facts["floor"]
+    figure = Figure(figsize=(7, 6), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
+    upper.errorbar(signal, variance, stderr, fmt=".", label="pairs of repeated frames")
+    gain, read = product.facts["gain_e_per_count"], product.facts["read_noise_e"]
+    upper.plot(signal, fitted, label=f"{gain:.4g} e/count, {read:.3g} e read noise")
+    upper.set_ylabel("variance / counts$^2$")
+    upper.legend()
+    lower.errorbar(signal, (variance - fitted) / fitted * 100, stderr / fitted * 100, fmt=".")
+    lower.axhline(0, color="black", linewidth=0.8)
+    lower.set_ylabel("residual / %")
+    lower.set_xlabel("signal above black / counts")
+    _entitle(figure, f"photon transfer: {product.header.title}", product.simulated)
+    return figure
+
+
+def png(figure: Figure) -> bytes:
+    """A figure as a PNG for a page."""
+    out = BytesIO()
+    figure.savefig(out, format="png", dpi=PAGE_DPI)
+    return out.getvalue()
+
+
+def thin(image: NDArray[Any]) -> NDArray[Any]:
+    """Every k-th row and column, so that the longer side is at most PANEL_PIXELS."""
+    step = max(1, -(-max(image.shape[-2:]) // PANEL_PIXELS))
+    return image[..., ::step, ::step]
+
+
+def _lit(intensity: NDArray[Any], error: NDArray[Any]) -> NDArray[np.bool_]:
+    # Where the noise is not known the error is NaN, and any light counts.
+    with np.errstate(invalid="ignore"):
+        return np.asarray(intensity > LIT_ERRORS * np.nan_to_num(error))
+
+
+def _map(figure: Figure, axis: Any, values: NDArray[Any], label: str, **keywords: Any) -> None:
+    shown = axis.imshow(values, interpolation="nearest", **keywords)
+    axis.set_title(label, fontsize=10)
+    axis.set_facecolor("0.85")
+    axis.set_xticks([])
+    axis.set_yticks([])
+    figure.colorbar(shown, ax=axis, shrink=0.85)
+
+
+def _entitle(figure: Figure, title: str, simulated: bool) -> None:
+    figure.suptitle(
+        f"{SIMULATED}   {title}" if simulated else title, color="darkred" if simulated else "black", fontsize=11
+    )
+
+
+def _title(product: Product) -> str:
+    header = product.header
+    wavelength = f"{header.wavelength_nm:g} nm"
+    return header.title if wavelength in header.title else f"{header.title}, {wavelength}"
+
+
+def _percentile(values: NDArray[Any], percent: float) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.percentile(finite, percent)) if finite.size else 1.0

@@ -1,0 +1,70 @@
+"""Figure of a quantities product: eigenvalues, depolarization, DoLP and AoLP, retardance, polarizer pairs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.polarization.quantities import PAPER_PAIRS
+from processing.reports.figures import CYCLIC, WORST_ORIENTATION_DEG, grid_figure, thin
+from processing.storage.product import Product
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_FRACTION = {"vmin": 0, "vmax": 1}
+
+
+def quantities_figure(product: Product, title: str) -> Figure:
+    """Five rows of four maps each; angles on a cyclic colour map, NaN and pixels without light in grey."""
+    lit = thin(product.get("lit")) > 0
+
+    def get(name: str) -> NDArray[Any]:
+        return np.where(lit, thin(product.get(name)), np.nan)
+
+    def orientation(name: str) -> NDArray[Any]:
+        angle, error = get(name), get(f"{name}_errors")
+        return np.where(error > WORST_ORIENTATION_DEG, np.nan, angle)
+
+    def label(text: str, name: str) -> str:
+        error = get(f"{name}_errors")
+        middle = np.nanmedian(error[0] if error.ndim == 3 else error) if np.isfinite(error).any() else np.nan
+        return text if np.isnan(middle) else f"{text}   ($\\pm$ {middle:.2g})"
+
+    xi, deviation = get("coherency_eigenvalues"), get("eigenvalue_deviation")
+    spread = max(_percentile(np.abs(deviation), 99), 1e-6)
+    signed = {"cmap": "RdBu_r", "vmin": -spread, "vmax": spread}
+    panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = [
+        (label(r"$\xi_0$", "coherency_eigenvalues"), xi[0], {"vmin": 0.25}),
+        *((rf"$\xi_{k}$", xi[k], {"vmin": 0, "vmax": 1 / 3}) for k in (1, 2, 3)),
+        *((rf"$\xi_{k} - \bar\xi$", deviation[k - 1], signed) for k in (1, 2, 3)),
+        (label("light the TD model misses", "td_missed"), get("td_missed"), {"cmap": "magma", "vmin": 0}),
+        (label("depolarization index", "depolarization_index"), get("depolarization_index"), {"vmin": 0}),
+        (label("entropy", "entropy"), get("entropy"), {"vmax": 1}),
+        (label("depolarization power (Lu-Chipman)", "depolarization_power"), get("depolarization_power"), {"vmax": 1}),
+        (label("retardance (Lu-Chipman) / deg", "retardance_deg"), get("retardance_deg"), {"vmin": 0, "vmax": 180}),
+        (label("DoLP, unpolarized light", "polarizance_linear"), get("polarizance_linear"), {"vmin": 0}),
+        ("AoLP, unpolarized light, PSA frame / deg", orientation("polarizance_orientation_deg"), CYCLIC),
+        (
+            label("$|D|$ of the dominant process", "dominant_diattenuation_linear"),
+            get("dominant_diattenuation_linear"),
+            _FRACTION,
+        ),
+        (
+            r"$\psi$ of the dominant process, PSG frame / deg",
+            orientation("dominant_diattenuation_orientation_deg"),
+            CYCLIC,
+        ),
+    ]
+    for name in product.names:
+        if name in PAPER_PAIRS or ("_to_" in name and not name.endswith("_errors")):
+            text = name.replace("_", " ") + " over $m_{00}$"
+            panels.append((label(text, name), get(name), {"cmap": "gray", "vmin": 0}))
+    return grid_figure(panels, f"{title}\n($\\pm$: median standard error of a pixel)", product.simulated)
+
+
+def _percentile(values: NDArray[Any], percent: float) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.percentile(finite, percent)) if finite.size else 1.0

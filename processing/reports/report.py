@@ -1,0 +1,241 @@
+"""Collect captures, products, curves and pictures of a measurement into one report."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from processing.errors import ProcessError
+from processing.reflectance.tables import ScatteringTable, is_table
+from processing.reports.figures import map_figure, png, product_figure, thin
+from processing.reports.mueller_maps import mueller_maps
+from processing.reports.tables import table_section
+from processing.reports.template import Figure, Section, render
+from processing.storage.capture import Capture, CaptureError
+from processing.storage.product import Product, Step, is_product, step_text
+
+#: File types that a report takes in.
+PICTURES = (".png", ".svg")
+SUFFIXES = (".h5", ".csv", *PICTURES)
+#: Rows of a CSV that are shown.
+ROWS = 200
+
+
+def collect(sources: Sequence[Path]) -> list[Path]:
+    """Files for a report: those given, and those in the folders given; curves and pictures first, then the oldest.
+
+    A picture beside an HDF5 file of its name shows what that file's own section shows, and is left out.
+
+    Raises
+    ------
+    ProcessError : a source does not exist, or nothing is there.
+    """
+    files: list[Path] = []
+    for source in sources:
+        if source.is_dir():
+            inside = [p for p in source.rglob("*") if p.suffix in SUFFIXES and p.is_file()]
+            twins = [p for p in inside if p.suffix in PICTURES and p.with_suffix(".h5").is_file()]
+            kept = set(inside) - set(twins)
+            files += sorted(kept, key=lambda p: (p.suffix == ".h5", p.stat().st_mtime, p.name))
+        elif source.is_file():
+            if source.suffix not in SUFFIXES:
+                raise ProcessError(f"{source}: a report takes {', '.join(SUFFIXES)} files.")
+            files.append(source)
+        else:
+            raise ProcessError(f"{source}: no such file or folder.")
+    if not files:
+        places = ", ".join(str(s) for s in sources)
+        raise ProcessError(f"nothing to report in {places}: no {', '.join(SUFFIXES)} files.")
+    return list(dict.fromkeys(files))
+
+
+def write_report(
+    sources: Sequence[Path],
+    out: Path,
+    title: str,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Write one self-contained HTML file about captures, products, CSV tables and pictures.
+
+    Raises
+    ------
+    ProcessError : nothing to report, `out` exists, or simulated and measured data are mixed.
+    """
+    if out.exists() and not overwrite:
+        raise ProcessError(f"{out} exists. Give another --out, or --overwrite to replace it.")
+    files = [f for f in collect(sources) if f.resolve() != out.resolve()]
+    simulated = _kind_of_data(files)
+    sections: list[Section] = []
+    for count, file in enumerate(files, 1):
+        if file.suffix == ".h5":
+            section = _section(file)
+        elif file.suffix == ".csv":
+            section = _curve(file)
+        else:
+            section = Section(file.name, [], [Figure(file.read_bytes(), file.name, _media_type(file))])
+        sections.append(section)
+        if progress:
+            progress(count, len(files))
+    made = f"Made by umov {version('umov')} on {datetime.now(UTC).isoformat(timespec='seconds')}, {len(files)} files."
+    out.write_text(render(title, simulated, made, sections), encoding="utf-8")
+    return out
+
+
+def _section(path: Path) -> Section:
+    if is_product(path):
+        return _product(path)
+    if is_table(path):
+        return table_section(path)
+    try:
+        return _capture(path)
+    except CaptureError as error:
+        return Section(path.name, [("kind", "not shown")], warnings=[str(error)])
+
+
+def _kind_of_data(files: Sequence[Path]) -> bool:
+    """Whether the captures, products and tables are simulated; ProcessError if some are and some are not."""
+    found: dict[bool, Path] = {}
+    for file in files:
+        if file.suffix != ".h5":
+            continue
+        # A file of another program says nothing; its section says what it is.
+        with suppress(CaptureError):
+            found.setdefault(_is_simulated(file), file)
+    if len(found) == 2:
+        raise ProcessError(
+            f"{found[True]} is simulated and {found[False]} is measured; they are never mixed. Make one report of each."
+        )
+    return True in found
+
+
+def _is_simulated(path: Path) -> bool:
+    if is_table(path):
+        return ScatteringTable.load(path).simulated
+    with Product(path) if is_product(path) else Capture(path) as opened:
+        return opened.simulated
+
+
+def _capture(path: Path) -> Section:
+    with Capture(path) as capture:
+        header, closing = capture.header, capture.closing
+        warnings = [str(m) for m in closing.get("messages", [])]
+        if capture.status != "complete":
+            warnings.append(f"the capture is {capture.status}: {len(capture.role)} of {capture.planned_states} states")
+        saturated = capture.column("saturated_fraction")
+        if saturated.size and np.nanmax(np.nan_to_num(saturated)) > 0.001:
+            warnings.append(f"up to {100 * np.nanmax(saturated):.2f} % of the pixels of a state are saturated")
+        summary = [
+            ("title", header.title),
+            ("kind", f"capture, {header.mode}, {'simulated' if capture.simulated else 'measured'}"),
+            ("wavelength", f"{header.wavelength_nm:g} nm"),
+            ("Omega", "not stated" if header.omega_deg is None else f"{header.omega_deg:g} degrees"),
+            ("sample", f"{header.sample.name or header.sample.kind} ({header.sample.kind})"),
+            ("states", f"{len(capture.role)} of {capture.planned_states} done; {_roles(capture)}"),
+            (
+                "frame",
+                f"{capture.frame_shape[1]} x {capture.frame_shape[0]}, {capture.channels} channel(s), {capture.dtype}",
+            ),
+        ]
+        records = (("time ledger", "ledger"), ("stream statistics", "stream"))
+        named = [(heading, _pairs(closing[name])) for heading, name in records if closing.get(name)]
+        notes = [
+            (name, text)
+            for name, text in (
+                ("plan", header.plan_yaml),
+                ("rig", header.rig_yaml),
+                ("instrument model", header.instrument_yaml),
+                ("camera settings as read back", header.camera_settings_json),
+                ("versions", "\n".join(f"{k} {v}" for k, v in header.versions.items())),
+            )
+            if text.strip() not in ("", "{}")
+        ]
+        figures = []
+        if len(capture.role):
+            state = int(capture.states_with("sample")[0]) if capture.states_with("sample").size else 0
+            frame = thin(capture.frames(state)[0])
+            if frame.size > 1:
+                drawn = map_figure(
+                    [(f"state {state}, counts", frame, {"cmap": "gray"})], header.title, capture.simulated
+                )
+                figures.append(Figure(png(drawn), "first frame of the sample"))
+        return Section(path.name, summary, figures, named, warnings, notes)
+
+
+def _product(path: Path) -> Section:
+    with Product(path) as product:
+        facts = {k: v for k, v in product.facts.items() if k not in ("warnings", "masked")}
+        summary = [("kind", f"{product.kind} image, {'simulated' if product.simulated else 'measured'}")]
+        summary += [(name.replace("_", " "), _shown(value)) for name, value in facts.items()]
+        figures = []
+        # A kind without a figure is reported by its numbers.
+        with suppress(ProcessError):
+            figures.append(Figure(png(product_figure(product)), f"{product.kind} image"))
+        if product.kind == "mueller" and "residual_rms" in product.names:
+            residual = thin(product.get("residual_rms"))
+            title = product.header.title
+            drawn = map_figure([("residual rms / counts", residual, {"cmap": "magma"})], title, product.simulated)
+            figures.append(
+                Figure(png(mueller_maps(product, title)), "coherency eigenvalues, xi0 and its error, DoLP, AoLP")
+            )
+            figures.append(Figure(png(drawn), "residual of the fit"))
+        datasets = [("dataset", "unit", "what it is")]
+        datasets += [(name, product.units(name), product.long_name(name)) for name in product.names]
+        provenance = "\n".join(line for step in product.steps for line in _provenance(step))
+        warnings = list(product.facts.get("warnings", []))
+        notes = [("provenance, oldest first", provenance)]
+        return Section(path.name, summary, figures, [("datasets", datasets)], warnings, notes)
+
+
+def _provenance(step: Step) -> list[str]:
+    inputs = [f"    from {i['path']} ({i['bytes']} bytes, {i['modified']})" for i in step.inputs]
+    return [step_text(step), *inputs]
+
+
+def _curve(path: Path) -> Section:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = [row for row in csv.reader(file) if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ProcessError(f"{path}: cannot be read as CSV ({error})") from error
+    shown = [rows[0], *([_rounded(cell) for cell in row] for row in rows[1 : ROWS + 1])] if rows else []
+    name = path.name if len(rows) <= ROWS + 1 else f"{path.name}: first {ROWS} of {len(rows) - 1} rows"
+    return Section(path.name, [], (), [(name, shown)] if shown else ())
+
+
+def _rounded(cell: str) -> str:
+    try:
+        number = float(cell)
+    except ValueError:
+        return cell
+    return f"{number:.5g}" if number == number else "-"
+
+
+def _pairs(values: dict[str, Any]) -> list[tuple[str, str]]:
+    return [("", ""), *((_label(name), _shown(value)) for name, value in values.items())]
+
+
+def _label(name: str) -> str:
+    words = name.removesuffix("_s").replace("_", " ")
+    return f"{words} / s" if name.endswith("_s") else words
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.5g}"
+    return "not known" if value is None else str(value)
+
+
+def _roles(capture: Capture) -> str:
+    return ", ".join(f"{capture.role.count(r)} {r}" for r in dict.fromkeys(capture.role))
+
+
+def _media_type(path: Path) -> str:
+    return {".svg": "image/svg+xml", ".png": "image/png"}[path.suffix]

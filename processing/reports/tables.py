@@ -1,0 +1,57 @@
+"""Report section of a table over scattering geometry."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.reflectance.table_axes import SHAPE
+from processing.reflectance.tables import ScatteringTable
+from processing.reports.figures import map_figure, png
+from processing.reports.template import Figure, Section
+
+
+def table_section(path: Path) -> Section:
+    """Numbers of a table, and its first quantity over theta_h and theta_d, averaged over phi_d."""
+    table = ScatteringTable.load(path)
+    name = table.quantities[0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        stderr = np.sqrt(table.variance[0] / table.count) if table.bins.size else np.empty(0)
+    known = stderr[np.isfinite(stderr)]
+    summary = [
+        ("kind", f"table over theta_h, theta_d, phi_d, {'simulated' if table.simulated else 'measured'}"),
+        ("quantities", ", ".join(table.quantities)),
+        ("wavelength", f"{table.wavelength_nm:g} nm"),
+        ("layout", table.axes.layout),
+        ("bins filled", f"{table.bins.size} of {SHAPE[0] * SHAPE[1] * (SHAPE[2] - 1)}"),
+        ("samples", str(int(table.count.sum()))),
+        (
+            f"standard error of a bin's mean {name}, median",
+            f"{np.median(known):.3g}" if known.size else "not known: no bin has two samples",
+        ),
+    ]
+    if not table.bins.size:
+        return Section(path.name, summary)
+    mean, count = _over_phi(table)
+    drawn = map_figure(
+        [
+            (f"{name}, mean over $\\phi_d$", mean, {"cmap": "viridis", "origin": "lower"}),
+            ("samples (log10)", count, {"cmap": "magma", "origin": "lower"}),
+        ],
+        f"{path.name}: rows $\\theta_h$, columns $\\theta_d$, bins",
+        table.simulated,
+    )
+    return Section(path.name, summary, [Figure(png(drawn), f"{name} over theta_h (up) and theta_d (right)")])
+
+
+def _over_phi(table: ScatteringTable) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    # Samples count alike, so bins with many of them count more.
+    plane = table.bins // SHAPE[2]
+    size = SHAPE[0] * SHAPE[1]
+    count = np.bincount(plane, weights=table.count, minlength=size)
+    total = np.bincount(plane, weights=table.mean[0] * table.count, minlength=size)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean, samples = total / count, np.where(count > 0, np.log10(count), np.nan)
+    return mean.reshape(SHAPE[:2]), samples.reshape(SHAPE[:2])

@@ -1,0 +1,1 @@
+"""Files in and out: captures, products, and the formats of other programs."""

@@ -1,0 +1,90 @@
+"""Mueller products from and to AxoStep's Mueller files."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from processing.reduction.counts_to_signal import Mask
+from processing.reduction.mueller import PLANES
+from processing.storage.axostep import AxoStepError, MuellerFile, read_mueller_file, write_mueller_file
+from processing.storage.capture_schema import CaptureHeader
+from processing.storage.product import Product, ProductWriter, Step, file_identity
+
+
+def product_of_axostep(
+    source: Path, out: Path, wavelength_nm: float | None, omega_deg: float | None, overwrite: bool
+) -> list[str]:
+    """Write a Mueller product with the image of a .cmmi or .bmmi file; returns lines that say what was found.
+
+    Raises
+    ------
+    AxoStepError : the file cannot be read, or nothing says the wavelength.
+    """
+    if source.suffix.lower() not in (".cmmi", ".bmmi"):
+        raise AxoStepError(f"{source}: expected a .cmmi or .bmmi file; raw .rmmd files go to `process import --stack`")
+    image = read_mueller_file(source)
+    nm = wavelength_nm if wavelength_nm is not None else image.metadata.get("wavelength_nm", 0.0)
+    if not 100 < nm < 30_000:
+        raise AxoStepError(f"{source} says a wavelength of {nm:g} nm. Give the true one with --wavelength-nm.")
+    header = CaptureHeader(
+        title=source.name,
+        simulated=False,
+        mode="axostep",
+        wavelength_nm=nm,
+        omega_deg=omega_deg,
+        versions={"umov": version("umov")},
+    )
+    rows, columns = image.mueller.shape[-2:]
+    step = Step(
+        "from-axostep",
+        {"source": source.name, "header_words": image.header_words, "metadata": image.metadata, "date": image.date},
+        (file_identity(source),),
+    )
+    nothing = np.full((rows, columns), np.nan, np.float32)
+    finite = np.isfinite(image.mueller).all(axis=(0, 1))
+    facts: dict[str, Any] = {
+        "method": "as in the file",
+        "weighted": False,
+        "warnings": ["the file holds no standard errors and no raw intensities"],
+    }
+    with ProductWriter(out, "mueller", header, (rows, columns), PLANES, (step,), overwrite) as writer:
+        # One intensity an element, whose noise is not known: readers of products then give NaN as standard error.
+        writer.array("measurement_matrix", np.eye(16), "", "identity: the file holds elements, not intensities")
+        for name in ("noise_slope", "noise_floor"):
+            writer.array(name, np.full(16, np.nan), "count", "not known")
+        writer.write(
+            slice(0, rows),
+            mueller=image.mueller,
+            mueller_errors=np.full((4, 4, rows, columns), np.nan, np.float32),
+            residual_rms=nothing,
+            pixel_mask=np.where(finite, 0, np.uint8(Mask.NOT_FINITE)).astype(np.uint8),
+        )
+        writer.seal(facts)
+    date = f", {image.date:%Y-%m-%d %H:%M} GMT" if image.date else ""
+    return [
+        f"{columns} x {rows} pixels, {nm:g} nm{date}, {len(image.reduced)} reduced parameters (not taken over)",
+        f"header of {image.header_words} words" + (" as the lab's reader expects" if image.header_words == 5 else ""),
+    ]
+
+
+def axostep_of_product(source: Path, out: Path, overwrite: bool) -> None:
+    """Write the Mueller image of a product as a .bmmi or .cmmi file (without reduced parameters, which are AxoStep's).
+
+    Raises
+    ------
+    AxoStepError : the target exists, or has another ending.
+    ProductError : the source is no Mueller product.
+    """
+    if out.suffix.lower() not in (".cmmi", ".bmmi"):
+        raise AxoStepError(f"{out}: AxoStep's Mueller images end in .cmmi or .bmmi")
+    if out.exists() and not overwrite:
+        raise AxoStepError(f"{out} exists. Give another --out, or --overwrite to replace it.")
+    with Product(source) as product:
+        product.require("mueller")
+        values, nm = product.get("mueller").astype(np.float32), product.header.wavelength_nm
+    empty = np.empty((0, *values.shape[-2:]), np.float32)
+    write_mueller_file(out, MuellerFile(values, empty, {"wavelength_nm": nm}))

@@ -1,0 +1,179 @@
+"""Mueller and Stokes images read back from product files, with what error propagation needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.storage.capture_schema import CaptureHeader
+from processing.storage.product import Product, Step
+
+
+@dataclass(frozen=True)
+class MuellerImage:
+    """A reduced Mueller image, or some rows of it.
+
+    Attributes
+    ----------
+    values : (4, 4, rows, columns) float32, counts, not normalized; NaN where nothing was determined.
+    errors : same shape, standard errors; NaN where they are not known.
+    mask : (rows, columns) uint8, bits of `processing.reduction.counts_to_signal.Mask`.
+    residual_rms : (rows, columns), counts.
+    w : (N, 16), measurement matrix, rows scaled with the exposure.
+    noise_slope, noise_floor : (N,), variance of intensity n = slope * signal + floor; NaN where noise is not known.
+    header, steps, simulated, facts : as in the product.
+    """
+
+    values: NDArray[np.float32]
+    errors: NDArray[np.float32]
+    mask: NDArray[np.uint8]
+    residual_rms: NDArray[np.float32]
+    w: NDArray[np.float64]
+    noise_slope: NDArray[np.float64]
+    noise_floor: NDArray[np.float64]
+    header: CaptureHeader
+    steps: tuple[Step, ...]
+    simulated: bool
+    facts: dict[str, Any]
+
+    @classmethod
+    def load(cls, path: Path | str, rows: slice = slice(None)) -> Self:
+        """Read a product of `process reduce`. Raises ProductError for another kind of file."""
+        with Product(path) as product:
+            product.require("mueller")
+            return cls.of(product, rows)
+
+    @classmethod
+    def of(cls, product: Product, rows: slice = slice(None)) -> Self:
+        """From an open product; block by block for large images."""
+        return cls(
+            values=product.get("mueller", rows),
+            errors=product.get("mueller_errors", rows),
+            mask=product.get("pixel_mask", rows),
+            residual_rms=product.get("residual_rms", rows),
+            w=product.array("measurement_matrix").reshape(-1, 16),
+            noise_slope=product.array("noise_slope"),
+            noise_floor=product.array("noise_floor"),
+            header=product.header,
+            steps=product.steps,
+            simulated=product.simulated,
+            facts=product.facts,
+        )
+
+    @property
+    def matrices(self) -> NDArray[np.float32]:
+        """View (rows, columns, 4, 4)."""
+        return np.moveaxis(self.values, (0, 1), (-2, -1))
+
+    def at(self, pixels: NDArray[np.int64]) -> Self:
+        """The image of some pixels alone (n rows of one), given by their numbers in row-major order."""
+        count = self.mask.size
+
+        def pick(values: NDArray[Any]) -> NDArray[Any]:
+            return values.reshape(*values.shape[:-2], count)[..., pixels, None]
+
+        return replace(
+            self,
+            values=pick(self.values),
+            errors=pick(self.errors),
+            mask=pick(self.mask),
+            residual_rms=pick(self.residual_rms),
+        )
+
+    def intensity_variance(self) -> NDArray[np.float64]:
+        """Variance (N, pixels) of every intensity, from the fitted intensities and the noise of the reduction."""
+        rows, columns = self.mask.shape
+        n = self.w.shape[0]
+        if np.isnan(self.noise_slope).any():
+            free = max(n - 16, 0)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                level = self.residual_rms.reshape(-1).astype(float) ** 2 * n / free if free else np.nan
+            return np.broadcast_to(level, (n, rows * columns))
+        fitted = self.w @ self.values.reshape(16, -1)
+        floor = self.noise_floor[:, None]
+        return np.asarray(np.maximum(self.noise_slope[:, None] * fitted + floor, 0.5 * floor))
+
+    def covariance(self) -> NDArray[np.float64]:
+        """Covariance (rows, columns, 16, 16) of the elements, counts^2, row-major order m00, m01, ... m33.
+
+        Rebuilt from W, the noise model and the fitted intensities, then scaled so that its diagonal is `errors`
+        squared (which also holds what the dark frames and left-out states add).
+        """
+        return self._covariance
+
+    @cached_property
+    def _covariance(self) -> NDArray[np.float64]:
+        inverse = self._inverse()
+        variance = self.intensity_variance()
+        if self.facts["weighted"]:
+            normal = np.einsum("np,ni,nj->pij", 1 / variance, self.w, self.w, optimize=True)
+            full = np.linalg.inv(normal)
+        else:
+            full = np.einsum("np,in,jn->pij", variance, inverse, inverse, optimize=True)
+        scale = self.errors.reshape(16, -1).T / np.sqrt(np.einsum("pii->pi", full))
+        full *= scale[:, :, None] * scale[:, None, :]
+        return np.asarray(full.reshape(*self.mask.shape, 16, 16))
+
+    def variance_of(self, gradient: NDArray[np.floating]) -> NDArray[np.float64]:
+        """First-order variance (rows, columns) of a quantity with gradient (rows, columns, 16) by the elements.
+
+        The same as gradient . covariance . gradient, without forming the covariance.
+        """
+        g = np.asarray(gradient).reshape(-1, 16)
+        if self.facts["weighted"]:
+            full = self._covariance.reshape(-1, 16, 16)
+            return np.asarray(np.einsum("pi,pi->p", (full @ g[:, :, None])[..., 0], g).reshape(self.mask.shape))
+        inverse, variance = self._inverse(), self.intensity_variance()
+        found = np.einsum("pn,np->p", np.square(g @ inverse), variance)
+        # Flats, dark frames and left-out states change all errors of a pixel much alike.
+        told = np.square(self.errors.reshape(16, -1)).sum(axis=0) / (np.square(inverse) @ variance).sum(axis=0)
+        return np.asarray((found * told).reshape(self.mask.shape))
+
+    def _inverse(self) -> NDArray[np.float64]:
+        return np.asarray(np.linalg.pinv(self.w))
+
+
+@dataclass(frozen=True)
+class StokesImage:
+    """A reduced linear Stokes image.
+
+    Attributes
+    ----------
+    values : (3, rows, columns) float32, S0, S1, S2 in counts; NaN where masked.
+    covariance : (rows, columns, 3, 3), counts^2.
+    w, analyzers : (channels, 16) and (channels, 3), from the Mueller matrix and from S to intensities.
+    mask : (rows, columns) uint8, bits of `processing.reduction.counts_to_signal.Mask`.
+    """
+
+    values: NDArray[np.float32]
+    covariance: NDArray[np.float32]
+    mask: NDArray[np.uint8]
+    w: NDArray[np.float64]
+    analyzers: NDArray[np.float64]
+    header: CaptureHeader
+    steps: tuple[Step, ...]
+    simulated: bool
+    facts: dict[str, Any]
+
+    @classmethod
+    def load(cls, path: Path | str, rows: slice = slice(None)) -> Self:
+        """Read a product of `process reduce` of a mosaic capture. Raises ProductError for another kind of file."""
+        with Product(path) as product:
+            product.require("stokes")
+            packed = product.get("stokes_covariance", rows)
+            return cls(
+                values=np.stack([product.get(name, rows) for name in ("s0", "s1", "s2")]),
+                covariance=np.moveaxis(packed[[0, 3, 4, 3, 1, 5, 4, 5, 2]], 0, -1).reshape(*packed.shape[1:], 3, 3),
+                mask=product.get("pixel_mask", rows),
+                w=product.array("measurement_matrix"),
+                analyzers=product.array("analyzers"),
+                header=product.header,
+                steps=product.steps,
+                simulated=product.simulated,
+                facts=product.facts,
+            )

@@ -1,0 +1,255 @@
+"""Make a capture out of data measured elsewhere: a table of states, and frames or channel fluxes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.computing.threads import thread_count
+from processing.instrument.model import InstrumentModel
+from processing.storage.axostep import read_rmmd
+from processing.storage.capture_schema import CaptureHeader, Detector, Sample, create_layout, write_closing
+from processing.storage.state_csv import ImportFailed, StatesFile, read_states
+
+#: Called with (states done, states in all).
+Progress = Callable[[int, int], None]
+
+Frame = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class FrameSource:
+    """Frames of all states, whatever they come from: shape (channels, rows, columns), type, and an iterator."""
+
+    shape: tuple[int, int, int]
+    dtype: np.dtype[Any]
+    frames: Callable[[], Iterator[Frame]]
+    channels: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ImportRequest:
+    """What `process import` was asked for; see its help."""
+
+    states: Path
+    out: Path
+    wavelength_nm: float
+    stack: str | None = None
+    instrument: Path | None = None
+    sample: Sample = field(default_factory=Sample)
+    detector: Detector = field(default_factory=Detector)
+    omega_deg: float | None = None
+    title: str = ""
+    overwrite: bool = False
+
+
+def import_capture(request: ImportRequest, progress: Progress | None = None) -> CaptureHeader:
+    """Write a capture file from states.csv and its frames; returns the header that was written.
+
+    Raises
+    ------
+    ImportFailed : the states file, a frame or the stack cannot be used, or the capture exists already.
+    ConfigError, WavelengthError : the instrument file cannot be used.
+    """
+    if request.out.exists() and not request.overwrite:
+        raise ImportFailed(f"{request.out} exists. Give another --out, or --overwrite to replace it.")
+    model = None
+    if request.instrument is not None:
+        model = InstrumentModel.load(request.instrument)
+        model.at(request.wavelength_nm)
+    states = read_states(request.states, model.axes if model else ())
+    source = _source(request, states, model)
+    detector = request.detector
+    if detector.bits is None and source.dtype.kind == "u":
+        detector = detector.model_copy(update={"bits": 8 * source.dtype.itemsize})
+    header = CaptureHeader(
+        title=request.title or f"imported from {request.states.resolve().parent.name}/{request.states.name}",
+        simulated=False,
+        mode="import",
+        wavelength_nm=request.wavelength_nm,
+        omega_deg=request.omega_deg,
+        sample=request.sample,
+        detector=detector,
+        channels=source.channels,
+        mosaic=model.mosaic if model else None,
+        instrument_yaml=request.instrument.read_text(encoding="utf-8") if request.instrument else "",
+        versions={"umov": version("umov"), "numpy": np.__version__, "h5py": h5py.__version__},
+    )
+    partial = request.out.with_name(request.out.name + ".partial")
+    try:
+        with h5py.File(partial, "w") as h5:
+            _write(h5, header, states, source, progress)
+        os.replace(partial, request.out)
+    finally:
+        partial.unlink(missing_ok=True)
+    return header
+
+
+def _write(
+    h5: h5py.File, header: CaptureHeader, states: StatesFile, source: FrameSource, progress: Progress | None
+) -> None:
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    create_layout(h5, header, states.angles_deg, states.role, source.shape[1:], source.dtype, now)
+    data = h5["entry/instrument/detector/data"]
+    count = 0
+    for count, frame in enumerate(source.frames(), 1):
+        data[count - 1] = frame
+        if progress:
+            progress(count, len(states))
+    for axis, angle in states.angles_deg.items():
+        h5[f"entry/instrument/{axis}/value"][...] = angle
+    table = h5["entry/states"]
+    table["frame_id"][...] = np.arange(count)
+    if states.exposure_s is not None:
+        table["exposure_s"][...] = states.exposure_s
+    if states.time_s is not None:
+        table["host_time_s"][...] = states.time_s
+    table["done"][...] = 1
+    write_closing(h5, "complete", f'{{"imported": "{now}"}}')
+
+
+def _source(request: ImportRequest, states: StatesFile, model: InstrumentModel | None) -> FrameSource:
+    given = {
+        "the column `file`": states.files is not None,
+        "--stack": request.stack is not None,
+        "columns `channel_<name>`": bool(states.channels),
+    }
+    ways = [name for name, present in given.items() if present]
+    if len(ways) != 1:
+        found = " and ".join(ways) or "none of them"
+        raise ImportFailed(f"{states.path}: frames come from exactly one of {', '.join(given)}; found {found}.")
+    names = tuple(c.name for c in model.channels) if model and model.mosaic is None else ("camera",)
+    if states.channels:
+        return _fluxes(states, names if model else tuple(states.channels))
+    if request.stack is not None:
+        return _stack(request.stack, states, names)
+    return _images(states, names)
+
+
+def _fluxes(states: StatesFile, names: tuple[str, ...]) -> FrameSource:
+    if sorted(names) != sorted(states.channels):
+        raise ImportFailed(
+            f"{states.path}:1: the instrument's channels are {', '.join(names)}; "
+            f"the file has columns for: {', '.join(states.channels)}."
+        )
+    fluxes = np.stack([states.channels[n] for n in names], axis=1)[..., None, None]
+    return FrameSource((len(names), 1, 1), fluxes.dtype, lambda: iter(fluxes), names)
+
+
+def _stack(text: str, states: StatesFile, names: tuple[str, ...]) -> FrameSource:
+    file, _, inside = text.partition("::")
+    try:
+        if file.endswith(".rmmd"):
+            stack: Any = read_rmmd(Path(file)).states(len(states))
+        elif file.endswith(".npy"):
+            stack = np.load(file, mmap_mode="r")
+        else:
+            h5 = h5py.File(file, "r")
+            stack = h5[inside or _only_stack(h5, file)]
+    except (OSError, ValueError, KeyError) as error:
+        raise ImportFailed(
+            f"{text}: cannot be read as .npy or HDF5 ({error}). Write HDF5 as FILE::/path/to/dataset."
+        ) from error
+    shape = tuple(stack.shape)
+    expected = f"({len(states)}, rows, columns)" if len(names) == 1 else f"({len(states)}, {len(names)}, rows, columns)"
+    if shape[0] != len(states) or len(shape) not in (3, 4) or (shape[1] if len(shape) == 4 else 1) != len(names):
+        raise ImportFailed(f"{text}: shape {shape}; {states.path} and the instrument ask for {expected}.")
+    if stack.dtype.kind not in "uif":
+        raise ImportFailed(f"{text}: holds {stack.dtype}; frames are integers or floating numbers.")
+    per_state = (len(names), *shape[-2:])
+    return FrameSource(per_state, stack.dtype, lambda: (np.asarray(s).reshape(per_state) for s in stack), names)
+
+
+def _only_stack(h5: h5py.File, file: str) -> str:
+    found: list[str] = []
+    h5.visititems(lambda name, item: found.append(name) if isinstance(item, h5py.Dataset) and item.ndim >= 3 else None)
+    if len(found) != 1:
+        shown = ", ".join(found) or "none"
+        raise ImportFailed(f"{file}: datasets with three or four dimensions: {shown}. Say which: --stack {file}::/NAME")
+    return found[0]
+
+
+def _images(states: StatesFile, names: tuple[str, ...]) -> FrameSource:
+    if len(names) != 1:
+        raise ImportFailed(
+            f"{states.path}: one image a state is one channel, but the instrument has {', '.join(names)}; "
+            "give a --stack (states, channels, rows, columns) or channel columns."
+        )
+    files = states.files or ()
+    absent = [(line, file) for line, file in zip(states.line, files, strict=True) if not file.is_file()]
+    if absent:
+        line, file = absent[0]
+        more = f" (and {len(absent) - 1} more)" if len(absent) > 1 else ""
+        raise ImportFailed(f"{states.path}:{line}: column file: no such frame: {file}{more}")
+    first = _image(files[0])
+
+    def load(item: tuple[int, Path]) -> Frame:
+        line, file = item
+        image = _image(file)
+        if image.shape != first.shape or image.dtype != first.dtype:
+            raise ImportFailed(
+                f"{states.path}:{line}: {file.name} is {_kind(image)}, but the first frame is {_kind(first)}; "
+                "all must be alike."
+            )
+        return image[None]
+
+    def frames() -> Iterator[Frame]:
+        # Decoding releases the interpreter lock; a few frames ahead keep the writer fed at constant memory.
+        items = iter(list(zip(states.line, files, strict=True)))
+        with ThreadPoolExecutor(thread_count()) as pool:
+            waiting = [pool.submit(load, item) for item in islice(items, 4 * thread_count())]
+            while waiting:
+                frame = waiting.pop(0).result()
+                waiting += [pool.submit(load, item) for item in islice(items, 1)]
+                yield frame
+
+    return FrameSource((1, *first.shape), first.dtype, frames, names)
+
+
+def _image(file: Path) -> Frame:
+    import cv2
+
+    image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise ImportFailed(f"{file}: is not an image that can be read (PNG or TIFF)")
+    if image.ndim == 3:
+        grey = image[..., 0]
+        colours = image[..., :3]
+        if not np.array_equal(colours, np.broadcast_to(grey[..., None], colours.shape)):
+            raise ImportFailed(f"{file}: is a colour image; frames are raw grey values of one channel")
+        image = np.ascontiguousarray(grey)
+    return np.asarray(image)
+
+
+def _kind(image: Frame) -> str:
+    return f"{image.shape[1]} x {image.shape[0]} {image.dtype}"
+
+
+def read_sample(text: str) -> Sample:
+    """Sample from `--sample`: air, mirror, unknown, or a file with 16 numbers (text or .npy)."""
+    if text in ("air", "mirror", "unknown"):
+        return Sample(kind=text)  # type: ignore[arg-type]
+    path = Path(text)
+    try:
+        if path.suffix == ".npy":
+            values = np.load(path)
+        else:
+            values = np.array(path.read_text(encoding="utf-8").replace(",", " ").split(), dtype=float)
+    except (OSError, ValueError) as error:
+        raise ImportFailed(
+            f"--sample {text}: neither air, mirror, unknown nor a readable file of numbers ({error})"
+        ) from error
+    if values.size != 16 or not np.all(np.isfinite(values)):
+        raise ImportFailed(f"--sample {text}: a Mueller matrix has 16 finite numbers; found {values.size}")
+    return Sample(kind="mueller", name=path.stem, mueller=tuple(float(v) for v in values.reshape(-1)))

@@ -1,0 +1,267 @@
+"""Product files: what processing makes out of captures. One HDF5 file, NeXus-shaped, with its provenance.
+
+Layout (docs/processing.md): planes first, then (rows, columns); `<name>_errors` holds one standard error for each
+value; every step that led here is an NXprocess with its arguments, oldest first.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.errors import ProcessError
+from processing.storage.capture_schema import CaptureHeader
+from processing.storage.provenance import Step as Step
+from processing.storage.provenance import file_identity as file_identity
+from processing.storage.provenance import jsonable, read_steps, write_steps
+from processing.storage.provenance import step_text as step_text
+
+PRODUCT_VERSION = 1
+
+#: A pixel has light where its intensity is this many standard errors above zero; figures and summaries count those.
+LIT_ERRORS = 10.0
+
+
+class ProductError(ProcessError):
+    """A product file cannot be read or written."""
+
+
+@dataclass(frozen=True)
+class Plane:
+    """One dataset of a product: leading shape before (rows, columns), type, unit and a line that says what it is."""
+
+    leading: tuple[int, ...]
+    units: str
+    long_name: str
+    dtype: Any = np.float32
+
+
+class ProductWriter:
+    """Writes a product row block by row block; an interrupted one goes on where it stopped.
+
+    The file is `<path>.partial`, all space allocated at the start, until `seal` renames it.
+
+    Parameters
+    ----------
+    path : of the finished product.
+    kind : "mueller", "stokes", ...
+    header : of the capture that the product comes from.
+    shape : (rows, columns).
+    planes : dataset name to Plane; the first one is the default signal of a viewer.
+    steps : provenance so far, oldest first.
+    overwrite : replace a finished product of that name.
+
+    Raises
+    ------
+    ProductError : the product exists and `overwrite` is false, or the space cannot be had.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        kind: str,
+        header: CaptureHeader,
+        shape: tuple[int, int],
+        planes: Mapping[str, Plane],
+        steps: Sequence[Step],
+        overwrite: bool = False,
+    ) -> None:
+        self.path = path
+        if path.exists() and not overwrite:
+            raise ProductError(f"{path} exists. Give another --out, or --overwrite to replace it.")
+        self._partial = path.with_name(path.name + ".partial")
+        #: Equal in two runs exactly if they would write the same values.
+        self._signature = json.dumps(
+            [kind, header.model_dump_json(), shape, sorted(planes), [(s.name, s.arguments, s.inputs) for s in steps]],
+            default=str,
+        )
+        self.rows_done = 0
+        if not self._reopen():
+            self._create(kind, header, shape, planes, steps)
+
+    def _reopen(self) -> bool:
+        if not self._partial.exists():
+            return False
+        try:
+            h5 = h5py.File(self._partial, "r+")
+        except OSError:
+            return False
+        if h5.attrs.get("signature") != self._signature:
+            h5.close()
+            return False
+        self._h5 = h5
+        self.rows_done = int(h5["entry/rows_done"][()])
+        return True
+
+    def _create(
+        self,
+        kind: str,
+        header: CaptureHeader,
+        shape: tuple[int, int],
+        planes: Mapping[str, Plane],
+        steps: Sequence[Step],
+    ) -> None:
+        try:
+            self._h5 = h5py.File(self._partial, "w")
+            entry = self._h5.create_group("entry")
+            entry.attrs.update({"NX_class": "NXentry", "default": "data"})
+            self._h5.attrs.update({"default": "entry", "umov_product": PRODUCT_VERSION, "signature": self._signature})
+            entry.attrs.update({"kind": kind, "simulated": header.simulated, "header_json": header.model_dump_json()})
+            entry.attrs["facts_json"] = "{}"
+            entry["title"] = header.title
+            entry["rows_done"] = 0
+            data = entry.create_group("data")
+            data.attrs.update({"NX_class": "NXdata", "signal": next(iter(planes))})
+            for name, plane in planes.items():
+                dataset = _early(data, name, (*plane.leading, *shape), plane.dtype)
+                dataset.attrs.update({"units": plane.units, "long_name": plane.long_name})
+            write_steps(entry, steps)
+            self._h5.flush()
+        except OSError as error:
+            raise ProductError(f"{self._partial} cannot be written ({error}). Free space, or give --out.") from error
+
+    def write(self, rows: slice, **blocks: NDArray[Any]) -> None:
+        """Store the blocks (leading..., rows, columns) of some datasets, and remember that the rows are done."""
+        data = self._h5["entry/data"]
+        for name, block in blocks.items():
+            data[name][..., rows, :] = block
+        # Values first, then the count of rows that can be trusted: a kill between the two only repeats work.
+        self._h5.flush()
+        self._h5["entry/rows_done"][...] = rows.stop
+
+    def get(self, name: str, rows: slice = slice(None)) -> NDArray[Any]:
+        """What has been written so far: dataset (leading..., rows, columns)."""
+        return np.asarray(self._h5["entry/data"][name][..., rows, :])
+
+    def array(self, name: str, values: NDArray[Any], units: str, long_name: str) -> None:
+        """Store something that is not per pixel (W, a curve) in /entry/reduction."""
+        group = self._h5["entry"].require_group("reduction")
+        group.attrs["NX_class"] = "NXcollection"
+        if name in group:
+            del group[name]
+        group.create_dataset(name, data=values).attrs.update({"units": units, "long_name": long_name})
+
+    def seal(self, facts: Mapping[str, Any]) -> Path:
+        """Add the facts (JSON-able: numbers, warnings), close, and give the file its name."""
+        self._h5["entry"].attrs["facts_json"] = json.dumps(dict(facts), default=jsonable)
+        self._h5.close()
+        os.replace(self._partial, self.path)
+        return self.path
+
+    def close(self) -> None:
+        """Close without sealing; the partial file can be resumed."""
+        self._h5.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+
+class Product:
+    """One product file, open for reading.
+
+    Attributes
+    ----------
+    kind : str; "mueller", "stokes", ...
+    simulated : bool
+    header : CaptureHeader of the capture it comes from
+    steps : provenance, oldest first
+    facts : dict of numbers and warnings of the last step
+    shape : (rows, columns)
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        if not self.path.exists():
+            raise ProductError(f"{self.path}: no such file. `process reduce` prints the name of what it writes.")
+        try:
+            self._h5 = h5py.File(self.path, "r")
+        except OSError as error:
+            raise ProductError(
+                f"{self.path} cannot be opened as HDF5 ({error}); it is truncated or no product."
+            ) from error
+        if "umov_product" not in self._h5.attrs:
+            self._h5.close()
+            raise ProductError(
+                f"{self.path} is not a product of `process`. A capture goes through `process reduce` first."
+            )
+        if int(self._h5.attrs["umov_product"]) > PRODUCT_VERSION:
+            found = int(self._h5.attrs["umov_product"])
+            self._h5.close()
+            raise ProductError(f"{self.path} has product version {found}; this program reads up to {PRODUCT_VERSION}.")
+        entry = self._h5["entry"]
+        self.kind = str(entry.attrs["kind"])
+        self.simulated = bool(entry.attrs["simulated"])
+        self.header = CaptureHeader.model_validate_json(entry.attrs["header_json"])
+        self.facts: dict[str, Any] = json.loads(entry.attrs["facts_json"])
+        self.steps = read_steps(entry)
+        self.names: tuple[str, ...] = tuple(entry["data"])
+        self.shape: tuple[int, int] = tuple(entry["data"][entry["data"].attrs["signal"]].shape[-2:])
+
+    def require(self, *kinds: str) -> None:
+        """Raise ProductError unless the product is of one of the kinds."""
+        if self.kind not in kinds:
+            raise ProductError(f"{self.path} holds a {self.kind} image; this needs: {', '.join(kinds)}.")
+
+    def get(self, name: str, rows: slice = slice(None)) -> NDArray[Any]:
+        """Dataset (leading..., rows, columns)."""
+        if name not in self.names:
+            raise ProductError(f"{self.path} has no {name!r}; it has: {', '.join(self.names)}.")
+        return np.asarray(self._h5["entry/data"][name][..., rows, :])
+
+    def units(self, name: str) -> str:
+        """Unit of a dataset."""
+        return str(self._h5["entry/data"][name].attrs["units"])
+
+    def long_name(self, name: str) -> str:
+        """What a dataset is, in one line."""
+        return str(self._h5["entry/data"][name].attrs["long_name"])
+
+    def array(self, name: str) -> NDArray[Any]:
+        """An array of /entry/reduction that is not per pixel, such as the measurement matrix."""
+        return np.asarray(self._h5[f"entry/reduction/{name}"][...])
+
+    def row_blocks(self, pixels: int = 1 << 17) -> Iterable[slice]:
+        """Row slices of about `pixels` pixels."""
+        step = max(1, pixels // max(self.shape[1], 1))
+        return [slice(k, min(k + step, self.shape[0])) for k in range(0, self.shape[0], step)]
+
+    def close(self) -> None:
+        """Close the file."""
+        self._h5.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+
+def is_product(path: Path) -> bool:
+    """Whether a file is a product of `process` (and not a capture, or anything else)."""
+    try:
+        with h5py.File(path, "r") as h5:
+            return "umov_product" in h5.attrs
+    except OSError:
+        return False
+
+
+def _early(parent: h5py.Group, name: str, shape: tuple[int, ...], dtype: Any) -> h5py.Dataset:
+    # Contiguous and allocated now: a full disc fails at the start, and a killed run leaves a readable file.
+    create = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    create.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    create.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+    space = h5py.h5s.create_simple(shape)
+    kind = h5py.h5t.py_create(np.dtype(dtype), logical=True)
+    return h5py.Dataset(h5py.h5d.create(parent.id, name.encode(), kind, space, dcpl=create))

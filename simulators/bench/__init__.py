@@ -1,0 +1,1 @@
+"""The optical bench: scene, optics, what they do undeclared; angles in, counts out."""

@@ -1,0 +1,73 @@
+"""A whole capture file straight from the simulated bench, without drivers or motors: for virtual experiments."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from processing.instrument.model import InstrumentModel
+from processing.instrument.states import RGB950_RATIO, RGB950_STATES, RGB950_STEP_DEG
+from processing.storage.capture_schema import CaptureHeader, Sample, create_layout, write_closing
+from simulators.bench.bench import SimulatedBench
+
+
+def write_virtual_capture(
+    path: Path,
+    bench: SimulatedBench,
+    instrument: InstrumentModel,
+    omega_deg: float,
+    exposure_s: float = 0.02,
+    states: int = RGB950_STATES,
+    darks: int = 4,
+    name: str = "virtual",
+) -> None:
+    """Take `darks` dark states and `states` states of the sample, and write them as a simulated capture.
+
+    Parameters
+    ----------
+    bench : with its scene, true optics and wavelength.
+    instrument : the model declared in the file, all wavelengths; with a mosaic, every state is alike.
+    """
+    axes = instrument.axes
+    psg = RGB950_STEP_DEG * np.arange(states)
+    turned = {"psg": psg, "psa": RGB950_RATIO * psg}
+    unknown = [axis for axis in axes if axis not in turned]
+    if unknown:
+        raise ValueError(f"virtual captures turn psg and psa only; the instrument has {', '.join(unknown)}")
+    angles = {axis: np.concatenate([np.zeros(darks), turned[axis]]) for axis in axes}
+    header = CaptureHeader(
+        title=f"{name} {bench.wavelength_nm:g} nm omega {omega_deg:g}",
+        simulated=True,
+        mode="stokes" if instrument.mosaic else "drr",
+        wavelength_nm=bench.wavelength_nm,
+        omega_deg=omega_deg,
+        sample=Sample(name=name),
+        detector=bench.detector,
+        mosaic=instrument.mosaic,
+        instrument_yaml=_yaml(instrument),
+        seed=bench.seed,
+    )
+    role = ("dark",) * darks + ("sample",) * states
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    with h5py.File(path, "w") as h5:
+        create_layout(h5, header, angles, role, (bench.rows, bench.columns), np.uint16, now)
+        frames = h5["entry/instrument/detector/data"]
+        for k in range(len(role)):
+            here = {axis: float(values[k]) for axis, values in angles.items()}
+            frames[k, 0] = bench.expose(here, exposure_s, k, light=k >= darks, omega_deg=omega_deg)
+            for axis in axes:
+                h5[f"entry/instrument/{axis}/value"][k] = angles[axis][k]
+        h5["entry/states/exposure_s"][...] = exposure_s
+        if "repeats" in h5["entry/states"]:
+            h5["entry/states/repeats"][...] = 1
+        h5["entry/states/done"][...] = 1
+        write_closing(h5, "complete", "{}")
+
+
+def _yaml(instrument: InstrumentModel) -> str:
+    from processing.yaml_file import dump_yaml
+
+    return dump_yaml(instrument)

@@ -1,0 +1,1 @@
+"""A GigE Vision camera on loopback that shows pixels of the bench."""

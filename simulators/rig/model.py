@@ -1,0 +1,71 @@
+"""The `simulator` section of a rig file: emulators, the scene, and the truth that the declared rig may not know."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from processing.storage.capture_schema import Detector
+from simulators.bench.bench import DARK_CURRENT_E_PER_S, DETECTOR
+from simulators.bench.faults import AnyBenchFault
+
+#: A device whose port reads `sim:NAME` stands at the emulator of that name.
+SCHEME = "sim:"
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class SimulatedPort(_Part):
+    """An emulated controller behind a pseudo-terminal; `faults` as in `simulate serve`, e.g. "garbled@12x1"."""
+
+    kind: str
+    axes: int | None = None
+    speed_deg_s: float = Field(default=300.0, gt=0)
+    acceleration_deg_s2: float = Field(default=1500.0, gt=0)
+    limits_deg: tuple[float | None, float | None] | None = None
+    homed: bool = False
+    faults: tuple[str, ...] = ()
+
+
+class SimulatedAxis(_Part):
+    """Where an axis of the rig is emulated: which port, and which axis of that controller, from 0."""
+
+    port: str
+    index: int = Field(default=0, ge=0)
+
+
+class SimulatorConfig(_Part):
+    """What stands behind a simulated rig.
+
+    `truth` names, for each mode, the instrument that the bench really has where it differs from the declared one;
+    `detector` the same for the detector. `stamp` writes the true axis angles into the first pixels of each frame.
+    """
+
+    seed: int = 1
+    clock_speed: float = Field(default=10.0, gt=0, description="simulated seconds for a real second")
+    rows: int = Field(default=600, gt=0)
+    columns: int = Field(default=600, gt=0)
+    ports: dict[str, SimulatedPort]
+    axes: dict[str, SimulatedAxis]
+    samples: dict[str, Path]
+    truth: dict[str, Path] = {}
+    detector: Detector = DETECTOR
+    flux_e_per_s: float = Field(gt=0, description="electrons a second where a . M . g is 1")
+    dark_current_e_per_s: float = Field(default=DARK_CURRENT_E_PER_S, ge=0)
+    effects: tuple[AnyBenchFault, ...] = ()
+    camera_address: str = Field(default="127.0.0.1", description="loopback address that the camera occupies")
+    camera_wait_s: float = Field(default=10.0, ge=0, description="wait for that address while another run has it")
+    packet_loss: float = Field(default=0.0, ge=0, lt=1)
+    stamp: bool = False
+
+    def below(self, folder: Path) -> SimulatorConfig:
+        """The same with its relative paths made absolute, from `folder`."""
+        return self.model_copy(
+            update={
+                "samples": {name: folder / path for name, path in self.samples.items()},
+                "truth": {name: folder / path for name, path in self.truth.items()},
+            }
+        )

@@ -1,0 +1,85 @@
+"""What `simulate serve` and the tests can choose for an emulated controller."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import simulators.controllers
+from drivers.motion import AxisConfig
+from simulators.clock import Clock
+from simulators.serial.emulator import EmulatedAxis, Emulator
+from simulators.serial.reply_faults import FaultSchedule
+
+
+@dataclass
+class ServeOptions:
+    """Choices for an emulator; None means the default of its kind.
+
+    Attributes
+    ----------
+    model : str or None
+        Model that it says it is.
+    axes : int or None
+        Number of devices, modules or channels.
+    limits_deg : tuple or None
+        Travel of every axis in degrees.
+    speed_deg_s, acceleration_deg_s2 : float
+        A full turn takes 1.4 s with the defaults.
+    homed : bool
+        Start with a reference, at angle zero.
+    true_angle : callable, optional
+        Hidden error: turns the mechanical into the true angle (degrees).
+    """
+
+    model: str | None = None
+    axes: int | None = None
+    limits_deg: tuple[float | None, float | None] | None = None
+    speed_deg_s: float = 300.0
+    acceleration_deg_s2: float = 1500.0
+    homed: bool = False
+    true_angle: Callable[[float], float] | None = None
+    clock: Clock = field(default_factory=Clock)
+    faults: FaultSchedule = field(default_factory=FaultSchedule)
+
+    def axis(self, low_deg: float | None, high_deg: float | None, start_deg: float) -> EmulatedAxis:
+        """Make one axis with these choices."""
+        return EmulatedAxis(
+            self.clock,
+            self.speed_deg_s,
+            self.acceleration_deg_s2,
+            low_deg,
+            high_deg,
+            self.homed,
+            0.0 if self.homed else start_deg,
+            self.true_angle,
+        )
+
+
+def axis_configs(emulator: Emulator, port: str, *, homed: bool = False) -> list[AxisConfig]:
+    """Return a rig entry for every axis of an emulator behind `port`; none for what is not a motion controller.
+
+    Parameters
+    ----------
+    homed : bool
+        State it in the rig entry where the device cannot tell; for an emulator that starts with a reference.
+    """
+    module = importlib.import_module(type(emulator).__module__)
+    configs: list[AxisConfig] = module.axis_configs(emulator, port) if hasattr(module, "axis_configs") else []
+    if homed:
+        configs = [
+            config.model_copy(update={"assume_homed": True}) if "assume_homed" in type(config).model_fields else config
+            for config in configs
+        ]
+    return configs
+
+
+def served_kinds() -> dict[str, Callable[[ServeOptions], Emulator]]:
+    """Find what can be served: the `SERVES` table of every module in `simulators/controllers/` that has one."""
+    kinds: dict[str, Callable[[ServeOptions], Emulator]] = {}
+    for entry in pkgutil.iter_modules(simulators.controllers.__path__):
+        module = importlib.import_module(f"simulators.controllers.{entry.name}")
+        kinds.update(getattr(module, "SERVES", {}))
+    return dict(sorted(kinds.items()))
