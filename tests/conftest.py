@@ -129,7 +129,7 @@ class SyntheticCapture:
                 h5[f"entry/instrument/{axis}/value"][...] = values
             states = h5["entry/states"]
             states["exposure_s"][...], states["repeats"][...], states["done"][...] = exposure_s, repeats, done
-            write_closing(h5, "complete", "{}")
+            write_closing(h5, "complete", {})
         return path
 
 

@@ -7,7 +7,6 @@ thread, while the next state is under way. A finished file loses its `.partial` 
 from __future__ import annotations
 
 import errno
-import json
 import os
 import queue
 import shutil
@@ -165,7 +164,7 @@ class CaptureWriter:
         """
         self._finish()
         try:
-            write_closing(self._h5, status, json.dumps(closing))
+            write_closing(self._h5, status, closing)
             self._h5.flush()
         finally:
             self._h5.close()

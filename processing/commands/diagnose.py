@@ -40,7 +40,7 @@ def diagnose_command(
     """Trace the residual between intensities and model to the effects that explain it; say so if none does."""
     # The problems are many and small: BLAS threads would only wait for one another.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    for target in (write, report):
+    for target in (write, json, report):
         if target is not None and target.exists():
             from processing.errors import ProcessError
 

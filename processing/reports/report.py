@@ -127,6 +127,9 @@ def _capture(path: Path) -> Section:
     with Capture(path) as capture:
         header, closing = capture.header, capture.closing
         warnings = [str(m) for m in closing.get("messages", [])]
+        if cut := closing.get("left_out"):
+            told = ", ".join(f"{number} of {name}" for name, number in cut.items())
+            warnings.append(f"the closing record was too long for its place; left out: {told}")
         if capture.status != "complete":
             warnings.append(f"the capture is {capture.status}: {len(capture.role)} of {capture.planned_states} states")
         saturated = capture.column("saturated_fraction")

@@ -5,6 +5,8 @@ Both writers use it: `acquisition` state by state from the bench, `process impor
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import h5py
@@ -160,19 +162,38 @@ def create_layout(
     _allocated(closing, "json", (256 * 1024,), np.uint8, chunks=None)
 
 
-def write_closing(h5: h5py.File, status: Status, closing_json: str) -> None:
+def write_closing(h5: h5py.File, status: Status, closing: Mapping[str, Any]) -> None:
     """Write the closing record (end time, time ledger, stream statistics, messages) and the status.
 
-    A record that does not fit is cut in its `messages`, which is said in the record by the caller.
+    The room for it was taken when the file was made. A record that is longer loses the newest entries of its longest
+    lists, and says so under `left_out`: a capture is sealed whatever happened in it.
     """
     box = h5["entry/closing/json"]
-    raw = np.frombuffer(closing_json.encode(), dtype=np.uint8)
-    if raw.size > box.shape[0]:
-        raise ValueError(f"closing record of {raw.size} bytes does not fit in {box.shape[0]}")
+    raw = _closing_json(closing, room=box.shape[0])
     padded = np.zeros(box.shape, dtype=np.uint8)
-    padded[: raw.size] = raw
+    padded[: len(raw)] = np.frombuffer(raw, dtype=np.uint8)
     box[...] = padded
     h5["entry"].attrs.modify("status", status)
+
+
+def _closing_json(closing: Mapping[str, Any], room: int) -> bytes:
+    """JSON in at most `room` bytes; `left_out` tells entries of lists, characters of texts and whole values cut."""
+    record, left_out = dict(closing), dict[str, int]()
+    while len(raw := _json(record)) > room:
+        longest = max(set(record) - {"left_out"}, key=lambda name: len(_json(record[name])))
+        value = record.pop(longest)
+        cut = 1
+        if isinstance(value, (list, str)) and len(value) > 1:
+            cut = -(-len(value) // 8)
+            record[longest] = value[:-cut]
+        left_out[longest] = left_out.get(longest, 0) + cut
+        record["left_out"] = left_out
+    return raw
+
+
+def _json(value: Any) -> bytes:
+    # A lone surrogate, from the name of a file, becomes an escape that JSON reads.
+    return json.dumps(value, ensure_ascii=False, default=str).encode(errors="backslashreplace")
 
 
 def _group(parent: h5py.Group, name: str, nx_class: str) -> h5py.Group:

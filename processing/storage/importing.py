@@ -116,7 +116,7 @@ def _write(
     if states.time_s is not None:
         table["host_time_s"][...] = states.time_s
     table["done"][...] = 1
-    write_closing(h5, "complete", f'{{"imported": "{now}"}}')
+    write_closing(h5, "complete", {"imported": now})
 
 
 def _source(request: ImportRequest, states: StatesFile, model: InstrumentModel | None) -> FrameSource:

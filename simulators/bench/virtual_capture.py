@@ -64,7 +64,7 @@ def write_virtual_capture(
         if "repeats" in h5["entry/states"]:
             h5["entry/states/repeats"][...] = 1
         h5["entry/states/done"][...] = 1
-        write_closing(h5, "complete", "{}")
+        write_closing(h5, "complete", {})
 
 
 def _yaml(instrument: InstrumentModel) -> str:

@@ -262,4 +262,4 @@ def write_capture(
         states["host_time_s"][...] = np.arange(n) * 2.0
         states["repeats"][...] = 1
         states["done"][...] = 1
-        write_closing(h5, "complete", "{}")
+        write_closing(h5, "complete", {})

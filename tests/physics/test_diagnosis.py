@@ -239,6 +239,13 @@ def test_what_is_written_is_used_and_nothing_is_overwritten(configs, tmp_path, c
         cli.main(call)
     assert ended.value.code == 2
     assert "exists" in capsys.readouterr().err
+    for name, target in (("--json", out), ("--report", report)):
+        kept = target.read_bytes()
+        with pytest.raises(SystemExit) as ended:
+            cli.main([*call[:3], name, str(target)])
+        assert ended.value.code == 2
+        assert f"{target} exists and is not replaced" in capsys.readouterr().err
+        assert target.read_bytes() == kept
 
 
 def test_reduce_with_the_written_model_is_closer_to_the_truth(configs, tmp_path):
