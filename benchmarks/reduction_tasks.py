@@ -15,11 +15,11 @@ from drivers.motion import Position
 from processing.computing.threads import for_ranges
 from processing.diagnosis.instrument.run import diagnose_captures
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
-from processing.instrument.noise import NoiseModel
 from processing.instrument.states import rotating_retarders
 from processing.reduction.counts_to_signal import BlockReader, Correction
 from processing.reduction.effects_of_capture import capture_changes
 from processing.reduction.mueller import BLOCK_PIXELS, field_of, measurement_matrix, sample_states
+from processing.reduction.noise import NoiseModel
 from processing.reduction.solvers.field import FieldSolver
 from processing.reduction.solvers.inversion import Inversion
 from processing.reduction.solvers.plain import MuellerSolver

@@ -41,9 +41,10 @@ def serve(
 ) -> None:
     """Serve an emulated controller until SIGTERM; the first line of output is the path of its port."""
     from simulators.clock import Clock
+    from simulators.rig.controller_kinds import served_kinds
     from simulators.serial.pty_port import PtyPort
     from simulators.serial.reply_faults import FaultSchedule, parse_fault
-    from simulators.serial.serve import ServeOptions, served_kinds
+    from simulators.serial.serve_options import ServeOptions
 
     kinds = served_kinds()
     if kind not in kinds:

@@ -10,14 +10,11 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from acquisition.commands import by_hand as hand_commands
+from acquisition.commands import by_hand
+from acquisition.commands.defaults import INTERRUPTED, RigFile
 
 if TYPE_CHECKING:
     from acquisition.stop_request import StopRequest
-
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-DEFAULT_RIG = CONFIGS / "rigs" / "simulated.yaml"
-INTERRUPTED = 130
 
 app = typer.Typer(
     name="acquire",
@@ -31,7 +28,6 @@ app = typer.Typer(
 Omega = Annotated[float | None, typer.Option("--omega", help="angle between source and camera, degrees")]
 ModeName = Annotated[str | None, typer.Option("--mode", help="drr (Mueller image) or stokes (one generator state)")]
 Wavelength = Annotated[float | None, typer.Option("--wavelength", help="nm")]
-RigFile = Annotated[Path | None, typer.Option("--rig", help="rig file; without it the SIMULATED rig")]
 PlanFile = Annotated[Path | None, typer.Option("--plan", help="plan file; options override it")]
 
 
@@ -78,7 +74,7 @@ def capture(
     raise typer.Exit(_stoppable(lambda stop: campaign_command.run(options, campaign, stop)))
 
 
-hand_commands.register(app)
+by_hand.register(app)
 
 
 def _stoppable(action: Callable[[StopRequest], int]) -> int:

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from acquisition.commands.defaults import DEFAULT_RIG, RigFile
+
 if TYPE_CHECKING:
     from acquisition.rig.config import RigConfig
-
-RigFile = Annotated[Path | None, typer.Option("--rig", help="rig file; without it the SIMULATED rig")]
 
 
 def register(app: typer.Typer) -> None:
@@ -149,7 +149,6 @@ def snap(
 def _load(rig: Path | None) -> RigConfig:
     from rich.console import Console
 
-    from acquisition.commands.application import DEFAULT_RIG
     from acquisition.commands.single import say_simulated
     from acquisition.rig.config import load_rig
 

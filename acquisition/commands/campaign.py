@@ -16,7 +16,7 @@ from acquisition.campaign.plan import Campaign
 from acquisition.campaign.run import CampaignRun, Planned
 from acquisition.capture.checks import Check, refuse_failed
 from acquisition.capture.operator import Operator
-from acquisition.commands.application import DEFAULT_RIG, INTERRUPTED
+from acquisition.commands.defaults import DEFAULT_RIG, INTERRUPTED
 from acquisition.commands.single import Options, live_page, say_simulated, seeded, show_checks
 from acquisition.rig.config import load_rig
 from acquisition.rig.rig import Rig

@@ -19,7 +19,7 @@ from acquisition.capture.header import default_name
 from acquisition.capture.job import Job, Result, check_with_devices, job_of, prepare
 from acquisition.capture.operator import Operator
 from acquisition.capture.plan import MeasurementPlan
-from acquisition.commands.application import CONFIGS, DEFAULT_RIG, INTERRUPTED
+from acquisition.commands.defaults import CONFIGS, DEFAULT_RIG, INTERRUPTED
 from acquisition.rig.config import RigConfig, load_rig
 from acquisition.rig.rig import Rig
 from acquisition.screen.observer import Observer

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.errors import NotDetermined, ProcessError
-from processing.instrument.noise import QUANTIZATION, NoiseModel
 from processing.reduction.black import Black
-from processing.reduction.counts_to_signal import Mask
+from processing.reduction.noise import QUANTIZATION, NoiseModel
 from processing.storage.capture import Capture
+from processing.storage.pixel_mask import Mask
 from processing.storage.product import Plane, Product, ProductWriter, Step
 
 #: Levels between black and the brightest pixel at which the variance is taken.

@@ -113,7 +113,7 @@ def reduce_file(path: Path, out: Path | None, options: ReduceOptions, overwrite:
                     "--weighted, --covariance and --physical are for Mueller captures."
                 )
             # Imported here: OpenCV is not needed for a Mueller capture.
-            from processing.calibration.mosaic import read_response
+            from processing.reduction.mosaic.pixel_response import read_response
             from processing.reduction.stokes import DEFAULT_METHOD, reduce_stokes
 
             method = options.demosaic or DEFAULT_METHOD

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from processing.instrument.noise import NoiseModel
+from processing.reduction.noise import NoiseModel
 from processing.storage.capture import Capture
 
 Array = NDArray[np.float64]

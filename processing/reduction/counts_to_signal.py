@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntFlag
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,20 +14,7 @@ from processing.reduction.effects_of_capture import CountsCorrection
 from processing.reduction.flat import Flat
 from processing.reduction.move_image import REACH, shifted_back
 from processing.storage.capture import Capture, CaptureError
-
-
-class Mask(IntFlag):
-    """Bits of `pixel_mask` in every product; 0 is a good pixel."""
-
-    SATURATED = 1  # some state was at the top of the range and was left out
-    NOT_FINITE = 2  # some state has no number there
-    BAD = 4  # listed as a bad pixel
-    NOT_DETERMINED = 8  # too few states are left
-
-    @classmethod
-    def meaning(cls) -> str:
-        """The bits in words, for the file."""
-        return ", ".join(f"{flag.value} = {flag.name.lower().replace('_', ' ')}" for flag in cls if flag.name)
+from processing.storage.pixel_mask import Mask
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.instrument.noise import NoiseModel
-from processing.reduction.counts_to_signal import Correction, Mask
+from processing.reduction.counts_to_signal import Correction
+from processing.reduction.noise import NoiseModel
 from processing.reduction.solvers.inversion import Inversion
 from processing.storage.capture import CaptureError
+from processing.storage.pixel_mask import Mask
 from processing.storage.product import LIT_ERRORS, ProductWriter
 
 #: Above this median, the model and not the noise makes the residual (the median of a good one is within 0.1 of 1).

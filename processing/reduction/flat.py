@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.instrument.noise import NoiseModel
 from processing.reduction.black import Black
+from processing.reduction.noise import NoiseModel
 from processing.storage.capture import Capture, CaptureError
 
 #: A response below this is a dead pixel; dividing by less would blow its noise up without end.

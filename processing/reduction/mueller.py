@@ -17,15 +17,17 @@ from numpy.typing import NDArray
 from processing.errors import ProcessError
 from processing.instrument.changes import Changes
 from processing.instrument.model import InstrumentModel
-from processing.instrument.noise import NoiseModel
 from processing.polarization.physical import nearest
-from processing.reduction.counts_to_signal import BlockReader, Correction, Mask
+from processing.reduction.counts_to_signal import BlockReader, Correction
 from processing.reduction.effects_of_capture import capture_changes, counts_correction, extra_retardance, with_extra
 from processing.reduction.facts import mueller_facts
+from processing.reduction.noise import NoiseModel
 from processing.reduction.solvers.field import Field, FieldSolver
 from processing.reduction.solvers.inversion import ELEMENTS, Inversion
 from processing.reduction.solvers.plain import MuellerSolver
 from processing.storage.capture import Capture, CaptureError
+from processing.storage.mueller_planes import MUELLER_PLANES
+from processing.storage.pixel_mask import Mask
 from processing.storage.product import Plane, ProductWriter, Step
 
 if TYPE_CHECKING:
@@ -37,13 +39,6 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int], None]
 
 BLOCK_PIXELS = 1 << 18
-
-PLANES = {
-    "mueller": Plane((4, 4), "count", "Mueller matrix, row-major, not normalized"),
-    "mueller_errors": Plane((4, 4), "count", "standard errors of mueller"),
-    "residual_rms": Plane((), "count", "root mean square over the states of intensity minus fit"),
-    "pixel_mask": Plane((), "", f"0 = good; bits: {Mask.meaning()}", np.uint8),
-}
 
 CHI_SQUARE = Plane((), "", "squared residual over what the noise model expects; 1 if the model is complete")
 COVARIANCE = Plane(
@@ -95,7 +90,7 @@ class Choice:
 
     def planes(self, known_noise: bool) -> dict[str, Plane]:
         """Datasets of the product."""
-        planes = dict(PLANES)
+        planes = dict(MUELLER_PLANES)
         if known_noise:
             planes["reduced_chi_square"] = CHI_SQUARE
         if self.covariance:

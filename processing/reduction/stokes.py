@@ -8,20 +8,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.calibration.mosaic import correct
 from processing.errors import NotDetermined
 from processing.instrument.changes import Changes
 from processing.instrument.model import InstrumentModel
-from processing.instrument.noise import NoiseModel
-from processing.reduction.counts_to_signal import Correction, Mask
+from processing.reduction.counts_to_signal import Correction
 from processing.reduction.effects_of_capture import capture_changes, counts_correction
 from processing.reduction.facts import in_words
 from processing.reduction.mosaic.layout import MosaicLayout
 from processing.reduction.mosaic.merge import MergedFrame, merge
 from processing.reduction.mosaic.methods import demosaic
 from processing.reduction.mosaic.noise import stokes_covariance
+from processing.reduction.mosaic.pixel_response import corrected_frame
 from processing.reduction.mueller import Progress, sample_states
+from processing.reduction.noise import NoiseModel
 from processing.storage.capture import Capture, CaptureError
+from processing.storage.pixel_mask import Mask
 from processing.storage.product import LIT_ERRORS, Plane, ProductWriter, Step
 
 #: The method that docs/mosaic.md found best.
@@ -114,7 +115,7 @@ def reduce_stokes(
     merged = merge(capture, states, correction, noise, counts_correction(changes, model), progress)
     frame = merged.signal
     if response is not None:
-        frame = correct(frame, response, layout, analyzers)
+        frame = corrected_frame(frame, response, layout, analyzers)
     channels = demosaic(frame, layout, method)
     found = stokes(channels, analyzers, layout, method, merged, frame)
     found["pixel_mask"] = _spread(merged.mask, channels.shape[1:])

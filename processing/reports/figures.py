@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,21 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.errors import ProcessError
+from processing.reports.figure_style import (
+    CYCLIC,
+    WORST_ORIENTATION_DEG,
+    entitle,
+    grid_figure,
+    map_figure,
+    percentile,
+    thin,
+)
+from processing.reports.quantities_figures import quantities_figure
 from processing.storage.product import LIT_ERRORS, Product
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Longest side of a panel in pixels; larger images are thinned before drawing, which changes no file.
-PANEL_PIXELS = 600
-SIMULATED = "SIMULATED"
-PAGE_DPI = 100
 #: A standard error of xi0 above this is no knowledge of it: valid values lie between 0.25 and 1.
 UNKNOWN_XI0 = 0.1
-#: Orientation is drawn in grey where its standard error is above this: it is not known there.
-WORST_ORIENTATION_DEG = 20.0
-#: Keywords of `imshow` for orientations.
-CYCLIC = {"cmap": "twilight", "vmin": 0, "vmax": 180}
 
 
 def draw_product(path: Path, figure: Path) -> None:
@@ -60,11 +60,11 @@ def product_figure(product: Product) -> Figure:
     if product.kind == "xi0":
         xi0, errors, valid = (thin(product.get(name)) for name in ("xi0", "xi0_errors", "valid"))
         shown = np.where(valid > 0, xi0, np.nan)
-        limit = max(_percentile(errors[valid > 0], 95), 1e-6)
+        limit = max(percentile(errors[valid > 0], 95), 1e-6)
         known = np.where(errors <= UNKNOWN_XI0, errors, np.nan)
         label = f"standard error of $\\xi_0$ (grey: > {UNKNOWN_XI0:g})"
         panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = [
-            ("$\\xi_0$ where valid", shown, {"cmap": "viridis", "vmin": 0.25, "vmax": _percentile(shown, 99.8)}),
+            ("$\\xi_0$ where valid", shown, {"cmap": "viridis", "vmin": 0.25, "vmax": percentile(shown, 99.8)}),
             (
                 label,
                 known,
@@ -74,8 +74,6 @@ def product_figure(product: Product) -> Figure:
         ]
         return map_figure(panels, _title(product), product.simulated)
     if product.kind == "quantities":
-        from processing.reports.quantities_figures import quantities_figure
-
         return quantities_figure(product, _title(product))
     if product.kind == "camera":
         return photon_transfer_figure(product)
@@ -95,7 +93,7 @@ def mueller_figure(elements: NDArray[Any], lit: NDArray[np.bool_], title: str, s
     with np.errstate(divide="ignore", invalid="ignore"):
         normalized = np.where(lit, elements / m00, np.nan)
     rest = np.abs(normalized.reshape(16, *m00.shape)[1:])
-    limit = float(np.clip(_percentile(rest, 99.5), 1e-6, 1.0))
+    limit = float(np.clip(percentile(rest, 99.5), 1e-6, 1.0))
     figure = Figure(figsize=(9.5, 8.6 * max(0.45, m00.shape[0] / max(m00.shape[1], 1)) + 0.8), layout="constrained")
     panels = figure.subplots(4, 4)
     shown: Any = None
@@ -107,12 +105,12 @@ def mueller_figure(elements: NDArray[Any], lit: NDArray[np.bool_], title: str, s
             panel.set_facecolor("0.85")
             panel.set_title(f"$m_{{{i}{j}}}$", fontsize=9, pad=2)
             if i == j == 0:
-                panel.imshow(m00, cmap="gray", vmin=0, vmax=max(_percentile(m00, 99.5), 1e-30))
+                panel.imshow(m00, cmap="gray", vmin=0, vmax=max(percentile(m00, 99.5), 1e-30))
                 continue
             shown = panel.imshow(normalized[i, j], cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
     label = "$m_{ij}/m_{00}$, instrument frames (first panel: $m_{00}$; plain grey: too dark)"
     figure.colorbar(shown, ax=panels, shrink=0.8, label=label)
-    _entitle(figure, title, simulated)
+    entitle(figure, title, simulated)
     return figure
 
 
@@ -126,37 +124,6 @@ def stokes_figure(maps: dict[str, NDArray[Any]], title: str, simulated: bool) ->
         ("angle of linear polarization, PSA frame / degrees", angle, CYCLIC),
     ]
     return grid_figure(panels, title, simulated)
-
-
-def map_figure(panels: Sequence[tuple[str, NDArray[Any], dict[str, Any]]], title: str, simulated: bool) -> Figure:
-    """Maps side by side; each is (label, values (rows, columns), keywords of imshow such as cmap, vmin, vmax)."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(0.6 + 4.3 * len(panels), 4.2), layout="constrained")
-    axes = figure.subplots(1, len(panels), squeeze=False)[0]
-    for axis, (label, values, keywords) in zip(axes, panels, strict=True):
-        _map(figure, axis, values, label, **keywords)
-    _entitle(figure, title, simulated)
-    return figure
-
-
-def grid_figure(
-    panels: Sequence[tuple[str, NDArray[Any], dict[str, Any]]], title: str, simulated: bool, columns: int = 4
-) -> Figure:
-    """Maps in rows of `columns`, as in `map_figure`; where no `vmax` is given it is the 99.5th percentile."""
-    from matplotlib.figure import Figure
-
-    shape = panels[0][1].shape
-    rows = -(-len(panels) // columns)
-    high = 0.5 + 3.6 * max(0.4, shape[0] / max(shape[1], 1))
-    figure = Figure(figsize=(4.25 * min(columns, len(panels)), 0.6 + rows * high), layout="constrained")
-    axes = figure.subplots(rows, min(columns, len(panels)), squeeze=False)
-    for axis in axes.flat[len(panels) :]:
-        axis.set_axis_off()
-    for axis, (label, values, keywords) in zip(axes.flat, panels, strict=False):
-        _map(figure, axis, values, label, **({"vmax": max(_percentile(values, 99.5), 1e-30)} | keywords))
-    _entitle(figure, title, simulated)
-    return figure
 
 
 def photon_transfer_figure(product: Product) -> Figure:
@@ -176,21 +143,8 @@ def photon_transfer_figure(product: Product) -> Figure:
     lower.axhline(0, color="black", linewidth=0.8)
     lower.set_ylabel("residual / %")
     lower.set_xlabel("signal above black / counts")
-    _entitle(figure, f"photon transfer: {product.header.title}", product.simulated)
+    entitle(figure, f"photon transfer: {product.header.title}", product.simulated)
     return figure
-
-
-def png(figure: Figure) -> bytes:
-    """A figure as a PNG for a page."""
-    out = BytesIO()
-    figure.savefig(out, format="png", dpi=PAGE_DPI)
-    return out.getvalue()
-
-
-def thin(image: NDArray[Any]) -> NDArray[Any]:
-    """Every k-th row and column, so that the longer side is at most PANEL_PIXELS."""
-    step = max(1, -(-max(image.shape[-2:]) // PANEL_PIXELS))
-    return image[..., ::step, ::step]
 
 
 def _lit(intensity: NDArray[Any], error: NDArray[Any]) -> NDArray[np.bool_]:
@@ -199,27 +153,7 @@ def _lit(intensity: NDArray[Any], error: NDArray[Any]) -> NDArray[np.bool_]:
         return np.asarray(intensity > LIT_ERRORS * np.nan_to_num(error))
 
 
-def _map(figure: Figure, axis: Any, values: NDArray[Any], label: str, **keywords: Any) -> None:
-    shown = axis.imshow(values, interpolation="nearest", **keywords)
-    axis.set_title(label, fontsize=10)
-    axis.set_facecolor("0.85")
-    axis.set_xticks([])
-    axis.set_yticks([])
-    figure.colorbar(shown, ax=axis, shrink=0.85)
-
-
-def _entitle(figure: Figure, title: str, simulated: bool) -> None:
-    figure.suptitle(
-        f"{SIMULATED}   {title}" if simulated else title, color="darkred" if simulated else "black", fontsize=11
-    )
-
-
 def _title(product: Product) -> str:
     header = product.header
     wavelength = f"{header.wavelength_nm:g} nm"
     return header.title if wavelength in header.title else f"{header.title}, {wavelength}"
-
-
-def _percentile(values: NDArray[Any], percent: float) -> float:
-    finite = values[np.isfinite(values)]
-    return float(np.percentile(finite, percent)) if finite.size else 1.0

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.polarization import gradients
-from processing.reports.figures import CYCLIC, PANEL_PIXELS, WORST_ORIENTATION_DEG, grid_figure
+from processing.reports.figure_style import CYCLIC, PANEL_PIXELS, WORST_ORIENTATION_DEG, grid_figure
 from processing.storage.images import MuellerImage
 from processing.storage.product import LIT_ERRORS, Product
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.polarization.quantities import PAPER_PAIRS
-from processing.reports.figures import CYCLIC, WORST_ORIENTATION_DEG, grid_figure, thin
+from processing.reports.figure_style import CYCLIC, WORST_ORIENTATION_DEG, grid_figure, percentile, thin
 from processing.storage.product import Product
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def quantities_figure(product: Product, title: str) -> Figure:
         return text if np.isnan(middle) else f"{text}   ($\\pm$ {middle:.2g})"
 
     xi, deviation = get("coherency_eigenvalues"), get("eigenvalue_deviation")
-    spread = max(_percentile(np.abs(deviation), 99), 1e-6)
+    spread = max(percentile(np.abs(deviation), 99), 1e-6)
     signed = {"cmap": "RdBu_r", "vmin": -spread, "vmax": spread}
     panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = [
         (label(r"$\xi_0$", "coherency_eigenvalues"), xi[0], {"vmin": 0.25}),
@@ -63,8 +63,3 @@ def quantities_figure(product: Product, title: str) -> Figure:
             text = name.replace("_", " ") + " over $m_{00}$"
             panels.append((label(text, name), get(name), {"cmap": "gray", "vmin": 0}))
     return grid_figure(panels, f"{title}\n($\\pm$: median standard error of a pixel)", product.simulated)
-
-
-def _percentile(values: NDArray[Any], percent: float) -> float:
-    finite = values[np.isfinite(values)]
-    return float(np.percentile(finite, percent)) if finite.size else 1.0

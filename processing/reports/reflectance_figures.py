@@ -55,7 +55,7 @@ def tables_figure(
     reference: ScatteringTable, other: ScatteringTable, view: ViewingGeometry, omega_deg: float, shape: tuple[int, int]
 ) -> Figure:
     """xi0 of two tables on a virtual object, and their difference."""
-    from processing.reports.figures import grid_figure
+    from processing.reports.figure_style import grid_figure
 
     image = view.at(omega_deg, *shape)
     a, b = (image.fill(t.lookup(image.points.angles)[0]) for t in (reference, other))

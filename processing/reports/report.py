@@ -14,7 +14,8 @@ import numpy as np
 
 from processing.errors import ProcessError
 from processing.reflectance.tables import ScatteringTable, is_table
-from processing.reports.figures import map_figure, png, product_figure, thin
+from processing.reports.figure_style import map_figure, png, thin
+from processing.reports.figures import product_figure
 from processing.reports.mueller_maps import mueller_maps
 from processing.reports.tables import table_section
 from processing.reports.template import Figure, Section, render

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from processing.reflectance.table_axes import SHAPE
 from processing.reflectance.tables import ScatteringTable
-from processing.reports.figures import map_figure, png
+from processing.reports.figure_style import map_figure, png
 from processing.reports.template import Figure, Section
 
 

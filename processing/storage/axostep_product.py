@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from processing.reduction.counts_to_signal import Mask
-from processing.reduction.mueller import PLANES
 from processing.storage.axostep import AxoStepError, MuellerFile, read_mueller_file, write_mueller_file
 from processing.storage.capture_schema import CaptureHeader
+from processing.storage.mueller_planes import MUELLER_PLANES
+from processing.storage.pixel_mask import Mask
 from processing.storage.product import Product, ProductWriter, Step, file_identity
 
 
@@ -51,7 +51,7 @@ def product_of_axostep(
         "weighted": False,
         "warnings": ["the file holds no standard errors and no raw intensities"],
     }
-    with ProductWriter(out, "mueller", header, (rows, columns), PLANES, (step,), overwrite) as writer:
+    with ProductWriter(out, "mueller", header, (rows, columns), MUELLER_PLANES, (step,), overwrite) as writer:
         # One intensity an element, whose noise is not known: readers of products then give NaN as standard error.
         writer.array("measurement_matrix", np.eye(16), "", "identity: the file holds elements, not intensities")
         for name in ("noise_slope", "noise_floor"):

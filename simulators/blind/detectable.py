@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.diagnosis.instrument.capture_data import CaptureData, read_capture
+from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import pool
 from processing.diagnosis.search.fit import minimize

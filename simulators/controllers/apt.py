@@ -9,7 +9,7 @@ from drivers.axes.apt import Config
 from simulators.clock import Clock
 from simulators.serial.emulator import EmulatedAxis, Emulator
 from simulators.serial.reply_faults import FaultSchedule
-from simulators.serial.serve import ServeOptions
+from simulators.serial.serve_options import ServeOptions
 
 HOST, UNIT = 0x01, 0x50
 # A rack answers at 0x11 and its bays from 0x21 on; these units are single ones.

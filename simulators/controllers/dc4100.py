@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from simulators.clock import Clock
 from simulators.serial.emulator import Emulator
 from simulators.serial.reply_faults import FaultSchedule
-from simulators.serial.serve import ServeOptions
+from simulators.serial.serve_options import ServeOptions
 
 #: Half the width of the filter that stands on the bench for each wavelength.
 FILTER_NM = 15.0

@@ -11,7 +11,7 @@ from drivers.axes.elliptec import Config
 from simulators.clock import Clock
 from simulators.serial.emulator import EmulatedAxis, Emulator
 from simulators.serial.reply_faults import FaultSchedule
-from simulators.serial.serve import ServeOptions
+from simulators.serial.serve_options import ServeOptions
 
 PULSES_PER_TURN = 0x23000
 # A gap of this length inside a packet discards it.

@@ -11,7 +11,7 @@ from drivers.axes.esp301 import Config
 from simulators.clock import Clock
 from simulators.serial.emulator import EmulatedAxis, Emulator
 from simulators.serial.reply_faults import FaultSchedule
-from simulators.serial.serve import ServeOptions
+from simulators.serial.serve_options import ServeOptions
 
 ERROR_TEXTS = {
     0: "NO ERROR DETECTED",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from simulators.clock import Clock
 from simulators.serial.emulator import Emulator
 from simulators.serial.reply_faults import FaultSchedule
-from simulators.serial.serve import ServeOptions
+from simulators.serial.serve_options import ServeOptions
 
 PROMPT = b"> "
 

@@ -10,7 +10,7 @@ from drivers.axes.smc100 import Config
 from simulators.clock import Clock
 from simulators.serial.emulator import EmulatedAxis, Emulator
 from simulators.serial.reply_faults import FaultSchedule
-from simulators.serial.serve import ServeOptions
+from simulators.serial.serve_options import ServeOptions
 
 ERROR_TEXTS = {
     "@": "No error",

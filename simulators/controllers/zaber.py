@@ -13,7 +13,7 @@ from drivers.axes.zaber import Config
 from simulators.clock import Clock
 from simulators.serial.emulator import EmulatedAxis, Emulator
 from simulators.serial.reply_faults import FaultSchedule
-from simulators.serial.serve import ServeOptions
+from simulators.serial.serve_options import ServeOptions
 
 # Velocity unit per microstep/s, and acceleration unit per microstep/s^2 (unverified).
 VELOCITY_UNIT = 1.6384

@@ -22,11 +22,12 @@ from simulators.bench.scene import Scene
 from simulators.camera.gige_camera import GigeCamera
 from simulators.camera.pixel_stamp import stamp
 from simulators.clock import Clock
+from simulators.rig.controller_kinds import served_kinds
 from simulators.rig.model import SimulatorConfig
 from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort
 from simulators.serial.reply_faults import FaultSchedule, parse_fault
-from simulators.serial.serve import ServeOptions, served_kinds
+from simulators.serial.serve_options import ServeOptions
 
 #: Exposure indices of one state: tries of it come this far apart.
 RETAKE_STRIDE = 1_000_000

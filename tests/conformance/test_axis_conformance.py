@@ -30,10 +30,11 @@ from drivers.motion import AxisConfig, MotionAxis
 from drivers.registry import axis_kinds, open_axis
 from drivers.serial_link import LineRegistry
 from simulators.clock import Clock
+from simulators.rig.controller_kinds import axis_configs, served_kinds
 from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort
 from simulators.serial.reply_faults import Fault, FaultSchedule
-from simulators.serial.serve import ServeOptions, axis_configs, served_kinds
+from simulators.serial.serve_options import ServeOptions
 
 MOTION_KINDS = [kind for kind, make in served_kinds().items() if axis_configs(make(ServeOptions()), "none")]
 SHARED_LINES = [kind for kind in MOTION_KINDS if not kind.startswith("apt")]

@@ -16,9 +16,10 @@ from drivers.motion import MotionAxis
 from drivers.registry import open_axis
 from drivers.serial_link import LineRegistry
 from simulators.clock import Clock
+from simulators.rig.controller_kinds import axis_configs, served_kinds
 from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort
-from simulators.serial.serve import ServeOptions, axis_configs, served_kinds
+from simulators.serial.serve_options import ServeOptions
 
 FUZZ_S = float(os.environ.get("UMOV_FUZZ_SECONDS", "0.6"))
 KINDS = [kind for kind, make in served_kinds().items() if axis_configs(make(ServeOptions()), "none")]

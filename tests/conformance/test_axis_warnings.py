@@ -10,9 +10,10 @@ from drivers.motion import MotionAxis
 from drivers.registry import open_axis
 from drivers.serial_link import LineRegistry
 from simulators.clock import Clock
+from simulators.rig.controller_kinds import axis_configs, served_kinds
 from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort
-from simulators.serial.serve import ServeOptions, axis_configs, served_kinds
+from simulators.serial.serve_options import ServeOptions
 
 
 @contextmanager

@@ -8,7 +8,8 @@ from ruamel.yaml import YAML
 
 from processing.storage.capture import Capture
 from simulators.camera.pixel_stamp import read_stamp
-from simulators.serial.serve import ServeOptions, axis_configs, served_kinds
+from simulators.rig.controller_kinds import axis_configs, served_kinds
+from simulators.serial.serve_options import ServeOptions
 
 #: Rotators turn freely, where the controller can be without limits; the second pair is for those that always have some.
 FREE = ((None, None), (-400.0, 2000.0))

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processing.diagnosis.instrument.capture_data import read_capture
+from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.instrument.judge import closure
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.run import diagnose_captures
-from processing.diagnosis.instrument.write import extended
+from processing.diagnosis.instrument_file import extended
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture import Capture

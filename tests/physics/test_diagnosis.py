@@ -249,7 +249,7 @@ def test_what_is_written_is_used_and_nothing_is_overwritten(configs, tmp_path, c
 
 
 def test_reduce_with_the_written_model_is_closer_to_the_truth(configs, tmp_path):
-    from processing.diagnosis.instrument.write import write_instrument
+    from processing.diagnosis.instrument_file import write_instrument
     from processing.reduction.mueller import reduce_mueller
     from processing.storage.capture import Capture
     from processing.storage.images import MuellerImage

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processing.diagnosis.instrument.capture_data import CaptureData
+from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.moments import DERIVATIVES, FEATURES, moments_of
 from processing.diagnosis.instrument.projection import add_block, noise_information
 from processing.diagnosis.search.space import Sums

@@ -5,11 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processing.calibration.mosaic import correct, fit_response, read_response
+from processing.calibration.mosaic import fit_response
 from processing.errors import NotDetermined, ProcessError
 from processing.instrument.model import InstrumentModel
 from processing.reduction.mosaic.layout import MosaicError, MosaicLayout
 from processing.reduction.mosaic.methods import demosaic
+from processing.reduction.mosaic.pixel_response import corrected_frame, read_response
 from processing.storage.capture import Capture
 from processing.storage.product import Step
 from processing.yaml_file import parse_yaml
@@ -64,7 +65,7 @@ def test_response_is_found_and_taken_out(turning: InstrumentModel, synthetic_cap
         return float(np.sqrt(np.mean((found - stokes)[inner] ** 2)))
 
     assert error(raw) > 20
-    assert error(correct(raw, response, layout, IDEAL)) < 1.5
+    assert error(corrected_frame(raw, response, layout, IDEAL)) < 1.5
     with pytest.raises(MosaicError, match="frames of"):
         read_response(tmp_path / "a.h5", (10, 10))
 

@@ -11,10 +11,11 @@ import pytest
 from processing.errors import NotDetermined
 from processing.instrument.model import InstrumentModel
 from processing.polarization import mueller
-from processing.reduction.counts_to_signal import Correction, Mask
+from processing.reduction.counts_to_signal import Correction
 from processing.reduction.mueller import reduce_mueller
 from processing.storage.capture import Capture, CaptureError
 from processing.storage.images import MuellerImage
+from processing.storage.pixel_mask import Mask
 from processing.storage.product import Product, ProductError, Step
 
 GAIN, READ_NOISE, BLACK = 2.5, 4.0, 64.0

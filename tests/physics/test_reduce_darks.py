@@ -5,13 +5,13 @@ import pytest
 
 from processing.calibration.train import calibrate
 from processing.instrument.model import InstrumentModel
-from processing.instrument.noise import NoiseModel
 from processing.instrument.states import rotating_retarders
 from processing.reduction.black import Black
 from processing.reduction.counts_to_signal import Correction
 from processing.reduction.mosaic.layout import MosaicLayout
 from processing.reduction.mosaic.merge import merge
 from processing.reduction.mueller import Choice, reduce_mueller, sample_states
+from processing.reduction.noise import NoiseModel
 from processing.reduction.stokes import reduce_stokes
 from processing.storage.capture import Capture, CaptureError
 from processing.storage.images import MuellerImage

@@ -3,8 +3,9 @@
 import pytest
 
 from simulators.clock import ManualClock
+from simulators.rig.controller_kinds import served_kinds
 from simulators.serial.emulator import Emulator
-from simulators.serial.serve import ServeOptions, served_kinds
+from simulators.serial.serve_options import ServeOptions
 
 
 def emulator(kind: str, **options: object) -> tuple[Emulator, ManualClock]:

@@ -13,8 +13,9 @@ from drivers.errors import PermissionRefused, PortBusy, PortNotFound
 from drivers.registry import axis_kinds, open_axis
 from drivers.serial_link import LineRegistry, SerialLink, line_framer
 from simulators.clock import Clock
+from simulators.rig.controller_kinds import axis_configs, served_kinds
 from simulators.serial.pty_port import PtyPort
-from simulators.serial.serve import ServeOptions, axis_configs, served_kinds
+from simulators.serial.serve_options import ServeOptions
 
 
 def zaber_emulator(**options: object):  # type: ignore[no-untyped-def]

@@ -10,7 +10,8 @@ import pytest
 from drivers.registry import open_axis
 from drivers.serial_link import LineRegistry
 from simulators.clock import Clock
-from simulators.serial.serve import ServeOptions, axis_configs, served_kinds
+from simulators.rig.controller_kinds import axis_configs, served_kinds
+from simulators.serial.serve_options import ServeOptions
 
 SERVE = [sys.executable, "-c", "from simulators.cli import main; main()", "serve"]
 KINDS = ["elliptec", "zaber", "apt-k10cr1", "apt-kdc101", "smc100", "esp301"]

@@ -8,9 +8,10 @@ from unittest.mock import MagicMock
 import pytest
 
 from simulators.clock import Clock
+from simulators.rig.controller_kinds import served_kinds
 from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort
-from simulators.serial.serve import ServeOptions, served_kinds
+from simulators.serial.serve_options import ServeOptions
 
 # The warnings that these packages cause are theirs, not ours.
 pytestmark = [pytest.mark.third_party, pytest.mark.filterwarnings("ignore")]

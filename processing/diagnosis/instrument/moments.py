@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.computing.threads import for_ranges
-from processing.diagnosis.instrument.capture_data import CaptureData
+from processing.diagnosis.captured.capture_data import CaptureData
 from processing.reduction.move_image import taps
 
 Array = NDArray[np.float64]

@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.diagnosis.instrument.capture_data import CaptureData
+from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.moments import (
     DERIVATIVES,
     FEATURES,

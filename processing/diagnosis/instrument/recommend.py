@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit
+from processing.diagnosis.search.rules import APART
 from processing.diagnosis.search.space import Space
 from processing.polarization import mueller
 
@@ -23,8 +24,6 @@ SAMPLES: dict[str, NDArray[np.float64]] = {
     "a mirror": mueller.IDEAL_MIRROR,
     "a depolarizing white target (integrating sphere)": mueller.IDEAL_DEPOLARIZER,
 }
-#: Sine of the angle between two signatures from which on a capture tells them apart.
-APART = 0.3
 #: Signature, relative to the signal for a typical size, below which a capture does not see an effect.
 VISIBLE = 1e-4
 

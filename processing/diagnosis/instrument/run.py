@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from processing.diagnosis.instrument.capture_data import CaptureData, read_capture
+from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.instrument.judge import Judged, diagnose
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.search import Say

@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.diagnosis.instrument.capture_data import CaptureData
+from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.moments import DERIVATIVES, FEATURES, Moments, Tiles, tile_products
 from processing.diagnosis.instrument.projection import RANK
 from processing.diagnosis.search.space import Sums

@@ -8,16 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from processing.diagnosis.instrument.capture_data import CaptureData, read_capture
+from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.surface.view import SurfaceView
 from processing.errors import ProcessError
 from processing.geometry.pinhole import PinholeCamera
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.changes import Conditions
 from processing.instrument.model import InstrumentModel
-from processing.instrument.noise import NoiseModel
 from processing.reduction.counts_to_signal import Correction
 from processing.reduction.mueller import sample_states
+from processing.reduction.noise import NoiseModel
 from processing.reflectance.base import ReflectanceModel
 from processing.storage.capture import Capture
 

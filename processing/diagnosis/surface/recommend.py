@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.diagnosis.instrument.recommend import APART
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit
+from processing.diagnosis.search.rules import APART
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.problem import SurfaceProblem
 

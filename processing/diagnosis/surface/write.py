@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from processing.diagnosis.instrument.write import WriteError, extended
+from processing.diagnosis.instrument_file import WriteError, extended
 from processing.diagnosis.surface.judge import SurfaceDiagnosis
 from processing.geometry.sphere import Sphere
 from processing.geometry.viewing import ViewingGeometry

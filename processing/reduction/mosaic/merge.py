@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.instrument.noise import NoiseModel
-from processing.reduction.counts_to_signal import Correction, Mask
+from processing.reduction.counts_to_signal import Correction
 from processing.reduction.effects_of_capture import CountsCorrection
 from processing.reduction.mueller import relative_exposure
+from processing.reduction.noise import NoiseModel
 from processing.storage.capture import Capture
+from processing.storage.pixel_mask import Mask
 
 FloatArray = NDArray[np.float32]
 

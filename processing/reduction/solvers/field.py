@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.computing.threads import for_ranges
-from processing.reduction.counts_to_signal import Mask
 from processing.reduction.solvers.field_matrix import FieldMatrix
 from processing.reduction.solvers.plain import MuellerSolver
+from processing.storage.pixel_mask import Mask
 
 #: Pixels solved at a time, about: whole rows of the image.
 TILE = 2048

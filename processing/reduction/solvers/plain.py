@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.computing.threads import for_ranges
-from processing.instrument.noise import NoiseModel
-from processing.reduction.counts_to_signal import BlockReader, Mask
+from processing.reduction.counts_to_signal import BlockReader
+from processing.reduction.noise import NoiseModel
 from processing.reduction.solvers.inversion import TILE, Inversion
+from processing.storage.pixel_mask import Mask
 
 #: Saturated pixels solved at a time, each with its own matrix.
 REPAIR_BATCH = 4096

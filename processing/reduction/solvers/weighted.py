@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from processing.computing.threads import for_ranges
 from processing.errors import ProcessError
-from processing.instrument.noise import NoiseModel
 from processing.polarization.physical import most_likely
-from processing.reduction.counts_to_signal import Mask
+from processing.reduction.noise import NoiseModel
 from processing.reduction.solvers.plain import LEAST, MuellerSolver
 from processing.reduction.solvers.weighted_kernels import ELEMENTS, PACKED, solve_range
+from processing.storage.pixel_mask import Mask
 
 TILE = 2048
 

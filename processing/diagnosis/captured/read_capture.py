@@ -1,23 +1,22 @@
-"""What `diagnose` keeps of a capture: the signal of all states, its noise, and what is known of the sample."""
+"""Read a capture for `diagnose`: counts above black, what is clipped, cut off or too dark, and the noise."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from processing.calibration.train import known_mueller
+from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captured.noise_estimate import estimated_noise
 from processing.instrument.changes import Conditions, elapsed
 from processing.instrument.model import InstrumentModel
-from processing.instrument.noise import NoiseModel
 from processing.reduction.counts_to_signal import Correction
-from processing.reduction.move_image import shifted_back
 from processing.reduction.mueller import measurement_matrix, relative_exposure, sample_states
+from processing.reduction.noise import NoiseModel
 from processing.storage.capture import Capture, CaptureError
-
-Array = NDArray[np.float64]
 
 #: Values of a capture that are kept; a larger one is averaged over squares of pixels first.
 MOST_VALUES = 40_000_000
@@ -33,110 +32,6 @@ CUT_OFF = 6.0
 MOST_CUT_OFF = 0.01
 #: Below this number of pixels their scatter says nothing about the noise.
 FEWEST_PIXELS = 30
-
-
-@dataclass(frozen=True)
-class CaptureData:
-    """One capture, ready to be compared with a model.
-
-    Attributes
-    ----------
-    name : identity for reports: title and file name.
-    signal : (N, channels, rows, columns) float32, counts above black over full scale.
-    exposure : (N,) relative; multiplies the rows of W.
-    sample : (16,) known Mueller matrix up to a throughput, or None.
-    slope, floor : variance of a signal u is slope[n] * u + floor[n], in units of full scale squared, each (N,).
-    noise_known : False if no noise could be found (few pixels and no detector constants): then slope is 0, and
-        what is left over after the fit is the only measure.
-    noise_source : in words.
-    clipped : (rows, columns) True where some state is at the top of the range.
-    clipped_states : (N,) True for states in which some pixel is.
-    noise_estimated : slope and floor describe the scatter of these very counts, not the photons and the read-out.
-    true_variance : (N, channels, rows, columns) where the variance is not a line in the counts any more.
-    moved_px : (N, 2) by how much each frame was moved back, from what it had moved to the right and down; pixels here.
-        That averages the noise of neighbours, and adds no information.
-    usable : (rows, columns) True where every state has a number and the pixel is not dark.
-    dark_fraction : part of the pixels that are too dark, or too close to dark ones, to be used.
-    cut_off : numbers of states that do not count because their counts are cut off at zero.
-    binned : side of the squares over which pixels were averaged.
-    pitch : pixels of the sensor from one pixel here to the next.
-    """
-
-    name: str
-    signal: NDArray[np.float32]
-    conditions: Conditions
-    exposure: Array
-    sample: Array | None
-    slope: Array
-    floor: Array
-    noise_known: bool
-    noise_source: str
-    clipped: NDArray[np.bool_]
-    clipped_states: NDArray[np.bool_]
-    usable: NDArray[np.bool_]
-    simulated: bool
-    wavelength_nm: float
-    binned: int = 1
-    pitch: int = 1
-    dark_fraction: float = 0.0
-    cut_off: tuple[int, ...] = ()
-    noise_estimated: bool = False
-    true_variance: NDArray[np.float32] | None = None
-    moved_px: Array | None = None
-
-    @property
-    def values_per_pixel(self) -> int:
-        """Intensities of one pixel: states times channels."""
-        return int(self.signal.shape[0] * self.signal.shape[1])
-
-    @property
-    def row_exposure(self) -> Array:
-        """Exposure (values_per_pixel,) of each row of W."""
-        return np.repeat(self.exposure, self.signal.shape[1])
-
-    @property
-    def row_counts(self) -> NDArray[np.bool_]:
-        """(values_per_pixel,) whether a row of W counts."""
-        counts = np.ones(self.conditions.states, dtype=bool)
-        counts[list(self.cut_off)] = False
-        return np.repeat(counts, self.signal.shape[1])
-
-    @property
-    def row_moved_px(self) -> Array:
-        """`moved_px` (values_per_pixel, 2) of each row of W; zero where nothing was moved."""
-        moved = np.zeros((self.conditions.states, 2)) if self.moved_px is None else self.moved_px
-        return np.repeat(moved, self.signal.shape[1], axis=0)
-
-    def variance(self) -> Array:
-        """Variance (N, channels, rows, columns) in full scale squared; right on average over noisy signals.
-
-        Cutting it off at zero signal would make it too large in dark states, so a single one may be negative.
-        """
-        if self.true_variance is not None:
-            return np.asarray(self.true_variance, dtype=float)
-        shape = (-1, 1, 1, 1)
-        return np.asarray(self.slope.reshape(shape) * self.signal + self.floor.reshape(shape))
-
-    def undone(self, signal: Array, slope: Array) -> CaptureData:
-        """The capture with corrected counts, of the given slope over the old ones: the noise is stretched with them."""
-        # A bend weighs dark pixels by their slope: none may have a negative variance here.
-        variance = slope**2 * np.maximum(self.variance(), self.floor.reshape(-1, 1, 1, 1) / 2)
-        return replace(self, signal=signal.astype(np.float32), true_variance=variance.astype(np.float32))
-
-    def moved_back(self, shift_px: Array) -> CaptureData:
-        """The capture with every frame moved back by what it had moved to the right and down, (N, 2) pixels here."""
-        signal, variance = self.signal.copy(), self.variance().astype(np.float32)
-        for n, (x, y) in enumerate(shift_px):
-            for channel in range(signal.shape[1]):
-                signal[n, channel] = shifted_back(signal[n, channel], x, y)
-                variance[n, channel] = shifted_back(variance[n, channel], x, y)
-        return replace(self, signal=signal, true_variance=variance, moved_px=shift_px)
-
-    def with_noise_of(self, signal: Array, slope: Array) -> CaptureData:
-        """The same counts with the noise that corrected counts tell: photon noise follows the light, not the counts."""
-        shape = (-1, 1, 1, 1)
-        variance = self.slope.reshape(shape) * np.maximum(signal, 0) / slope**2 + self.floor.reshape(shape)
-        return replace(self, true_variance=variance.astype(np.float32))
 
 
 def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
@@ -192,8 +87,6 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
         data = replace(data, slope=slope, floor=floor, noise_known=True, noise_source=noise.source)
     data = _binned(data)
     if noise is None and data.usable.sum() >= FEWEST_PIXELS:
-        from processing.diagnosis.instrument.noise_estimate import estimated_noise
-
         data = estimated_noise(data)
     return without_dark_pixels(data) if data.noise_known else data
 

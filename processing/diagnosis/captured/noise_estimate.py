@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import nnls
 
-from processing.diagnosis.instrument.capture_data import CaptureData
+from processing.diagnosis.captured.capture_data import CaptureData
 
 #: Components of the states that count as signal: a Mueller matrix has 16 unknowns.
 COMPONENTS = 16

@@ -1,0 +1,15 @@
+"""What the commands of `acquire` share: files that come with the program, the rig option, the exit code of a stop."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+DEFAULT_RIG = CONFIGS / "rigs" / "simulated.yaml"
+#: Exit code after Ctrl-C or the stop button.
+INTERRUPTED = 130
+
+RigFile = Annotated[Path | None, typer.Option("--rig", help="rig file; without it the SIMULATED rig")]

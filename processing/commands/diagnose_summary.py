@@ -1,0 +1,54 @@
+"""What `diagnose` prints."""
+
+from __future__ import annotations
+
+import typer
+
+from processing.diagnosis.search.result import Diagnosis, FoundEffect
+
+
+def show(d: Diagnosis) -> None:
+    """Print a summary."""
+    if d.simulated:
+        typer.echo("SIMULATED data")
+    typer.echo(f"{d.instrument}, {d.wavelength_nm:g} nm: {d.verdict.replace('_', ' ')}")
+    before, after = d.error_before, d.error_after
+    typer.echo(f"  error before  {before.rms_percent:8.4f} % of the mean signal, chi2/dof {before.chi2_reduced:.4g}")
+    typer.echo(f"  error after   {after.rms_percent:8.4f} % of the mean signal, chi2/dof {after.chi2_reduced:.4g}")
+    if d.noise_floor_percent is not None:
+        typer.echo(f"  noise floor   {d.noise_floor_percent:8.4f} %")
+    typer.echo(f"  held out: {before.held_out}")
+    for c in d.captures:
+        if c.cut_off:
+            states = f"state{'s' if len(c.cut_off) > 1 else ''} {', '.join(str(k) for k in c.cut_off)}"
+            typer.echo(f"  left out: {states} of {c.name}, cut off at zero counts; raise the black level")
+        if c.dark_fraction > 0:
+            typer.echo(f"  left out as too dark, with their rim: {c.dark_fraction:.1%} of the pixels of {c.name}")
+        if c.closure_before_percent is not None and c.closure_after_percent is not None:
+            typer.echo(f"  closure of {c.name}: {c.closure_before_percent:.3f} % -> {c.closure_after_percent:.3f} %")
+    for effect in d.effects:
+        _show_effect(effect)
+    if d.unexplained is not None:
+        typer.echo("  unexplained structure is left:")
+        for line in d.unexplained.description:
+            typer.echo(f"    {line}")
+        if d.unexplained.empirical is not None:
+            e = d.unexplained.empirical
+            typer.echo(
+                f"    empirical {e.kind} would leave {e.rms_percent_in_sample:.4f} % (in sample, names no cause)"
+            )
+            typer.echo(f"    would also fit: {', '.join(e.would_also_fit)}")
+    if d.unobservable:
+        typer.echo(f"  cannot be seen with these captures: {', '.join(d.unobservable)}")
+    typer.echo(f"  recommendation: {d.recommendation}")
+
+
+def _show_effect(effect: FoundEffect) -> None:
+    doubt = "" if effect.confident else " (it helps, but its name may be wrong)"
+    where = f" of {effect.element}" if effect.element else ""
+    typer.echo(f"  {effect.kind}{where}: evidence {effect.evidence:.0f}{doubt}")
+    for name, p in effect.parameters.items():
+        unit, note = "" if p.unit == "1" else f" {p.unit}", f" ({p.note})" if p.note else ""
+        typer.echo(f"      {name}: {p.told}{unit}{note}")
+    if effect.indistinguishable_from:
+        typer.echo(f"      cannot be told from: {', '.join(effect.indistinguishable_from)}")

@@ -1,0 +1,88 @@
+"""How figures look: panels of maps, colour maps for angles, what simulated data say of themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from io import BytesIO
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Longest side of a panel in pixels; larger images are thinned before drawing, which changes no file.
+PANEL_PIXELS = 600
+SIMULATED = "SIMULATED"
+PAGE_DPI = 100
+#: Orientation is drawn in grey where its standard error is above this: it is not known there.
+WORST_ORIENTATION_DEG = 20.0
+#: Keywords of `imshow` for orientations.
+CYCLIC = {"cmap": "twilight", "vmin": 0, "vmax": 180}
+
+
+def map_figure(panels: Sequence[tuple[str, NDArray[Any], dict[str, Any]]], title: str, simulated: bool) -> Figure:
+    """Maps side by side; each is (label, values (rows, columns), keywords of imshow such as cmap, vmin, vmax)."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(0.6 + 4.3 * len(panels), 4.2), layout="constrained")
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axis, (label, values, keywords) in zip(axes, panels, strict=True):
+        _map(figure, axis, values, label, **keywords)
+    entitle(figure, title, simulated)
+    return figure
+
+
+def grid_figure(
+    panels: Sequence[tuple[str, NDArray[Any], dict[str, Any]]], title: str, simulated: bool, columns: int = 4
+) -> Figure:
+    """Maps in rows of `columns`, as in `map_figure`; where no `vmax` is given it is the 99.5th percentile."""
+    from matplotlib.figure import Figure
+
+    shape = panels[0][1].shape
+    rows = -(-len(panels) // columns)
+    high = 0.5 + 3.6 * max(0.4, shape[0] / max(shape[1], 1))
+    figure = Figure(figsize=(4.25 * min(columns, len(panels)), 0.6 + rows * high), layout="constrained")
+    axes = figure.subplots(rows, min(columns, len(panels)), squeeze=False)
+    for axis in axes.flat[len(panels) :]:
+        axis.set_axis_off()
+    for axis, (label, values, keywords) in zip(axes.flat, panels, strict=False):
+        _map(figure, axis, values, label, **({"vmax": max(percentile(values, 99.5), 1e-30)} | keywords))
+    entitle(figure, title, simulated)
+    return figure
+
+
+def png(figure: Figure) -> bytes:
+    """A figure as a PNG for a page."""
+    out = BytesIO()
+    figure.savefig(out, format="png", dpi=PAGE_DPI)
+    return out.getvalue()
+
+
+def thin(image: NDArray[Any]) -> NDArray[Any]:
+    """Every k-th row and column, so that the longer side is at most PANEL_PIXELS."""
+    step = max(1, -(-max(image.shape[-2:]) // PANEL_PIXELS))
+    return image[..., ::step, ::step]
+
+
+def _map(figure: Figure, axis: Any, values: NDArray[Any], label: str, **keywords: Any) -> None:
+    shown = axis.imshow(values, interpolation="nearest", **keywords)
+    axis.set_title(label, fontsize=10)
+    axis.set_facecolor("0.85")
+    axis.set_xticks([])
+    axis.set_yticks([])
+    figure.colorbar(shown, ax=axis, shrink=0.85)
+
+
+def entitle(figure: Figure, title: str, simulated: bool) -> None:
+    """Put the title on a figure; simulated data say so in red."""
+    figure.suptitle(
+        f"{SIMULATED}   {title}" if simulated else title, color="darkred" if simulated else "black", fontsize=11
+    )
+
+
+def percentile(values: NDArray[Any], percent: float) -> float:
+    """Percentile of the finite values; 1 where there are none."""
+    finite = values[np.isfinite(values)]
+    return float(np.percentile(finite, percent)) if finite.size else 1.0

@@ -1,0 +1,15 @@
+"""The planes of a Mueller product: what every image of Mueller matrices holds beside the matrices."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from processing.storage.pixel_mask import Mask
+from processing.storage.product import Plane
+
+MUELLER_PLANES = {
+    "mueller": Plane((4, 4), "count", "Mueller matrix, row-major, not normalized"),
+    "mueller_errors": Plane((4, 4), "count", "standard errors of mueller"),
+    "residual_rms": Plane((), "count", "root mean square over the states of intensity minus fit"),
+    "pixel_mask": Plane((), "", f"0 = good; bits: {Mask.meaning()}", np.uint8),
+}

@@ -1,0 +1,19 @@
+"""What is wrong with a pixel of a product, as bits."""
+
+from __future__ import annotations
+
+from enum import IntFlag
+
+
+class Mask(IntFlag):
+    """Bits of `pixel_mask` in every product; 0 is a good pixel."""
+
+    SATURATED = 1  # some state was at the top of the range and was left out
+    NOT_FINITE = 2  # some state has no number there
+    BAD = 4  # listed as a bad pixel
+    NOT_DETERMINED = 8  # too few states are left
+
+    @classmethod
+    def meaning(cls) -> str:
+        """The bits in words, for the file."""
+        return ", ".join(f"{flag.value} = {flag.name.lower().replace('_', ' ')}" for flag in cls if flag.name)
