@@ -154,7 +154,9 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._is_local():
             self._send(403, "text/plain", b"only for a browser on this machine")
         elif path == "/":
-            self._send(200, "text/html; charset=utf-8", files("acquisition").joinpath("live_view.html").read_bytes())
+            self._send(
+                200, "text/html; charset=utf-8", files("acquisition.screen").joinpath("live_view.html").read_bytes()
+            )
         elif path == "/state":
             self._send(200, "application/json", json.dumps(self.live.snapshot()).encode())
         elif path in ("/frame.png", "/quick.png"):

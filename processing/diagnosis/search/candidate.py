@@ -123,11 +123,11 @@ def nominal_values(model: InstrumentModel, conditions: Conditions) -> tuple[Cand
 
 
 def pool(model: InstrumentModel, conditions: Sequence[Conditions]) -> tuple[Candidate, ...]:
-    """Every effect at every place of the captures; the reflectance group works on another model."""
+    """Every effect at every place of the captures; what turns a whole train is part of an unknown sample."""
     found: dict[tuple[str, str, int | None], Candidate] = {}
     fitted = _fitted_by_calibration(model)
     for effect in all_effects().values():
-        if effect.group == "reflectance":
+        if effect.group == "frame":
             continue
         for k, condition in enumerate(conditions):
             number = k if effect.scope == "capture" else None

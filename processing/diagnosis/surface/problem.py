@@ -18,7 +18,7 @@ from processing.diagnosis.search.space import Space, Sums
 from processing.diagnosis.surface.data import FEWEST_PIXELS, FOLDS, SurfaceData
 from processing.errors import ProcessError
 from processing.instrument.changes import Changes
-from processing.instrument.effects.base import Parameter, apply_to
+from processing.instrument.effects.base import Parameter, all_effects, apply_to
 from processing.instrument.model import InstrumentModel
 from processing.reflectance.changes import ReflectanceChanges
 from processing.reflectance.effects.base import ReflectanceEffect, reflectance_effects
@@ -114,7 +114,7 @@ class SurfaceProblem:
         """The effects of the reflectance, and those of the optics: with m0 known, an unknown xi0 hides few of them."""
         conditions = self.captures[0].conditions
         out = []
-        for effect in reflectance_effects().values():
+        for effect in (*all_effects().values(), *reflectance_effects().values()):
             if isinstance(effect, ReflectanceEffect):
                 places = effect.places_on(self.shape)
             elif effect.group in ("optics", "mosaic") and not effect.corrects_counts and effect.kind not in NOT_HERE:

@@ -19,7 +19,7 @@ from processing.instrument.changes import Changes, Conditions
 from processing.instrument.model import AppliedEffect, InstrumentModel, Retarder
 
 Array = NDArray[np.float64]
-Group = Literal["optics", "motion", "source", "detector", "mosaic", "reflectance"]
+Group = Literal["optics", "frame", "motion", "source", "detector", "mosaic", "reflectance"]
 Scope = Literal["instrument", "capture"]
 
 ENTRY_POINT_GROUP = "umov.effects"
@@ -52,7 +52,7 @@ class Effect(ABC):
 
     Attributes
     ----------
-    group : where it happens.
+    group : where it happens; "frame" turns all of a train, which only a known surface shows.
     scope : "capture" if another capture of the same instrument would have other values.
     per_state : parameter k acts on state k alone (which also makes its derivative cheap).
     corrects_counts : it is undone in the counts, not put into the rows of W.

@@ -7,11 +7,9 @@ pattern of polarization is symmetric about the horizontal line.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from processing.instrument.changes import Changes, Conditions
+from processing.instrument.changes import Conditions
 from processing.instrument.effects.base import Array, Parameter
 from processing.instrument.model import InstrumentModel
 from processing.reflectance.changes import ReflectanceChanges
@@ -29,11 +27,3 @@ class This(ReflectanceEffect):
 
     def bend(self, changes: ReflectanceChanges, values: Array) -> None:
         changes.analyzer_rad += float(np.deg2rad(values[0]))
-
-    # What was found with a known reflectance goes into an instrument file, so it can act there as well.
-    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
-        return ("",)
-
-    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
-        for element in (*model.analyzer, *(e for c in model.channels for e in c.elements)):
-            changes.azimuth_rad[element.name] = changes.azimuth_rad[element.name] + np.deg2rad(values[0])

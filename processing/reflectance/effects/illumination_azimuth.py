@@ -6,14 +6,11 @@ Mend: level the source's polarizer against the camera's with the arm at 180 degr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from processing.instrument.changes import Changes, Conditions
+from processing.instrument.changes import Conditions
 from processing.instrument.effects.base import Array, Parameter
 from processing.instrument.model import InstrumentModel
-from processing.polarization import mueller
 from processing.reflectance.changes import ReflectanceChanges
 from processing.reflectance.effects.base import ReflectanceEffect
 
@@ -26,10 +23,3 @@ class This(ReflectanceEffect):
 
     def bend(self, changes: ReflectanceChanges, values: Array) -> None:
         changes.generator_rad += float(np.deg2rad(values[0]))
-
-    # What was found with a known reflectance goes into an instrument file, so it can act there as well.
-    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
-        return ("",)
-
-    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
-        changes.follow(model.generator[-1].name, mueller.rotation(np.deg2rad(values[0])))

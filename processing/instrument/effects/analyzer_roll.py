@@ -1,0 +1,35 @@
+"""The whole analyzer, with the camera or without it, stands turned about the beam.
+
+Cause: camera body or analyzer unit put in askew; the polarization camera's mount is not level.
+Mend: level it against the source's polarizer with the arm at 180 degrees, or on a sphere seen near Omega 0, whose
+pattern of polarization is symmetric about the horizontal line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import Array, Effect, Parameter
+from processing.instrument.model import InstrumentModel
+
+
+class This(Effect):
+    """Degrees by which every element of the analyzer is turned.
+
+    A known surface shows it; with an unknown sample it is a part of the Mueller matrix.
+    """
+
+    group = "frame"
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        return ("",)
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return (Parameter("azimuth", "degree", -20, 20, 1.0),)
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        for element in (*model.analyzer, *(e for c in model.channels for e in c.elements)):
+            changes.azimuth_rad[element.name] = changes.azimuth_rad[element.name] + np.deg2rad(values[0])

@@ -1,0 +1,31 @@
+"""The polarization of the illumination is turned against the axes that the model takes.
+
+Cause: polarizer of the source not horizontal, arm or source rolled about the beam.
+Mend: level the source's polarizer against the camera's with the arm at 180 degrees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import Array, Effect, Parameter
+from processing.instrument.model import InstrumentModel
+from processing.polarization import mueller
+
+
+class This(Effect):
+    """Degrees by which the generator azimuth is off; only a known surface shows it."""
+
+    group = "frame"
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        return ("",)
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return (Parameter("azimuth", "degree", -20, 20, 1.0),)
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        changes.follow(model.generator[-1].name, mueller.rotation(np.deg2rad(values[0])))
