@@ -51,6 +51,9 @@ class AxisConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     port: str = Field(description="device path, /dev/serial/by-id path or socket://host:port")
+    held_by: str | None = Field(
+        default=None, description="program that may hold the port too: the simulator behind a pseudo-terminal"
+    )
     zero_deg: float = Field(default=0.0, allow_inf_nan=False, description="controller angle at user angle zero")
     direction: Literal[1, -1] = Field(default=1, description="-1 if the user angle grows the other way")
     limits_deg: tuple[float | None, float | None] | None = Field(

@@ -27,15 +27,15 @@ READ_SLICE_S = 0.02
 
 
 def line_framer(buffer: bytearray) -> bytes | None:
-    """Take one text line off the buffer, without its CR and LF; empty lines are skipped."""
+    """Take one text line off the buffer: it ends with CR, LF or both; empty lines are skipped."""
     while True:
-        end = buffer.find(b"\n")
-        if end < 0:
+        ends = [end for end in (buffer.find(b"\r"), buffer.find(b"\n")) if end >= 0]
+        if not ends:
             if len(buffer) > LONGEST_FRAME:
                 buffer.clear()
             return None
-        line = bytes(buffer[:end]).strip(b"\r\n")
-        del buffer[: end + 1]
+        line = bytes(buffer[: min(ends)])
+        del buffer[: min(ends) + 1]
         if line:
             return line
 
@@ -76,6 +76,8 @@ class SerialLink:
         Flow control.
     transcript : Transcript, optional
         Where to log the wire.
+    held_by : str, optional
+        Name of a program that may have the port open too: the simulator at the other end of a pseudo-terminal.
 
     Raises
     ------
@@ -92,6 +94,7 @@ class SerialLink:
         xonxoff: bool = False,
         rtscts: bool = False,
         transcript: Transcript | None = None,
+        held_by: str | None = None,
     ) -> None:
         self.port = port
         # One exchange at a time; a stop does not wait for it.
@@ -100,7 +103,7 @@ class SerialLink:
         self._framer = framer
         self._buffer = bytearray()
         self._transcript = transcript
-        self._serial: Any = _open_port(port, baudrate, xonxoff, rtscts)
+        self._serial: Any = _open_port(port, baudrate, xonxoff, rtscts, held_by)
         self.purge(0.0)
 
     def write(self, data: bytes) -> None:
@@ -162,14 +165,15 @@ class SerialLink:
             ) from error
 
 
-def _open_port(port: str, baudrate: int, xonxoff: bool, rtscts: bool) -> Any:
+def _open_port(port: str, baudrate: int, xonxoff: bool, rtscts: bool, held_by: str | None) -> Any:
     asked = f"open port {port}"
     if "://" not in port:
         if not Path(port).exists():
             raise PortNotFound(asked, "there is no such port", _ports_hint())
-        others = [who for pid, who in port_holders(port) if pid != os.getpid()]
+        holders = [(pid, who) for pid, who in port_holders(port) if pid != os.getpid()]
+        others = [who for pid, who in holders if who != f"{held_by} (pid {pid})"]
         if others:
-            raise PortBusy(asked, f"it is in use by {', '.join(others)}", "End that program; nothing was sent")
+            raise PortBusy(asked, f"it is in use by {', '.join(others)}", f"{_end_the_holder(port)}; nothing was sent")
     try:
         options: dict[str, Any] = {} if "://" in port else {"exclusive": True}
         return serial.serial_for_url(
@@ -182,8 +186,7 @@ def _open_port(port: str, baudrate: int, xonxoff: bool, rtscts: bool) -> Any:
                 asked, f"this user may not; {_owner(port)}", "Join that group and log in again"
             ) from error
         if number in (errno.EWOULDBLOCK, errno.EAGAIN, errno.EBUSY):
-            holders = [who for _, who in port_holders(port)]
-            named = ", ".join(holders) or "a program that this user may not see"
+            named = ", ".join(who for _, who in port_holders(port)) or "a program that this user may not see"
             raise PortBusy(asked, f"it is in use by {named}", "End that program; nothing was sent") from error
         raise PortNotFound(asked, str(error), _ports_hint()) from error
 
@@ -204,6 +207,12 @@ def port_holders(port: str) -> list[tuple[int, str]]:
         except OSError:
             continue
     return holders
+
+
+def _end_the_holder(port: str) -> str:
+    if not os.path.realpath(port).startswith("/dev/pts/"):
+        return "End that program"
+    return "End that program or, if it is the simulator behind this port, write its name as `held_by` in the rig file"
 
 
 def _owner(port: str) -> str:

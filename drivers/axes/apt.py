@@ -1,8 +1,9 @@
 """Thorlabs APT controllers over their binary protocol: K10CR1, and KDC101 with a PRM1-Z8 stage.
 
-Facts: shared/instruments.md 2.4. A plain serial port is enough on Linux, no vendor's driver. States are read, the
-messages at the end of a motion are not relied on: they go missing on real units (PnPQ#104). Counts per degree and
-the units of speed and acceleration are those of qmi and pylablib.
+Facts: public drivers (pylablib, qmi, thorlabs-apt-protocol, PnPQ) and their issues. A plain serial port is enough
+on Linux, no vendor's driver. States are read, the messages at the end of a motion are not relied on: they go
+missing on real units (PnPQ#104). Counts per degree and the units of speed and acceleration are those of qmi and
+pylablib.
 """
 
 from __future__ import annotations
@@ -58,8 +59,8 @@ class Config(AxisConfig):
 class APTLine:
     """The port of one APT unit."""
 
-    def __init__(self, port: str, reply_s: float, transcript: Transcript | None) -> None:
-        self.link = SerialLink(port, 115_200, apt_framer, transcript=transcript)
+    def __init__(self, port: str, reply_s: float, transcript: Transcript | None, held_by: str | None = None) -> None:
+        self.link = SerialLink(port, 115_200, apt_framer, transcript=transcript, held_by=held_by)
         self.reply_s = reply_s
         # The vendor's order of opening: a unit that is not reset so can stay silent.
         self.link.set_rts(True)
@@ -234,7 +235,9 @@ class APTAxis(MotionAxis):
 
 def open(name: str, config: Config, lines: LineRegistry) -> APTAxis:
     """Open one unit; reads its identity, homing parameters and speed and moves nothing."""
-    line = lines.take(config.port, APTLine, lambda transcript: APTLine(config.port, config.reply_s or 0.5, transcript))
+    line = lines.take(
+        config.port, APTLine, lambda transcript: APTLine(config.port, config.reply_s or 0.5, transcript, config.held_by)
+    )
     try:
         return APTAxis(name, config, line, lines)
     except BaseException:

@@ -1,8 +1,9 @@
 """Thorlabs Elliptec rotation mounts ELL14 and ELL18 on a multi-drop line.
 
-Facts: shared/instruments.md 2.2. A module says at the end of a move where it is, once; it cannot be stopped in
-between, and it cannot say whether it was ever homed. Assumed, not read: 430 deg/s at full velocity (vendor's
-specification) and 2000 deg/s^2, used for deadlines only.
+Facts: Thorlabs' ELL18K manual, public drivers (pylablib, elliptec, tl_elliptec) and captures of real units. A
+module says at the end of a move where it is, once; it cannot be stopped in between, and it cannot say whether it
+was ever homed. Assumed, not read: 430 deg/s at full velocity (vendor's specification) and 2000 deg/s^2, used for
+deadlines only.
 """
 
 from __future__ import annotations
@@ -60,8 +61,8 @@ class Config(SessionReferenceConfig):
 class ElliptecLine:
     """Up to 16 modules on one line; replies are sorted by address and letters."""
 
-    def __init__(self, port: str, reply_s: float, transcript: Transcript | None) -> None:
-        self.link = SerialLink(port, 9600, line_framer, transcript=transcript)
+    def __init__(self, port: str, reply_s: float, transcript: Transcript | None, held_by: str | None = None) -> None:
+        self.link = SerialLink(port, 9600, line_framer, transcript=transcript, held_by=held_by)
         self.reply_s = reply_s
         # Last message of each module that nobody had asked for: the end of its move.
         self.ended: dict[str, tuple[str, str]] = {}
@@ -259,7 +260,7 @@ def open(name: str, config: Config, lines: LineRegistry) -> ElliptecAxis:
     line = lines.take(
         config.port,
         ElliptecLine,
-        lambda transcript: ElliptecLine(config.port, config.reply_s or 0.6, transcript),
+        lambda transcript: ElliptecLine(config.port, config.reply_s or 0.6, transcript, config.held_by),
     )
     try:
         return ElliptecAxis(name, config, line, lines)

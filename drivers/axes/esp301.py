@@ -1,7 +1,8 @@
 """Newport ESP301 and ESP300 with rotation stages.
 
-Facts: shared/instruments.md 2.5. Replies carry neither address nor command, so only their order and their form tell
-whose they are. The controller cannot say whether an axis is homed. Use RS-232: USB is reported unusable on Linux.
+Facts: Newport's ESP300 manual 3.4 and the public drivers of odemis, pymeasure and instrumentkit. Replies carry
+neither address nor command, so only their order and their form tell whose they are. The controller cannot say
+whether an axis is homed. Use RS-232: USB is reported unusable on Linux.
 """
 
 from __future__ import annotations
@@ -54,9 +55,19 @@ class Config(SessionReferenceConfig):
 class ESP301Line:
     """The port of one controller, shared by its axes."""
 
-    def __init__(self, port: str, baudrate: int, rtscts: bool, reply_s: float, transcript: Transcript | None) -> None:
-        self.link = SerialLink(port, baudrate, line_framer, rtscts=rtscts, transcript=transcript)
+    def __init__(
+        self,
+        port: str,
+        baudrate: int,
+        rtscts: bool,
+        reply_s: float,
+        transcript: Transcript | None,
+        held_by: str | None = None,
+    ) -> None:
+        self.link = SerialLink(port, baudrate, line_framer, rtscts=rtscts, transcript=transcript, held_by=held_by)
         self.reply_s = reply_s
+        # The controller has one error memory for all axes, and reading takes out: each axis's own are kept here.
+        self._errors: dict[int, list[int]] = {}
 
     def close(self) -> None:
         """Close the port."""
@@ -89,6 +100,19 @@ class ESP301Line:
         if seen:
             raise ReplyError(asked, f"no valid reply, but {seen[:3]}", "Check cable and baud rate")
         raise ReplyTimeout(asked, f"nothing within {self.reply_s} s", "Check power, cable, baud rate and RTS/CTS")
+
+    def take_errors(self, axis: int) -> list[int]:
+        """Empty the controller's error memory and return what concerns an axis, oldest first.
+
+        Errors of other axes are kept for them. An error without an axis belongs to who asks: it is of the last command.
+        """
+        with self.link.lock:
+            for _ in range(20):
+                code = int(self.ask("TE?", _INTEGER))
+                if code == 0:
+                    break
+                self._errors.setdefault(code // 100 or axis, []).append(code)
+            return self._errors.pop(axis, [])
 
 
 class ESP301Axis(SessionReferenceAxis):
@@ -135,18 +159,8 @@ class ESP301Axis(SessionReferenceAxis):
         value = self._constant(command)
         return None if abs(value) >= NO_LIMIT_DEG else value
 
-    def _take_errors(self) -> list[int]:
-        """Empty the error memory; it holds each error once, oldest first."""
-        codes: list[int] = []
-        for _ in range(20):
-            code = int(self._line.ask("TE?", _INTEGER))
-            if code == 0:
-                break
-            codes.append(code)
-        return codes
-
     def _raise_errors(self, asked: str) -> None:
-        own = [code for code in self._take_errors() if code < 100 or code // 100 == self.config.axis]
+        own = self._line.take_errors(self.config.axis)
         if own:
             words = [
                 f"error {code}: {(AXIS_ERRORS.get(code % 100) if code >= 100 else ERRORS.get(code)) or 'see manual'}"
@@ -158,7 +172,7 @@ class ESP301Axis(SessionReferenceAxis):
     def _command(self, command: str) -> None:
         axis = self.config.axis
         with self._line.link.lock:
-            self._take_errors()
+            self._line.take_errors(axis)
             # The motor is off at power-up; a move would only leave an error behind.
             if self._line.ask(f"{axis}MO?", _FLAG) == "0":
                 self._line.send(f"{axis}MO")
@@ -208,7 +222,9 @@ def open(name: str, config: Config, lines: LineRegistry) -> ESP301Axis:
     line = lines.take(
         config.port,
         ESP301Line,
-        lambda transcript: ESP301Line(config.port, config.baudrate, config.rtscts, config.reply_s or 2.0, transcript),
+        lambda transcript: ESP301Line(
+            config.port, config.baudrate, config.rtscts, config.reply_s or 2.0, transcript, config.held_by
+        ),
     )
     try:
         return ESP301Axis(name, config, line, lines)

@@ -1,7 +1,8 @@
 """Newport SMC100CC/PP and the CONEX controllers that share its commands (CONEX-CC, CONEX-PP, CONEX-AGP).
 
-Facts: shared/instruments.md 2.3. The state word of `TS` is trusted, not the name of a command. Unverified on
-hardware: `ID?` (stage identifier) on every model of the family, and CONEX-PR50CC as a member of it.
+Facts: Newport's SMC100CC manual and the public drivers of QMI, yaqd and pymodaq. The state word of `TS` is trusted,
+not the name of a command. Unverified on hardware: `ID?` (stage identifier) on every model of the family, and CONEX-
+PR50CC as a member of it.
 """
 
 from __future__ import annotations
@@ -81,8 +82,10 @@ class Config(AxisConfig):
 class SMC100Line:
     """One line of controllers; replies are matched by address and command letters."""
 
-    def __init__(self, port: str, baudrate: int, reply_s: float, transcript: Transcript | None) -> None:
-        self.link = SerialLink(port, baudrate, line_framer, xonxoff=True, transcript=transcript)
+    def __init__(
+        self, port: str, baudrate: int, reply_s: float, transcript: Transcript | None, held_by: str | None = None
+    ) -> None:
+        self.link = SerialLink(port, baudrate, line_framer, xonxoff=True, transcript=transcript, held_by=held_by)
         self.reply_s = reply_s
 
     def close(self) -> None:
@@ -278,7 +281,7 @@ def open(name: str, config: Config, lines: LineRegistry) -> SMC100Axis:
     line = lines.take(
         config.port,
         SMC100Line,
-        lambda transcript: SMC100Line(config.port, config.baudrate, config.reply_s or 0.5, transcript),
+        lambda transcript: SMC100Line(config.port, config.baudrate, config.reply_s or 0.5, transcript, config.held_by),
     )
     try:
         return SMC100Axis(name, config, line, lines)

@@ -1,7 +1,8 @@
 """Zaber rotary stages over Zaber ASCII (firmware 6/7), message ids and checksums on.
 
-Facts: shared/instruments.md 2.1. Unverified on hardware: the unit of speed and acceleration, which word goes with
-which rejection, and that a rotary position does not wrap at a turn.
+Facts: Zaber's "ASCII protocol" page, the libraries zaber.serial and zaber-motion, and traffic of the latter.
+Unverified on hardware: the unit of speed and acceleration, which word goes with which rejection, and that a rotary
+position does not wrap at a turn.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ FLAGS = {
     "NI": "movement interrupted",
     "NC": "manual control",
 }
-_REPLY = re.compile(r"@(\d\d) (\d) (\d\d) (OK|RJ) (IDLE|BUSY) (--|[A-Z0-9]{2}) ([^:]*):([0-9A-F]{2})")
+_REPLY = re.compile(r"@(\d\d) (\d) (\d\d) (OK|RJ) (IDLE|BUSY) (--|[A-Z0-9]{2}) ([^:]*)(?::([0-9A-F]{2}))?")
 
 
 class Config(AxisConfig):
@@ -72,7 +73,7 @@ class Config(AxisConfig):
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """A reply with a valid checksum."""
+    """A reply; `summed` says that it came with a checksum, and a checksum that is there is right."""
 
     address: int
     axis: int
@@ -81,6 +82,7 @@ class Reply:
     busy: bool
     flag: str
     data: str
+    summed: bool = True
 
 
 def checksum(text: str) -> str:
@@ -89,22 +91,30 @@ def checksum(text: str) -> str:
 
 
 def parse_reply(frame: bytes) -> Reply | None:
-    """Read a reply line; None if it is not a whole reply with a valid checksum."""
+    """Read a reply line; None if it is not a whole reply, or its checksum is wrong."""
     text = frame.decode("ascii", "replace")
     match = _REPLY.fullmatch(text)
-    if match is None or checksum(text[1:-3].replace("\ufffd", "?")) != match[8]:
+    if match is None:
         return None
-    return Reply(int(match[1]), int(match[2]), int(match[3]), match[4] == "OK", match[5] == "BUSY", match[6], match[7])
+    summed = match[8] is not None
+    if summed and checksum(text[1:-3].replace("\ufffd", "?")) != match[8]:
+        return None
+    numbers = int(match[1]), int(match[2]), int(match[3])
+    return Reply(*numbers, match[4] == "OK", match[5] == "BUSY", match[6], match[7], summed)
 
 
 class ZaberLine:
     """One chain of devices: sends commands, gives each reply to its request by address, axis and id."""
 
-    def __init__(self, port: str, baudrate: int, reply_s: float, transcript: Transcript | None) -> None:
-        self.link = SerialLink(port, baudrate, line_framer, transcript=transcript)
+    def __init__(
+        self, port: str, baudrate: int, reply_s: float, transcript: Transcript | None, held_by: str | None = None
+    ) -> None:
+        self.link = SerialLink(port, baudrate, line_framer, transcript=transcript, held_by=held_by)
         self.reply_s = reply_s
         # A stop from another thread takes an id at the same time: never the same one.
         self._message_ids = itertools.cycle(range(1, 100))
+        # Devices set to answer without checksums (`comm.checksum` 0). From others such a reply is a damaged one.
+        self._unsummed: set[int] = set()
 
     def close(self) -> None:
         """Close the port."""
@@ -152,7 +162,11 @@ class ZaberLine:
         deadline_s = time.monotonic() + self.reply_s
         while (frame := self.link.read_frame(deadline_s)) is not None:
             reply = parse_reply(frame)
-            if reply is not None and (reply.address, reply.axis, reply.message_id) == (address, axis, message_id):
+            if (
+                reply is not None
+                and (reply.address, reply.axis, reply.message_id) == (address, axis, message_id)
+                and (reply.summed or address in self._unsummed)
+            ):
                 return reply, seen
             # Alerts (!), extra info (#), late replies and noise.
             seen.append(frame)
@@ -170,7 +184,16 @@ class ZaberLine:
                 if reply is not None and reply.message_id == message_id:
                     replies.append(reply)
                     deadline_s = time.monotonic() + quiet_s
-        return replies
+            return [reply for reply in replies if reply.summed or self._sends_no_checksums(reply.address)]
+
+    def _sends_no_checksums(self, address: int) -> bool:
+        """True if the device itself says so, twice; its replies are believed without from then on."""
+        if address not in self._unsummed:
+            self._unsummed.add(address)
+            settings = [self._exchange(address, 0, "get comm.checksum")[0] for _ in range(2)]
+            if not all(reply is not None and reply.accepted and reply.data == "0" for reply in settings):
+                self._unsummed.discard(address)
+        return address in self._unsummed
 
 
 class ZaberAxis(MotionAxis):
@@ -183,9 +206,12 @@ class ZaberAxis(MotionAxis):
         self._address, serial_number = self._find()
         turn = config.counts_per_turn or self._constant("limit.cycle.dist")
         self.counts_per_deg = turn / 360.0
-        self.speed_deg_s = self._constant("maxspeed") / VELOCITY_UNIT / self.counts_per_deg
+        speed = self._constant("maxspeed")
+        self.speed_deg_s = speed / VELOCITY_UNIT / self.counts_per_deg
         self.acceleration_deg_s2 = self._constant("accel") / ACCELERATION_UNIT / self.counts_per_deg
-        self._home_speed_deg_s = self._constant("limit.approach.maxspeed") / VELOCITY_UNIT / self.counts_per_deg
+        # The vendor: an approach takes the lesser of the two speeds.
+        approach = min(self._constant("limit.approach.maxspeed"), speed)
+        self._home_speed_deg_s = approach / VELOCITY_UNIT / self.counts_per_deg
         if min(turn, self.speed_deg_s, self.acceleration_deg_s2, self._home_speed_deg_s) <= 0:
             raise ReplyError(
                 f"axis {name}, turn, speed and acceleration", "one of them is zero", "Restore the defaults"
@@ -287,7 +313,7 @@ def open(name: str, config: Config, lines: LineRegistry) -> ZaberAxis:
     line = lines.take(
         config.port,
         ZaberLine,
-        lambda transcript: ZaberLine(config.port, config.baudrate, config.reply_s or 0.5, transcript),
+        lambda transcript: ZaberLine(config.port, config.baudrate, config.reply_s or 0.5, transcript, config.held_by),
     )
     try:
         return ZaberAxis(name, config, line, lines)

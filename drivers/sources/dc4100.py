@@ -47,6 +47,7 @@ class Config(BaseModel):
 
     kind: Literal["dc4100"] = "dc4100"
     port: str = Field(description="device path, /dev/serial/by-id path or socket://host:port")
+    held_by: str | None = Field(default=None, description="program that may hold the port too: its simulator")
     channels: dict[float, int] = Field(
         default={}, description="wavelength in nm to channel 1 to 4; empty: as the LEDs say themselves"
     )
@@ -263,4 +264,4 @@ def open(config: Config, lines: LineRegistry) -> LedDriver:
 
 
 def _link(config: Config, transcript: Transcript | None) -> SerialLink:
-    return SerialLink(config.port, BAUDRATE, line_framer, transcript=transcript)
+    return SerialLink(config.port, BAUDRATE, line_framer, transcript=transcript, held_by=config.held_by)

@@ -27,6 +27,7 @@ class Config(BaseModel):
 
     kind: Literal["sc10"] = "sc10"
     port: str = Field(description="device path, /dev/serial/by-id path or socket://host:port")
+    held_by: str | None = Field(default=None, description="program that may hold the port too: its simulator")
     reply_s: float = Field(default=1.0, gt=0, description="longest wait for a reply")
     blade_s: float = Field(default=1.0, gt=0, description="longest time for the blade to open or close")
 
@@ -140,4 +141,4 @@ def open(config: Config, lines: LineRegistry) -> Shutter:
 
 
 def _link(config: Config, transcript: Transcript | None) -> SerialLink:
-    return SerialLink(config.port, BAUDRATE, prompt_framer, transcript=transcript)
+    return SerialLink(config.port, BAUDRATE, prompt_framer, transcript=transcript, held_by=config.held_by)

@@ -50,6 +50,10 @@ class ZaberDevice:
     device_id: int = 50081
     microsteps_per_turn: int = 768_000
     settings: dict[str, str] = field(default_factory=dict)
+    # Setting `comm.checksum`: 0 leaves the checksum off every reply.
+    sums: bool = True
+    # Setting `limit.approach.maxspeed` in deg/s; None for that of moves. Homing takes the lesser of the two.
+    approach_deg_s: float | None = None
     interrupted: bool = False
     alerts_for: int | None = None
     # Flags that a test raises: FS stalled, WT hot, ...
@@ -113,13 +117,16 @@ class ZaberDevice:
             "system.axiscount": lambda: 1,
             "system.access": lambda: 1,
             "comm.address": lambda: self.address,
+            "comm.checksum": lambda: int(self.sums),
             "resolution": lambda: 64,
             "limit.min": lambda: self.limit(axis.min_deg, -1),
             "limit.max": lambda: self.limit(axis.max_deg, 1),
             "limit.home.triggered": lambda: int(axis.homed),
             "limit.cycle.dist": lambda: self.microsteps_per_turn,
             "maxspeed": lambda: round(axis.speed_deg_s * self.per_deg * VELOCITY_UNIT),
-            "limit.approach.maxspeed": lambda: round(axis.speed_deg_s * self.per_deg * VELOCITY_UNIT),
+            "limit.approach.maxspeed": lambda: round(
+                (self.approach_deg_s or axis.speed_deg_s) * self.per_deg * VELOCITY_UNIT
+            ),
             "accel": lambda: round(axis.acceleration_deg_s2 * self.per_deg * ACCELERATION_UNIT),
         }
 
@@ -184,7 +191,7 @@ class ZaberDevice:
 
     def _home(self, _: list[str]) -> str:
         self.interrupted = False
-        self.axis.home()
+        self.axis.home(min(self.approach_deg_s or self.axis.speed_deg_s, self.axis.speed_deg_s))
         self.alerts_for = 1
         return "0"
 
@@ -264,7 +271,7 @@ class ZaberEmulator(Emulator):
         state = "BUSY" if device.axis.is_moving() else "IDLE"
         flag = (device.flags() or ["--"])[0]
         body = f"{device.address:02d} {axis} {message_id}{verdict} {state} {flag} {data}"
-        self._reply(_framed("@", body, sums))
+        self._reply(_framed("@", body, sums and device.sums))
 
     def _do_make_foreign(self, reply: bytes) -> bytes:
         text = reply.decode("latin-1").strip()
@@ -307,4 +314,12 @@ def axis_configs(emulator: ZaberEmulator, port: str) -> list[Config]:
     return [Config(port=port, serial_number=device.serial_number) for device in emulator.devices]
 
 
-SERVES = {"zaber": make}
+def make_without_checksums(options: ServeOptions) -> ZaberEmulator:
+    """The same devices with `comm.checksum` 0."""
+    emulator = make(options)
+    for device in emulator.devices:
+        device.sums = False
+    return emulator
+
+
+SERVES = {"zaber": make, "zaber-no-checksums": make_without_checksums}

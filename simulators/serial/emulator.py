@@ -105,13 +105,13 @@ class EmulatedAxis:
         end = self.max_deg if velocity_deg_s > 0 else self.min_deg
         self._start((far_deg if end is None else end) + self._origin_deg, abs(velocity_deg_s))
 
-    def home(self) -> None:
-        """Turn to the home switch; the reference is there when the motion ends."""
+    def home(self, speed_deg_s: float | None = None) -> None:
+        """Turn to the home switch, at the speed of moves unless another is given; the reference is there at the end."""
         here_deg = self._motion.position(self.clock.now_s())
         self._homed = False
         # A rotary stage meets its switch once a turn.
         turns = math.floor(here_deg / 360.0 + 1e-9) if self.min_deg is None else 0
-        self._start(360.0 * turns)
+        self._start(360.0 * turns, speed_deg_s)
         self.homing = True
 
     def stop(self) -> None:

@@ -12,7 +12,11 @@ from drivers.apt_frames import apt_framer
 from drivers.axes import apt, elliptec, esp301, smc100, zaber
 from drivers.errors import CommandRejected, NotHomedError, ReplyError
 from drivers.serial_link import LONGEST_FRAME, LineRegistry, line_framer
+from simulators.clock import Clock
+from simulators.controllers import esp301 as esp301_emulator
+from simulators.controllers import zaber as zaber_emulator
 from simulators.serial.pty_port import PtyPort
+from simulators.serial.serve_options import ServeOptions
 
 
 class Script:
@@ -60,8 +64,9 @@ def test_zaber_checksum_and_reply() -> None:
     assert zaber.checksum("1 1 07 move abs 10000") == "B9"
     reply = zaber.parse_reply(b"@01 1 07 OK BUSY -- 0:E0")
     assert reply == zaber.Reply(1, 1, 7, True, True, "--", "0")
-    for spoiled in (b"@01 1 07 OK IDLE -- 0:E0", b"@01 1 07 OK BUSY -- 0", b"01 1 07 OK BUSY -- 0:E0", b"", b"\xff"):
+    for spoiled in (b"@01 1 07 OK IDLE -- 0:E0", b"@01 1 07 OK BUSY -- 0:", b"01 1 07 OK BUSY -- 0:E0", b"", b"\xff"):
         assert zaber.parse_reply(spoiled) is None
+    assert zaber.parse_reply(b"@01 1 07 OK BUSY -- 0") == zaber.Reply(1, 1, 7, True, True, "--", "0", summed=False)
 
 
 def test_zaber_exchange_sorts_out_what_is_not_its_reply() -> None:
@@ -244,3 +249,58 @@ def test_elliptec_end_message_just_before_the_status_still_proves_the_homing() -
         config = elliptec.Config(port=path, address="0", pause_before_move_s=0.0)
         axis = elliptec.open("psg", config, lines)
         assert axis.home().wait().counts == 0
+
+
+def test_zaber_replies_without_checksum_count_where_the_device_says_that_it_sends_none() -> None:
+    with scripted(
+        (b"/" + summed("0 0 01 get system.serial") + b"\n", b"@01 0 01 OK IDLE -- 4711\r\n"),
+        (b"/" + summed("1 0 02 get comm.checksum") + b"\n", b"@01 0 02 OK IDLE -- 0\r\n"),
+        (b"/" + summed("1 0 03 get comm.checksum") + b"\n", b"@01 0 03 OK IDLE -- 0\r\n"),
+        (b"/" + summed("1 1 04 get pos") + b"\n", b"@01 1 04 OK IDLE -- -77\r\n"),
+        # A checksum that is there must still be right.
+        (b"/" + summed("1 1 05 get pos") + b"\n", b"@01 1 05 OK IDLE -- -77:00\r\n"),
+    ) as path:
+        line = zaber.ZaberLine(path, 115200, 0.2, None)
+        assert [reply.data for reply in line.ask_all("get system.serial")] == ["4711"]
+        assert line.ask(1, 1, "get pos", repeat=False).data == "-77"
+        with pytest.raises(ReplyError):
+            line.ask(1, 1, "get pos", repeat=False)
+        line.close()
+
+
+def test_a_zaber_reply_that_lost_its_checksum_is_not_believed() -> None:
+    with scripted(
+        (b"/" + summed("0 0 01 get system.serial") + b"\n", b"@01 0 01 OK IDLE -- 47\r\n"),
+        (b"/" + summed("1 0 02 get comm.checksum") + b"\n", b"@" + summed("01 0 02 OK IDLE -- 1") + b"\r\n"),
+        (b"/" + summed("1 0 03 get comm.checksum") + b"\n", b"@" + summed("01 0 03 OK IDLE -- 1") + b"\r\n"),
+        (b"/" + summed("1 1 04 get pos") + b"\n", b"@01 1 04 OK IDLE -- 7\r\n"),
+    ) as path:
+        line = zaber.ZaberLine(path, 115200, 0.2, None)
+        assert line.ask_all("get system.serial") == []
+        with pytest.raises(ReplyError):
+            line.ask(1, 1, "get pos", repeat=False)
+        line.close()
+
+
+def test_zaber_homes_at_the_lesser_of_two_speeds() -> None:
+    emulator = zaber_emulator.make(ServeOptions(homed=True, clock=Clock(100.0)))
+    for device in emulator.devices:
+        device.approach_deg_s = 10 * device.axis.speed_deg_s
+    with PtyPort(emulator) as port, LineRegistry() as lines:
+        axis = zaber.open("psg", zaber.Config(port=port.path, address=1), lines)
+        motion = axis.home()
+        assert motion.expected_s == pytest.approx(2 * 360.0 / axis.speed_deg_s, rel=1e-3)
+        motion.wait()
+
+
+def test_errors_of_one_esp301_axis_are_kept_while_another_is_asked() -> None:
+    emulator = esp301_emulator.make(ServeOptions(clock=Clock(100.0)))
+    with PtyPort(emulator) as port, LineRegistry() as lines:
+        first, second = (esp301.open(f"axis {k}", esp301.Config(port=port.path, axis=k), lines) for k in (1, 2))
+        emulator.errors.extend([(204, 0), (7, 0), (120, 0)])
+        with pytest.raises(CommandRejected, match=r"error 7: .*, error 120: homing aborted"):
+            first.check_fault()
+        first.check_fault()
+        with pytest.raises(CommandRejected, match="error 204: hardware limit"):
+            second.check_fault()
+        second.check_fault()

@@ -1,4 +1,4 @@
-"""Byte transcripts: what each emulated controller answers, from the fact sheet (shared/instruments.md 2)."""
+"""Byte transcripts: what each emulated controller answers, from manuals, public drivers and recorded traffic."""
 
 import pytest
 

@@ -2,7 +2,10 @@
 
 import errno
 import socket
+import subprocess
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -14,6 +17,7 @@ from drivers.registry import axis_kinds, open_axis
 from drivers.serial_link import LineRegistry, SerialLink, line_framer
 from simulators.clock import Clock
 from simulators.rig.controller_kinds import axis_configs, served_kinds
+from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort
 from simulators.serial.serve_options import ServeOptions
 
@@ -43,8 +47,9 @@ def test_a_file_that_is_no_port(tmp_path: Path) -> None:
         SerialLink("socket://127.0.0.1:1", 9600, line_framer)
 
 
-def test_an_axis_behind_tcp() -> None:
-    emulator = zaber_emulator()
+@contextmanager
+def behind_tcp(emulator: Emulator, line_end: bytes = b"\r\n") -> Iterator[str]:
+    """Serve one client over TCP, with replies that end as said; gives the port to write into a rig file."""
     server = socket.create_server(("127.0.0.1", 0))
 
     def serve() -> None:
@@ -59,17 +64,41 @@ def test_an_axis_behind_tcp() -> None:
                     emulator.receive(data)
                 except TimeoutError:
                     pass
-                connection.sendall(emulator.take_output())
+                connection.sendall(emulator.take_output().replace(b"\r\n", line_end))
 
     thread = threading.Thread(target=serve)
     thread.start()
-    with LineRegistry() as lines:
-        config = zaber.Config(port=f"socket://127.0.0.1:{server.getsockname()[1]}", serial_number=110_001)
-        axis = open_axis("psg", config, lines)
-        assert axis.start_move(45.0).wait().deg == pytest.approx(45.0, abs=0.01)
-        axis.close()
+    yield f"socket://127.0.0.1:{server.getsockname()[1]}"
     thread.join()
     server.close()
+
+
+@pytest.mark.parametrize("line_end", [b"\r\n", b"\r", b"\n"])
+@pytest.mark.parametrize("kind", ["zaber", "esp301", "smc100"])
+def test_an_axis_behind_tcp(kind: str, line_end: bytes) -> None:
+    emulator = served_kinds()[kind](ServeOptions(homed=True, clock=Clock(100.0)))
+    with behind_tcp(emulator, line_end) as port, LineRegistry() as lines:
+        axis = open_axis("psg", axis_configs(emulator, port, homed=True)[0], lines)
+        assert axis.start_move(45.0).wait().deg == pytest.approx(45.0, abs=0.01)
+        axis.close()
+
+
+def test_the_simulator_behind_a_pseudo_terminal_may_be_named_as_its_holder() -> None:
+    # A simulator that keeps both ends of its pseudo-terminal open, as socat does.
+    with PtyPort(zaber_emulator()) as port:
+        with open(port.path, "r+b", buffering=0) as other_end:
+            holder = subprocess.Popen(["sleep", "30"], stdin=other_end)
+        try:
+            with pytest.raises(PortBusy, match=r"sleep \(pid \d+\).*write its name as `held_by`"):
+                SerialLink(port.path, 9600, line_framer)
+            with pytest.raises(PortBusy, match="sleep"):
+                SerialLink(port.path, 9600, line_framer, held_by="cat")
+            with LineRegistry() as lines:
+                config = zaber.Config(port=port.path, address=1, held_by="sleep")
+                assert open_axis("psg", config, lines).start_move(20.0).wait().deg == pytest.approx(20.0, abs=0.01)
+        finally:
+            holder.kill()
+            holder.wait()
 
 
 def test_a_link_by_another_name_is_the_same_line(tmp_path: Path) -> None:
