@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.diagnosis.surface.run import diagnose_object
 from processing.diagnosis.surface.write import corrected_material
 from processing.instrument.model import InstrumentModel
@@ -30,7 +30,6 @@ from simulators.blind.sphere_suite import SphereFault, first_surface_of, take
 
 ROOT = Path(__file__).resolve().parents[1]
 NM, OMEGA_DEG, BORDER = 662.0, 35.0, 4
-Image = NDArray[np.float64]
 
 
 def main() -> None:
@@ -114,7 +113,7 @@ def draw(titles: list[str], maps: list[dict[str, Any]]) -> Any:
     units = {"psi": "psi / degree", "size": "|D| / %", "xi0": "xi0"}
     for row, (title, found) in enumerate(zip(titles, maps, strict=True)):
         for axis, key in zip(axes[row], wide, strict=True):
-            image: Image = found[key]
+            image: Array = found[key]
             drawn_image = axis.imshow(image, vmin=-wide[key], vmax=wide[key], cmap="RdBu")
             axis.set_title(f"{units[key]}: {title}, rms {found[key + '_rms']:.3g}", fontsize=8)
             axis.set_axis_off()

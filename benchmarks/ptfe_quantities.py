@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from processing.arrays import Array
 from processing.polarization import mueller, quantities, triply_degenerate
 from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
 
-Array = NDArray[np.float64]
 WAVELENGTHS_UM = (0.351, 0.532, 0.633, 1.064)
 MIRROR = np.diag([1.0, 1.0, -1.0, -1.0])
 #: M of the reversed path is RECIPROCAL M^T RECIPROCAL, with x = s on both sides (van de Hulst; Sekera).

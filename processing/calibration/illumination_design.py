@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.geometry.frames import ScatteringGeometry
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
@@ -16,15 +16,13 @@ from processing.polarization.xi0 import Xi0Estimate, estimate
 from processing.reduction.mueller import Progress
 from processing.reflectance.base import ReflectanceModel
 
-FloatArray = NDArray[np.float64]
-
 #: The paper's fifteen arm angles.
 PAPER_OMEGA_DEG = tuple(float(v) for v in range(20, 91, 5))
 
 
-def linear_states(step_deg: float = 15.0) -> dict[str, FloatArray]:
+def linear_states(step_deg: float = 15.0) -> dict[str, Array]:
     """Stokes vectors of unit power by name: linear at every `step_deg` (horizontal is 0, vertical 90), circular."""
-    found: dict[str, FloatArray] = {}
+    found: dict[str, Array] = {}
     for angle in np.arange(0.0, 180.0, step_deg):
         name = {0.0: "horizontal", 90.0: "vertical"}.get(float(angle), f"linear {angle:g} deg")
         t = 2 * np.deg2rad(angle)
@@ -55,12 +53,12 @@ class Prediction:
     """
 
     name: str
-    stokes: FloatArray
-    omega_deg: FloatArray
-    p90: FloatArray
-    median: FloatArray
-    lost: FloatArray
-    condition: FloatArray
+    stokes: Array
+    omega_deg: Array
+    p90: Array
+    median: Array
+    lost: Array
+    condition: Array
 
     @property
     def score(self) -> float:
@@ -73,7 +71,7 @@ def predict(
     model: ReflectanceModel,
     wavelength_nm: float,
     camera: InstrumentModel,
-    states: dict[str, FloatArray],
+    states: dict[str, Array],
     omega_deg: Sequence[float] = PAPER_OMEGA_DEG,
     assumptions: Assumptions | None = None,
     pixels: int = 100,
@@ -105,7 +103,7 @@ def predict(
 
 
 def predicted(
-    m0: FloatArray, points: ScatteringGeometry, analyzers: FloatArray, stokes: FloatArray, given: Assumptions
+    m0: Array, points: ScatteringGeometry, analyzers: Array, stokes: Array, given: Assumptions
 ) -> Xi0Estimate:
     """Estimate from noise-free intensities with the variance that noise would have: its standard errors count."""
     normal, source = points.normal, points.to_source

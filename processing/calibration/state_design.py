@@ -12,15 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from processing.arrays import Array
 from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel, Retarder, condition_number, rank
 from processing.instrument.states import Role, StateTable, rotating_retarders
 from processing.polarization import mueller
-
-Array = NDArray[np.float64]
 
 #: Ratios that the optimizer tries: both signs leave the same determination, so only positive ones.
 RATIOS = np.round(np.arange(1.0, 12.0001, 0.01), 2)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.space import Space, Sums
 from processing.geometry.frames import ScatteringGeometry
@@ -18,7 +19,6 @@ from processing.polarization import mueller
 from processing.reflectance.changes import ReflectanceChanges
 from processing.reflectance.effects.base import ReflectanceEffect, reflectance_effects
 
-Array = NDArray[np.float64]
 STEP = 1e-4
 #: Parts of the points that are held out in turn.
 FOLDS = 5

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-FloatArray = NDArray[np.float64]
+from processing.arrays import Array
 
 
 class Flat(BaseModel):
@@ -25,9 +25,7 @@ class Flat(BaseModel):
     height_mm: float = Field(gt=0)
     normal_deg: float | None = None
 
-    def intersect(
-        self, origin_mm: FloatArray, rays: FloatArray, omega_deg: float
-    ) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
+    def intersect(self, origin_mm: Array, rays: Array, omega_deg: float) -> tuple[NDArray[np.bool_], Array, Array]:
         """Hits of rays (..., 3): mask (...), points (N, 3) in mm and normals (N, 3)."""
         turn = np.deg2rad(omega_deg / 2 if self.normal_deg is None else self.normal_deg)
         normal = np.array([np.sin(turn), 0.0, np.cos(turn)])
@@ -45,7 +43,7 @@ class Flat(BaseModel):
         found = points[hit]
         return hit, found, np.broadcast_to(normal, found.shape).copy()
 
-    def occluded(self, points_mm: FloatArray, towards: FloatArray) -> NDArray[np.bool_]:
+    def occluded(self, points_mm: Array, towards: Array) -> NDArray[np.bool_]:
         """No point on the lit side is shaded by the shape itself: (N,) of False."""
         del towards
         return np.zeros(len(points_mm), dtype=bool)

@@ -15,27 +15,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from processing.arrays import Array
 from processing.geometry import rusinkiewicz
 from processing.polarization import mueller
 
-FloatArray = NDArray[np.float64]
-
-WORLD_UP: FloatArray = np.array([0.0, 1.0, 0.0])
+WORLD_UP: Array = np.array([0.0, 1.0, 0.0])
 
 
-def unit(v: ArrayLike) -> FloatArray:
+def unit(v: ArrayLike) -> Array:
     """Vectors (..., 3) at unit length; a zero vector stays zero."""
     a = np.asarray(v, dtype=np.float64)
     length = np.sqrt(np.einsum("...i,...i->...", a, a))[..., None]
     return np.asarray(np.divide(a, length, out=np.zeros_like(a), where=length > 0))
 
 
-def dot(a: ArrayLike, b: ArrayLike) -> FloatArray:
+def dot(a: ArrayLike, b: ArrayLike) -> Array:
     """Scalar products over the last axis."""
     return np.asarray(np.einsum("...i,...i->...", np.asarray(a), np.asarray(b)))
 
 
-def cross(a: ArrayLike, b: ArrayLike) -> FloatArray:
+def cross(a: ArrayLike, b: ArrayLike) -> Array:
     """Vector products over the last axis (several times faster than numpy's general one)."""
     u, v = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
     out = np.empty(u.shape)
@@ -55,13 +54,13 @@ class ScatteringGeometry:
     up : (3,) or (..., 3), the direction that fixes the transverse axes of both beams.
     """
 
-    normal: FloatArray
-    to_source: FloatArray
-    to_camera: FloatArray
-    up: FloatArray = field(default_factory=WORLD_UP.copy)
+    normal: Array
+    to_source: Array
+    to_camera: Array
+    up: Array = field(default_factory=WORLD_UP.copy)
 
     @cached_property
-    def half(self) -> FloatArray:
+    def half(self) -> Array:
         """h, unit half vector of wi and wo."""
         return unit(self.to_source + self.to_camera)
 
@@ -71,7 +70,7 @@ class ScatteringGeometry:
         return rusinkiewicz.angles(self.normal, self.to_source, self.to_camera)
 
     @cached_property
-    def s_axis(self) -> FloatArray:
+    def s_axis(self) -> Array:
         """s = unit(h cross wi); where source and camera coincide any transverse axis serves, `up` is taken."""
         s = cross(self.half, self.to_source)
         length = np.sqrt(dot(s, s))
@@ -82,12 +81,12 @@ class ScatteringGeometry:
         return unit(s)
 
     @property
-    def axes_in(self) -> tuple[FloatArray, FloatArray]:
+    def axes_in(self) -> tuple[Array, Array]:
         """x, y of the generator's beam, ki = -wi."""
         return transverse_axes(-self.to_source, self.up)
 
     @property
-    def axes_out(self) -> tuple[FloatArray, FloatArray]:
+    def axes_out(self) -> tuple[Array, Array]:
         """x, y of the analyzer's beam, ko = wo."""
         return transverse_axes(self.to_camera, self.up)
 
@@ -128,13 +127,13 @@ class GeometryImage:
         return out
 
 
-def transverse_axes(k: FloatArray, up: FloatArray = WORLD_UP) -> tuple[FloatArray, FloatArray]:
+def transverse_axes(k: Array, up: Array = WORLD_UP) -> tuple[Array, Array]:
     """x = unit(up cross k) and y = k cross x for propagation directions k (..., 3)."""
     x = unit(cross(up, k))
     return x, cross(k, x)
 
 
-def change_frames(m: ArrayLike, geometry: ScatteringGeometry, up: ArrayLike) -> FloatArray:
+def change_frames(m: ArrayLike, geometry: ScatteringGeometry, up: ArrayLike) -> Array:
     """Mueller matrices (..., 4, 4) given in the geometry's axes, referred to the axes that `up` fixes."""
     target = geometry.with_up(up)
     turn_in = _turn(-geometry.to_source, geometry.axes_in[0], target.axes_in[0])
@@ -142,6 +141,6 @@ def change_frames(m: ArrayLike, geometry: ScatteringGeometry, up: ArrayLike) -> 
     return np.asarray(mueller.rotation(-turn_out) @ np.asarray(m, dtype=np.float64) @ mueller.rotation(turn_in))
 
 
-def _turn(k: FloatArray, x_from: FloatArray, x_to: FloatArray) -> FloatArray:
+def _turn(k: Array, x_from: Array, x_to: Array) -> Array:
     # Counter-clockwise angle about k, that is, as seen looking into the beam.
     return np.asarray(np.arctan2(dot(k, cross(x_from, x_to)), dot(x_from, x_to)))

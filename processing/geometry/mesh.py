@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from processing.arrays import Array
 from processing.computing.threads import for_ranges
 from processing.geometry.errors import GeometryError
 
-FloatArray = NDArray[np.float64]
 #: Rays that embree gets at a time.
 RAYS = 1 << 15
 
@@ -40,9 +40,7 @@ class Mesh(BaseModel):
         """The same mesh with its file looked up from `folder`."""
         return self.model_copy(update={"file": str(folder / self.file)})
 
-    def intersect(
-        self, origin_mm: FloatArray, rays: FloatArray, omega_deg: float
-    ) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
+    def intersect(self, origin_mm: Array, rays: Array, omega_deg: float) -> tuple[NDArray[np.bool_], Array, Array]:
         """Nearest hits of rays (..., 3): mask (...), points (N, 3) in mm and unit normals (N, 3).
 
         Raises GeometryError when the file cannot be read or the mesh has holes.
@@ -67,7 +65,7 @@ class Mesh(BaseModel):
         )
         return hit.reshape(rays.shape[:-1]), points, normal
 
-    def occluded(self, points_mm: FloatArray, towards: FloatArray) -> NDArray[np.bool_]:
+    def occluded(self, points_mm: Array, towards: Array) -> NDArray[np.bool_]:
         """Whether the mesh itself stands between points (N, 3) and the directions (N, 3) towards the source."""
         world = self._world()
         start = points_mm + towards * (1e-4 * world.size_mm)
@@ -86,10 +84,10 @@ class Mesh(BaseModel):
 class _World:
     """A mesh in world coordinates: arrays for the compiled loop, and embree's scene."""
 
-    triangles: FloatArray
-    face_normals: FloatArray
-    corner_normals: FloatArray
-    flat_normals: FloatArray
+    triangles: Array
+    face_normals: Array
+    corner_normals: Array
+    flat_normals: Array
     size_mm: float
     scene: Any
 
@@ -138,7 +136,7 @@ def _load(
     )
 
 
-def _first_hits(scene: Any, origin: FloatArray, rays: FloatArray) -> NDArray[np.int32]:
+def _first_hits(scene: Any, origin: Array, rays: Array) -> NDArray[np.int32]:
     # Index of the first triangle that each ray (N, 3) from origin (3,) or (N, 3) meets, -1 for none. In chunks, because
     # embree wants single precision and the first touch of new memory for all rays costs a tenth of the time.
     count = len(rays)
@@ -153,7 +151,7 @@ def _first_hits(scene: Any, origin: FloatArray, rays: FloatArray) -> NDArray[np.
     return face
 
 
-def _turn(rotation_deg: tuple[float, float, float]) -> FloatArray:
+def _turn(rotation_deg: tuple[float, float, float]) -> Array:
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_rotvec(np.deg2rad(rotation_deg)).as_matrix())

@@ -10,11 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
+from processing.arrays import Array
 from processing.geometry.errors import OutlineNotFound
 from processing.geometry.sphere import Sphere
 from processing.geometry.viewing import ViewingGeometry
-
-FloatArray = NDArray[np.float64]
 
 #: Half length of the radial profile across the edge, in pixels.
 REACH_PX = 6.0
@@ -121,7 +120,7 @@ def registered(view: ViewingGeometry, circle: Circle, rows: int, columns: int) -
     return view.model_copy(update={"camera": camera, "shape": centred})
 
 
-def _check_frame(circle: FloatArray, shape: tuple[int, ...]) -> None:
+def _check_frame(circle: Array, shape: tuple[int, ...]) -> None:
     row, column, radius = (float(v) for v in circle)
     reach = min(row - radius, column - radius, shape[0] - 1 - row - radius, shape[1] - 1 - column - radius)
     if reach < 0:
@@ -131,7 +130,7 @@ def _check_frame(circle: FloatArray, shape: tuple[int, ...]) -> None:
         )
 
 
-def _bright_contour(img: FloatArray) -> tuple[FloatArray, NDArray[np.uint8]]:
+def _bright_contour(img: Array) -> tuple[Array, NDArray[np.uint8]]:
     top = float(np.percentile(img, 99.5))
     if top <= 0 or not np.isfinite(top):
         raise OutlineNotFound("the image is dark everywhere: there is no sphere to find")
@@ -150,14 +149,14 @@ def _bright_contour(img: FloatArray) -> tuple[FloatArray, NDArray[np.uint8]]:
     return xy[:, ::-1].astype(float), mask
 
 
-def _sharp(contour: FloatArray, smooth: FloatArray) -> FloatArray:
+def _sharp(contour: Array, smooth: Array) -> Array:
     # The border of the shadow falls off over the whole radius, the limb within two pixels.
     slope = cv2.dilate(np.hypot(*np.gradient(smooth)), np.ones((7, 7)))
     steepness = slope[contour[:, 0].astype(int), contour[:, 1].astype(int)]
     return np.asarray(contour[steepness > 0.3 * np.percentile(steepness, 95)])
 
 
-def _consensus(contour: FloatArray, mask: NDArray[np.uint8], rng: np.random.Generator) -> FloatArray:
+def _consensus(contour: Array, mask: NDArray[np.uint8], rng: np.random.Generator) -> Array:
     # A circle through three points of the contour, best supported, that holds nearly all of the object.
     best, support = None, 0
     area = np.argwhere(mask)[:: max(1, int(mask.sum()) // 2000)]
@@ -180,7 +179,7 @@ def _consensus(contour: FloatArray, mask: NDArray[np.uint8], rng: np.random.Gene
     return best
 
 
-def _edge_points(img: FloatArray, circle: FloatArray) -> FloatArray:
+def _edge_points(img: Array, circle: Array) -> Array:
     row, column, radius = circle
     angle = np.linspace(0, 2 * np.pi, max(60, int(2 * np.pi * radius)), endpoint=False)
     offset = np.arange(-REACH_PX, REACH_PX + 0.125, 0.25)
@@ -198,10 +197,10 @@ def _edge_points(img: FloatArray, circle: FloatArray) -> FloatArray:
     # A step blurred by one pixel falls with 0.38 of its height a pixel; the border of the shadow is softer.
     sharp = (at > SHARPNESS * step) & (np.abs(crossing) < REACH_PX - 1)
     good = sharp & (step > 0.3 * np.percentile(step, 95)) & (step > 5 * noise)
-    points: FloatArray = np.array([row, column]) + away[good] * (radius + crossing[good])[:, None]
+    points: Array = np.array([row, column]) + away[good] * (radius + crossing[good])[:, None]
     inside = (points >= 0).all(axis=1) & (points <= np.array(img.shape) - 1).all(axis=1)
     return points[inside]
 
 
-def _distances(circle: FloatArray, points: FloatArray) -> FloatArray:
+def _distances(circle: Array, points: Array) -> Array:
     return np.asarray(np.hypot(points[:, 0] - circle[0], points[:, 1] - circle[1]) - circle[2])

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-FloatArray = NDArray[np.float64]
+from processing.arrays import Array
 
 
 class PinholeCamera(BaseModel):
@@ -39,7 +38,7 @@ class PinholeCamera(BaseModel):
         return self.centre_px if self.centre_px is not None else ((self.rows - 1) / 2, (self.columns - 1) / 2)
 
     @property
-    def position_mm(self) -> FloatArray:
+    def position_mm(self) -> Array:
         """Centre of projection in the world, mm."""
         return np.array([0.0, 0.0, self.distance_mm])
 
@@ -56,7 +55,7 @@ class PinholeCamera(BaseModel):
             update={"rows": rows, "columns": columns, "pixel_mm": self.pixel_mm / zoom, "centre_px": centre}
         )
 
-    def rays(self, rows: slice = slice(None)) -> FloatArray:
+    def rays(self, rows: slice = slice(None)) -> Array:
         """Unit directions (rows, columns, 3) from the camera through each pixel of the rows asked for."""
         r = np.arange(self.rows)[rows].astype(float)
         c = np.arange(self.columns, dtype=float)
@@ -70,7 +69,7 @@ class PinholeCamera(BaseModel):
         d[..., 0], d[..., 1], d[..., 2] = x * scale, y * scale, -scale
         return d
 
-    def project(self, points_mm: FloatArray) -> FloatArray:
+    def project(self, points_mm: Array) -> Array:
         """(row, column) of world points (..., 3) in mm."""
         p = np.asarray(points_mm, dtype=float)
         depth = self.distance_mm - p[..., 2]
@@ -80,7 +79,7 @@ class PinholeCamera(BaseModel):
         row0, column0 = self.axis_px
         return np.stack([row0 - y * self.focal_px, column0 + x * self.focal_px], axis=-1)
 
-    def _distort(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _distort(self, x: Array, y: Array) -> tuple[Array, Array]:
         # Brown-Conrady as in OpenCV's calib3d; OpenCV's y runs down, hence the sign of the tangential terms.
         k1, k2, p1, p2, k3 = (*self.distortion, *(0.0,) * (5 - len(self.distortion)))
         yd = -y
@@ -90,7 +89,7 @@ class PinholeCamera(BaseModel):
         yy = yd * radial + p1 * (r2 + 2 * yd * yd) + 2 * p2 * x * yd
         return xx, -yy
 
-    def _undistort(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _undistort(self, x: Array, y: Array) -> tuple[Array, Array]:
         # Fixed point of the forward map; converges for every distortion a real lens has.
         u, v = x, y
         for _ in range(20):

@@ -10,12 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_erosion, distance_transform_edt, map_coordinates
 from scipy.spatial.transform import Rotation
 
+from processing.arrays import Array
 from processing.geometry.errors import OutlineNotFound
 from processing.geometry.frames import unit
 from processing.geometry.mesh import Mesh
 from processing.geometry.pinhole import PinholeCamera
-
-FloatArray = NDArray[np.float64]
 
 #: Where the outline runs between pixels is known to about this; it moves all of the outline at once.
 OUTLINE_BIAS_PX = 0.15
@@ -40,7 +39,7 @@ class PoseFit:
     mesh: Mesh
     residual_px: float
     identifiable: int
-    stderr: FloatArray
+    stderr: Array
     steps: int
 
 
@@ -92,14 +91,14 @@ def refine_pose(mesh: Mesh, camera: PinholeCamera, silhouette: ArrayLike, max_st
     return PoseFit(mesh, rms, int(keep.sum()), error, step)
 
 
-def _signed_distance(mask: NDArray[np.bool_]) -> FloatArray:
+def _signed_distance(mask: NDArray[np.bool_]) -> Array:
     # Positive outside; the border runs half way between a pixel inside and one outside.
     inside, outside = distance_transform_edt(mask), distance_transform_edt(~mask)
     signed = np.where(mask, 0.5 - inside, outside - 0.5)
     return np.asarray(cv2.GaussianBlur(signed, (0, 0), 1.0))
 
 
-def _rim(mesh: Mesh, camera: PinholeCamera, seen: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray, float]:
+def _rim(mesh: Mesh, camera: PinholeCamera, seen: NDArray[np.bool_]) -> tuple[Array, Array, float]:
     hit, points, normals = mesh.intersect(camera.position_mm, camera.rays(), 0.0)
     if not hit.any():
         raise OutlineNotFound("the mesh is not in the frame at its start pose. Check its scale and translation.")
@@ -110,12 +109,12 @@ def _rim(mesh: Mesh, camera: PinholeCamera, seen: NDArray[np.bool_]) -> tuple[Fl
     return points[chosen], normals[chosen], float((hit & seen).sum() / seen.sum())
 
 
-def _sample(image: FloatArray, where: FloatArray) -> FloatArray:
+def _sample(image: Array, where: Array) -> Array:
     # The rim's pixel centres lie half a pixel inside the outline, so they are due at -0.5.
     return np.asarray(map_coordinates(image, where.T, order=1, mode="nearest") + 0.5)
 
 
-def _jacobian(rim: FloatArray, normal: FloatArray, mesh: Mesh, camera: PinholeCamera) -> FloatArray:
+def _jacobian(rim: Array, normal: Array, mesh: Mesh, camera: PinholeCamera) -> Array:
     # How far the outline moves outwards, in pixels, for an arc and a shift of 1 mm along each axis. A turn moves
     # the surface along its normal; a shift counts across the line of sight, since the outline is where the two
     # are perpendicular and the rim pixel's own normal still leans towards the camera.
@@ -127,11 +126,11 @@ def _jacobian(rim: FloatArray, normal: FloatArray, mesh: Mesh, camera: PinholeCa
     return np.asarray(scale[:, None] * np.hstack([turn, across]))
 
 
-def _size(points: FloatArray, pivot: FloatArray) -> float:
+def _size(points: Array, pivot: Array) -> float:
     return float(np.sqrt(np.mean(np.sum((points - pivot) ** 2, axis=1))))
 
 
-def _moved(mesh: Mesh, move: FloatArray, size_mm: float) -> Mesh:
+def _moved(mesh: Mesh, move: Array, size_mm: float) -> Mesh:
     turn = Rotation.from_rotvec(move[:3] / size_mm) * Rotation.from_rotvec(np.deg2rad(mesh.rotation_deg))
     x, y, z = (float(v) for v in np.rad2deg(turn.as_rotvec()))
     a, b, c = (float(v) for v in np.asarray(mesh.translation_mm) + move[3:])

@@ -5,20 +5,19 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from processing.arrays import Array
 
 
 class Angles(NamedTuple):
     """theta_h, theta_d (0..pi/2) and phi_d (-pi..pi), radians, each (...)."""
 
-    theta_h: FloatArray
-    theta_d: FloatArray
-    phi_d: FloatArray
+    theta_h: Array
+    theta_d: Array
+    phi_d: Array
 
 
-def angles(n: FloatArray, wi: FloatArray, wo: FloatArray) -> Angles:
+def angles(n: Array, wi: Array, wo: Array) -> Angles:
     """Angles of unit vectors (..., 3): normal, to the source, to the camera.
 
     theta_h = angle(n, h), theta_d = angle(wi, h); phi_d is the azimuth of wi about h, counted from the
@@ -43,9 +42,7 @@ def angles(n: FloatArray, wi: FloatArray, wo: FloatArray) -> Angles:
     return Angles(np.arctan2(sh, ch), np.arctan2(sd, cd), phi)
 
 
-def directions(
-    theta_h: FloatArray, theta_d: FloatArray, phi_d: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def directions(theta_h: Array, theta_d: Array, phi_d: Array) -> tuple[Array, Array, Array]:
     """Unit vectors n, wi, wo (..., 3) with the given angles: h on +z, wi and wo in the horizontal plane.
 
     wi = (sin theta_d, 0, cos theta_d), wo = (-sin theta_d, 0, cos theta_d): the instrument that stands
@@ -60,5 +57,5 @@ def directions(
     return n, wi, wo
 
 
-def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+def _dot(a: Array, b: Array) -> Array:
     return np.asarray(np.einsum("...i,...i->...", a, b))

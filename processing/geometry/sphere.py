@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-FloatArray = NDArray[np.float64]
+from processing.arrays import Array
 
 
 class Sphere(BaseModel):
@@ -20,9 +20,7 @@ class Sphere(BaseModel):
     radius_mm: float = Field(gt=0)
     centre_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    def intersect(
-        self, origin_mm: FloatArray, rays: FloatArray, omega_deg: float
-    ) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
+    def intersect(self, origin_mm: Array, rays: Array, omega_deg: float) -> tuple[NDArray[np.bool_], Array, Array]:
         """Nearest hits of rays (..., 3): mask (...), points (N, 3) in mm and outward normals (N, 3)."""
         del omega_deg  # a sphere at the centre looks the same at any arm angle
         centre = np.asarray(self.centre_mm)
@@ -34,7 +32,7 @@ class Sphere(BaseModel):
         points = np.asarray(origin_mm) + rays[hit] * t[:, None]
         return hit, points, (points - centre) / self.radius_mm
 
-    def occluded(self, points_mm: FloatArray, towards: FloatArray) -> NDArray[np.bool_]:
+    def occluded(self, points_mm: Array, towards: Array) -> NDArray[np.bool_]:
         """No point on the lit side is shaded by the shape itself: (N,) of False."""
         del towards
         return np.zeros(len(points_mm), dtype=bool)

@@ -6,17 +6,15 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from processing.arrays import Array
 from processing.geometry.flat import Flat
 from processing.geometry.frames import GeometryImage, ScatteringGeometry, dot, unit
 from processing.geometry.mesh import Mesh
 from processing.geometry.pinhole import PinholeCamera
 from processing.geometry.sphere import Sphere
 from processing.yaml_file import load_yaml
-
-FloatArray = NDArray[np.float64]
 
 Shape = Annotated[Sphere | Flat | Mesh, Field(discriminator="kind")]
 
@@ -45,7 +43,7 @@ class ViewingGeometry(BaseModel):
             return self
         return self.model_copy(update={"shape": self.shape.relative_to(folder)})
 
-    def source_position_mm(self, omega_deg: float) -> FloatArray:
+    def source_position_mm(self, omega_deg: float) -> Array:
         """(sin W, 0, cos W) times the source's distance, W being the arm's reading and its zero."""
         w = np.deg2rad(omega_deg + self.arm_zero_deg)
         return self.source_distance_mm * np.array([np.sin(w), 0.0, np.cos(w)])

@@ -11,15 +11,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from processing.arrays import Array
 from processing.errors import ProcessError
 from processing.instrument.changes import Changes, Conditions
 from processing.polarization import mueller
 from processing.yaml_file import load_yaml
-
-Row = NDArray[np.float64]
 
 #: A number, or one number for each wavelength in nm.
 Dispersive = float | dict[float, float]
@@ -47,7 +46,7 @@ class Element(_Part):
             raise ValueError(f"element {self.name!r} has a ratio but no axis that turns it")
         return self
 
-    def azimuth_rad(self, angles_deg: Mapping[str, ArrayLike], states: int) -> Row:
+    def azimuth_rad(self, angles_deg: Mapping[str, ArrayLike], states: int) -> Array:
         """Azimuth (states,) in radians; angles_deg holds the angle of each axis for each state."""
         azimuth = np.full(states, _number(self.azimuth_deg))
         if self.axis is not None:
@@ -57,7 +56,7 @@ class Element(_Part):
             azimuth = azimuth + self.ratio * np.asarray(angles_deg[self.axis], dtype=float)
         return np.asarray(np.deg2rad(azimuth))
 
-    def mueller(self, azimuth_rad: Row, changes: Changes | None = None) -> Row:
+    def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
         """Mueller matrices (states, 4, 4) of the element at each azimuth, with what effects change in it."""
         raise NotImplementedError
 
@@ -68,7 +67,7 @@ class Polarizer(Element):
     kind: Literal["polarizer"]
     extinction: Dispersive = 0.0
 
-    def mueller(self, azimuth_rad: Row, changes: Changes | None = None) -> Row:
+    def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
         extinction = _number(self.extinction) + (changes.extinction[self.name] if changes else 0.0)
         return mueller.polarizer(azimuth_rad, extinction)
 
@@ -80,7 +79,7 @@ class Retarder(Element):
     retardance_deg: Dispersive
     diattenuation: Dispersive = 0.0
 
-    def mueller(self, azimuth_rad: Row, changes: Changes | None = None) -> Row:
+    def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
         retardance = np.deg2rad(_number(self.retardance_deg)) + (changes.retardance_rad[self.name] if changes else 0.0)
         plain = mueller.retarder(azimuth_rad, retardance)
         d = _number(self.diattenuation) + (changes.diattenuation[self.name] if changes else 0.0)
@@ -96,7 +95,7 @@ class Diattenuator(Element):
     t_max: Dispersive = 1.0
     t_min: Dispersive
 
-    def mueller(self, azimuth_rad: Row, changes: Changes | None = None) -> Row:
+    def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
         return mueller.diattenuator(azimuth_rad, _number(self.t_max), _number(self.t_min))
 
 
@@ -215,7 +214,7 @@ class InstrumentModel(_Part):
         ]
         return InstrumentModel.model_validate(resolved | {"wavelengths_nm": (wavelength_nm,)})
 
-    def generator_states(self, angles_deg: Mapping[str, ArrayLike], changes: Changes | None = None) -> Row:
+    def generator_states(self, angles_deg: Mapping[str, ArrayLike], changes: Changes | None = None) -> Array:
         """Stokes vectors g (states, 4): first column of the generator train's Mueller matrix."""
         n = _state_count(angles_deg)
         stokes = np.zeros((n, 4))
@@ -224,7 +223,7 @@ class InstrumentModel(_Part):
             stokes = np.einsum("nij,nj->ni", _matrices(element, angles_deg, n, changes), stokes)
         return stokes
 
-    def analyzer_states(self, angles_deg: Mapping[str, ArrayLike], changes: Changes | None = None) -> Row:
+    def analyzer_states(self, angles_deg: Mapping[str, ArrayLike], changes: Changes | None = None) -> Array:
         """Analyzer vectors a (states, channels, 4): first row of each channel's train."""
         n = _state_count(angles_deg)
         common = [_matrices(e, angles_deg, n, changes) for e in self.analyzer]
@@ -238,7 +237,7 @@ class InstrumentModel(_Part):
             out[:, k] = row
         return out
 
-    def rows(self, angles_deg: Mapping[str, ArrayLike], changes: Changes | None = None) -> Row:
+    def rows(self, angles_deg: Mapping[str, ArrayLike], changes: Changes | None = None) -> Array:
         """Measurement matrix W (states, channels, 16): row = kron(a, g), so that P = W . vec(M), row-major.
 
         The model must be resolved at a wavelength (`at`). Angles are those read back, in degrees. `changes` is
@@ -268,7 +267,7 @@ def rank(w: ArrayLike) -> int:
     return int(np.linalg.matrix_rank(np.asarray(w, dtype=float).reshape(-1, 16), rtol=1e-8))
 
 
-def _matrices(element: Element, angles_deg: Mapping[str, ArrayLike], states: int, changes: Changes | None) -> Row:
+def _matrices(element: Element, angles_deg: Mapping[str, ArrayLike], states: int, changes: Changes | None) -> Array:
     azimuth = element.azimuth_rad(angles_deg, states)
     if changes is None:
         return element.mueller(azimuth)
@@ -283,7 +282,7 @@ def _matrices(element: Element, angles_deg: Mapping[str, ArrayLike], states: int
     return changes.after[element.name] @ matrix if element.name in changes.after else matrix
 
 
-def _detected(w: Row, changes: Changes) -> Row:
+def _detected(w: Array, changes: Changes) -> Array:
     if changes.stray:
         # Light that no element modulates: the same for every state, as strong as the fraction of the mean signal.
         w = w.copy()

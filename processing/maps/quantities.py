@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import RealArray
 from processing.errors import ProcessError
 from processing.polarization import gradients
-from processing.polarization.cloude import Floats
 from processing.polarization.decompositions.differential import differential
 from processing.polarization.decompositions.lu_chipman import lu_chipman
 from processing.polarization.decompositions.symmetric import symmetric
@@ -69,7 +69,7 @@ _DIFFERENTIAL = {
     "differential_diattenuation_linear": Plane((), "", "linear diattenuation exponent, ln(T_max / T_min) / 2"),
 } | {f"differential_depolarization_{k}": Plane((), "", f"depolarization exponent of S{k}") for k in (1, 2, 3)}
 
-_GROUPS: tuple[Callable[[Floats], dict[str, Derived]], ...] = (
+_GROUPS: tuple[Callable[[RealArray], dict[str, Derived]], ...] = (
     gradients.coherency,
     gradients.depolarization_index,
     gradients.diattenuation,

@@ -9,24 +9,22 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from processing.arrays import RealArray
 from processing.computing.chunks import for_chunks
 from processing.polarization import coherency_kernels as kernels
-
-Floats = NDArray[np.floating]
 
 
 class Cloude(NamedTuple):
     """Cloude decomposition: M = m00 sum_k xi_k m_k."""
 
-    eigenvalues: Floats
+    eigenvalues: RealArray
     """(..., 4), descending, sum 1."""
-    mueller_jones: Floats
+    mueller_jones: RealArray
     """(..., 4, 4, 4): the matrix of each eigenvalue, m00 = 1."""
 
 
-def coherency_eigenvalues(m: Floats) -> Floats:
+def coherency_eigenvalues(m: RealArray) -> RealArray:
     """Eigenvalues xi0 >= xi1 >= xi2 >= xi3 of the coherency matrices of Mueller matrices, divided by their trace.
 
     Parameters
@@ -45,7 +43,7 @@ def coherency_eigenvalues(m: Floats) -> Floats:
     return np.moveaxis(xi.reshape(4, *shape), 0, -1)
 
 
-def cloude(m: Floats) -> Cloude:
+def cloude(m: RealArray) -> Cloude:
     """All four eigenvalues and Mueller-Jones matrices of Mueller matrices (..., 4, 4).
 
     Values and NaN as in `coherency_eigenvalues`. Where eigenvalues are equal their matrices are one choice of
@@ -59,7 +57,7 @@ def cloude(m: Floats) -> Cloude:
     return Cloude(np.moveaxis(xi.reshape(4, *shape), 0, -1), matrices)
 
 
-def xi0_and_dominant(m: Floats, out: tuple[Floats, Floats] | None = None) -> tuple[Floats, Floats]:
+def xi0_and_dominant(m: RealArray, out: tuple[RealArray, RealArray] | None = None) -> tuple[RealArray, RealArray]:
     """Largest coherency eigenvalue xi0 and the dominant Mueller-Jones matrix m0.
 
     Newton's method on the characteristic polynomial and the adjugate, in float64; where the largest eigenvalues
@@ -88,7 +86,7 @@ def xi0_and_dominant(m: Floats, out: tuple[Floats, Floats] | None = None) -> tup
     return xi0.reshape(shape), np.moveaxis(m0.reshape(4, 4, *shape), (0, 1), (-2, -1))
 
 
-def xi0_of_dominant(m: Floats, m0: Floats) -> Floats:
+def xi0_of_dominant(m: RealArray, m0: RealArray) -> RealArray:
     """Eigenvalue of the coherency matrix of M that belongs to a given Mueller-Jones matrix m0 (m00 = 1).
 
     For a triply degenerate M = m00 4/3 ((xi0 - 1/4) m0 + (1 - xi0) m_ID) with xi0 below 1/4, m0 belongs to the
@@ -98,7 +96,7 @@ def xi0_of_dominant(m: Floats, m0: Floats) -> Floats:
     return np.asarray(np.einsum("...ij,...ij->...", m, m0) / (4 * m[..., 0, 0]))
 
 
-def as_planar(m: Floats) -> tuple[Floats, tuple[int, ...]]:
+def as_planar(m: RealArray) -> tuple[RealArray, tuple[int, ...]]:
     """View m as (16, pixels), C- or Fortran-ordered, copying only where its memory is neither."""
     m = np.asarray(m)
     if m.shape[-2:] != (4, 4):

@@ -10,8 +10,9 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from processing.arrays import RealArray
 from processing.polarization import quantities
-from processing.polarization.cloude import Floats, cloude, xi0_and_dominant
+from processing.polarization.cloude import cloude, xi0_and_dominant
 from processing.polarization.decompositions.differential import differential, differential_slopes
 from processing.polarization.decompositions.lu_chipman import depolarization_power, lu_chipman
 from processing.polarization.decompositions.symmetric import G, symmetric
@@ -19,7 +20,7 @@ from processing.polarization.propagation import Derived, numeric_gradient
 from processing.polarization.quantities import State
 
 
-def coherency(m: Floats) -> dict[str, Derived]:
+def coherency(m: RealArray) -> dict[str, Derived]:
     """Coherency eigenvalues, their deviation from the triply degenerate model, entropy.
 
     d xi_k = v_k^H dH v_k for the eigenvector v_k of H: in Mueller elements (m_k - 4 xi_k e00) / (4 m00).
@@ -42,7 +43,7 @@ def coherency(m: Floats) -> dict[str, Derived]:
     }
 
 
-def depolarization_index(m: Floats) -> dict[str, Derived]:
+def depolarization_index(m: RealArray) -> dict[str, Derived]:
     """Depolarization index: d DI = (sum of m_ij d m_ij without 00) / (3 m00^2 DI) - DI d m00 / m00."""
     m = np.asarray(m, dtype=float)
     value, m00 = quantities.depolarization_index(m), m[..., 0, 0]
@@ -52,19 +53,19 @@ def depolarization_index(m: Floats) -> dict[str, Derived]:
     return {"depolarization_index": Derived(value, gradient)}
 
 
-def diattenuation(m: Floats) -> dict[str, Derived]:
+def diattenuation(m: RealArray) -> dict[str, Derived]:
     """Diattenuation of M itself: magnitude, linear, circular, orientation."""
     m = np.asarray(m, dtype=float)
     return _vector("diattenuation", quantities.diattenuation_vector(m), m[..., 0, 0], (1, 2, 3))
 
 
-def polarizance(m: Floats) -> dict[str, Derived]:
+def polarizance(m: RealArray) -> dict[str, Derived]:
     """Polarizance of M itself: magnitude, linear, circular, orientation."""
     m = np.asarray(m, dtype=float)
     return _vector("polarizance", quantities.polarizance_vector(m), m[..., 0, 0], (4, 8, 12))
 
 
-def _vector(name: str, v: Floats, m00: Floats, elements: tuple[int, int, int]) -> dict[str, Derived]:
+def _vector(name: str, v: RealArray, m00: RealArray, elements: tuple[int, int, int]) -> dict[str, Derived]:
     slope = np.zeros((3, *v.shape[:-1], 16))  # d v_i = d m_i / m00 - v_i d m00 / m00
     for i, element in enumerate(elements):
         slope[i, ..., element] = 1 / m00
@@ -75,7 +76,7 @@ def _vector(name: str, v: Floats, m00: Floats, elements: tuple[int, int, int]) -
     return {name: Derived(size, whole)} | _parts(name, v, slope)
 
 
-def _parts(name: str, v: Floats, slope: Floats) -> dict[str, Derived]:
+def _parts(name: str, v: RealArray, slope: RealArray) -> dict[str, Derived]:
     """Linear part, circular part and orientation of a vector v (..., 3) with gradient slope (3, ..., 16)."""
     linear = quantities.linear_magnitude(v)
     v1, v2 = v[..., 0, None], v[..., 1, None]
@@ -93,10 +94,10 @@ RETARDER = ("retardance_deg", "retardance_linear_deg", "retardance_fast_axis_deg
 _RETARDER_PERIOD = (np.inf, np.inf, 180.0, np.inf)
 
 
-def dominant(m: Floats) -> dict[str, Derived]:
+def dominant(m: RealArray) -> dict[str, Derived]:
     """The dominant Mueller-Jones matrix m0 (4, 4, ...), its diattenuation and polarizance (the paper's |D| and psi)."""
 
-    def values(mueller: Floats) -> Floats:
+    def values(mueller: RealArray) -> RealArray:
         m0 = xi0_and_dominant(mueller)[1]
         return m0.reshape(*m0.shape[:-2], 16)
 
@@ -112,10 +113,10 @@ def dominant(m: Floats) -> dict[str, Derived]:
     )
 
 
-def lu_chipman_quantities(m: Floats) -> dict[str, Derived]:
+def lu_chipman_quantities(m: RealArray) -> dict[str, Derived]:
     """Retardance and depolarization power of the Lu-Chipman decomposition; NaN where it is not defined."""
 
-    def values(mueller: Floats) -> Floats:
+    def values(mueller: RealArray) -> RealArray:
         factors = lu_chipman(mueller)
         vector = quantities.retardance_vector(factors.retarder)
         return np.stack([*_retardance_deg(vector), depolarization_power(factors.depolarizer)], axis=-1)
@@ -123,7 +124,7 @@ def lu_chipman_quantities(m: Floats) -> dict[str, Derived]:
     return _numeric(values, m, (*RETARDER, "depolarization_power"), (*_RETARDER_PERIOD, np.inf))
 
 
-def symmetric_quantities(m: Floats) -> dict[str, Derived]:
+def symmetric_quantities(m: RealArray) -> dict[str, Derived]:
     """Diagonal of the symmetric decomposition's depolarizer over its first element; NaN where not defined.
 
     The squares of the four elements are the eigenvalues of N = M^T G M G up to one factor; with N v = lambda v the left
@@ -148,7 +149,7 @@ def symmetric_quantities(m: Floats) -> dict[str, Derived]:
     return {f"symmetric_d{k}": Derived(ratio[..., k - 1], flat[..., k - 1, :]) for k in (1, 2, 3)}
 
 
-def differential_quantities(m: Floats) -> dict[str, Derived]:
+def differential_quantities(m: RealArray) -> dict[str, Derived]:
     """Retardance, linear diattenuation and depolarization exponents of the differential decomposition."""
     found = differential(m)
     slope = differential_slopes(np.asarray(m, dtype=float), found.defined)
@@ -170,7 +171,7 @@ def differential_quantities(m: Floats) -> dict[str, Derived]:
     }
 
 
-def pairs(m: Floats, states: Mapping[str, tuple[State, State]]) -> dict[str, Derived]:
+def pairs(m: RealArray, states: Mapping[str, tuple[State, State]]) -> dict[str, Derived]:
     """Light between generator and analyzer over m00, for named pairs; linear in M apart from m00."""
     m = np.asarray(m, dtype=float)
     m00 = m[..., 0, 0]
@@ -184,7 +185,7 @@ def pairs(m: Floats, states: Mapping[str, tuple[State, State]]) -> dict[str, Der
     return found
 
 
-def _retardance_deg(vector: Floats) -> list[Floats]:
+def _retardance_deg(vector: RealArray) -> list[RealArray]:
     return [
         np.rad2deg(quantities.magnitude(vector)),
         np.rad2deg(quantities.linear_magnitude(vector)),
@@ -194,7 +195,7 @@ def _retardance_deg(vector: Floats) -> list[Floats]:
 
 
 def _numeric(
-    values: Callable[[Floats], Floats], m: Floats, names: tuple[str, ...], period: tuple[float, ...]
+    values: Callable[[RealArray], RealArray], m: RealArray, names: tuple[str, ...], period: tuple[float, ...]
 ) -> dict[str, Derived]:
     m = np.asarray(m, dtype=float)
     value = values(m)

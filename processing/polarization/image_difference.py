@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from processing.arrays import Array
 
 
-def linear_diattenuation(m: ArrayLike) -> FloatArray:
+def linear_diattenuation(m: ArrayLike) -> Array:
     """(D1, D2) = (m01, m02)/m00 of Mueller matrices (..., 4, 4): shape (..., 2)."""
     a = np.asarray(m, dtype=float)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(a[..., 0, 1:3] / a[..., 0, 0, None])
 
 
-def orientation_difference(d_a: ArrayLike, d_b: ArrayLike) -> FloatArray:
+def orientation_difference(d_a: ArrayLike, d_b: ArrayLike) -> Array:
     """psi_a - psi_b, radians in -pi/2..pi/2, of linear diattenuations (..., 2).
 
     Half the wrapped difference of the doubled angles: the paper's arc cosine loses half its digits near zero,
@@ -27,7 +27,7 @@ def orientation_difference(d_a: ArrayLike, d_b: ArrayLike) -> FloatArray:
     return np.asarray(0.5 * np.arctan2(sine, cosine))
 
 
-def magnitude(d: ArrayLike) -> FloatArray:
+def magnitude(d: ArrayLike) -> Array:
     """|D|, the linear diattenuation, of (..., 2)."""
     v = np.asarray(d, dtype=float)
     return np.asarray(np.hypot(v[..., 0], v[..., 1]))

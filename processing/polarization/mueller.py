@@ -10,8 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
+from processing.arrays import Array, ComplexArray
 
 IDEAL_DEPOLARIZER: NDArray[np.float64] = np.diag([1.0, 0.0, 0.0, 0.0])
 IDEAL_MIRROR: NDArray[np.float64] = np.diag([1.0, 1.0, -1.0, -1.0])
@@ -25,7 +24,7 @@ _TO_MUELLER = 0.5 * np.einsum("aji,bkl->abikjl", PAULI, PAULI).reshape(16, 16)
 _TO_COHERENCY = np.linalg.inv(_TO_MUELLER)
 
 
-def _assemble(rows: list[list[FloatArray]]) -> FloatArray:
+def _assemble(rows: list[list[Array]]) -> Array:
     shape = np.broadcast_shapes(*(np.shape(x) for row in rows for x in row))
     out = np.empty((*shape, 4, 4))
     for i, row in enumerate(rows):
@@ -34,14 +33,14 @@ def _assemble(rows: list[list[FloatArray]]) -> FloatArray:
     return out
 
 
-def rotation(angle: ArrayLike) -> FloatArray:
+def rotation(angle: ArrayLike) -> Array:
     """Mueller rotation R such that an element turned by `angle` is R(angle) M R(-angle)."""
     t = 2 * np.asarray(angle, dtype=float)
     c, s, o, z = np.cos(t), np.sin(t), np.ones_like(t), np.zeros_like(t)
     return _assemble([[o, z, z, z], [z, c, -s, z], [z, s, c, z], [z, z, z, o]])
 
 
-def retarder(azimuth: ArrayLike, retardance: ArrayLike) -> FloatArray:
+def retarder(azimuth: ArrayLike, retardance: ArrayLike) -> Array:
     """Linear retarder with its fast axis at `azimuth` (conventions.md, "Mueller calculus")."""
     t = 2 * np.asarray(azimuth, dtype=float)
     d = np.asarray(retardance, dtype=float)
@@ -58,7 +57,7 @@ def retarder(azimuth: ArrayLike, retardance: ArrayLike) -> FloatArray:
     )
 
 
-def diattenuator(azimuth: ArrayLike, t_max: ArrayLike, t_min: ArrayLike) -> FloatArray:
+def diattenuator(azimuth: ArrayLike, t_max: ArrayLike, t_min: ArrayLike) -> Array:
     """Linear diattenuator that transmits `t_max` along `azimuth` and `t_min` across it (intensities)."""
     t = 2 * np.asarray(azimuth, dtype=float)
     hi, lo = np.asarray(t_max, dtype=float), np.asarray(t_min, dtype=float)
@@ -76,7 +75,7 @@ def diattenuator(azimuth: ArrayLike, t_max: ArrayLike, t_min: ArrayLike) -> Floa
     )
 
 
-def polarizer(azimuth: ArrayLike, extinction: ArrayLike = 0.0) -> FloatArray:
+def polarizer(azimuth: ArrayLike, extinction: ArrayLike = 0.0) -> Array:
     """Linear polarizer with its transmission axis at `azimuth`; it carries its factor 1/2.
 
     `extinction` is the intensity leak T_min / T_max (0 = ideal).
@@ -84,12 +83,12 @@ def polarizer(azimuth: ArrayLike, extinction: ArrayLike = 0.0) -> FloatArray:
     return diattenuator(azimuth, 1.0, extinction)
 
 
-def circular_retarder(retardance: ArrayLike) -> FloatArray:
+def circular_retarder(retardance: ArrayLike) -> Array:
     """Circular retarder: turns linear polarization by half of `retardance`, counter-clockwise."""
     return rotation(np.asarray(retardance, dtype=float) / 2)
 
 
-def from_jones(jones: ArrayLike) -> FloatArray:
+def from_jones(jones: ArrayLike) -> Array:
     """Mueller-Jones matrix of Jones matrices (..., 2, 2): M_ab = 1/2 tr(s_a J s_b J^H)."""
     j = np.asarray(jones, dtype=complex)
     return coherency_to_mueller(_outer_vec(j))
@@ -110,7 +109,7 @@ def coherency(mueller: ArrayLike) -> ComplexArray:
     return h.reshape(*m.shape[:-2], 4, 4)
 
 
-def coherency_to_mueller(h: ArrayLike) -> FloatArray:
+def coherency_to_mueller(h: ArrayLike) -> Array:
     """Mueller matrix of a coherency matrix; the inverse of `coherency`."""
     h = np.asarray(h, dtype=complex)
     m = h.reshape(*h.shape[:-2], 16) @ _TO_MUELLER.T

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.polarization.cloude import Floats
+from processing.arrays import RealArray
 
 #: Step of the numerical derivative, relative to m00: rounding and truncation are then both about 1e-9.
 STEP = 1e-6
@@ -21,13 +21,13 @@ STEP = 1e-6
 class Derived(NamedTuple):
     """A quantity of each pixel with its gradient by the 16 Mueller elements, row-major."""
 
-    value: Floats
+    value: RealArray
     """(..., pixels...)"""
-    gradient: Floats
+    gradient: RealArray
     """(..., pixels..., 16)"""
 
 
-def standard_error(gradient: Floats, covariance: Floats) -> NDArray[np.float64]:
+def standard_error(gradient: RealArray, covariance: RealArray) -> NDArray[np.float64]:
     """Standard error sqrt(g C g) of a quantity with gradient g (..., 16), covariance C (..., 16, 16).
 
     One covariance (16, 16) serves all pixels; several quantities stack on the left of the gradient.
@@ -38,7 +38,7 @@ def standard_error(gradient: Floats, covariance: Floats) -> NDArray[np.float64]:
 
 
 def numeric_gradient(
-    function: Callable[[Floats], Floats], m: Floats, period: Floats | float = np.inf
+    function: Callable[[RealArray], RealArray], m: RealArray, period: RealArray | float = np.inf
 ) -> NDArray[np.float64]:
     """Gradient (..., Q, 16) of a function from Mueller matrices (..., 4, 4) to (..., Q), by central differences.
 

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from processing.polarization.cloude import Floats
+from processing.arrays import RealArray
 
 State = Literal["horizontal", "vertical", "45", "135", "right", "left", "unpolarized"]
 
@@ -34,7 +34,7 @@ PAPER_PAIRS: dict[str, tuple[State, State]] = {
 }
 
 
-def depolarization_index(m: Floats) -> Floats:
+def depolarization_index(m: RealArray) -> RealArray:
     """Gil and Bernabeu's index sqrt(|M|^2 - m00^2) / (sqrt 3 m00): 1 for a pure matrix, 0 for the ideal depolarizer."""
     m = np.asarray(m)
     total = np.einsum("...ij,...ij->...", m, m)
@@ -43,7 +43,7 @@ def depolarization_index(m: Floats) -> Floats:
         return np.asarray(np.sqrt(np.maximum(total - m00 * m00, 0)) / (np.sqrt(3, dtype=m.dtype) * m00))
 
 
-def entropy(eigenvalues: Floats) -> Floats:
+def entropy(eigenvalues: RealArray) -> RealArray:
     """Cloude's entropy -sum xi log4 xi (0 pure, 1 ideal depolarizer) of coherency eigenvalues (..., 4).
 
     NaN where an eigenvalue is negative: an unphysical matrix has no entropy.
@@ -54,13 +54,13 @@ def entropy(eigenvalues: Floats) -> Floats:
     return np.asarray(-terms.sum(axis=-1) / np.log(4))
 
 
-def deviation_from_td(eigenvalues: Floats) -> Floats:
+def deviation_from_td(eigenvalues: RealArray) -> RealArray:
     """xi1, xi2, xi3 minus their mean (1 - xi0) / 3: (..., 3), zero where the triply degenerate model holds."""
     xi = np.asarray(eigenvalues)
     return np.asarray(xi[..., 1:] - xi[..., 1:].mean(axis=-1, keepdims=True))
 
 
-def td_missed(eigenvalues: Floats) -> Floats:
+def td_missed(eigenvalues: RealArray) -> RealArray:
     """Fraction of the light that the triply degenerate model puts in the wrong process: sum |deviation| / 2.
 
     Half, because what one process has too much another has too little. Noise makes it positive even for a matrix
@@ -69,38 +69,38 @@ def td_missed(eigenvalues: Floats) -> Floats:
     return np.asarray(np.abs(deviation_from_td(eigenvalues)).sum(axis=-1) / 2)
 
 
-def diattenuation_vector(m: Floats) -> Floats:
+def diattenuation_vector(m: RealArray) -> RealArray:
     """D = (m01, m02, m03) / m00: (..., 3)."""
     m = np.asarray(m)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(m[..., 0, 1:] / m[..., :1, 0])
 
 
-def polarizance_vector(m: Floats) -> Floats:
+def polarizance_vector(m: RealArray) -> RealArray:
     """P = (m10, m20, m30) / m00: (..., 3)."""
     m = np.asarray(m)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(m[..., 1:, 0] / m[..., 0, :1])
 
 
-def magnitude(vector: Floats) -> Floats:
+def magnitude(vector: RealArray) -> RealArray:
     """Length of a vector (..., 3)."""
     return np.asarray(np.sqrt(np.sum(np.square(vector), axis=-1)))
 
 
-def linear_magnitude(vector: Floats) -> Floats:
+def linear_magnitude(vector: RealArray) -> RealArray:
     """Linear part sqrt(v1^2 + v2^2) of a vector (..., 3): |D| in the paper."""
     v = np.asarray(vector)
     return np.asarray(np.hypot(v[..., 0], v[..., 1]))
 
 
-def orientation(vector: Floats) -> Floats:
+def orientation(vector: RealArray) -> RealArray:
     """Azimuth 1/2 atan2(v2, v1) of a vector (..., 3), radians from horizontal in [0, pi)."""
     v = np.asarray(vector)
     return np.asarray(np.mod(0.5 * np.arctan2(v[..., 1], v[..., 0]), np.pi))
 
 
-def retardance_vector(retarder: Floats) -> Floats:
+def retardance_vector(retarder: RealArray) -> RealArray:
     """Retardance vector (..., 3) of rotations MR (..., 4, 4): length in [0, pi], direction the fast state.
 
     Components: horizontal, 45 degrees, right circular (Lu and Chipman, Eqs. 16-17). At pi the fast and the slow state
@@ -122,7 +122,7 @@ def retardance_vector(retarder: Floats) -> Floats:
     return np.asarray(np.where((length == 0)[..., None] & ~half_turn[..., None], 0.0, vector))
 
 
-def _near_half_turn(r: Floats, twice_sine: Floats, angle: Floats) -> Floats:
+def _near_half_turn(r: RealArray, twice_sine: RealArray, angle: RealArray) -> RealArray:
     """The same vector from the symmetric part, (1 - cos) a a^T + cos 1, which stays well conditioned at pi."""
     outer = (r + np.swapaxes(r, -1, -2)) / 2 - np.cos(angle)[..., None, None] * np.eye(3)
     longest = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
@@ -133,7 +133,7 @@ def _near_half_turn(r: Floats, twice_sine: Floats, angle: Floats) -> Floats:
     return np.asarray(axis * (sign * angle)[..., None])
 
 
-def between(m: Floats, generator: State | ArrayLike, analyzer: State | ArrayLike) -> Floats:
+def between(m: RealArray, generator: State | ArrayLike, analyzer: State | ArrayLike) -> RealArray:
     """Fraction of the light, generated in one state, that a polarizer for the other state passes after the sample.
 
     Parameters

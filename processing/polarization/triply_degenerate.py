@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.floating]
+from processing.arrays import RealArray
 
 
-def mueller_matrix(m0: ArrayLike, xi0: ArrayLike, m00: ArrayLike = 1.0) -> FloatArray:
+def mueller_matrix(m0: ArrayLike, xi0: ArrayLike, m00: ArrayLike = 1.0) -> RealArray:
     """M = 4 M00/3 [(xi0 - 1/4) m0 + (1 - xi0) mID].
 
     Parameters
@@ -24,13 +24,13 @@ def mueller_matrix(m0: ArrayLike, xi0: ArrayLike, m00: ArrayLike = 1.0) -> Float
     return out
 
 
-def coefficients(xi0: ArrayLike, m00: ArrayLike = 1.0) -> tuple[FloatArray, FloatArray]:
+def coefficients(xi0: ArrayLike, m00: ArrayLike = 1.0) -> tuple[RealArray, RealArray]:
     """alpha_0 and alpha_ID, the weights of m0 and of the ideal depolarizer (paper, Eq. for alpha)."""
     xi, t = np.asarray(xi0, dtype=float), np.asarray(m00, dtype=float)
     return np.asarray(4 * t / 3 * (xi - 0.25)), np.asarray(4 * t / 3 * (1 - xi))
 
 
-def from_coefficients(alpha_0: ArrayLike, alpha_id: ArrayLike) -> tuple[FloatArray, FloatArray]:
+def from_coefficients(alpha_0: ArrayLike, alpha_id: ArrayLike) -> tuple[RealArray, RealArray]:
     """xi0 and M00 of the two weights, in the form without a singularity at alpha_ID = 0 or xi0 = 1/4 (trap 5)."""
     a, b = np.asarray(alpha_0, dtype=float), np.asarray(alpha_id, dtype=float)
     total = a + b
@@ -38,6 +38,6 @@ def from_coefficients(alpha_0: ArrayLike, alpha_id: ArrayLike) -> tuple[FloatArr
         return np.asarray((a + b / 4) / total), total
 
 
-def depolarization_index(xi0: ArrayLike) -> FloatArray:
+def depolarization_index(xi0: ArrayLike) -> RealArray:
     """|4 xi0 - 1| / 3 of a TD matrix; not monotonic below xi0 = 1/4 (trap 22)."""
     return np.asarray(np.abs(4 * np.asarray(xi0, dtype=float) - 1) / 3)

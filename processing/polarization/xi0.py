@@ -13,11 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from processing.arrays import Array, BoolArray
 from processing.computing.compiling import njit
 from processing.computing.threads import for_ranges
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -36,15 +34,15 @@ class Xi0Estimate:
     alpha_0_stderr : standard error of alpha_0 = M00 (4 xi0 - 1)/3, the weight of m0 in the matrix.
     """
 
-    xi0: FloatArray
-    xi0_stderr: FloatArray
-    m00: FloatArray
-    m00_stderr: FloatArray
-    condition: FloatArray
+    xi0: Array
+    xi0_stderr: Array
+    m00: Array
+    m00_stderr: Array
+    condition: Array
     valid: BoolArray
     unphysical: BoolArray
-    chi_square: FloatArray
-    alpha_0_stderr: FloatArray | None = None
+    chi_square: Array
+    alpha_0_stderr: Array | None = None
 
 
 def estimate(
@@ -98,7 +96,7 @@ class _Sums:
         self.scaled = False
         self.have_variance = False
 
-    def add(self, p: FloatArray, p0: FloatArray, pid: float, v: FloatArray | None, weighted: bool) -> None:
+    def add(self, p: Array, p0: Array, pid: float, v: Array | None, weighted: bool) -> None:
         self.have_variance = v is not None
         weight = 1.0 / v if weighted and v is not None else np.ones(())
         spread = weight * weight * v if v is not None else weight
@@ -141,9 +139,7 @@ class _Sums:
         return Xi0Estimate(xi0, xi0_stderr, total, m00_stderr, condition, valid, unphysical, chi_square, alpha_0_stderr)
 
 
-def _sandwich(
-    inverse: tuple[FloatArray, FloatArray, FloatArray], t: list[FloatArray]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _sandwich(inverse: tuple[Array, Array, Array], t: list[Array]) -> tuple[Array, Array, Array]:
     # (G^-1) T (G^-1) of symmetric 2 x 2 matrices, as (00, 01, 11).
     i, j, k = inverse
     x, y, z = t
@@ -154,7 +150,7 @@ def _sandwich(
     )
 
 
-def _condition(gram: list[FloatArray]) -> FloatArray:
+def _condition(gram: list[Array]) -> Array:
     # Singular values of Phi are square roots of the gram matrix's eigenvalues.
     a, c, d = gram
     half, gap = (a + d) / 2, np.sqrt(((a - d) / 2) ** 2 + c * c)

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from processing.arrays import Array
 from processing.reduction.noise import NoiseModel
 from processing.storage.capture import Capture
-
-Array = NDArray[np.float64]
 
 #: Exposures closer than this part of themselves are one exposure: cameras set them in steps.
 SAME_EXPOSURE = 1e-3

@@ -10,14 +10,11 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
+from processing.arrays import Array, ComplexArray
 from processing.geometry.frames import ScatteringGeometry
 from processing.yaml_file import ConfigError, load_yaml
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 ENTRY_POINT_GROUP = "umov.reflectance"
 
@@ -34,7 +31,7 @@ class ReflectanceModel(Protocol):
         """Jones matrices (..., 2, 2), not normalized."""
         ...
 
-    def mueller_jones(self, geometry: ScatteringGeometry, wavelength_nm: float) -> FloatArray:
+    def mueller_jones(self, geometry: ScatteringGeometry, wavelength_nm: float) -> Array:
         """Mueller-Jones matrices (..., 4, 4) with element 00 equal to 1."""
         ...
 
@@ -44,7 +41,7 @@ class _Header(BaseModel):
     kind: str
 
 
-def normalized_mueller(jones: ComplexArray) -> FloatArray:
+def normalized_mueller(jones: ComplexArray) -> Array:
     """Mueller-Jones matrices (..., 4, 4) of Jones matrices (..., 2, 2), divided by their element 00.
 
     M_ab = 1/2 tr(s_a J s_b J^H), written out (the general product costs three times as much).

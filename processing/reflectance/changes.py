@@ -7,13 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.geometry.frames import ScatteringGeometry, unit
 from processing.polarization import mueller
 from processing.reflectance import fresnel
 from processing.reflectance.base import normalized_mueller
 from processing.reflectance.polarized_diffuse import diffuse_jones
-
-Array = NDArray[np.float64]
 
 #: Refractive index so near one that only the ratio of the amplitudes is left.
 DIPOLE = 1.0005 + 0j

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from processing.arrays import Array, ComplexArray
 from processing.geometry.frames import ScatteringGeometry, cross, dot
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 def amplitudes(index: complex, angle: ArrayLike) -> tuple[ComplexArray, ComplexArray]:
@@ -25,7 +23,7 @@ def amplitudes(index: complex, angle: ArrayLike) -> tuple[ComplexArray, ComplexA
     return rs, rp
 
 
-def basis(geometry: ScatteringGeometry) -> tuple[FloatArray, FloatArray]:
+def basis(geometry: ScatteringGeometry) -> tuple[Array, Array]:
     """Real matrices (..., 2, 2) of s- and p-polarized reflection at the facet: F = r_s S + r_p P."""
     s = geometry.s_axis
     p_in, p_out = cross(-geometry.to_source, s), cross(geometry.to_camera, s)

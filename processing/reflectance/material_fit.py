@@ -15,12 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
+from processing.arrays import Array, ComplexArray
 from processing.errors import NotDetermined
 from processing.geometry.frames import ScatteringGeometry
 from processing.reflectance import fresnel, polarized_diffuse
-from processing.reflectance.base import ComplexArray, normalized_mueller
-
-FloatArray = NDArray[np.float64]
+from processing.reflectance.base import normalized_mueller
 
 NAMES = ("n", "k", "a", "b")
 LOWER, UPPER = np.array([1.01, 0.0, 0.0, 0.3]), np.array([4.0, 4.0, 3.0, 8.0])
@@ -44,8 +43,8 @@ class MaterialFit:
     residual : root mean square of the residual over that of the data's polarized part.
     """
 
-    constants: FloatArray
-    covariance: FloatArray
+    constants: Array
+    covariance: Array
     identified: dict[str, bool]
     condition: float
     residual: float
@@ -53,7 +52,7 @@ class MaterialFit:
     pixels: int
 
     @property
-    def stderr(self) -> FloatArray:
+    def stderr(self) -> Array:
         """(4,), standard errors."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
@@ -98,7 +97,7 @@ def fit_mueller(
     weight = t[keep] * (4 * xi[keep] - 1) / 3
     data = weight[:, None] * m0[keep].reshape(-1, 16)[:, 1:]
 
-    def residual(p: FloatArray) -> FloatArray:
+    def residual(p: Array) -> Array:
         return np.asarray(data - weight[:, None] * model.mueller(p).reshape(-1, 16)[:, 1:])
 
     found, jacobian = _search(residual)
@@ -138,12 +137,12 @@ def fit_intensities(
     flat = flat / np.linalg.norm(flat, axis=1, keepdims=True)
     data = data - flat * np.sum(flat * data, axis=1, keepdims=True)
 
-    def parts(q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def parts(q: Array) -> tuple[Array, Array]:
         modelled = model.mueller(q).reshape(-1, 16) @ rows.T * scale
         modelled = modelled - flat * np.sum(flat * modelled, axis=1, keepdims=True)
         return modelled, np.sum(modelled * data, axis=1, keepdims=True)
 
-    def residual(q: FloatArray) -> FloatArray:
+    def residual(q: Array) -> Array:
         modelled, overlap = parts(q)
         size = np.maximum(np.sum(modelled**2, axis=1, keepdims=True), 1e-300)
         return np.asarray(data - modelled * np.maximum(overlap, 0) / size)
@@ -164,7 +163,7 @@ class _Forward:
         self.theta_d, self.sine = geometry.angles.theta_d, np.sin(geometry.angles.theta_h)
         self.diffuse = polarized_diffuse.diffuse_jones(geometry)
 
-    def mueller(self, p: FloatArray) -> FloatArray:
+    def mueller(self, p: Array) -> Array:
         n, k, a, b = p
         rs, rp = fresnel.amplitudes(complex(n, k), self.theta_d)
         jones: ComplexArray = rs[:, None, None] * self.via_s + rp[:, None, None] * self.via_p
@@ -178,8 +177,8 @@ def _some(good: NDArray[np.bool_], limit: int) -> NDArray[np.int64]:
     return index[np.linspace(0, index.size - 1, min(index.size, limit)).astype(np.int64)]
 
 
-def _search(residual: Callable[[FloatArray], FloatArray]) -> tuple[FloatArray, FloatArray]:
-    def flat(p: FloatArray) -> FloatArray:
+def _search(residual: Callable[[Array], Array]) -> tuple[Array, Array]:
+    def flat(p: Array) -> Array:
         return residual(p).reshape(-1)
 
     best = None
@@ -192,9 +191,7 @@ def _search(residual: Callable[[FloatArray], FloatArray]) -> tuple[FloatArray, F
     return np.asarray(best.x), np.asarray(best.jac)
 
 
-def _result(
-    found: FloatArray, jacobian: FloatArray, left: FloatArray, residual: float, correlation: float
-) -> MaterialFit:
+def _result(found: Array, jacobian: Array, left: Array, residual: float, correlation: float) -> MaterialFit:
     width = UPPER - LOWER
     free = (found > LOWER + 1e-4 * width) & (found < UPPER - 1e-4 * width)
     per_pixel = jacobian.reshape(*left.shape, 4)[..., free]

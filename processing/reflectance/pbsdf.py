@@ -15,20 +15,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 
+from processing.arrays import Array
 from processing.geometry.frames import ScatteringGeometry, change_frames
 from processing.geometry.rusinkiewicz import Angles
 from processing.reflectance.table_axes import SHAPE, TableAxes
 from processing.reflectance.tables import ScatteringTable, TableError
 from processing.storage.tensor_file import create_tensor_file, read_tensor_file
 
-FloatArray = NDArray[np.float64]
-
 MUELLER = tuple(f"m{i}{j}" for i in range(4) for j in range(4))
 #: The renderer's reader takes exactly this many wavelengths.
 RENDERER_WAVELENGTHS = 5
 
 
-def to_renderer_frames(m: ArrayLike, geometry: ScatteringGeometry) -> FloatArray:
+def to_renderer_frames(m: ArrayLike, geometry: ScatteringGeometry) -> Array:
     """Mueller matrices (N, 4, 4) in the geometry's axes, referred to s for both beams."""
     return change_frames(m, geometry, geometry.half)
 
@@ -141,7 +140,7 @@ def _check(table: ScatteringTable) -> None:
         raise TableError(f"the table at {table.wavelength_nm:g} nm is empty: nothing to export")
 
 
-def _grid() -> tuple[Angles, FloatArray, FloatArray]:
+def _grid() -> tuple[Angles, Array, Array]:
     # Bin centres (theta_h, theta_d, phi_d) and the cosines at them.
     axes = TableAxes("renderer")
     grid = np.meshgrid(

@@ -7,9 +7,10 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from processing.arrays import Array, ComplexArray
 from processing.geometry.frames import ScatteringGeometry
 from processing.reflectance import fresnel
-from processing.reflectance.base import ComplexArray, FloatArray, constants_at, normalized_mueller
+from processing.reflectance.base import constants_at, normalized_mueller
 
 
 class Constants(BaseModel):
@@ -54,6 +55,6 @@ class Model(BaseModel):
         weight = c.a * np.sin(geometry.angles.theta_h) ** c.b
         return fresnel.jones(geometry, complex(c.n, c.k)) + weight[..., None, None] * diffuse_jones(geometry)
 
-    def mueller_jones(self, geometry: ScatteringGeometry, wavelength_nm: float) -> FloatArray:
+    def mueller_jones(self, geometry: ScatteringGeometry, wavelength_nm: float) -> Array:
         """Mueller-Jones matrices (..., 4, 4), element 00 equal to 1."""
         return normalized_mueller(self.jones(geometry, wavelength_nm))

@@ -12,13 +12,12 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from processing.arrays import Array
 from processing.computing.compiling import njit
 from processing.computing.threads import for_ranges
 from processing.errors import ProcessError
 from processing.geometry.rusinkiewicz import Angles
 from processing.reflectance.table_axes import SHAPE, Layout, TableAxes
-
-FloatArray = NDArray[np.float64]
 
 SCHEMA_VERSION = 1
 
@@ -94,17 +93,17 @@ class ScatteringTable:
         )
 
     @property
-    def mean(self) -> FloatArray:
+    def mean(self) -> Array:
         """(quantities, bins)."""
         return np.asarray(self._sum / self.count)
 
     @property
-    def variance(self) -> FloatArray:
+    def variance(self) -> Array:
         """(quantities, bins), of the samples in each bin; NaN with one sample."""
         spread = np.maximum(self._square - self._sum**2 / self.count, 0.0)
         return np.where(self.count > 1, spread / np.maximum(self.count - 1, 1), np.nan)
 
-    def lookup(self, angles: Angles, min_count: int = 1) -> FloatArray:
+    def lookup(self, angles: Angles, min_count: int = 1) -> Array:
         """Mean (quantities, ...) at directions (...) in radians, of the nearest bin; NaN with too few samples."""
         bins = self.axes.bins(angles)
         rows = np.where(bins >= 0, self._row[bins], -1)

@@ -13,9 +13,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from processing.arrays import Image
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture_schema import Detector
-from simulators.bench.effects import BenchEffect, Image, Shot
+from simulators.bench.effects.base import BenchEffect, Shot
 
 #: The IMX250 and kin, rounded: 12 bits, 10.5 ke full well, 2.3 e read noise.
 DETECTOR = Detector(black_level_counts=64.0, gain_e_per_count=2.6, read_noise_e=2.3, full_well_e=10_500.0, bits=12)

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from processing.arrays import Array
 from processing.geometry.frames import ScatteringGeometry, dot
 from processing.polarization import mueller
-
-FloatArray = NDArray[np.float64]
 
 
 class Xi0Law(BaseModel):
@@ -33,7 +32,7 @@ class Xi0Law(BaseModel):
             raise ValueError("base + lobe + rise exceeds 1, the largest value of xi0")
         return self
 
-    def __call__(self, geometry: ScatteringGeometry) -> FloatArray:
+    def __call__(self, geometry: ScatteringGeometry) -> Array:
         """xi0 (...) at the points."""
         th, td, _ = geometry.angles
         lobe = np.exp(-((th / np.deg2rad(self.width_deg)) ** 2))
@@ -49,14 +48,14 @@ class M00Law(BaseModel):
     lobe: float = Field(default=0.0, ge=0)
     width_deg: float = Field(default=12.0, gt=0)
 
-    def __call__(self, geometry: ScatteringGeometry) -> FloatArray:
+    def __call__(self, geometry: ScatteringGeometry) -> Array:
         """M00 (...) at the points."""
         th = geometry.angles.theta_h
         lobe = np.exp(-((th / np.deg2rad(self.width_deg)) ** 2))
         return np.asarray(self.albedo * dot(geometry.normal, geometry.to_source) + self.lobe * lobe)
 
 
-def split_eigenvalues(m: FloatArray, jones: NDArray[np.complex128], shift: FloatArray) -> FloatArray:
+def split_eigenvalues(m: Array, jones: NDArray[np.complex128], shift: Array) -> Array:
     """Add to TD matrices what takes their three small eigenvalues apart, by (+shift, 0, -shift).
 
     Parameters

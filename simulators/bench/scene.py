@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, RootModel
 
+from processing.arrays import RealArray
 from processing.geometry.frames import GeometryImage
 from processing.geometry.viewing import ViewingGeometry
 from processing.polarization import mueller, triply_degenerate
@@ -18,8 +19,6 @@ from processing.reflectance.base import ReflectanceModel, load_reflectance
 from processing.yaml_file import ConfigError, load_yaml
 from simulators.bench.scattering_laws import M00Law, Xi0Law, split_eigenvalues
 from simulators.bench.traced_surface import traced
-
-FloatArray = NDArray[np.floating]
 
 BLOCK_PIXELS = 1 << 17
 
@@ -103,8 +102,8 @@ class SceneTruth:
     geometry : of those pixels; None for what is no object.
     """
 
-    xi0: FloatArray
-    m00: FloatArray
+    xi0: RealArray
+    m00: RealArray
     mask: NDArray[np.bool_]
     geometry: GeometryImage | None
 
@@ -192,7 +191,7 @@ class Scene:
         known = ", ".join(f"{k:g}" for k in spec.surface)
         raise ConfigError(f"scene {spec.name!r} is given at {known} nm, not at {wavelength_nm:g} nm")
 
-    def _points(self, surface: Surface, image: GeometryImage, wavelength_nm: float) -> FloatArray:
+    def _points(self, surface: Surface, image: GeometryImage, wavelength_nm: float) -> RealArray:
         optics = self.optics
         if optics is None:
             raise ValueError("an object scene needs its reflectance model")

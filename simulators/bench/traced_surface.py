@@ -11,14 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from processing.arrays import Array, ComplexArray
 from processing.geometry.frames import ScatteringGeometry
 from processing.reflectance import first_surface, polarized_diffuse
 from processing.reflectance.base import ReflectanceModel, constants_at
-
-Real = NDArray[np.float64]
-Field = NDArray[np.complex128]
 
 #: Beams sent in: horizontal, vertical, 45 degrees, right circular; components along x and y of the generator.
 BEAMS: tuple[tuple[complex, complex], ...] = (
@@ -40,7 +37,7 @@ class TracedSurface:
         """Wavelengths at which the material is given."""
         return self.material.wavelengths_nm
 
-    def jones(self, geometry: ScatteringGeometry, wavelength_nm: float) -> Field:
+    def jones(self, geometry: ScatteringGeometry, wavelength_nm: float) -> ComplexArray:
         """Jones matrices (..., 2, 2), not normalized."""
         c = constants_at(self.material.constants, wavelength_nm, self.material.name)
         g, facet = geometry, geometry.to_source + geometry.to_camera
@@ -56,7 +53,7 @@ class TracedSurface:
             out[1] -= weight * u[1] * u
         return np.moveaxis(out, (0, 1), (-2, -1))
 
-    def mueller_jones(self, geometry: ScatteringGeometry, wavelength_nm: float) -> Real:
+    def mueller_jones(self, geometry: ScatteringGeometry, wavelength_nm: float) -> Array:
         """Mueller-Jones matrices (..., 4, 4) with element 00 equal to 1."""
         j = self.jones(geometry, wavelength_nm)
         h, v, d, r = (_stokes(j[..., 0] * x + j[..., 1] * y) for x, y in BEAMS)
@@ -72,7 +69,7 @@ def traced(material: ReflectanceModel) -> ReflectanceModel:
     return material
 
 
-def _outwards(g: ScatteringGeometry, facet: Real) -> tuple[Real, Real]:
+def _outwards(g: ScatteringGeometry, facet: Array) -> tuple[Array, Array]:
     """Axis (2, ...) of the polarizer that diffuse light meets, away from where facet and surface agree; sin theta_h."""
     cosine = _dot(facet, g.normal)
     away = facet * cosine[..., None] - g.normal
@@ -84,7 +81,7 @@ def _outwards(g: ScatteringGeometry, facet: Real) -> tuple[Real, Real]:
     return np.divide(u, length, out=np.zeros_like(u), where=length > 0), sine
 
 
-def _mirrored(field: Field, to_source: Real, facet: Real, index: complex) -> Field:
+def _mirrored(field: ComplexArray, to_source: Array, facet: Array, index: complex) -> ComplexArray:
     """Field (..., 3) that a facet sends back, from the tangential parts on both sides (admittances)."""
     cosine = _dot(to_source, facet)[..., None]
     # Tangential wave vector of incoming and reflected light, in units of 2 pi over the wavelength outside.
@@ -105,7 +102,7 @@ def _dot(a: Any, b: Any) -> Any:
     return np.einsum("...i,...i->...", a, b)
 
 
-def _axes(k: Real) -> tuple[Real, Real]:
+def _axes(k: Array) -> tuple[Array, Array]:
     """x = unit(y cross k), and y = k cross x, for a propagation k."""
     level = np.hypot(k[..., 0], k[..., 2])
     zero = np.zeros_like(level)
@@ -113,7 +110,7 @@ def _axes(k: Real) -> tuple[Real, Real]:
     return x, np.stack([-k[..., 1] * k[..., 0] / level, level, -k[..., 1] * k[..., 2] / level], axis=-1)
 
 
-def _stokes(e: Field) -> Real:
+def _stokes(e: ComplexArray) -> Array:
     """Stokes vector (..., 4) of fields (..., 2), decreasing phase: right circular is (1, -i)/sqrt 2."""
     x, y = e[..., 0], e[..., 1]
     power_x, power_y, both = np.abs(x) ** 2, np.abs(y) ** 2, x * np.conj(y)

@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.instrument.problem import InstrumentProblem
@@ -19,8 +19,6 @@ from processing.instrument.model import InstrumentModel
 from processing.storage.capture import Capture
 from simulators.blind.undeclared_captures import BITS, BLACK, Bench
 from simulators.blind.undeclared_faults import Truth
-
-Array = NDArray[np.float64]
 
 #: Chi-square from which on a fault is detectable.
 DETECTABLE = 50.0

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.geometry.frames import ScatteringGeometry, dot, unit
 from processing.geometry.sphere import Sphere
 from processing.instrument.model import InstrumentModel, Polarizer, Retarder
@@ -17,8 +18,6 @@ from processing.polarization import mueller, triply_degenerate
 from processing.reflectance import first_surface
 from simulators.bench.bench import SceneImage
 from simulators.bench.scene import Scene, Surface
-
-FloatArray = NDArray[np.float64]
 
 
 def moved_sphere(scene: Scene, x_mm: float = 0.0, y_mm: float = 0.0, scale: float = 0.0) -> Scene:
@@ -202,7 +201,7 @@ def _surface(scene: Scene, wavelength_nm: float) -> Surface:
     return next(s for nm, s in scene.object.surface.items() if abs(nm - wavelength_nm) < 0.5)
 
 
-def _triply_degenerate(scene: Scene, surface: Surface, points: ScatteringGeometry, wavelength_nm: float) -> FloatArray:
+def _triply_degenerate(scene: Scene, surface: Surface, points: ScatteringGeometry, wavelength_nm: float) -> Array:
     if scene.optics is None:
         raise ValueError("an object scene needs its reflectance model")
     m0 = scene.optics.mueller_jones(points, wavelength_nm)

@@ -13,15 +13,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.instrument.model import InstrumentModel, Polarizer, Retarder
 from processing.storage.capture_schema import Sample
 from simulators.blind.detectable import evidence, expected
 from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
 from simulators.blind.undeclared_faults import LISTED, MOSAIC, UNLISTED, Fault, Truth
-
-Array = NDArray[np.float64]
 
 SHARES = {"single": 0.62, "two": 0.12, "none": 0.1, "unlisted": 0.16}
 INSTRUMENTS = {"drr": "rgb950.yaml", "mosaic": "mosaic_polarimeter.yaml"}

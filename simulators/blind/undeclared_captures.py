@@ -16,10 +16,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import Array, ComplexArray
 from processing.storage.capture_schema import CaptureHeader, Detector, Sample, create_layout, write_closing
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 #: Pauli matrices in the order of conventions.md.
 _PAULI = np.array([[[1, 0], [0, 1]], [[1, 0], [0, -1]], [[0, 1], [1, 0]], [[0, 1j], [-1j, 0]]], dtype=complex)
@@ -27,7 +25,7 @@ BITS = 16
 BLACK = 100.0
 
 
-def retarder_jones(azimuth_rad: float, retardance_rad: Any, t_fast: float = 1.0, t_slow: float = 1.0) -> Complex:
+def retarder_jones(azimuth_rad: float, retardance_rad: Any, t_fast: float = 1.0, t_slow: float = 1.0) -> ComplexArray:
     """Jones matrices (..., 2, 2) of a retarder; phase so that S3 has the sign of conventions.md."""
     d = np.asarray(retardance_rad, dtype=float)[..., None, None]
     c, s = np.cos(azimuth_rad), np.sin(azimuth_rad)
@@ -36,7 +34,7 @@ def retarder_jones(azimuth_rad: float, retardance_rad: Any, t_fast: float = 1.0,
     return np.asarray(np.sqrt(t_fast) * fast * np.exp(-0.5j * d) + np.sqrt(t_slow) * slow * np.exp(0.5j * d))
 
 
-def polarizer_jones(azimuth_rad: float, extinction: float = 0.0) -> Complex:
+def polarizer_jones(azimuth_rad: float, extinction: float = 0.0) -> ComplexArray:
     """Jones matrix (2, 2) of a polarizer that leaks the intensity `extinction`."""
     c, s = np.cos(azimuth_rad), np.sin(azimuth_rad)
     along = np.array([[c * c, c * s], [c * s, s * s]])
@@ -99,12 +97,12 @@ class Bench:
             out = out + np.einsum("aij,...ji->...a", _PAULI, coherency).real / len(self.band)
         return np.asarray(out)
 
-    def _ellipse(self) -> Complex:
+    def _ellipse(self) -> ComplexArray:
         c, s = np.cos(self.ellipticity), np.sin(self.ellipticity)
         # S3 = I(right) - I(left) > 0 for positive ellipticity: (c, -i s) with the Pauli matrix s3 of the conventions.
         return np.array([[c, -1j * s], [-1j * s, c]])
 
-    def _window(self) -> Complex:
+    def _window(self) -> ComplexArray:
         size, azimuth = np.hypot(*self.path), np.arctan2(self.path[1], self.path[0]) / 2
         return retarder_jones(azimuth, size)
 
@@ -125,7 +123,7 @@ class Bench:
         return np.asarray(np.mean(rows, axis=0)[None])
 
 
-def _analyzer(jones: Complex) -> Array:
+def _analyzer(jones: ComplexArray) -> Array:
     # Intensity behind J of Stokes vector S is 1/2 sum of S_a tr(J s_a J^H).
     return np.asarray(0.5 * np.einsum("ij,ajk,ik->a", jones, _PAULI, jones.conj()).real)
 

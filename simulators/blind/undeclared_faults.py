@@ -10,12 +10,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from processing.arrays import Array
 from simulators.blind.undeclared_captures import Bench
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

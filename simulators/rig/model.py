@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from processing.storage.capture_schema import Detector
 from simulators.bench.bench import DARK_CURRENT_E_PER_S, DETECTOR
-from simulators.bench.faults import AnyBenchFault
+from simulators.bench.effects import AnyBenchEffect
 
 #: A device whose port reads `sim:NAME` stands at the emulator of that name.
 SCHEME = "sim:"
@@ -55,7 +55,7 @@ class SimulatorConfig(_Part):
     detector: Detector = DETECTOR
     flux_e_per_s: float = Field(gt=0, description="electrons a second where a . M . g is 1")
     dark_current_e_per_s: float = Field(default=DARK_CURRENT_E_PER_S, ge=0)
-    effects: tuple[AnyBenchFault, ...] = ()
+    effects: tuple[AnyBenchEffect, ...] = ()
     camera_address: str = Field(default="127.0.0.1", description="loopback address that the camera occupies")
     camera_wait_s: float = Field(default=10.0, ge=0, description="wait for that address while another run has it")
     packet_loss: float = Field(default=0.0, ge=0, lt=1)

@@ -18,7 +18,7 @@ from processing.storage.images import MuellerImage
 from processing.storage.product import Product, Step
 from processing.yaml_file import dump_yaml
 from simulators.bench.bench import DETECTOR, FixedScene, SimulatedBench
-from simulators.bench.effects import with_element
+from simulators.bench.effects.base import with_element
 
 ANGLES = {"psg": np.arange(6.0)}
 ROLE = ("dark", "dark", "sample", "sample", "sample", "sample")

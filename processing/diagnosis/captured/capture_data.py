@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.instrument.changes import Conditions
 from processing.reduction.move_image import shifted_back
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.diagnosis.instrument.moments import DERIVATIVES, FEATURES, features
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.recommend import recommended
@@ -29,8 +29,6 @@ from processing.diagnosis.search.result import (
 from processing.diagnosis.search.search import CHANCE, Say, Search
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import EffectParameter
-
-Array = NDArray[np.float64]
 
 #: Share of the excess that must be explained before anything is named while structure is left.
 SHARE = 0.97

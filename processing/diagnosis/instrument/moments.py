@@ -15,11 +15,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.computing.threads import for_ranges
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.reduction.move_image import taps
-
-Array = NDArray[np.float64]
 
 #: Features of a signal u (counts over full scale); corrected counts = u + sum of coefficient times feature.
 FEATURES = (

@@ -14,8 +14,8 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.moments import (
     DERIVATIVES,
@@ -35,7 +35,6 @@ from processing.instrument.changes import Changes
 from processing.instrument.effects.base import apply_to, changes_of, turned_by
 from processing.instrument.model import InstrumentModel
 
-Array = NDArray[np.float64]
 #: Makes A (..., L, K) of the changes of a capture.
 Columns = Callable[[Changes], Array]
 STEP = 1e-4

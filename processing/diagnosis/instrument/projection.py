@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.diagnosis.instrument.moments import DERIVATIVES, Block, Moments, features, image_derivatives
 from processing.diagnosis.search.space import Sums
 
-Array = NDArray[np.float64]
 #: Singular values below this, relative to the largest, are none.
 RANK = 1e-8
 

@@ -7,14 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.rules import APART
 from processing.diagnosis.search.space import Space
 from processing.polarization import mueller
-
-Array = NDArray[np.float64]
 
 #: Samples that a lab has at hand, in the order of the trouble they make.
 SAMPLES: dict[str, NDArray[np.float64]] = {

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.diagnosis.instrument.moments import MARGIN, inside
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import add_response
@@ -16,8 +17,6 @@ from processing.diagnosis.search.space import Space
 from processing.instrument.changes import Changes
 from processing.instrument.effects.field_retardance import terms
 from processing.reduction.move_image import neighbour_noise
-
-Array = NDArray[np.float64]
 
 #: Standard deviations beyond which a test says "structure".
 LIMIT = 5.0

@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.moments import DERIVATIVES, FEATURES, Moments, Tiles, tile_products
 from processing.diagnosis.instrument.projection import RANK
@@ -16,7 +17,6 @@ from processing.instrument.changes import Changes
 from processing.instrument.model import InstrumentModel
 from processing.reduction.effects_of_capture import extra_retardance, with_extra
 
-Array = NDArray[np.float64]
 #: A retarder's Mueller matrix is linear in 1, cosine and sine of its retardance: three values tell all.
 THIRDS = (0.0, 2 * np.pi / 3, 4 * np.pi / 3)
 

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.diagnosis.instrument.problem import STEP, InstrumentProblem
 from processing.diagnosis.instrument.projection import RANK
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.field_retardance import terms
-
-Array = NDArray[np.float64]
 
 
 def unevenness(problem: InstrumentProblem, candidate: Candidate, space: Space, values: Array) -> tuple[float, int]:

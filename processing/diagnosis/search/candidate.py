@@ -7,14 +7,12 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.errors import ProcessError
 from processing.instrument.changes import Changes, Conditions
 from processing.instrument.effects.base import Effect, Parameter, all_effects
 from processing.instrument.model import InstrumentModel
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.diagnosis.search.problem import Problem
 from processing.diagnosis.search.space import Space, Sums
-
-Array = NDArray[np.float64]
 
 #: The prior that keeps unseen parameters still is this many times wider than a typical size.
 PRIOR_WIDTH = 10.0

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit, HeldOut
 from processing.diagnosis.search.space import Space
-
-Array = NDArray[np.float64]
 
 #: Growth of the unweighted residual that is still put down to noise.
 WORSE = 1.002

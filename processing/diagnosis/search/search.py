@@ -9,16 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
+from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit, HeldOut, held_out, minimize, prior, score
 from processing.diagnosis.search.outcome import Found, Trial
 from processing.diagnosis.search.problem import Problem
 from processing.diagnosis.search.space import Space
 
-Array = NDArray[np.float64]
 #: Called with a line that says what is being done.
 Say = Callable[[str], None]
 

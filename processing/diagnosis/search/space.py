@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
-
-Array = NDArray[np.float64]
 
 
 @dataclass

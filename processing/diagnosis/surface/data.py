@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.surface.view import SurfaceView
@@ -21,8 +22,6 @@ from processing.reduction.mueller import sample_states
 from processing.reduction.noise import NoiseModel
 from processing.reflectance.base import ReflectanceModel
 from processing.storage.capture import Capture
-
-Array = NDArray[np.float64]
 
 #: Pixels of a capture that are used, evenly spread.
 MOST_PIXELS = 4000

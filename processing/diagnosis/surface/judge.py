@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.outcome import Found
 from processing.diagnosis.search.result import (
@@ -28,8 +28,6 @@ from processing.diagnosis.surface.search import SurfaceSearch
 from processing.diagnosis.surface.standard_errors import standard_errors
 from processing.instrument.model import EffectParameter
 from processing.polarization.image_difference import rmsd
-
-Array = NDArray[np.float64]
 
 CONFIRM = (
     " Confirm with a full Mueller capture: linear Stokes cannot test that the three other processes are equal, and so "

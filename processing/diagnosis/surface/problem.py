@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.space import Space, Sums
 from processing.diagnosis.surface.data import FEWEST_PIXELS, FOLDS, SurfaceData
@@ -23,7 +24,6 @@ from processing.instrument.model import InstrumentModel
 from processing.reflectance.changes import ReflectanceChanges
 from processing.reflectance.effects.base import ReflectanceEffect, reflectance_effects
 
-Array = NDArray[np.float64]
 STEP = 1e-4
 #: Smooth patterns over an object that a misfit can have: up to second order in the position.
 PATTERNS = 6

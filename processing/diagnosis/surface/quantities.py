@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
+from processing.arrays import Array
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.polarization.cloude import xi0_and_dominant
 from processing.polarization.image_difference import linear_diattenuation, magnitude, orientation_difference, rmsd
 
-Array = NDArray[np.float64]
 #: Signal of the polarized light over its noise from which on a pixel's xi0 is shown.
 LEAST_SIGNAL = 20.0
 

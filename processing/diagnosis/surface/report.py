@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.judge import SurfaceJudged
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.diagnosis.surface.quantities import dominant_errors, quantities
 from processing.errors import ProcessError
 from processing.reports.template import Figure, Section, render
-
-Array = NDArray[np.float64]
 
 
 def write_surface_report(path: Path, judged: SurfaceJudged, problem: SurfaceProblem) -> None:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.diagnosis.search.fit import Fit, covariance, minimize
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.diagnosis.surface.search import bent
-
-Array = NDArray[np.float64]
 
 #: The excess is looked at this many errors from the minimum; errors grow at most by the factor.
 AT, WIDEST = 3.0, 32.0

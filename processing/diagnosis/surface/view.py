@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Delaunay
 
+from processing.arrays import Array
 from processing.errors import ProcessError
 from processing.geometry.frames import ScatteringGeometry, dot, unit
 from processing.geometry.pinhole import PinholeCamera
@@ -18,8 +19,6 @@ from processing.polarization import mueller
 from processing.reflectance import first_surface, polarized_diffuse
 from processing.reflectance.base import ReflectanceModel, constants_at
 from processing.reflectance.changes import ReflectanceChanges
-
-Array = NDArray[np.float64]
 
 #: The support: a level disc, cut into parts, that the object's middle sees in this half angle, this many times the
 #: object's half width below it.

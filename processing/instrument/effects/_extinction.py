@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import ClassVar, Literal
 
+from processing.arrays import Array
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Array, Effect, Parameter
+from processing.instrument.effects.base import Effect, Parameter
 from processing.instrument.model import InstrumentModel, Polarizer
 
 

@@ -7,8 +7,9 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
+from processing.arrays import Array
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Array, Effect, Parameter, retarders
+from processing.instrument.effects.base import Effect, Parameter, retarders
 from processing.instrument.model import InstrumentModel
 
 

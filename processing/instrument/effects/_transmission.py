@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from processing.arrays import Array
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Array, Effect, Parameter, turns
+from processing.instrument.effects.base import Effect, Parameter, turns
 from processing.instrument.model import InstrumentModel
 
 

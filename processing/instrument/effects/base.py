@@ -12,13 +12,12 @@ from importlib.metadata import entry_points
 from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.errors import ProcessError
 from processing.instrument.changes import Changes, Conditions
 from processing.instrument.model import AppliedEffect, InstrumentModel, Retarder
 
-Array = NDArray[np.float64]
 Group = Literal["optics", "frame", "motion", "source", "detector", "mosaic", "reflectance"]
 Scope = Literal["instrument", "capture"]
 

@@ -6,9 +6,10 @@ Mend: measure each channel behind a turning polarizer and put the extinctions in
 
 from __future__ import annotations
 
+from processing.arrays import Array
 from processing.instrument.changes import Changes, Conditions
 from processing.instrument.effects._channel import ChannelEffect, polarizer_of
-from processing.instrument.effects.base import Array, Parameter
+from processing.instrument.effects.base import Parameter
 from processing.instrument.model import InstrumentModel
 
 

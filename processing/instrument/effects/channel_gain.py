@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from processing.arrays import Array
 from processing.instrument.changes import Changes, Conditions
 from processing.instrument.effects._channel import ChannelEffect
-from processing.instrument.effects.base import Array, Parameter
+from processing.instrument.effects.base import Parameter
 from processing.instrument.model import InstrumentModel
 
 

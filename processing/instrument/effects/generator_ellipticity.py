@@ -10,8 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from processing.arrays import Array
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Array, Effect, Parameter
+from processing.instrument.effects.base import Effect, Parameter
 from processing.instrument.model import InstrumentModel, Polarizer
 from processing.polarization import mueller
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.polarization.cloude import Floats
+from processing.arrays import RealArray
 
 G = np.diag([1.0, -1.0, -1.0, -1.0])
 #: Condition number of the eigenvectors above which the logarithm is computed by scipy, one matrix at a time.
@@ -22,28 +22,28 @@ WORST_EIGENVECTORS = 1e5
 class Differential(NamedTuple):
     """Parts of L = ln M = mean + fluctuation; NaN where not defined."""
 
-    mean: Floats
+    mean: RealArray
     """(..., 4, 4): Lm, G-antisymmetric: diattenuation and retardance; its diagonal is ln of the throughput."""
-    fluctuation: Floats
+    fluctuation: RealArray
     """(..., 4, 4): Lu, G-symmetric, 00 element zero: depolarization."""
     defined: NDArray[np.bool_]
     """(...): no eigenvalue of M on the closed negative real axis, so the real logarithm exists and is unique."""
 
-    def diattenuation(self) -> Floats:
+    def diattenuation(self) -> RealArray:
         """Vector (..., 3): ln of the amplitude ratio along each Stokes axis; |.| = ln(T_max / T_min) / 2."""
         return np.asarray(self.mean[..., 0, 1:])
 
-    def retardance(self) -> Floats:
+    def retardance(self) -> RealArray:
         """Vector (..., 3), radians, along the fast state: horizontal, 45 degrees, right circular (as Lu-Chipman)."""
         m = self.mean
         return np.stack([m[..., 2, 3], m[..., 3, 1], m[..., 1, 2]], axis=-1)
 
-    def depolarization(self) -> Floats:
+    def depolarization(self) -> RealArray:
         """Diagonal (..., 3) of -Lu: decay exponents of S1, S2 and S3; not below 0 for a physical medium."""
         return np.stack([-self.fluctuation[..., k, k] for k in (1, 2, 3)], axis=-1)
 
 
-def differential(m: Floats) -> Differential:
+def differential(m: RealArray) -> Differential:
     """Differential decomposition of Mueller matrices (..., 4, 4).
 
     A retardance above 180 degrees comes back as the shorter way round: the principal logarithm cannot tell.
@@ -71,7 +71,7 @@ def differential(m: Floats) -> Differential:
     return Differential(mean, (logarithm + turned) / 2 - throughput, defined.reshape(m.shape[:-2]))
 
 
-def differential_slopes(m: Floats, defined: NDArray[np.bool_]) -> NDArray[np.float64]:
+def differential_slopes(m: RealArray, defined: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Gradients (9, ..., 16) of the parts of Lm and Lu by the elements of m.
 
     Order: retardance vector, diattenuation vector, depolarization exponents. With m = V diag(w) V^-1 the derivative of
@@ -109,7 +109,7 @@ def _weights() -> NDArray[np.float64]:
 _WEIGHTS = _weights()
 
 
-def _careful_logarithm(m: Floats) -> Floats:
+def _careful_logarithm(m: RealArray) -> RealArray:
     """Real logarithm by scipy's inverse scaling and squaring; slower, but it needs no eigenvectors."""
     from scipy.linalg import logm
 

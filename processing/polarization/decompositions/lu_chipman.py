@@ -11,19 +11,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import RealArray
 from processing.computing.threads import for_ranges
-from processing.polarization.cloude import Floats, as_planar
+from processing.polarization.cloude import as_planar
 from processing.polarization.decompositions.polar_kernel import lu_chipman_range
 
 
 class LuChipman(NamedTuple):
     """Factors of M = depolarizer @ retarder @ diattenuator; NaN where not defined."""
 
-    depolarizer: Floats
+    depolarizer: RealArray
     """(..., 4, 4), m00 = 1, first row (1, 0, 0, 0), symmetric 3 x 3 block."""
-    retarder: Floats
+    retarder: RealArray
     """(..., 4, 4), a rotation: det +1 always."""
-    diattenuator: Floats
+    diattenuator: RealArray
     """(..., 4, 4), symmetric, with the throughput m00 of M. Defined wherever |D| < 1."""
     defined: NDArray[np.bool_]
     """(...): m00 > 0, |D| < 1 and det M not zero. Else retarder and depolarizer are not determined."""
@@ -31,7 +32,7 @@ class LuChipman(NamedTuple):
     """(...): det M < 0; the depolarizer's 3 x 3 block is then negative definite."""
 
 
-def lu_chipman(m: Floats) -> LuChipman:
+def lu_chipman(m: RealArray) -> LuChipman:
     """Lu-Chipman decomposition of Mueller matrices (..., 4, 4); the factors have the type of m.
 
     Linear retarder, half wave plate and rotation come back as themselves, the ideal depolarizer as not defined.
@@ -48,7 +49,7 @@ def lu_chipman(m: Floats) -> LuChipman:
     return LuChipman(depolarizer, retarder, diattenuator, ~np.isnan(sign), sign < 0)
 
 
-def depolarization_power(depolarizer: Floats) -> Floats:
+def depolarization_power(depolarizer: RealArray) -> RealArray:
     """Lu-Chipman depolarization power 1 - |tr mdelta| / 3 (Eq. 58): 0 for none, 1 for the ideal depolarizer."""
     trace = np.trace(np.asarray(depolarizer)[..., 1:, 1:], axis1=-2, axis2=-1)
     return np.asarray(1 - np.abs(trace) / 3)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.polarization.cloude import Floats
+from processing.arrays import RealArray
 
 G = np.diag([1.0, -1.0, -1.0, -1.0])
 #: Relative distance of the two largest eigenvalues below which their eigenvectors are arbitrary: a pure matrix.
@@ -23,21 +23,21 @@ SMALLEST_REST = 1e-10
 class Symmetric(NamedTuple):
     """M = diattenuator_2 @ retarder_2 @ depolarizer @ retarder_1.T @ diattenuator_1; NaN where not defined."""
 
-    diattenuator_2: Floats
+    diattenuator_2: RealArray
     """(..., 4, 4), symmetric, m00 = 1: the side where the light leaves."""
-    retarder_2: Floats
+    retarder_2: RealArray
     """(..., 4, 4), rotation."""
-    depolarizer: Floats
+    depolarizer: RealArray
     """(..., 4, 4), diagonal diag(d0, d1, d2, d3) with d1 >= d2 >= |d3|; d3 carries the sign of det M."""
-    retarder_1: Floats
+    retarder_1: RealArray
     """(..., 4, 4), rotation."""
-    diattenuator_1: Floats
+    diattenuator_1: RealArray
     """(..., 4, 4), symmetric, m00 = 1: the side where the light enters."""
     defined: NDArray[np.bool_]
     """(...): both eigenvectors are Stokes vectors with |D| < 1 (the Stokes diagonalizable case)."""
 
 
-def symmetric(m: Floats) -> Symmetric:
+def symmetric(m: RealArray) -> Symmetric:
     """Symmetric decomposition of Mueller matrices (..., 4, 4).
 
     Not defined for matrices that no such product gives (a polarizer, Stokes-non-diagonalizable matrices), for
@@ -71,7 +71,7 @@ def symmetric(m: Floats) -> Symmetric:
     return Symmetric(d2, r2, depolarizer, r1, d1, defined)
 
 
-def _eigen_diattenuation(n: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def _eigen_diattenuation(n: RealArray) -> tuple[RealArray, NDArray[np.bool_]]:
     """Vector part D of the eigenvector (1, D) of the largest eigenvalue, and whether it is a Stokes vector."""
     values, vectors = np.linalg.eig(n)
     # In the sense of the cone of Stokes vectors the largest eigenvalue is real; noise may spoil that.
@@ -88,7 +88,7 @@ def _eigen_diattenuation(n: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     return np.asarray(d.real), good
 
 
-def _diattenuator(d: Floats) -> Floats:
+def _diattenuator(d: RealArray) -> RealArray:
     """Normalized diattenuator (..., 4, 4) of diattenuation vectors d (..., 3)."""
     q = np.sqrt(1 - np.sum(d * d, axis=-1))[..., None, None]
     out = np.empty((*d.shape[:-1], 4, 4))
@@ -98,7 +98,7 @@ def _diattenuator(d: Floats) -> Floats:
     return out
 
 
-def _embed(rotation: Floats) -> Floats:
+def _embed(rotation: RealArray) -> RealArray:
     out = np.zeros((*rotation.shape[:-2], 4, 4))
     out[..., 0, 0] = 1
     out[..., 1:, 1:] = rotation

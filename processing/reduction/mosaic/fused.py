@@ -10,11 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import Image
 from processing.computing.compiling import njit
 from processing.computing.threads import for_ranges
 from processing.reduction.mosaic.layout import MosaicLayout
-
-Frame = NDArray[np.float32]
 
 # atan(t) = t (a0 + a1 t^2 + ...) for 0 <= t <= 1: least squares at Chebyshev nodes; error 2e-8 before rounding.
 _NODES = 0.5 * (1 - np.cos(np.pi * (np.arange(400) + 0.5) / 400))
@@ -26,11 +25,11 @@ _A0, _A1, _A2, _A3, _A4, _A5, _A6, _A7, _A8 = (np.float32(a) for a in _ATAN)
 class LinearStokes(NamedTuple):
     """Planes (rows, columns) float32; AoLP in radians, 0 to pi."""
 
-    s0: Frame
-    s1: Frame
-    s2: Frame
-    dolp: Frame
-    aolp: Frame
+    s0: Image
+    s1: Image
+    s2: Image
+    dolp: Image
+    aolp: Image
 
 
 def bilinear_stokes(

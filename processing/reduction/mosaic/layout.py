@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import Image
 from processing.errors import ProcessError
-
-Frame = NDArray[np.float32]
 
 
 class MosaicError(ProcessError):
@@ -52,7 +51,7 @@ class MosaicLayout:
         r, c = self.offsets[channel]
         return frame[r::2, c::2]
 
-    def sparse(self, frame: Frame, channel: int) -> Frame:
+    def sparse(self, frame: Image, channel: int) -> Image:
         """Frame with one channel's pixels and zero elsewhere."""
         out = np.zeros_like(frame)
         r, c = self.offsets[channel]

@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import Image
 from processing.reduction.counts_to_signal import Correction
 from processing.reduction.effects_of_capture import CountsCorrection
 from processing.reduction.mueller import relative_exposure
 from processing.reduction.noise import NoiseModel
 from processing.storage.capture import Capture
 from processing.storage.pixel_mask import Mask
-
-FloatArray = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -31,11 +30,11 @@ class MergedFrame:
         the error of the flat; each (rows, columns), or (1, 1) where all are alike. None: no noise model, no flat.
     """
 
-    signal: FloatArray
+    signal: Image
     mask: NDArray[np.uint8]
-    shot: FloatArray | None = None
-    floor: FloatArray | None = None
-    relative: FloatArray | None = None
+    shot: Image | None = None
+    floor: Image | None = None
+    relative: Image | None = None
 
 
 def merge(
@@ -109,9 +108,7 @@ def merge(
     )
 
 
-def _signal(
-    frame: NDArray[np.generic], black: FloatArray, flat: FloatArray | None, counts: CountsCorrection | None
-) -> FloatArray:
+def _signal(frame: NDArray[np.generic], black: Image, flat: Image | None, counts: CountsCorrection | None) -> Image:
     signal = frame.astype(np.float32) - black
     if flat is not None:
         signal /= flat

@@ -12,8 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import Image
 from processing.reduction.mosaic import oriented as lmmse
-from processing.reduction.mosaic.layout import Frame, MosaicError, MosaicLayout
+from processing.reduction.mosaic.layout import MosaicError, MosaicLayout
 
 #: 1D kernels that fill the gaps between samples two pixels apart: tent, and cubic convolution (a = -1/2).
 TENT = np.array([0.5, 1.0, 0.5], np.float32)
@@ -29,25 +30,25 @@ GUIDE_CONTRAST = 0.03
 # Reflection about the border pixel keeps the parity of the mosaic.
 _BORDER = cv2.BORDER_REFLECT_101
 
-Method = Callable[[Frame, MosaicLayout], NDArray[np.float32]]
+Method = Callable[[Image, MosaicLayout], NDArray[np.float32]]
 
 
-def superpixel(frame: Frame, layout: MosaicLayout) -> NDArray[np.float32]:
+def superpixel(frame: Image, layout: MosaicLayout) -> NDArray[np.float32]:
     """Each 2 x 2 super-pixel becomes one pixel: half the size, no interpolation."""
     return np.stack([layout.samples(frame, k) for k in range(len(layout.channels))]).astype(np.float32)
 
 
-def bilinear(frame: Frame, layout: MosaicLayout) -> NDArray[np.float32]:
+def bilinear(frame: Image, layout: MosaicLayout) -> NDArray[np.float32]:
     """Mean of the nearest two or four samples of the channel."""
     return _fill(frame, layout, TENT)
 
 
-def bicubic(frame: Frame, layout: MosaicLayout) -> NDArray[np.float32]:
+def bicubic(frame: Image, layout: MosaicLayout) -> NDArray[np.float32]:
     """Cubic convolution of the channel's samples."""
     return _fill(frame, layout, CUBIC)
 
 
-def difference(frame: Frame, layout: MosaicLayout) -> NDArray[np.float32]:
+def difference(frame: Image, layout: MosaicLayout) -> NDArray[np.float32]:
     """Pseudo-panchromatic image difference (PPID; Mihoubi, Lapray, Bigué, Sensors 18, 3688, 2018), linear form.
 
     The mean of all four channels around a pixel is known at full resolution; only each channel's difference
@@ -59,7 +60,7 @@ def difference(frame: Frame, layout: MosaicLayout) -> NDArray[np.float32]:
     return out
 
 
-def guided_residual(frame: Frame, layout: MosaicLayout) -> NDArray[np.float32]:
+def guided_residual(frame: Image, layout: MosaicLayout) -> NDArray[np.float32]:
     """Residual interpolation: a guided filter predicts each channel from the mean of all, the rest is interpolated.
 
     The guided filter is opencv-contrib's (`cv2.ximgproc.guidedFilter`), its source the bilinear channel.
@@ -112,7 +113,7 @@ def demosaic(frame: NDArray[np.generic], layout: MosaicLayout, method: str) -> N
     return METHODS[method](np.ascontiguousarray(frame, dtype=np.float32), layout)
 
 
-def _fill(frame: Frame, layout: MosaicLayout, kernel: NDArray[np.float32]) -> NDArray[np.float32]:
+def _fill(frame: Image, layout: MosaicLayout, kernel: NDArray[np.float32]) -> NDArray[np.float32]:
     channels = range(len(layout.channels))
     return np.stack(
         [cv2.sepFilter2D(layout.sparse(frame, k), -1, kernel, kernel, borderType=_BORDER) for k in channels]

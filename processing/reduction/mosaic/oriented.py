@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from processing.arrays import Image
 from processing.computing.compiling import njit
 from processing.computing.threads import for_ranges
-from processing.reduction.mosaic.layout import Frame, MosaicLayout
+from processing.reduction.mosaic.layout import MosaicLayout
 
 #: Kernels reach this many pixels to each side.
 REACH = 4
@@ -39,7 +40,7 @@ _SCHARR = 32.0
 _BORDER = cv2.BORDER_REFLECT_101
 
 
-def oriented(frame: Frame, layout: MosaicLayout) -> NDArray[np.float32]:
+def oriented(frame: Image, layout: MosaicLayout) -> NDArray[np.float32]:
     """Channels (4, rows, columns) of a mosaic frame; see the module's text."""
     out, direction, padded = _first_pass(frame, layout)
     kernels = _kernels(layout)
@@ -47,7 +48,7 @@ def oriented(frame: Frame, layout: MosaicLayout) -> NDArray[np.float32]:
     return out
 
 
-def directions(frame: Frame, layout: MosaicLayout) -> NDArray[np.uint8]:
+def directions(frame: Image, layout: MosaicLayout) -> NDArray[np.uint8]:
     """Kernels that `oriented` uses (rows, columns): 0 without direction, k > 0: edge along 180 (k - 1)/16 degrees."""
     return _first_pass(frame, layout)[1]
 
@@ -71,7 +72,7 @@ def noise_gain(layout: MosaicLayout, solve: NDArray[np.float64]) -> NDArray[np.f
 
 
 def _first_pass(
-    frame: Frame, layout: MosaicLayout
+    frame: Image, layout: MosaicLayout
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.float32]]:
     """Channels without direction, the directions of edges, and the padded frame."""
     kernels = _kernels(layout)
@@ -82,7 +83,7 @@ def _first_pass(
     return out, _edges(out.mean(axis=0)), padded
 
 
-def _edges(mean: Frame) -> NDArray[np.uint8]:
+def _edges(mean: Image) -> NDArray[np.uint8]:
     """For each pixel 0, or 1 + the direction of its edge in steps of 180 / DIRECTIONS degrees."""
     gx, gy = cv2.Scharr(mean, cv2.CV_32F, 1, 0), cv2.Scharr(mean, cv2.CV_32F, 0, 1)
     xx, xy, yy = (cv2.GaussianBlur(p, (0, 0), _SMOOTHING_PX) for p in (gx * gx, gx * gy, gy * gy))

@@ -14,13 +14,12 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.errors import NotDetermined
 
 #: Largest error of an interpolated matrix, relative to its largest element.
 TOLERANCE = 1e-5
 NODES = (5, 7, 9, 12, 16)
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -34,10 +33,10 @@ class FieldMatrix:
     """
 
     stack: NDArray[np.float32]
-    polynomials: FloatArray
+    polynomials: Array
 
     @classmethod
-    def of(cls, matrix: Callable[[float, float], FloatArray], what: str) -> FieldMatrix:
+    def of(cls, matrix: Callable[[float, float], Array], what: str) -> FieldMatrix:
         """Interpolate `matrix(y, x)`, y and x from -1 to 1, down and to the right.
 
         Raises
@@ -69,7 +68,7 @@ class FieldMatrix:
             f"{what} so fast that {NODES[-1]} nodes each way leave an error of {worst:.1g}; check its coefficients."
         )
 
-    def weights(self, y: FloatArray, x: FloatArray) -> NDArray[np.float32]:
+    def weights(self, y: Array, x: Array) -> NDArray[np.float32]:
         """Weights (K, len(y) * len(x)) of the fixed matrices at rows y and columns x of the image, each -1 to 1."""
         last = self.polynomials.shape[1] - 1
         down, across = chebyshev.chebvander(y, last), chebyshev.chebvander(x, last).T

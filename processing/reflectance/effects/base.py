@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from functools import cache
 from typing import ClassVar
 
+from processing.arrays import Array
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Array, Effect, EffectError, effects_in
+from processing.instrument.effects.base import Effect, EffectError, effects_in
 from processing.instrument.model import InstrumentModel
 from processing.reflectance.changes import ReflectanceChanges
 

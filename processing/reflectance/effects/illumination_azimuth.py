@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from processing.arrays import Array
 from processing.instrument.changes import Conditions
-from processing.instrument.effects.base import Array, Parameter
+from processing.instrument.effects.base import Parameter
 from processing.instrument.model import InstrumentModel
 from processing.reflectance.changes import ReflectanceChanges
 from processing.reflectance.effects.base import ReflectanceEffect

@@ -6,8 +6,9 @@ Mend: use a `polarized_diffuse` material in place of `first_surface`; fit its a 
 
 from __future__ import annotations
 
+from processing.arrays import Array
 from processing.instrument.changes import Conditions
-from processing.instrument.effects.base import Array, Parameter
+from processing.instrument.effects.base import Parameter
 from processing.instrument.model import InstrumentModel
 from processing.reflectance.changes import ReflectanceChanges
 from processing.reflectance.effects.base import ReflectanceEffect

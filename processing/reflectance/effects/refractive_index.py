@@ -6,8 +6,9 @@ Mend: fit it (`process fit-material`), or measure it on a polished piece with an
 
 from __future__ import annotations
 
+from processing.arrays import Array
 from processing.instrument.changes import Conditions
-from processing.instrument.effects.base import Array, Parameter
+from processing.instrument.effects.base import Parameter
 from processing.instrument.model import InstrumentModel
 from processing.reflectance.changes import ReflectanceChanges
 from processing.reflectance.effects.base import ReflectanceEffect

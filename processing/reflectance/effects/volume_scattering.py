@@ -7,8 +7,9 @@ Mend: take the material's dominant process from measurement; a first-surface ind
 
 from __future__ import annotations
 
+from processing.arrays import Array
 from processing.instrument.changes import Conditions
-from processing.instrument.effects.base import Array, Parameter
+from processing.instrument.effects.base import Parameter
 from processing.instrument.model import InstrumentModel
 from processing.reflectance.changes import ReflectanceChanges
 from processing.reflectance.effects.base import ReflectanceEffect

@@ -1,18 +1,33 @@
-"""More of what a real bench does that its declared model does not: plates, play, slips, bent counts.
-
-The first half is in bench_effects.py. The name of each `diagnose` effect's switch is in docs/adding-an-effect.md.
-"""
+"""Optics that are not as declared: elements, plates, channels, retardance that varies over the image."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-from pydantic import Field, PrivateAttr
 
+from processing.arrays import Image
 from processing.instrument.model import InstrumentModel, Retarder
-from simulators.bench.effects import AnyBenchEffect, BenchEffect, Image, Shot, with_element
+from simulators.bench.effects.base import BenchEffect, Shot, with_element
+
+
+def _value(model: InstrumentModel, element: str, name: str) -> float:
+    return float(getattr(next(e for e in model.elements() if e.name == element), name))
+
+
+class ElementError(BenchEffect):
+    """An element's value (retardance_deg, azimuth_deg, extinction, ...) is off, and drifts."""
+
+    kind: Literal["element_error"] = "element_error"
+    element: str
+    parameter: str = "retardance_deg"
+    offset: float = 0.0
+    per_hour: float = 0.0
+
+    def train(self, model: InstrumentModel, shot: Shot) -> InstrumentModel:
+        value = _value(model, self.element, self.parameter) + self.offset + self.per_hour * shot.time_s / 3600
+        return with_element(model, self.element, **{self.parameter: value})
 
 
 class Window(BenchEffect):
@@ -81,36 +96,6 @@ class FieldRetardance(BenchEffect):
         return np.asarray(mean + swing * np.cos(d) + (at_90 - mean) * np.sin(d), dtype=np.float32)
 
 
-class AngleSlip(BenchEffect):
-    """The axis slips by `slip_deg` on its shaft before exposure `at_index` and stays there."""
-
-    kind: Literal["angle_slip"] = "angle_slip"
-    axis: str
-    at_index: int = 0
-    slip_deg: float = 0.0
-
-    def angles(self, angles_deg: dict[str, float], shot: Shot) -> dict[str, float]:
-        if shot.index < self.at_index:
-            return angles_deg
-        return angles_deg | {self.axis: angles_deg[self.axis] + self.slip_deg}
-
-
-class AnglePlay(BenchEffect):
-    """Play in the gear: the shaft stays until the drive has turned by `play_deg` either way from its middle."""
-
-    kind: Literal["angle_play"] = "angle_play"
-    axis: str
-    play_deg: float = 0.0
-    _shaft: float | None = PrivateAttr(default=None)
-
-    def angles(self, angles_deg: dict[str, float], shot: Shot) -> dict[str, float]:
-        drive = angles_deg[self.axis]
-        before = drive - self.play_deg if self._shaft is None else self._shaft
-        # What the shaft remembers is its own business, not part of the settings, which stay as they are.
-        object.__setattr__(self, "_shaft", min(max(before, drive - self.play_deg), drive + self.play_deg))
-        return angles_deg | {self.axis: float(self._shaft or 0.0)}
-
-
 class ChannelError(BenchEffect):
     """One channel passes `gain` times what it should."""
 
@@ -125,50 +110,3 @@ class ChannelError(BenchEffect):
             c.model_copy(update={"gain": c.gain * self.gain}) if c.name == self.channel else c for c in model.channels
         )
         return model.model_copy(update={"channels": channels})
-
-
-class BlackOffset(BenchEffect):
-    """The black level is `electrons` above what the header says."""
-
-    kind: Literal["black_offset"] = "black_offset"
-    electrons: float = 0.0
-
-    def detector(self, electrons: Image, shot: Shot) -> Image:
-        return np.asarray(electrons + np.float32(self.electrons))
-
-
-class ToneCurve(BenchEffect):
-    """The camera stores a power of the light: its contrast setting is not 1."""
-
-    kind: Literal["tone_curve"] = "tone_curve"
-    gamma: float = 1.0
-    full_scale_e: float = 10_000.0
-
-    def detector(self, electrons: Image, shot: Shot) -> Image:
-        share = np.maximum(electrons, 0) / self.full_scale_e
-        return np.asarray(self.full_scale_e * share ** (1 / self.gamma), dtype=np.float32)
-
-
-class SourceLevel(BenchEffect):
-    """The source gives `factor` times its light: enough of it saturates the detector."""
-
-    kind: Literal["source_level"] = "source_level"
-    factor: float = 1.0
-
-    def source(self, level: float, shot: Shot) -> float:
-        return level * self.factor
-
-
-AnyBenchFault = Annotated[
-    AnyBenchEffect
-    | Window
-    | PlateTransmission
-    | FieldRetardance
-    | AngleSlip
-    | AnglePlay
-    | ChannelError
-    | BlackOffset
-    | ToneCurve
-    | SourceLevel,
-    Field(discriminator="kind"),
-]

@@ -10,7 +10,7 @@ from processing.instrument.model import InstrumentModel
 from processing.polarization import mueller
 from simulators.bench.bench import FixedScene
 from simulators.bench.bench import SimulatedBench as Bench
-from simulators.bench.faults import AnyBenchFault
+from simulators.bench.effects import AnyBenchEffect
 
 ANGLES = {"psg": np.linspace(0, 351, 24), "psa": 4.91 * np.linspace(0, 351, 24)}
 SIDE = 9
@@ -59,7 +59,7 @@ GLASS = mueller.diattenuator(0.4, 1.0, 0.5) @ mueller.retarder(1.1, 0.8)
 
 def bench(configs, *faults):
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml")
-    read = TypeAdapter(tuple[AnyBenchFault, ...]).validate_python
+    read = TypeAdapter(tuple[AnyBenchEffect, ...]).validate_python
     return Bench(FixedScene(GLASS), model, 662.0, SIDE, SIDE, flux_e_per_s=1e4, effects=read(faults)), model.at(662.0)
 
 
@@ -101,7 +101,7 @@ def test_play_is_taken_up_before_the_shaft_follows(configs):
 
 
 def test_counts_are_bent_and_lifted(configs):
-    read = TypeAdapter(tuple[AnyBenchFault, ...]).validate_python
+    read = TypeAdapter(tuple[AnyBenchEffect, ...]).validate_python
     curve, black = read(
         ({"kind": "tone_curve", "gamma": 2.0, "full_scale_e": 100.0}, {"kind": "black_offset", "electrons": 5})
     )
