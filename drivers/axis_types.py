@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +41,13 @@ class AxisIdentity:
     address: str
 
 
+def _ascending(ends: tuple[float | None, float | None]) -> tuple[float | None, float | None]:
+    low, high = ends
+    if low is not None and high is not None and low >= high:
+        raise ValueError(f"the limits {low:g} to {high:g} are high first or leave no way. Swap them")
+    return ends
+
+
 class AxisConfig(BaseModel):
     """What every kind of axis has in a rig file.
 
@@ -48,20 +55,26 @@ class AxisConfig(BaseModel):
     shows where the user's angle is zero, and the only offset there is. Angles are never wrapped.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     port: str = Field(description="device path, /dev/serial/by-id path or socket://host:port")
     held_by: str | None = Field(
         default=None, description="program that may hold the port too: the simulator behind a pseudo-terminal"
     )
-    zero_deg: float = Field(default=0.0, allow_inf_nan=False, description="controller angle at user angle zero")
+    zero_deg: float = Field(default=0.0, description="controller angle at user angle zero")
     direction: Literal[1, -1] = Field(default=1, description="-1 if the user angle grows the other way")
-    limits_deg: tuple[float | None, float | None] | None = Field(
+    limits_deg: Annotated[tuple[float | None, float | None], AfterValidator(_ascending)] | None = Field(
         default=None, description="host limits in user degrees, checked besides those of the controller"
     )
-    tolerance_deg: float = Field(default=0.05, gt=0, description="largest allowed distance from the target at rest")
-    poll_s: float = Field(default=0.03, gt=0, description="time between two looks at a moving axis")
-    margin_s: float = Field(default=2.0, gt=0, description="added to the time that distance and speed allow")
-    stall_s: float = Field(default=1.5, gt=0, description="moving without progress for so long is a stall")
-    home_allowed_s: float | None = Field(default=None, gt=0, description="longest homing; default from speed")
-    reply_s: float | None = Field(default=None, gt=0, description="longest wait for a reply; default by kind")
+    tolerance_deg: float = Field(
+        default=0.05, gt=0, le=10, description="largest allowed distance from the target at rest"
+    )
+    poll_s: float = Field(default=0.03, gt=0, le=5, description="time between two looks at a moving axis")
+    margin_s: float = Field(default=2.0, gt=0, le=600, description="added to the time that distance and speed allow")
+    stall_s: float = Field(default=1.5, gt=0, le=600, description="moving without progress for so long is a stall")
+    home_allowed_s: float | None = Field(default=None, gt=0, le=7200, description="longest homing; default from speed")
+    reply_s: float | None = Field(default=None, gt=0, le=60, description="longest wait for a reply; default by kind")
+
+    def place(self) -> str:
+        """What tells this axis from others on its line, in words; "" where a line has one axis only."""
+        return ""

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from acquisition.capture.plan import ARM, AutoExposure, MeasurementPlan
 from acquisition.errors import PlanRefused
 from acquisition.rig.config import RigConfig
-from acquisition.rig.forbidden_poses import describe, find_forbidden
 from acquisition.rig.rig import Rig
+from acquisition.rig.way import find_obstacle
 from drivers.errors import LimitError
 from processing.instrument.model import InstrumentModel, WavelengthError, condition_number, rank
 from processing.instrument.states import StateTable
@@ -81,7 +81,7 @@ def check_plan(plan: MeasurementPlan, rig: RigConfig) -> list[Check]:
 def check_table(table: StateTable, rig: RigConfig, instrument: InstrumentModel) -> list[Check]:
     """Forbidden poses of every state and step, and whether the states determine a Mueller matrix."""
     poses = [{axis: float(column[k]) for axis, column in table.angles_deg.items()} for k in range(len(table))]
-    checks = [_forbidden(rig, poses)]
+    checks = _free_ways(rig, poses)
     if instrument.mosaic is None and instrument.axes:
         light = [k for k, role in enumerate(table.role) if role != "dark"]
         lacking = [axis for axis in instrument.axes if axis not in table.angles_deg]
@@ -97,14 +97,21 @@ def check_table(table: StateTable, rig: RigConfig, instrument: InstrumentModel) 
     return checks
 
 
-def _forbidden(rig: RigConfig, poses: Sequence[Mapping[str, float]]) -> Check:
+def _free_ways(rig: RigConfig, poses: Sequence[Mapping[str, float]]) -> list[Check]:
+    """From each state to the next, and from each to where a run that is stopped parks."""
     before: Mapping[str, float] = poses[0]
     for k, pose in enumerate(poses):
-        box = find_forbidden(rig.forbidden, before, pose)
-        if box is not None:
-            return Check("poses", False, f"state {k} meets a {describe(box)}")
+        found = find_obstacle(rig, before, pose)
+        if found is not None:
+            return [Check("poses", False, f"state {k} meets {found}")]
         before = pose
-    return Check("poses", True, f"{len(poses)} states outside {len(rig.forbidden)} forbidden ranges")
+    solids = f", {len(rig.solids.parts)} solids" if rig.solids else ""
+    checks = [Check("poses", True, f"{len(poses)} states outside {len(rig.forbidden)} forbidden ranges{solids}")]
+    for k, pose in enumerate(poses if rig.park_deg else ()):
+        found = find_obstacle(rig, pose, {**pose, **rig.park_deg}, rig.park_deg)
+        if found is not None:
+            return [*checks, Check("way to the park pose", False, f"from state {k} it meets {found}")]
+    return checks
 
 
 def load_instrument(plan: MeasurementPlan, rig: RigConfig) -> InstrumentModel:
@@ -129,12 +136,22 @@ def check_devices(table: StateTable, rig: Rig) -> list[Check]:
             checks.append(Check(f"limits of {axis}", True, ends))
     first = {axis: float(column[0]) for axis, column in table.angles_deg.items()}
     homed = {name: axis.read_position().deg for name, axis in rig.axes.items() if axis.is_homed()}
-    box = find_forbidden(rig.config.forbidden, homed, first)
-    found = describe(box) if box else "free from here to the first state"
-    checks.append(Check("first move", box is None, found))
+    found = find_obstacle(rig.config, homed, homed | first)
+    checks.append(Check("first move", found is None, found or "free from here to the first state"))
+    checks += _check_park(rig)
     if rig.source is not None and rig.source.interlock_open():
         checks.append(Check("door", False, "the interlock circuit of the source is open; close it"))
     return checks
+
+
+def _check_park(rig: Rig) -> list[Check]:
+    failures = []
+    for name, angle in rig.config.park_deg.items():
+        try:
+            rig.axes[name].check(angle)
+        except LimitError as error:
+            failures.append(Check(f"park_deg of {name}", False, str(error)))
+    return failures
 
 
 def _member(what: str, value: str, known: list[str]) -> Check:

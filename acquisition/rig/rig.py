@@ -11,7 +11,7 @@ from typing import Any, Self
 from acquisition.cleanup import Step, run_all
 from acquisition.errors import AcquisitionError
 from acquisition.rig.config import RigConfig
-from acquisition.rig.forbidden_poses import describe, find_forbidden
+from acquisition.rig.way import concerned, find_homing_obstacle, find_obstacle
 from drivers.camera import Camera, CameraSettings
 from drivers.errors import LimitError, MotionFailed
 from drivers.motion import Motion, MotionAxis, Position
@@ -150,7 +150,18 @@ class Rig:
         return [name for name in self.homing_order() if not self.axes[name].is_homed()]
 
     def home(self, names: list[str]) -> None:
-        """Home the axes one after another. Raises MotionFailed; every axis has been sent a stop by then."""
+        """Home the axes one after another.
+
+        Raises
+        ------
+        AcquisitionError
+            One of them may meet a forbidden pose or bring solids together on its way; nothing was moved.
+        MotionFailed
+            Every axis has been sent a stop by then.
+        """
+        found = find_homing_obstacle(self.config, names, self._where_known())
+        if found is not None:
+            raise AcquisitionError(f"{found}. Nothing was moved.")
         for name in names:
             self.wait({name: self.axes[name].home()})
 
@@ -191,15 +202,15 @@ class Rig:
         return motions
 
     def _check_way(self, targets_deg: Mapping[str, float]) -> None:
-        boxes = [box for box in self.config.forbidden if box.ranges_deg.keys() & targets_deg.keys()]
-        if not boxes:
-            return
-        concerned = {axis for box in boxes for axis in box.ranges_deg if axis in self.axes}
+        found = find_obstacle(self.config, here := self._where_known(), here | dict(targets_deg), targets_deg)
+        if found is not None:
+            raise AcquisitionError(f"move to {dict(targets_deg)} meets {found}. Nothing was moved.")
+
+    def _where_known(self) -> dict[str, float]:
+        """Angles of the axes that forbidden poses and solids speak of, as far as they are known."""
         # Where an axis without a reference stands is not known, whatever it reads.
-        here = {axis: self.axes[axis].read_position().deg for axis in concerned if self.axes[axis].is_homed()}
-        box = find_forbidden(boxes, here, here | dict(targets_deg))
-        if box is not None:
-            raise AcquisitionError(f"move to {dict(targets_deg)} meets a {describe(box)}. Nothing was moved.")
+        axes = {name: self.axes[name] for name in concerned(self.config) if name in self.axes}
+        return {name: axis.read_position().deg for name, axis in axes.items() if axis.is_homed()}
 
     def wait(self, motions: Mapping[str, Motion]) -> dict[str, Position]:
         """Wait for all motions and return the positions read back at rest.

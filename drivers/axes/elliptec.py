@@ -57,6 +57,9 @@ class Config(SessionReferenceConfig):
         default=0.1, ge=0, description="pylablib notes that a move sent too soon after another command can end at zero"
     )
 
+    def place(self) -> str:
+        return f"serial number {self.serial_number}" if self.address is None else f"address {self.address}"
+
 
 class ElliptecLine:
     """Up to 16 modules on one line; replies are sorted by address and letters."""

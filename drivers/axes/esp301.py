@@ -51,6 +51,9 @@ class Config(SessionReferenceConfig):
     baudrate: int = 19_200
     rtscts: bool = True
 
+    def place(self) -> str:
+        return f"axis {self.axis}"
+
 
 class ESP301Line:
     """The port of one controller, shared by its axes."""

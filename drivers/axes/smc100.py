@@ -78,6 +78,9 @@ class Config(AxisConfig):
     stage_id: str | None = None
     baudrate: int = Field(default=57_600, description="57600 for SMC100, 921600 for CONEX")
 
+    def place(self) -> str:
+        return f"address {self.address}"
+
 
 class SMC100Line:
     """One line of controllers; replies are matched by address and command letters."""

@@ -70,6 +70,10 @@ class Config(AxisConfig):
     )
     baudrate: int = 115_200
 
+    def place(self) -> str:
+        who = f"serial number {self.serial_number}" if self.address is None else f"address {self.address}"
+        return f"{who} axis {self.axis}"
+
 
 @dataclass(frozen=True, slots=True)
 class Reply:

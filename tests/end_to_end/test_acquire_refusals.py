@@ -109,8 +109,8 @@ def test_camera_not_there(refused, small_rig):
         rig["source"] = {"kind": "manual"}
         rig["modes"] = {"stokes": {"instrument": rig["modes"]["stokes"]["instrument"]}}
         rig["interlocks"] = []
-        rig["home_order"] = []
-        rig["forbidden"] = []
+        for section in ("home_order", "homing", "endless", "backlash_deg", "park_deg", "forbidden", "solids"):
+            del rig[section]
 
     code, err = refused("--omega", 35, "--mode", "stokes", "--rig", _changed(small_rig(), camera_only))
     assert code == 1

@@ -10,8 +10,9 @@ from acquisition.capture.checks import check_devices
 from acquisition.capture.job import prepare
 from acquisition.capture.plan import MeasurementPlan
 from acquisition.errors import PlanRefused
-from acquisition.rig.config import ForbiddenPose, load_rig
+from acquisition.rig.config import load_rig
 from acquisition.rig.forbidden_poses import find_forbidden
+from acquisition.rig.parts import ForbiddenPose
 from acquisition.rig.rig import Rig
 from drivers.errors import LimitError
 
@@ -25,8 +26,8 @@ def open_rig(small_rig):
         top={
             "endless": [],
             "forbidden": [
-                {"why": "table", "ranges_deg": {"arm": [-10, 5]}},
-                {"why": "cable", "ranges_deg": {"arm": [100, 120], "psg": [200, 250]}},
+                {"why": "table", "ranges_deg": {"arm": [-10, 5]}, "homing_may_pass": True},
+                {"why": "cable", "ranges_deg": {"arm": [100, 120], "psg": [200, 250]}, "homing_may_pass": True},
             ],
         }
     )

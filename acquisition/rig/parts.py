@@ -1,0 +1,71 @@
+"""The sections of a rig file besides its devices."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+
+class Part(BaseModel):
+    """A section of a rig file: unknown keys and numbers that are not finite are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+def _ascending(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] > ends[1]:
+        raise ValueError(f"the range {ends[0]:g} to {ends[1]:g} is high first: nothing lies in it. Swap its ends")
+    return ends
+
+
+#: Lowest and highest value, in this order.
+Range = Annotated[tuple[float, float], AfterValidator(_ascending)]
+
+
+class ModeConfig(Part):
+    """How the rig measures in one mode.
+
+    `pose_deg`: where axes stand that do not turn in this mode, one angle or one for each wavelength.
+    """
+
+    instrument: Path
+    pose_deg: dict[str, float | dict[float, float]] = {}
+
+
+class ForbiddenPose(Part):
+    """A box of axis angles that the rig must neither stand in nor pass: all ranges hold at once."""
+
+    why: str
+    ranges_deg: Annotated[dict[str, Range], Field(min_length=1)]
+    homing_may_pass: bool = Field(
+        default=False, description="nothing is hit there; it is only no pose to measure in, so homing may pass it"
+    )
+
+
+class HomingPath(Part):
+    """What an axis may pass while it homes, from wherever it was left, and where it stands afterwards."""
+
+    passes_deg: Range
+    ends_deg: float
+
+    @model_validator(mode="after")
+    def _ends_inside(self) -> Self:
+        low, high = self.passes_deg
+        if not low <= self.ends_deg <= high:
+            raise ValueError(f"ends_deg {self.ends_deg:g} lies outside passes_deg {low:g} to {high:g}")
+        return self
+
+
+class InterlockConfig(Part):
+    """A condition under which states count.
+
+    `door`: the source's interlock circuit is closed. `temperature`: the camera is not warmer than `limit` degrees
+    Celsius. `saturation`: no more than the fraction `limit` of a state's pixels is saturated. `lamp`: a light
+    state has more than the fraction `limit` of the light of the first. `drift`: a state that repeats an earlier
+    pose and exposure has the same light, to the fraction `limit`.
+    """
+
+    kind: Literal["door", "temperature", "saturation", "lamp", "drift"]
+    limit: float = Field(default=0.0, ge=0)

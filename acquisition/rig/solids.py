@@ -1,0 +1,56 @@
+"""Arm, sample holder and whatever else could collide, as simple solids in the rig file's `solids` section.
+
+Lengths are in mm, in the frame of the instrument: the origin is the centre of rotation, y points up, the camera stands
+on +z. A solid that turns with an axis is given as it stands at that axis's angle 0; it turns about the vertical
+through the origin, from +z towards +x, as the arm does.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from acquisition.rig.parts import Part
+
+Length = Annotated[float, Field(gt=0, le=10_000)]
+Coordinate = Annotated[float, Field(ge=-10_000, le=10_000)]
+
+
+class _Solid(Part):
+    name: str
+    centre_mm: tuple[Coordinate, Coordinate, Coordinate]
+    turns_with: str | None = Field(default=None, description="axis that carries it; without one it stands still")
+
+
+class Box(_Solid):
+    """A box with its edges along x, y and z."""
+
+    shape: Literal["box"]
+    size_mm: tuple[Length, Length, Length]
+
+
+class Cylinder(_Solid):
+    """An upright cylinder."""
+
+    shape: Literal["cylinder"]
+    radius_mm: Length
+    height_mm: Length
+
+
+class Disc(_Solid):
+    """A disc on edge that faces along z, for instance a mount in the beam."""
+
+    shape: Literal["disc"]
+    radius_mm: Length
+    thickness_mm: Length
+
+
+Solid = Annotated[Box | Cylinder | Disc, Field(discriminator="shape")]
+
+
+class Solids(Part):
+    """Solids that must keep their distance from each other at every instant of every move."""
+
+    margin_mm: float = Field(ge=0, le=1000, description="smallest distance allowed")
+    parts: tuple[Solid, ...]

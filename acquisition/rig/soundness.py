@@ -1,0 +1,185 @@
+"""What a rig file says about itself that cannot be meant: names that are nowhere, two axes at one address, a park pose
+outside the limits. Every mistake is found, none hides another; nothing is opened.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING, Any
+
+from acquisition.rig.way import find_homing_obstacle, find_obstacle
+from drivers.motion import AxisConfig
+from simulators.rig.model import SCHEME
+
+if TYPE_CHECKING:
+    from acquisition.rig.config import RigConfig
+
+#: Keys that lead to the place in the file, and what is wrong there.
+Mistake = tuple[tuple[int | str, ...], str]
+
+
+def find_mistakes(rig: RigConfig) -> list[Mistake]:
+    """Everything that the sections of a rig file say about each other and cannot be meant.
+
+    Parameters
+    ----------
+    rig : may lack what could not be read; an axis that could not be read is None.
+    """
+    looks: tuple[Callable[[RigConfig], Iterator[Mistake]], ...] = (
+        _axis_names,
+        _axes_given_twice,
+        _shared_places,
+        _emulated_ports,
+        _angles_outside_limits,
+        _wavelengths,
+        _interlocks,
+        _solids,
+        _ways,
+    )
+    return [mistake for look in looks for mistake in look(rig)]
+
+
+def _named_axes(rig: RigConfig) -> Iterator[tuple[tuple[int | str, ...], str]]:
+    """Every place in the file that names an axis, with the name."""
+    for section in ("park_deg", "backlash_deg", "homing"):
+        for name in getattr(rig, section):
+            yield (section, name), name
+    for section in ("home_order", "endless"):
+        for k, name in enumerate(getattr(rig, section)):
+            yield (section, k), name
+    for k, box in enumerate(rig.forbidden):
+        for name in box.ranges_deg:
+            yield ("forbidden", k, "ranges_deg", name), name
+    for mode, config in rig.modes.items():
+        for name in config.pose_deg:
+            yield ("modes", mode, "pose_deg", name), name
+    for k, solid in enumerate(rig.solids.parts if rig.solids else ()):
+        if solid.turns_with is not None:
+            yield ("solids", "parts", k, "turns_with"), solid.turns_with
+    for name in rig.simulator.axes if rig.simulator else ():
+        yield ("simulator", "axes", name), name
+
+
+def _axis_names(rig: RigConfig) -> Iterator[Mistake]:
+    for where, name in _named_axes(rig):
+        if name not in rig.axes:
+            near = difflib.get_close_matches(name, rig.axes, n=1)
+            hint = f"; {near[0]} is meant?" if near else ""
+            yield where, f"there is no axis {name!r}, only {', '.join(rig.axes)}{hint}"
+
+
+def _axes_given_twice(rig: RigConfig) -> Iterator[Mistake]:
+    for section in ("home_order", "endless"):
+        names = getattr(rig, section)
+        for k, name in enumerate(names):
+            if name in names[:k]:
+                yield (section, k), f"axis {name!r} is there twice"
+
+
+def _shared_places(rig: RigConfig) -> Iterator[Mistake]:
+    """Two axes at one address, two kinds of device on one line, two rig axes on one emulated axis."""
+    places: dict[tuple[str, str], str] = {}
+    lines: dict[str, tuple[str, str]] = {}
+    for where, name, entry in _devices_with_port(rig):
+        port = os.path.realpath(entry.port) if entry.port.startswith("/") else entry.port
+        owner, first_kind = lines.setdefault(port, (name, entry.kind))
+        if first_kind != entry.kind:
+            yield (*where, "port"), f"{entry.kind} at the port of {owner}, a {first_kind}: one line, one protocol"
+            continue
+        place = entry.place() if isinstance(entry, AxisConfig) else ""
+        other = places.setdefault((port, place), name)
+        if other != name:
+            yield where, f"at the same port{' and ' + place if place else ''} as {other}: one device cannot be both"
+    emulated: dict[Any, str] = {}
+    for name, axis in rig.simulator.axes.items() if rig.simulator else ():
+        other = emulated.setdefault((axis.port, axis.index), name)
+        if other != name:
+            yield ("simulator", "axes", name), f"the same emulated axis as {other}"
+
+
+def _devices_with_port(rig: RigConfig) -> Iterator[tuple[tuple[str, ...], str, Any]]:
+    yield from ((("axes", name), name, entry) for name, entry in rig.axes.items() if entry is not None)
+    source = getattr(rig, "source", None)
+    if getattr(source, "port", None) is not None:
+        yield ("source",), "the source", source
+
+
+def _emulated_ports(rig: RigConfig) -> Iterator[Mistake]:
+    if rig.simulator is None:
+        return
+    for where, _, entry in _devices_with_port(rig):
+        if entry.port.startswith(SCHEME) and entry.port.removeprefix(SCHEME) not in rig.simulator.ports:
+            yield (*where, "port"), f"port {entry.port}: `simulator.ports` has {', '.join(rig.simulator.ports)}"
+    for name in rig.axes.keys() - rig.simulator.axes.keys():
+        yield ("simulator", "axes"), f"axis {name!r} of the rig is not there"
+
+
+def _angles_outside_limits(rig: RigConfig) -> Iterator[Mistake]:
+    for where, name, angle in _given_angles(rig):
+        low, high = getattr(rig.axes.get(name), "limits_deg", None) or (None, None)
+        if (low is not None and angle < low) or (high is not None and angle > high):
+            ends = " to ".join("no limit" if end is None else f"{end:g}" for end in (low, high))
+            yield where, f"{angle:g} deg lies outside the limits of {name}, {ends} deg"
+
+
+def _given_angles(rig: RigConfig) -> Iterator[tuple[tuple[int | str, ...], str, float]]:
+    for name, angle in rig.park_deg.items():
+        yield ("park_deg", name), name, angle
+    for mode, config in rig.modes.items():
+        for name, given in config.pose_deg.items():
+            for angle in given.values() if isinstance(given, dict) else (given,):
+                yield ("modes", mode, "pose_deg", name), name, angle
+
+
+def _wavelengths(rig: RigConfig) -> Iterator[Mistake]:
+    given = rig.wavelengths_nm
+    for k, wavelength in enumerate(given):
+        if wavelength in given[:k]:
+            yield ("wavelengths_nm", k), f"{wavelength:g} nm is there twice"
+    if rig.exposure_s[0] <= 0:
+        yield ("exposure_s",), f"the shortest exposure must be positive, not {rig.exposure_s[0]:g} s"
+
+
+def _interlocks(rig: RigConfig) -> Iterator[Mistake]:
+    kinds = [entry.kind for entry in rig.interlocks]
+    for k, entry in enumerate(rig.interlocks):
+        if entry.kind in kinds[:k]:
+            yield ("interlocks", k), f"{entry.kind} is there twice; one would be forgotten"
+        if entry.kind == "door" and getattr(rig, "source", None) is None:
+            yield ("interlocks", k), "door: the rig has no source whose interlock circuit could tell"
+        if entry.kind in ("temperature", "drift") and entry.limit == 0:
+            yield ("interlocks", k), f"{entry.kind}: limit 0 is never kept; give a limit"
+        if entry.kind in ("lamp", "saturation") and entry.limit >= 1:
+            yield ("interlocks", k), f"{entry.kind}: limit {entry.limit:g} is a fraction, less than 1"
+
+
+def _solids(rig: RigConfig) -> Iterator[Mistake]:
+    names = [solid.name for solid in rig.solids.parts] if rig.solids else []
+    for k, name in enumerate(names):
+        if name in names[:k]:
+            yield ("solids", "parts", k, "name"), f"a solid {name!r} is there already"
+
+
+def _ways(rig: RigConfig) -> Iterator[Mistake]:
+    """Parking and homing against forbidden poses and solids; asked only of names that are all there."""
+    if any(name not in rig.axes for _, name in _named_axes(rig)):
+        return
+    found = _park_meets(rig)
+    if found is not None:
+        yield ("park_deg",), f"parking there meets {found}"
+    order: Iterable[str] = [*rig.home_order, *(name for name in rig.axes if name not in rig.home_order)]
+    found = find_homing_obstacle(rig, order, {})
+    if found is not None:
+        yield ("homing",), found
+
+
+def _park_meets(rig: RigConfig) -> str | None:
+    """What is met in the park pose wherever the axes stand that are not parked."""
+    park = rig.park_deg
+    changes: dict[str, Any] = {"forbidden": tuple(box for box in rig.forbidden if box.ranges_deg.keys() <= park.keys())}
+    if rig.solids is not None:
+        parts = tuple(s for s in rig.solids.parts if s.turns_with is None or s.turns_with in park)
+        changes["solids"] = rig.solids.model_copy(update={"parts": parts})
+    return find_obstacle(rig.model_copy(update=changes), park, park)
