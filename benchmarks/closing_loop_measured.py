@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measured_points import FOLDS, ReflectanceProblem
 
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.instrument.judge import Judged, closure
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.run import diagnose_captures
 from processing.diagnosis.instrument_file import extended
-from processing.diagnosis.reflectance_problem import FOLDS, ReflectanceProblem
 from processing.diagnosis.search.fit import held_out, minimize
 from processing.diagnosis.search.space import Space
 from processing.geometry.frames import ScatteringGeometry, change_frames

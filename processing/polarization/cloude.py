@@ -86,16 +86,6 @@ def xi0_and_dominant(m: RealArray, out: tuple[RealArray, RealArray] | None = Non
     return xi0.reshape(shape), np.moveaxis(m0.reshape(4, 4, *shape), (0, 1), (-2, -1))
 
 
-def xi0_of_dominant(m: RealArray, m0: RealArray) -> RealArray:
-    """Eigenvalue of the coherency matrix of M that belongs to a given Mueller-Jones matrix m0 (m00 = 1).
-
-    For a triply degenerate M = m00 4/3 ((xi0 - 1/4) m0 + (1 - xi0) m_ID) with xi0 below 1/4, m0 belongs to the
-    smallest eigenvalue and not to the largest (conventions.md, trap 22); this gives xi0 on both sides.
-    """
-    m = np.asarray(m)
-    return np.asarray(np.einsum("...ij,...ij->...", m, m0) / (4 * m[..., 0, 0]))
-
-
 def as_planar(m: RealArray) -> tuple[RealArray, tuple[int, ...]]:
     """View m as (16, pixels), C- or Fortran-ordered, copying only where its memory is neither."""
     m = np.asarray(m)

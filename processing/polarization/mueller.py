@@ -83,11 +83,6 @@ def polarizer(azimuth: ArrayLike, extinction: ArrayLike = 0.0) -> Array:
     return diattenuator(azimuth, 1.0, extinction)
 
 
-def circular_retarder(retardance: ArrayLike) -> Array:
-    """Circular retarder: turns linear polarization by half of `retardance`, counter-clockwise."""
-    return rotation(np.asarray(retardance, dtype=float) / 2)
-
-
 def from_jones(jones: ArrayLike) -> Array:
     """Mueller-Jones matrix of Jones matrices (..., 2, 2): M_ab = 1/2 tr(s_a J s_b J^H)."""
     j = np.asarray(jones, dtype=complex)

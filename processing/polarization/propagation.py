@@ -27,16 +27,6 @@ class Derived(NamedTuple):
     """(..., pixels..., 16)"""
 
 
-def standard_error(gradient: RealArray, covariance: RealArray) -> NDArray[np.float64]:
-    """Standard error sqrt(g C g) of a quantity with gradient g (..., 16), covariance C (..., 16, 16).
-
-    One covariance (16, 16) serves all pixels; several quantities stack on the left of the gradient.
-    """
-    g = np.asarray(gradient)
-    projected = np.matmul(g[..., None, :], np.asarray(covariance))
-    return np.asarray(np.sqrt(np.maximum(np.matmul(projected, g[..., :, None])[..., 0, 0], 0.0)))
-
-
 def numeric_gradient(
     function: Callable[[RealArray], RealArray], m: RealArray, period: RealArray | float = np.inf
 ) -> NDArray[np.float64]:

@@ -30,14 +30,6 @@ def coefficients(xi0: ArrayLike, m00: ArrayLike = 1.0) -> tuple[RealArray, RealA
     return np.asarray(4 * t / 3 * (xi - 0.25)), np.asarray(4 * t / 3 * (1 - xi))
 
 
-def from_coefficients(alpha_0: ArrayLike, alpha_id: ArrayLike) -> tuple[RealArray, RealArray]:
-    """xi0 and M00 of the two weights, in the form without a singularity at alpha_ID = 0 or xi0 = 1/4 (trap 5)."""
-    a, b = np.asarray(alpha_0, dtype=float), np.asarray(alpha_id, dtype=float)
-    total = a + b
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray((a + b / 4) / total), total
-
-
 def depolarization_index(xi0: ArrayLike) -> RealArray:
     """|4 xi0 - 1| / 3 of a TD matrix; not monotonic below xi0 = 1/4 (trap 22)."""
     return np.asarray(np.abs(4 * np.asarray(xi0, dtype=float) - 1) / 3)

@@ -1,4 +1,4 @@
-"""Read and write the files of RGB950's own program, AxoStep: raw frames (.rmmd) and Mueller images (.cmmi, .bmmi).
+"""The files of RGB950's own program, AxoStep: raw frames (.rmmd) read, Mueller images (.cmmi, .bmmi) read and written.
 
 Big-endian 32-bit words, from the lab's public format sheet and readers (instruments.md, section 5). Not yet tried on
 a file from the instrument: two public readers even disagree on the length of the header, so it is told from the file.
@@ -80,13 +80,6 @@ def read_rmmd(path: Path) -> RawFrames:
         )
     frames = ints[header_words:].reshape(count, rows, columns)[:, ::-1].astype(np.int32)
     return RawFrames(frames, int(ints[0]), header_words, int(ints[4]) if header_words == 5 else 0)
-
-
-def write_rmmd(path: Path, raw: RawFrames) -> None:
-    """Write raw frames with the header that they came with."""
-    header = [raw.header, *raw.frames.shape] + ([raw.extra] if raw.header_words == 5 else [])
-    body = np.ascontiguousarray(raw.frames[:, ::-1], dtype=">i4")
-    path.write_bytes(np.array(header, dtype=">i4").tobytes() + body.tobytes())
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from processing.polarization import mueller, quantities
 from processing.polarization.cloude import coherency_eigenvalues
 from processing.polarization.decompositions.lu_chipman import lu_chipman
 from processing.polarization.triply_degenerate import mueller_matrix
-from processing.storage.axostep import RawFrames, read_mueller_file, write_rmmd
+from processing.storage.axostep import read_mueller_file
 from processing.storage.product import Product
 
 ROWS, COLUMNS = 40, 60
@@ -144,7 +144,8 @@ def test_raw_axostep_frames_are_imported_without_the_closing_repeat(
     process: Run, configs: Path, tmp_path: Path
 ) -> None:
     frames = np.random.default_rng(0).integers(100, 60_000, size=(41, 6, 8)).astype(np.int32)
-    write_rmmd(tmp_path / "raw.rmmd", RawFrames(frames))
+    words = np.concatenate([np.array([1, *frames.shape]), frames[:, ::-1].reshape(-1)])
+    (tmp_path / "raw.rmmd").write_bytes(words.astype(">i4").tobytes())
     table = rotating_retarders(0.01)
     lines = ["state,psg_deg,psa_deg"]
     lines += [f"{k},{table.angles_deg['psg'][k]},{table.angles_deg['psa'][k]}" for k in range(40)]

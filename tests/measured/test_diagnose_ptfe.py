@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from measured_points import FOLDS, ReflectanceProblem
 
-from processing.diagnosis.reflectance_problem import FOLDS, ReflectanceProblem
 from processing.diagnosis.search.fit import held_out, minimize
 from processing.diagnosis.search.search import Search
 from processing.diagnosis.search.space import Space

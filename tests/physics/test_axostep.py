@@ -17,7 +17,6 @@ from processing.storage.axostep import (
     read_mueller_file,
     read_rmmd,
     write_mueller_file,
-    write_rmmd,
 )
 
 
@@ -30,9 +29,6 @@ def test_raw_frames_byte_by_byte(tmp_path: Path) -> None:
         np.testing.assert_array_equal(raw.frames[0], [[103, 104, 105], [100, 101, 102]])
         np.testing.assert_array_equal(raw.frames[1], [[109, 110, 111], [106, 107, 108]])
         assert (raw.header, raw.header_words, raw.extra) == (7, len(header), 99 if len(header) == 5 else 0)
-        again = tmp_path / "b.rmmd"
-        write_rmmd(again, raw)
-        assert again.read_bytes() == file.read_bytes()
 
 
 def test_closing_repeat_is_dropped_and_tells_the_drift() -> None:

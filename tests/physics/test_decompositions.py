@@ -112,7 +112,7 @@ class TestLuChipman:
         np.testing.assert_allclose(coherency_eigenvalues(found.diattenuator)[:, 0], 1, atol=1e-10)
 
     def test_known_products(self) -> None:
-        retarder = mueller.retarder(0.3, 2.0) @ mueller.circular_retarder(0.4)
+        retarder = mueller.retarder(0.3, 2.0) @ mueller.rotation(0.2)
         diattenuator = mueller.diattenuator(1.1, 0.9, 0.2)
         depolarizer = np.array([[1, 0, 0, 0], [0.1, 0.5, 0.1, 0], [0.05, 0.1, 0.4, 0], [0, 0, 0, 0.3]])
         found = lu_chipman(depolarizer @ retarder @ diattenuator)
@@ -140,7 +140,7 @@ class TestLuChipman:
         np.testing.assert_allclose(found.diattenuator[1], np.eye(4))
 
     def test_nearly_singular_depolarizers(self) -> None:
-        retarder = mueller.retarder(0.7, 2.9) @ mueller.circular_retarder(-1.0)
+        retarder = mueller.retarder(0.7, 2.9) @ mueller.rotation(-0.5)
         depolarizer = np.diag([1.0, 0.5, 1e-6, 1e-3])
         found = lu_chipman(depolarizer @ retarder)
         np.testing.assert_allclose(found.retarder, retarder, atol=1e-9)
@@ -192,7 +192,7 @@ class TestSymmetric:
             mueller.diattenuator(1.0, 1, 0.7) / 0.85,
         )
         retarder_1 = mueller.retarder(0.2, 0.9)
-        retarder_2 = mueller.circular_retarder(0.5) @ mueller.retarder(-0.4, 0.4)
+        retarder_2 = mueller.rotation(0.25) @ mueller.retarder(-0.4, 0.4)
         depolarizer = np.diag([2.0, 1.4, 1.0, 0.4])
         m = diattenuator_2 @ retarder_2 @ depolarizer @ retarder_1.T @ diattenuator_1
         found = symmetric(m)

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from measured_points import ReflectanceProblem
 
-from processing.diagnosis.reflectance_problem import ReflectanceProblem
 from processing.diagnosis.search.search import Search
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel

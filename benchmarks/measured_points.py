@@ -1,4 +1,4 @@
-"""Measured reflectance against the paper's triply degenerate model with first-surface reflection.
+"""Measured or simulated points of a surface against the triply degenerate model with first-surface reflection.
 
 Each point has its own throughput and depolarization: intensities = W [m0 mID] alpha with two free coefficients, which
 are projected out; what is left depends on the dominant process m0 alone. The search is that of instruments.
