@@ -103,7 +103,7 @@ def upright(geometry: ScatteringGeometry) -> ScatteringGeometry:
 
 def dominant_process(model: Any, geometry: ScatteringGeometry) -> np.ndarray:
     """Mueller-Jones matrices in the facet's axes. The diffuse term of the paper belongs to the instrument that looks
-    (trap 3), so it is evaluated in the instrument's pose of these angles.
+    (docs/conventions.md), so it is evaluated in the instrument's pose of these angles.
     """
     pose = ScatteringGeometry(*directions(*geometry.angles))
     return pbsdf.to_renderer_frames(model.mueller_jones(pose, WAVELENGTH_NM), pose)

@@ -2,7 +2,7 @@
 
 Run by hand (about ten minutes on two cores, 3 GB of files):
 
-    python benchmarks/virtual_experiment.py --work /tmp/virtual --out docs/virtual_experiment_tables.md
+    python benchmarks/virtual_experiment.py --work /tmp/virtual --out /tmp/virtual.md
 
 True model: the processing knows the scene's own reflectance model and geometry. Not triply degenerate: the three
 small eigenvalues differ by up to 9 % at 451 nm and 3 % at 662 nm, as the paper saw. Misregistered: the real sphere

@@ -1,6 +1,7 @@
 """The house: no circle of imports anywhere, also none of imports inside functions."""
 
 import ast
+import re
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -45,3 +46,34 @@ def test_a_circle_would_be_seen(tmp_path):
     (folder / "two.py").write_text("def late():\n    from processing.one import thing\n")
     with pytest.raises(CycleError):
         TopologicalSorter(imports(tmp_path)).prepare()
+
+
+def cited_outside(text: str) -> list[str]:
+    """What a text cites that is not in the repository: papers of the workshop, pages of docs/ that are not there."""
+    found = re.findall(r"shared/\w+\.(?:md|tex)|\b[Tt]raps? \d+", text)
+    for page, heading in re.findall(r"docs/([\w-]+\.md)(?:, \"([^\"]+)\")?", text):
+        file = ROOT / "docs" / page
+        if not file.exists():
+            found.append(f"docs/{page}")
+        elif heading and not re.search(rf"^#+ .*{re.escape(' '.join(heading.split()))}", file.read_text(), re.M):
+            found.append(f'docs/{page}, "{heading}"')
+    return found
+
+
+@pytest.mark.parametrize("folder", [*PACKAGES, "tests", "benchmarks", "configs", "docs"])
+def test_nothing_cites_what_is_not_here(folder):
+    files = [f for ending in ("py", "md", "yaml") for f in sorted((ROOT / folder).rglob(f"*.{ending}"))]
+    assert files
+    here = Path(__file__)
+    wrong = {str(f.relative_to(ROOT)): cited_outside(f.read_text(encoding="utf-8")) for f in files if f != here}
+    assert {name: what for name, what in wrong.items() if what} == {}
+
+
+def test_a_citation_that_leads_outside_is_seen():
+    assert cited_outside("see ../shared/notes.md, trap 8, docs/no-such-page.md") == [
+        "shared/notes.md",
+        "trap 8",
+        "docs/no-such-page.md",
+    ]
+    assert cited_outside('docs/conventions.md, "No such heading"')
+    assert not cited_outside('docs/conventions.md, "Frames"')

@@ -1,4 +1,4 @@
-"""Which illumination a linear Stokes capture should have, by the standard error of xi0 that it predicts (trap 11)."""
+"""Which illumination a linear Stokes capture should have, by the standard error of xi0 that it predicts."""
 
 from __future__ import annotations
 

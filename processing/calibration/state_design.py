@@ -2,7 +2,7 @@
 
 With rows kron(a, g) of W and a, g = 1/2 (1, s), the equally weighted variance is trace (W^T W)^-1: the sum of the
 variances of the 16 elements for unit noise. It is least where s covers the sphere evenly on both sides, independently:
-then W^T W = N/16 D (x) D with D = diag(1, 1/3, 1/3, 1/3), and the variance 1600 / N (conventions.md, trap 20: 40).
+then W^T W = N/16 D (x) D with D = diag(1, 1/3, 1/3, 1/3), and the variance 1600 / N (40 for 40 states).
 """
 
 from __future__ import annotations

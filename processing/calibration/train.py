@@ -82,7 +82,7 @@ def known_mueller(sample: Sample) -> NDArray[np.float64]:
         return np.asarray(sample.mueller, dtype=float).reshape(4, 4)
     raise CalibrationError(
         "the sample of this capture is not known, and retardances cannot be told from an unknown sample "
-        "(conventions.md, trap 8). Capture air or a mirror, or import with --sample."
+        "(docs/conventions.md). Capture air or a mirror, or import with --sample."
     )
 
 

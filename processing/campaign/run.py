@@ -32,7 +32,7 @@ BORDER_PX = 4
 
 @dataclass(frozen=True)
 class PaperAverages:
-    """The paper's averages over fifteen arm angles (its conclusions; conventions.md, trap 17)."""
+    """The paper's averages over fifteen arm angles (its conclusions; see docs/conventions.md)."""
 
     psi_deg: float
     magnitude_percent: float

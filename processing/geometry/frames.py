@@ -1,9 +1,9 @@
 """Directions at surface points, and the transverse axes to which their Mueller matrices refer.
 
-World frame: origin at the centre of rotation, y up, camera on +z (conventions.md, "Frames"). Each beam has
+World frame: origin at the centre of rotation, y up, camera on +z (docs/conventions.md, "Frames"). Each beam has
 x = unit(up cross k) and y = k cross x, k being its propagation. With up = y these are the instrument frames
 that a measured Mueller image is in; with up = n they are the paper's normal-based ones, which turn with the
-surface (trap 1); with up = h, x is the axis s of the facet for both beams, as in a renderer's table (trap 15).
+surface (docs/conventions.md); with up = h, x is the axis s of the facet for both beams, as in a renderer's table.
 """
 
 from __future__ import annotations

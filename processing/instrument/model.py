@@ -1,7 +1,7 @@
 """Instrument models: two optical trains, a detector, and one row of W for each state and channel.
 
 Any rotating-element polarimeter is a YAML file: a generator train and an analyzer train of elements, each
-fixed or turned by a named axis, and one or more detector channels (conventions.md, "Instrument").
+fixed or turned by a named axis, and one or more detector channels (docs/conventions.md, "Instrument").
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 Role = Literal["dark", "flat", "air", "sample"]
 
-#: RGB950's own table (conventions.md, "Instrument"): tG = 9 n degrees, tA = 4.91 tG.
+#: RGB950's own table (docs/conventions.md, "Instrument"): tG = 9 n degrees, tA = 4.91 tG.
 RGB950_STATES = 40
 RGB950_STEP_DEG = 9.0
 RGB950_RATIO = 4.91

@@ -24,7 +24,7 @@ from processing.storage.product import Plane, Product, ProductWriter, Step
 DISTINCT = 3.0
 #: A pixel holds light where m00 is this many standard errors.
 LIT = 10.0
-#: Limits of the validity mask of the two-coefficient estimate (conventions.md, trap 6).
+#: Limits of the validity mask of the two-coefficient estimate (docs/conventions.md, "xi0 without singularity").
 MAX_CONDITION = 100.0
 MAX_STDERR = 0.1
 

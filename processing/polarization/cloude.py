@@ -1,7 +1,7 @@
 """Cloude decomposition of Mueller images: coherency eigenvalues, dominant process and xi0.
 
 A Mueller matrix is a sum of four Mueller-Jones matrices, M = m00 (xi0 m0 + xi1 m1 + xi2 m2 + xi3 m3), weighted by
-the eigenvalues of its coherency matrix divided by its trace (paper, Sec. II; conventions.md, traps 7 and 9).
+the eigenvalues of its coherency matrix divided by its trace (paper, Sec. II; docs/conventions.md, "Coherency matrix").
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ def orientation_difference(d_a: ArrayLike, d_b: ArrayLike) -> Array:
     """psi_a - psi_b, radians in -pi/2..pi/2, of linear diattenuations (..., 2).
 
     Half the wrapped difference of the doubled angles: the paper's arc cosine loses half its digits near zero,
-    and needs the linear magnitude to be divided by (trap 13).
+    and needs the linear magnitude to be divided by.
     """
     a, b = np.asarray(d_a, dtype=float), np.asarray(d_b, dtype=float)
     sine = a[..., 1] * b[..., 0] - a[..., 0] * b[..., 1]

@@ -1,6 +1,6 @@
 """Mueller matrices of ideal elements, and the algebra between Jones, Mueller and coherency matrices.
 
-Convention (../shared/conventions.md): decreasing phase, angles counter-clockwise from +x as seen looking
+Convention (docs/conventions.md): decreasing phase, angles counter-clockwise from +x as seen looking
 into the beam, Pauli order s0 = 1, s1 = diag(1, -1), s2 = [[0, 1], [1, 0]], s3 = [[0, i], [-i, 0]].
 Angles are in radians here; every function broadcasts over leading axes and returns (..., 4, 4).
 """
@@ -41,7 +41,7 @@ def rotation(angle: ArrayLike) -> Array:
 
 
 def retarder(azimuth: ArrayLike, retardance: ArrayLike) -> Array:
-    """Linear retarder with its fast axis at `azimuth` (conventions.md, "Mueller calculus")."""
+    """Linear retarder with its fast axis at `azimuth` (docs/conventions.md, "Mueller calculus")."""
     t = 2 * np.asarray(azimuth, dtype=float)
     d = np.asarray(retardance, dtype=float)
     t, d = np.broadcast_arrays(t, d)

@@ -31,5 +31,5 @@ def coefficients(xi0: ArrayLike, m00: ArrayLike = 1.0) -> tuple[RealArray, RealA
 
 
 def depolarization_index(xi0: ArrayLike) -> RealArray:
-    """|4 xi0 - 1| / 3 of a TD matrix; not monotonic below xi0 = 1/4 (trap 22)."""
+    """|4 xi0 - 1| / 3 of a TD matrix; not monotonic below xi0 = 1/4."""
     return np.asarray(np.abs(4 * np.asarray(xi0, dtype=float) - 1) / 3)

@@ -2,8 +2,8 @@
 
 With Phi = W [m0 mID], P = Phi alpha is linear in alpha = (alpha_0, alpha_ID), and
 xi0 = (alpha_0 + alpha_ID/4)/(alpha_0 + alpha_ID), M00 = alpha_0 + alpha_ID, which has none of the
-singularities of the paper's ratio form (trap 5). Nothing is clipped: a value outside [1/4, 1] speaks against the
-model m0 (trap 12) and is flagged. Standard errors hold the noise of the intensities, not errors of m0.
+singularities of the paper's ratio form (docs/conventions.md). Nothing is clipped: a value outside [1/4, 1] speaks
+against the model m0 and is flagged. Standard errors hold the noise of the intensities, not errors of m0.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def estimate(
     w : (K, 16), measurement matrix, rows kron(a, g). For a mosaic under one generator state, its 4 channels.
     m0 : (..., 4, 4), dominant Mueller-Jones matrix with element 00 equal to 1; NaN outside the object.
     weighted : weigh by 1/variance; else equal weights as in the paper, with the variance propagated.
-    max_condition, max_stderr : limits of the validity mask (trap 6).
+    max_condition, max_stderr : limits of the validity mask.
     """
     p = np.asarray(intensities)
     rows = np.asarray(w, dtype=float).reshape(-1, 16)

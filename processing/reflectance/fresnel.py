@@ -12,7 +12,7 @@ from processing.geometry.frames import ScatteringGeometry, cross, dot
 def amplitudes(index: complex, angle: ArrayLike) -> tuple[ComplexArray, ComplexArray]:
     """r_s and r_p at angles of incidence in radians, for a refractive index ratio n + i k, k >= 0.
 
-    r_p = -r_s at normal incidence (trap 2). The sign of k goes with decreasing phase.
+    r_p = -r_s at normal incidence (docs/conventions.md). The sign of k goes with decreasing phase.
     """
     c = np.cos(np.asarray(angle, dtype=float))
     n = complex(index)

@@ -1,8 +1,9 @@
 """Tables to and from the renderer Mitsuba's `.pbsdf`, the format in which the paper's lab publishes.
 
-A `.pbsdf` holds M[phi_d, theta_d, theta_h, wavelength, 4, 4], theta_h quadratic (trap 14), as a BRDF in 1/sr:
+A `.pbsdf` holds M[phi_d, theta_d, theta_h, wavelength, 4, 4], theta_h quadratic, as a BRDF in 1/sr:
 the cosine of the angle of incidence is divided out. Each matrix refers to the axis s of the facet for both beams
-(trap 15): `to_renderer_frames` turns every pixel by its own angles. Directions below the surface are NaN there.
+(docs/conventions.md, "Tables and renderers"): `to_renderer_frames` turns every pixel by its own angles. Directions
+below the surface are NaN there.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ class Constants(BaseModel):
 
 
 def diffuse_jones(geometry: ScatteringGeometry) -> ComplexArray:
-    """diag(1, -1) R(phi_d) diag(1, 0) R(-phi_d), (..., 2, 2); radial about the point where theta_h = 0 (trap 3)."""
+    """diag(1, -1) R(phi_d) diag(1, 0) R(-phi_d), (..., 2, 2); radial about the point where theta_h = 0."""
     phi = geometry.angles.phi_d
     c, s = np.cos(phi), np.sin(phi)
     out = np.empty((*phi.shape, 2, 2), dtype=complex)

@@ -216,7 +216,7 @@ def _column(parent: h5py.Group, name: str, n: int, dtype: Any, fill: Any) -> h5p
 def _allocated(
     parent: h5py.Group, name: str, shape: tuple[int, ...], dtype: Any, chunks: tuple[int, ...] | None
 ) -> h5py.Dataset:
-    # Early allocation: a full disc fails here, never in the middle of a run (promises.md, "HDF5, as measured").
+    # Early allocation: a full disc fails here, never in the middle of a run.
     create = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     create.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
     create.set_fill_time(h5py.h5d.FILL_TIME_NEVER if chunks else h5py.h5d.FILL_TIME_IFSET)

@@ -80,6 +80,6 @@ def split_eigenvalues(m: Array, jones: NDArray[np.complex128], shift: Array) -> 
     eye = np.eye(4)
     plus, minus = (eye[k] - 2 * w * w[:, k : k + 1].conj() for k in (1, 3))
     h = plus[:, :, None] * plus[:, None, :].conj() - minus[:, :, None] * minus[:, None, :].conj()
-    # A unit eigenvector gives m00 = 1/2 (trap 9): twice that times the throughput.
+    # A unit eigenvector gives m00 = 1/2 (docs/conventions.md, "Coherency matrix"): twice that times the throughput.
     scale = 2 * m[:, 0, 0] * shift
     return np.asarray(m + scale[:, None, None] * mueller.coherency_to_mueller(h))

@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 from processing.arrays import Array, ComplexArray
 from processing.storage.capture_schema import CaptureHeader, Detector, Sample, create_layout, write_closing
 
-#: Pauli matrices in the order of conventions.md.
+#: Pauli matrices in the order of docs/conventions.md.
 _PAULI = np.array([[[1, 0], [0, 1]], [[1, 0], [0, -1]], [[0, 1], [1, 0]], [[0, 1j], [-1j, 0]]], dtype=complex)
 BITS = 16
 BLACK = 100.0
 
 
 def retarder_jones(azimuth_rad: float, retardance_rad: Any, t_fast: float = 1.0, t_slow: float = 1.0) -> ComplexArray:
-    """Jones matrices (..., 2, 2) of a retarder; phase so that S3 has the sign of conventions.md."""
+    """Jones matrices (..., 2, 2) of a retarder; phase so that S3 has the sign of docs/conventions.md."""
     d = np.asarray(retardance_rad, dtype=float)[..., None, None]
     c, s = np.cos(azimuth_rad), np.sin(azimuth_rad)
     fast = np.array([[c * c, c * s], [c * s, s * s]])

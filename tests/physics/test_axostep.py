@@ -71,7 +71,7 @@ def test_mueller_image_byte_by_byte(tmp_path: Path) -> None:
 
 
 def test_the_labs_own_indexing_of_a_square_image(tmp_path: Path) -> None:
-    # Element i of pixel p at word 5 + i + 16 p; image[row, column] = file(column, 599 - row) (instruments.md).
+    # Element i of pixel p at word 5 + i + 16 p; image[row, column] = file(column, 599 - row).
     m = np.random.default_rng(1).normal(size=(4, 4, 600, 600)).astype(np.float32)
     file = tmp_path / "a.cmmi"
     write_mueller_file(file, MuellerFile(m, np.empty((0, 600, 600), np.float32)))

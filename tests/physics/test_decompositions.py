@@ -122,7 +122,7 @@ class TestLuChipman:
         np.testing.assert_allclose(depolarization_power(found.depolarizer), 1 - 1.2 / 3)
 
     def test_depolarization_does_not_lower_the_retardance(self) -> None:
-        # conventions.md, trap 16
+        # docs/conventions.md, "Below a quarter"
         for xi0 in (0.3, 0.6, 1.0):
             m = 4 / 3 * ((xi0 - 0.25) * mueller.retarder(0.3, 1.3) + (1 - xi0) * mueller.IDEAL_DEPOLARIZER)
             vector = quantities.retardance_vector(lu_chipman(m).retarder)

@@ -1,4 +1,4 @@
-"""State design: the known figures of RGB950 (conventions.md, trap 20), the bound, predicted errors by Monte Carlo."""
+"""State design: the known figures of RGB950 (docs/conventions.md), the bound, predicted errors by Monte Carlo."""
 
 from pathlib import Path
 

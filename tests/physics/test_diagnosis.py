@@ -44,7 +44,7 @@ def test_jones_bench_and_mueller_model_are_the_same_instrument(configs):
 
 
 def test_a_retardance_error_is_invisible_with_an_unknown_sample_and_plain_with_air(configs, tmp_path):
-    """Trap 8 of the conventions."""
+    """docs/conventions.md, "What an unknown sample hides"."""
     wrong = np.deg2rad(127.12 + 1.0)
     unknown = diagnosed(capture(tmp_path, configs, Bench(dg=wrong), air=False), configs)
     assert unknown.verdict == "consistent"
@@ -62,7 +62,7 @@ def test_a_retardance_error_is_invisible_with_an_unknown_sample_and_plain_with_a
 
 
 def test_azimuths_of_analyzer_and_its_retarder_are_named_together(configs, tmp_path):
-    """Trap 8: with an unknown sample the two cannot be told apart, and air is what separates them."""
+    """With an unknown sample the two cannot be told apart, and air is what separates them."""
     d = diagnosed(capture(tmp_path, configs, Bench(oa=np.deg2rad(13.41 + 0.4)), air=False), configs)
     (effect,) = d.effects
     both = {effect.kind, *(text.partition("[")[0] for text in effect.indistinguishable_from)}

@@ -160,7 +160,7 @@ def test_reflectance_effects_do_nothing_at_zero_and_something_elsewhere(kind, co
     assert changes.dominant(geometry, 1.3 + 0.08j) == pytest.approx(plain, abs=1e-12)
     effect.bend(changes, np.array([p.typical for p in parameters]))
     moved = changes.dominant(geometry, 1.3 + 0.08j)
-    # Registration acts through theta_h, which the first surface does not know (trap 1).
+    # Registration acts through theta_h, which the first surface does not know.
     assert np.abs(moved - plain).max() > 1e-3 or kind == "registration"
 
 

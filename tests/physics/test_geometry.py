@@ -11,7 +11,7 @@ from processing.geometry.sphere import Sphere
 from processing.geometry.viewing import ViewingGeometry
 from processing.polarization import mueller
 
-#: The lab's sphere (trap 19).
+#: The lab's sphere.
 LAB = ViewingGeometry(
     camera=PinholeCamera(rows=61, columns=61, pixel_mm=0.116, focal_length_mm=60, distance_mm=262.7),
     source_distance_mm=672.7,
@@ -105,7 +105,7 @@ def test_sphere_outline_is_the_tangent_cone():
 
 
 def test_theta_d_of_the_lab_sphere_is_near_half_of_omega():
-    # The nearest point stands 250 mm and, at omega 0, 660 mm away (trap 19).
+    # The nearest point stands 250 mm and, at omega 0, 660 mm away.
     for omega in (20.0, 35.0, 90.0):
         td = np.rad2deg(LAB.at(omega).points.angles.theta_d)
         assert abs(np.median(td) - omega / 2) < 1.5

@@ -30,14 +30,14 @@ def test_depolarization_index_and_entropy_of_known_matrices() -> None:
 
 @pytest.mark.parametrize("xi0", [0.05, 0.2, 0.25, 0.6, 1.0])
 def test_triply_degenerate_depolarization_index(xi0: float) -> None:
-    # conventions.md, trap 22: |4 xi0 - 1| / 3, not monotonic below 1/4.
+    # |4 xi0 - 1| / 3, not monotonic below 1/4.
     m = triply_degenerate.mueller_matrix(2 * mueller.polarizer(0.4), xi0, 3.0)
     np.testing.assert_allclose(quantities.depolarization_index(m), abs(4 * xi0 - 1) / 3, atol=1e-8)
 
 
 @pytest.mark.parametrize("xi0", [0.3, 0.7, 0.99])
 def test_depolarization_lowers_diattenuation_by_its_factor_exactly(xi0: float) -> None:
-    # conventions.md, trap 16
+    # docs/conventions.md, "Below a quarter"
     m0 = mueller.diattenuator(0.4, 1.0, 0.3) / 0.65
     m = triply_degenerate.mueller_matrix(m0, xi0)
     before = quantities.linear_magnitude(quantities.diattenuation_vector(m0))

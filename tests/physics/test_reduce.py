@@ -210,7 +210,7 @@ def test_nothing_but_nan_is_an_error(rgb950: InstrumentModel, synthetic_capture)
 def test_rank_deficient_table_names_rank_and_what_is_lost(rgb950: InstrumentModel, synthetic_capture) -> None:
     psg = 9.0 * np.arange(40)
     path = synthetic_capture(np.ones((40, 1, 4, 6)), {"psg": psg, "psa": 5 * psg})
-    # A ratio of exactly 5 with 40 equal steps over one turn has rank 12 (conventions.md, trap 20).
+    # A ratio of exactly 5 with 40 equal steps over one turn has rank 12 (docs/conventions.md).
     with pytest.raises(NotDetermined, match=r"rank 12, and 16 are needed"):
         reduced(path, rgb950)
     fixed = synthetic_capture(np.ones((40, 1, 4, 6)), {"psg": 0 * psg, "psa": 4.91 * psg})

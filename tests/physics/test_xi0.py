@@ -1,4 +1,4 @@
-"""The two-coefficient estimate: exactness, error bars, flags, and the traps of conventions.md."""
+"""The two-coefficient estimate: exactness, error bars, flags, and the cases of docs/conventions.md."""
 
 import numpy as np
 import pytest
@@ -81,7 +81,7 @@ def test_without_variance_the_residual_gives_the_error_bars(red, configs):
 
 
 def test_a_model_turned_by_45_degrees_gives_a_quarter_and_beyond_is_kept_and_flagged():
-    # Trap 12: alpha_0 scales with cos(2 x angle error).
+    # Alpha_0 scales with cos(2 x angle error).
     w = linear_stokes(np.array([1.0, 0, 0, 0]))
     true = mueller.diattenuator(0.0, 1.0, 0.2)
     true = true / true[0, 0]
@@ -106,7 +106,7 @@ def test_no_modulation_is_invalid_and_not_a_number_out_of_thin_air():
 
 
 def test_horizontal_light_loses_the_estimate_near_brewster_and_vertical_does_not(red):
-    # Trap 11, at the specular point, integer degrees of theta_d, 662 nm.
+    # At the specular point, integer degrees of theta_d, 662 nm.
     theta_d = np.deg2rad(np.arange(0.0, 89.0))
     zero = np.zeros_like(theta_d)
     m0 = red.mueller_jones(ScatteringGeometry(*directions(zero, theta_d, zero)), 662)

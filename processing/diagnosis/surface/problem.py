@@ -173,7 +173,7 @@ class SurfaceProblem:
     def pixels(self, k: int, space: Space, values: Array) -> Pixels:
         """Projection and residual of one capture.
 
-        Where the modelled light is hardly polarized, or p-polarized near the Brewster angle (traps 6 and 11), noise
+        Where the modelled light is hardly polarized, or p-polarized near the Brewster angle, noise
         would be met by any amount of alpha_0. So alpha_0 is q M with M the pixel's light, and q is within 1 of its mean
         over the tile, as xi0 from 0 to 1 allows. Elsewhere, where the light is seen at all, this holds nothing.
         """

@@ -1,7 +1,7 @@
 """The analyzer's polarizer stands elsewhere than the model says.
 
 Cause: the polarizer was turned in its cell, or the camera and analyzer were remounted together.
-With an unknown sample it cannot be told from an azimuth error of the analyzer's retarder (trap 8).
+With an unknown sample it cannot be told from an azimuth error of the analyzer's retarder.
 Mend: calibrate on air; look through crossed polarizers and note the dark position.
 """
 

@@ -1,7 +1,7 @@
 """An axis turns further, or less far, than its reading: a wrong scale, or the opposite sense.
 
 Cause: counts per degree of another stage model, a gear or belt ratio typed wrongly, a mount seen from behind. A
-published case: acquisition turned the analyzer by -4.91 times the generator's angle, reduction used +4.9 (trap 18).
+published case: acquisition turned the analyzer by -4.91 times the generator's angle, reduction used +4.9.
 Mend: turn ten turns and look at the mark; correct the counts per degree or the sign in the rig file.
 """
 

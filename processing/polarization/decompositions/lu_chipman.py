@@ -1,7 +1,8 @@
 """Lu-Chipman decomposition: depolarizer after retarder after diattenuator, M = Mdelta MR MD.
 
 Lu and Chipman, J. Opt. Soc. Am. A 13, 1106 (1996), Eqs. 42-52. For det M < 0 there is no agreed form
-(conventions.md, trap 21); here MR stays a rotation (det +1) and the 3 x 3 block of Mdelta turns negative, Eq. 52.
+(docs/conventions.md, "Negative determinants"); here MR stays a rotation (det +1) and the 3 x 3 block of Mdelta turns
+negative, Eq. 52.
 """
 
 from __future__ import annotations
