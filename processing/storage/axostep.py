@@ -1,7 +1,8 @@
 """The files of RGB950's own program, AxoStep: raw frames (.rmmd) read, Mueller images (.cmmi, .bmmi) read and written.
 
 Big-endian 32-bit words, from the lab's public format sheet (Polarization-Lab/RGB950) and reader (MMViewPy). Not yet
-tried on a file from the instrument: two public readers even disagree on the length of the header, so it is told from the file.
+tried on a file from the instrument: two public readers even disagree on the length of the header, so it is told from
+the file.
 """
 
 from __future__ import annotations
