@@ -13,8 +13,6 @@ from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.space import Space, Sums
 from processing.geometry.frames import ScatteringGeometry
-from processing.instrument.changes import Conditions
-from processing.instrument.model import InstrumentModel, Polarizer
 from processing.polarization import mueller
 from processing.reflectance.changes import ReflectanceChanges
 from processing.reflectance.effects.base import ReflectanceEffect, reflectance_effects
@@ -58,26 +56,21 @@ class ReflectanceProblem:
         n = len(intensities)
         self.fold = np.random.default_rng(0).permutation(n) % FOLDS if folds is None else folds
         self._mean = float(np.mean(np.abs(intensities[:, 0])))
-        self._model = InstrumentModel(
-            name="reflectance", generator=(Polarizer(kind="polarizer", name="none"),), analyzer=()
-        )
-        self._conditions = Conditions.of({"none": np.zeros(1)})
 
     def nominal(self) -> tuple[Candidate, ...]:
         """Nothing is nominal."""
         return ()
 
     def pool(self) -> tuple[Candidate, ...]:
-        """All effects of the reflectance group."""
+        """All effects of the reflectance."""
         found = []
         for effect in reflectance_effects().values():
-            if isinstance(effect, ReflectanceEffect):
-                parameters = effect.parameters(self._model, self._conditions, "")
-                # A diffuse weight of either sign is a separate valley.
-                starts = tuple(
-                    s * np.array([p.typical if k == 0 else 0.0 for k, p in enumerate(parameters)]) for s in (1, -1)
-                )
-                found.append(Candidate(effect, "", parameters, None, starts))
+            parameters = effect.parameters("")
+            # A diffuse weight of either sign is a separate valley.
+            starts = tuple(
+                s * np.array([p.typical if k == 0 else 0.0 for k, p in enumerate(parameters)]) for s in (1, -1)
+            )
+            found.append(Candidate(effect, "", parameters, None, starts))
         return tuple(found)
 
     def powers(self) -> list[tuple[int, Array]]:
@@ -89,7 +82,7 @@ class ReflectanceProblem:
         changes = ReflectanceChanges()
         for candidate, part in zip(space.candidates, space.slices, strict=True):
             if isinstance(candidate.effect, ReflectanceEffect):
-                candidate.effect.bend(changes, values[part])
+                candidate.effect.bend(changes, "", values[part])
         return changes.dominant(self.geometry, self.index)
 
     def _columns(self, space: Space, values: Array) -> Array:

@@ -10,6 +10,7 @@ import numpy as np
 from acquisition.capture.plan import AutoExposure
 from acquisition.rig.rig import Rig
 from acquisition.screen.observer import Observer
+from processing.instrument.applied_effects import changes_at
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import StateTable
 from processing.polarization import mueller
@@ -30,7 +31,8 @@ def brightest_states(table: StateTable, instrument: InstrumentModel, sample: str
     light = [k for k, role in enumerate(table.role) if role != "dark"]
     if not instrument.axes:
         return light[:1]
-    w = instrument.rows({axis: table.angles_deg[axis][light] for axis in instrument.axes}).max(axis=1)
+    angles = {axis: table.angles_deg[axis][light] for axis in instrument.axes}
+    w = instrument.rows(angles, changes_at(instrument, angles)).max(axis=1)
     known = {"air": [np.eye(4)], "mirror": [mueller.IDEAL_MIRROR]}
     samples = known.get(sample, [mueller.IDEAL_DEPOLARIZER, np.eye(4), mueller.IDEAL_MIRROR])
     chosen: list[int] = []

@@ -11,6 +11,7 @@ from acquisition.rig.config import RigConfig
 from acquisition.rig.rig import Rig
 from acquisition.rig.way import find_obstacle
 from drivers.errors import LimitError
+from processing.instrument.applied_effects import changes_at
 from processing.instrument.model import InstrumentModel, WavelengthError, condition_number, rank
 from processing.instrument.states import StateTable
 
@@ -88,7 +89,8 @@ def check_table(table: StateTable, rig: RigConfig, instrument: InstrumentModel) 
         if lacking:
             found = f"instrument {instrument.name!r} turns with {', '.join(lacking)}, the plan does not"
             return [*checks, Check("instrument", False, found)]
-        w = instrument.rows({axis: table.angles_deg[axis][light] for axis in instrument.axes})
+        angles = {axis: table.angles_deg[axis][light] for axis in instrument.axes}
+        w = instrument.rows(angles, changes_at(instrument, angles))
         r = rank(w)
         found = f"rank {r} of 16, condition number {condition_number(w):.2f}"
         if r < 16:

@@ -19,6 +19,7 @@ from ruamel.yaml import YAML
 from scipy.optimize import least_squares
 
 from processing.errors import NotDetermined, ProcessError
+from processing.instrument.applied_effects import changes_at
 from processing.instrument.model import Element, InstrumentModel
 from processing.polarization import mueller
 from processing.reduction.counts_to_signal import Correction
@@ -143,7 +144,8 @@ def fit_train(
     scale = float(np.mean(data))
 
     def residual(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        w = _with_values(model, names, x).rows(angles_deg) * weight[:, None, None]
+        tried = _with_values(model, names, x)
+        w = tried.rows(angles_deg, changes_at(tried, angles_deg)) * weight[:, None, None]
         shape = w.reshape(-1, 16) @ sample.reshape(16)
         throughput = shape @ data / (shape @ shape)
         return np.asarray((data - shape[:, None] * throughput).reshape(-1) / scale)

@@ -58,6 +58,7 @@ def design_command(
     if instrument is None:
         raise ProcessError("give an instrument file, for instance configs/instruments/rgb950.yaml (or --stokes)")
     from processing.calibration.state_design import Noise, score
+    from processing.instrument.applied_effects import changes_at
     from processing.instrument.model import InstrumentModel
 
     model = InstrumentModel.load(instrument)
@@ -72,7 +73,8 @@ def design_command(
         chosen = _optimized(model, noise, counts, optimize, ratio)
     else:
         chosen = _given(model, counts, ratio, step, table)
-        _show(f"{model.name}, {nm:g} nm, {len(chosen)} states", score(model.rows(chosen.angles_deg), noise), noise)
+        w = model.rows(chosen.angles_deg, changes_at(model, chosen.angles_deg))
+        _show(f"{model.name}, {nm:g} nm, {len(chosen)} states", score(w, noise), noise)
     if out is not None:
         _write(chosen, out)
         typer.echo(str(out))

@@ -10,6 +10,9 @@ import numpy as np
 
 from processing.arrays import Array
 
+#: Names of the smooth terms of what varies over the image.
+FIELD_TERMS = ("x", "y", "x2", "xy", "y2")
+
 
 @dataclass(frozen=True)
 class Conditions:
@@ -49,6 +52,11 @@ def elapsed(time_s: Array | None, states: int) -> Array:
     return np.asarray((t - t.min()) / span - 0.5 if span > 0 else np.zeros(states))
 
 
+def field_terms(x: Array, y: Array) -> Array:
+    """(5, ...) the smooth terms, each with mean zero over the image; x and y run from -1 to 1, right and down."""
+    return np.stack([x, y, x * x - 1 / 3, x * y, y * y - 1 / 3])
+
+
 def _zeros() -> defaultdict[str, Array]:
     return defaultdict(lambda: np.zeros(()))
 
@@ -59,7 +67,7 @@ class Changes:
 
     Light side, all by element name: `azimuth_rad`, `retardance_rad` (each () or (N,)), `extinction`, `diattenuation`,
     `after` (a Mueller matrix (4, 4) that follows the element), `field_retardance_rad` (5,) coefficients of
-    x, y, x^2, x y, y^2 with x and y from -1 to 1 over the image.
+    `field_terms`.
     Detector side: `gain` (N, channels), `stray` (fraction of the mean signal that bypasses the optics), `mixing`
     (channels, channels). Count side, what is added to the counts: `response` by feature of the counts, () or
     (N, channels); `shift_px` (N, 2), by how much the image has moved to the right and down.

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from processing.arrays import Array
 from processing.errors import ProcessError
-from processing.instrument.changes import Changes, Conditions
+from processing.instrument.changes import Changes
 from processing.polarization import mueller
 from processing.yaml_file import load_yaml
 
@@ -241,15 +241,14 @@ class InstrumentModel(_Part):
         """Measurement matrix W (states, channels, 16): row = kron(a, g), so that P = W . vec(M), row-major.
 
         The model must be resolved at a wavelength (`at`). Angles are those read back, in degrees. `changes` is
-        what effects do to this capture; without it the instrument's own effects apply, those that belong to
-        one capture alone left out (`processing.instrument.effects.base.capture_changes` has them).
+        what effects do (`processing.instrument.applied_effects`); only a model without effects needs none.
+
+        Raises
+        ------
+        ValueError : the model has effects, and nobody said what they change.
         """
         if changes is None and self.effects:
-            from processing.instrument.effects.base import changes_of
-
-            names = tuple(c.name for c in self.channels)
-            arrays = {k: np.asarray(v, dtype=float).reshape(-1) for k, v in angles_deg.items()}
-            changes = changes_of(self, Conditions.of(arrays, names))
+            raise ValueError(f"instrument {self.name!r} has effects: rows() needs the changes that they make")
         g = self.generator_states(angles_deg, changes)
         a = self.analyzer_states(angles_deg, changes)
         w = np.asarray((a[..., :, None] * g[:, None, None, :]).reshape(*a.shape[:2], 16))

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.instrument.changes import Changes, Conditions, elapsed
+from processing.instrument.applied_effects import changes_of
+from processing.instrument.changes import Changes, Conditions, elapsed, field_terms
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture import Capture
 
@@ -71,8 +72,6 @@ def capture_changes(capture: Capture, model: InstrumentModel, states: NDArray[np
     """
     if not model.effects:
         return None
-    from processing.instrument.effects.base import changes_of
-
     angles = {name: value[states] for name, value in capture.angles_deg.items()}
     channels = tuple(c.name for c in model.channels)
     when = elapsed(capture.column("host_time_s")[states], len(states))
@@ -85,9 +84,7 @@ def extra_retardance(changes: Changes, x: NDArray[np.float64], y: NDArray[np.flo
 
     x, y (pixels,) run from -1 to 1, to the right and down.
     """
-    from processing.instrument.effects.field_retardance import terms
-
-    parts = [coefficients @ terms(x, y) for coefficients in changes.field_retardance_rad.values()]
+    parts = [coefficients @ field_terms(x, y) for coefficients in changes.field_retardance_rad.values()]
     return np.stack(parts) if parts else np.zeros((0, np.size(x)))
 
 

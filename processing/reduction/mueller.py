@@ -110,12 +110,12 @@ def sample_states(capture: Capture) -> NDArray[np.int64]:
     return states
 
 
-def measurement_matrix(
-    capture: Capture, model: InstrumentModel, states: NDArray[np.int64], changes: Changes | None = None
-) -> NDArray[np.float64]:
-    """W (states, channels, 16) from the read-back angles, rows scaled with the exposure (longest = 1).
+def angles_of(capture: Capture, model: InstrumentModel, states: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
+    """Angles as read back, axis name to (states,), in degrees.
 
-    `changes` is what the model's effects do to this capture (`applied_effects.capture_changes`).
+    Raises
+    ------
+    CaptureError : an axis that the model turns has no angles, or not in every state.
     """
     angles = {name: value[states] for name, value in capture.angles_deg.items()}
     missing = [axis for axis in model.axes if axis not in angles]
@@ -125,12 +125,27 @@ def measurement_matrix(
             f"{capture.path}: instrument {model.name!r} turns {', '.join(missing)}, but the capture has angles of: "
             f"{have}. Use the instrument file that belongs to the capture."
         )
-    w = model.rows(angles, changes)
-    bad = ~np.all(np.isfinite(w.reshape(len(states), -1)), axis=1)
+    read = [np.isfinite(angles[axis]) for axis in model.axes]
+    bad = ~np.all([np.ones(len(states), dtype=bool), *read], axis=0)
     if np.any(bad):
         raise CaptureError(
             f"{capture.path}: no read-back angle in state(s) {_some(states[bad])}; they cannot be reduced."
         )
+    return angles
+
+
+def measurement_matrix(
+    capture: Capture, model: InstrumentModel, states: NDArray[np.int64], changes: Changes | None = None
+) -> NDArray[np.float64]:
+    """W (states, channels, 16) from the read-back angles, rows scaled with the exposure (longest = 1).
+
+    `changes` is what the model's effects do to this capture (`effects_of_capture.capture_changes`).
+
+    Raises
+    ------
+    CaptureError : see `angles_of`.
+    """
+    w = model.rows(angles_of(capture, model, states), changes)
     return w * relative_exposure(capture, states)[:, None, None]
 
 

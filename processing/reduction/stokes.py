@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.errors import NotDetermined
+from processing.instrument.applied_effects import changes_at
 from processing.instrument.changes import Changes
 from processing.instrument.model import InstrumentModel
 from processing.reduction.counts_to_signal import Correction
@@ -67,7 +68,7 @@ def channel_rows(
     else:
         every = angles or {"": np.zeros(len(states))}
         rows, light = model.rows(every, changes), model.generator_states(every, changes)
-    if np.ptp(model.rows(angles), axis=0).max(initial=0.0) > 1e-6:
+    if np.ptp(model.rows(angles, changes_at(model, angles)), axis=0).max(initial=0.0) > 1e-6:
         raise CaptureError(
             f"{capture.path}: the {len(states)} states of this mosaic capture have different angles, and one Stokes "
             "image comes from frames that are alike. Capture one generator state, or split the capture."

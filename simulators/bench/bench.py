@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from processing.arrays import Image
+from processing.instrument.applied_effects import changes_at
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture_schema import Detector
 from simulators.bench.effects.base import BenchEffect, Shot
@@ -164,7 +165,7 @@ class SimulatedBench:
             axes = {name: [angles[name]] for name in model.axes} or {"none": [0.0]}
 
             def seen(optics: InstrumentModel) -> Image:
-                weights = optics.rows(axes)[0] * (level * self.flux_e_per_s * exposure_s)
+                weights = optics.rows(axes, changes_at(optics, axes))[0] * (level * self.flux_e_per_s * exposure_s)
                 through = np.zeros_like(image)
                 self._render(through, weights.astype(np.float32), optics, float(angles.get("arm", omega_deg)))
                 return through

@@ -14,6 +14,7 @@ from processing.diagnosis.surface.run import diagnose_object
 from processing.diagnosis.surface.standard_errors import standard_errors
 from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
+from processing.reflectance.effects.base import ReflectanceEffect
 from processing.storage.capture import Capture
 from simulators.bench.scattering_laws import Xi0Law
 from simulators.bench.scene import Scene
@@ -153,7 +154,7 @@ def test_derivatives_are_those_of_the_residual(scene, configs, tmp_path):
     declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
     fault = drawn("polarized_diffuse", np.random.default_rng(1), scene, declared)
     _, problem = diagnosed(tmp_path, fault, declared, scene)
-    pool = [c for c in problem.pool() if c.effect.group == "reflectance"]
+    pool = [c for c in problem.pool() if isinstance(c.effect, ReflectanceEffect)]
     space = Space(tuple(pool))
     values = 0.5 * np.minimum(space.joined("typical"), space.joined("upper"))
     sums = problem.sums(space, values)

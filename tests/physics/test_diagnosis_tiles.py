@@ -10,8 +10,7 @@ from processing.diagnosis.instrument.moments import FEATURES, FOLDS_OF_TILES, mo
 from processing.diagnosis.instrument.projection import add_block
 from processing.diagnosis.instrument.tile_sums import add_tiles, tile_columns
 from processing.diagnosis.search.space import Sums
-from processing.instrument.changes import Changes
-from processing.instrument.effects.field_retardance import terms
+from processing.instrument.changes import Changes, field_terms
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture import Capture
 from processing.storage.capture_schema import Sample
@@ -43,7 +42,7 @@ def test_columns_of_every_tile_are_those_of_its_own_retardance(seen, elements):
     for element in elements:
         changes.field_retardance_rad[element] = random.normal(0, 0.3, 5)
     found = tile_columns(model, data, moments, changes)
-    smooth = terms(moments.tiles.x, moments.tiles.y)
+    smooth = field_terms(moments.tiles.x, moments.tiles.y)
     for tile in (0, 37, 255):
         here = Changes(data.conditions, stray=0.01)
         here.retardance_rad = defaultdict(lambda: np.zeros(()), changes.retardance_rad)

@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processing.instrument.changes import Conditions
-from processing.instrument.effects.base import all_effects, changes_of
-from processing.instrument.effects.field_retardance import terms
+from processing.instrument.applied_effects import changes_at, changes_of, instrument_effects
+from processing.instrument.changes import Conditions, field_terms
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
 from processing.polarization import mueller
 from processing.reduction.counts_to_signal import BlockReader, Correction
@@ -69,11 +68,11 @@ def test_effects_of_the_optics_go_into_w(
     kind: str, element: str, parameters: dict[str, float], rgb950: InstrumentModel, synthetic_capture
 ) -> None:
     conditions = Conditions.of(ANGLES)
-    names = [p.name for p in all_effects()[kind].parameters(rgb950, conditions, element)]
+    names = [p.name for p in instrument_effects()[kind].parameters(rgb950, conditions, element)]
     applied = effect(kind, element, **dict(zip(names, parameters.values(), strict=True)))
     real = rgb950.model_copy(update={"effects": (applied,)})
     truth = smooth_scene()
-    signal = np.einsum("nck,kxy->ncxy", real.rows(ANGLES), truth.reshape(16, *SHAPE))
+    signal = np.einsum("nck,kxy->ncxy", real.rows(ANGLES, changes_at(real, ANGLES)), truth.reshape(16, *SHAPE))
     path = capture_of(synthetic_capture, signal)
     assert error(reduced(path, rgb950), truth) > 0.01
     assert error(reduced(path, real), truth) < 1e-5
@@ -81,7 +80,7 @@ def test_effects_of_the_optics_go_into_w(
 
 def test_drift_of_the_source_counts_for_its_capture_alone(rgb950: InstrumentModel, synthetic_capture) -> None:
     conditions = Conditions.of(ANGLES)
-    drift = all_effects()["source_drift"]
+    drift = instrument_effects()["source_drift"]
     place = drift.places(rgb950, conditions)[0]
     names = [p.name for p in drift.parameters(rgb950, conditions, place)]
     values = dict.fromkeys(names, 0.0) | {names[0]: 0.08}
@@ -167,7 +166,7 @@ def test_retardance_that_varies_over_the_image(rgb950: InstrumentModel, syntheti
     real = rgb950.model_copy(update={"effects": (applied,)})
     truth = smooth_scene()
     y, x = np.meshgrid(np.linspace(-1, 1, SHAPE[0]), np.linspace(-1, 1, SHAPE[1]), indexing="ij")
-    extra = np.tensordot([4.0, -2.0, 3.0, 1.0, 0.0], terms(x, y), axes=1)
+    extra = np.tensordot([4.0, -2.0, 3.0, 1.0, 0.0], field_terms(x, y), axes=1)
     frames = np.empty((40, 1, *SHAPE))
     for r in range(SHAPE[0]):
         for c in range(SHAPE[1]):

@@ -14,7 +14,7 @@ from processing.diagnosis.captured.noise_estimate import estimated_noise
 from processing.instrument.changes import Conditions, elapsed
 from processing.instrument.model import InstrumentModel
 from processing.reduction.counts_to_signal import Correction
-from processing.reduction.mueller import measurement_matrix, relative_exposure, sample_states
+from processing.reduction.mueller import angles_of, relative_exposure, sample_states
 from processing.reduction.noise import NoiseModel
 from processing.storage.capture import Capture, CaptureError
 
@@ -42,7 +42,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     CaptureError : nothing to compare, or angles that the model does not have.
     """
     states = sample_states(capture)
-    measurement_matrix(capture, model, states)
+    angles_of(capture, model, states)
     correction = Correction.of(capture)
     raw, clipped, clipped_states, zero = _frames(capture, model, states, correction)
     cut_off = zero.mean(axis=(1, 2)) > MOST_CUT_OFF

@@ -28,6 +28,15 @@ from processing.diagnosis.search.result import (
 )
 from processing.diagnosis.search.search import CHANCE, Say, Search
 from processing.diagnosis.search.space import Space
+from processing.instrument.effects.base import (
+    CountsEffect,
+    FieldEffect,
+    GeneralEffect,
+    ImageShift,
+    SourceEffect,
+    Switch,
+    ValuePerState,
+)
 from processing.instrument.model import EffectParameter
 
 #: Share of the excess that must be explained before anything is named while structure is left.
@@ -69,7 +78,7 @@ def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
     """Search, test what is left, and judge."""
     search = Search(problem, say)
     found = search.run()
-    if problem.holds_out_states and any(c.effect.per_state for c in found.effects):
+    if problem.holds_out_states and any(isinstance(c.effect, ValuePerState) for c in found.effects):
         # Parts of the states that are held out have each a throughput of their own, so values for each state could
         # differ by a factor from part to part.
         found.fit = minimize(problem.undivided(), found.space, found.fit.values)
@@ -134,9 +143,9 @@ def _unname(problem: InstrumentProblem, search: Search, found: Found, after: Seq
     rest = TIMES * sum(found.gain.get(c, 0.0) for c in weak)
     small += [c for c in found.effects if weak and c not in alone and found.gain.get(c, 0.0) < rest]
     # An effect has to beat chance to be named; values for each state leave too few directions to ask that.
-    if not any(c.effect.per_state for c in found.effects):
+    if not any(isinstance(c.effect, ValuePerState) for c in found.effects):
         small += [c for c in found.effects if found.chance.get(c, 1.0) > CHANCE]
-    uneven = [c for c in found.effects if c.effect.group == "source" and _uneven(problem, found, c)]
+    uneven = [c for c in found.effects if isinstance(c.effect, SourceEffect) and _uneven(problem, found, c)]
     # What is uneven is another cause, and smaller effects beside it may be parts of it.
     limit = max((found.gain.get(c, 0.0) for c in uneven), default=0.0)
     small += uneven + [c for c in found.effects if c not in uneven and found.gain.get(c, np.inf) < limit]
@@ -145,14 +154,15 @@ def _unname(problem: InstrumentProblem, search: Search, found: Found, after: Seq
     waves = [
         c
         for c in found.effects
-        if c.effect.per_state and _one_wave(found.fit.values[part[c]], curvature[part[c], part[c]]) > ONE_WAVE
+        if isinstance(c.effect, ValuePerState)
+        and _one_wave(found.fit.values[part[c]], curvature[part[c], part[c]]) > ONE_WAVE
     ]
     found.nameless += dict.fromkeys((*small, *waves))
 
 
 def _uneven(problem: InstrumentProblem, found: Found, candidate: Candidate) -> bool:
     """A source that changes does so by the same share in the whole image; what differs from part to part is none."""
-    if any(c.kind == "field_retardance" for c in found.effects):
+    if any(isinstance(c.effect, FieldEffect) for c in found.effects):
         return False
     excess, terms = unevenness(problem, candidate, found.space, found.fit.values)
     return bool(excess > max(UNEVEN * np.sqrt(2 * terms), UNEVEN_SHARE * found.gain.get(candidate, 0.0)))
@@ -189,7 +199,7 @@ def _verdict(problem: InstrumentProblem, search: Search, found: Found, after: Se
             return "consistent"
     if not found.effects:
         return "unexplained" if structure else "consistent"
-    if any(c.effect.per_state for c in found.nameless):
+    if any(isinstance(c.effect, ValuePerState) for c in found.nameless):
         # A pattern over the states that is regular is not what this name means, and no other name fits.
         return "unexplained"
     if not structure:
@@ -238,9 +248,9 @@ def _standard_errors(problem: InstrumentProblem, search: Search, found: Found) -
 
 
 def _parameters(candidate: Candidate, values: Array, stderr: Array) -> dict[str, EffectParameter]:
-    if candidate.effect.switch:
+    if isinstance(candidate.effect, Switch):
         return {"left_out": EffectParameter(value=1.0, unit="1", note="pixels with a clipped state are left out")}
-    if candidate.effect.per_state:
+    if isinstance(candidate.effect, ValuePerState):
         unit = candidate.parameters[0].unit
         return {"states": EffectParameter(value=tuple(values.tolist()), stderr=tuple(stderr.tolist()), unit=unit)}
     return {
@@ -257,7 +267,7 @@ def _effect(problem: InstrumentProblem, found: Found, candidate: Candidate, stde
         parameters=_parameters(candidate, found.fit.values[part], stderr[part]),
         evidence=found.evidence.get(candidate, 0.0),
         indistinguishable_from=tuple(dict.fromkeys(c.short for c in found.sets.get(candidate, ()))),
-        scope=candidate.effect.scope,
+        scope="instrument" if candidate.capture is None else "capture",
         capture=None if candidate.capture is None else problem.captures[candidate.capture].name,
         removal_chance=found.chance.get(candidate, 1.0),
         confident=candidate not in found.nameless,
@@ -283,12 +293,12 @@ def _unobservable(problem: InstrumentProblem, found: Found) -> tuple[str, ...]:
     names = []
     for candidate, information in found.information.items():
         gain, least = np.diag(information) * candidate.typical**2, np.full(candidate.size, SEEN)
-        if candidate.effect.moves_image:
+        if isinstance(candidate.effect, ImageShift):
             # Noise alone has slopes too, from one pixel to the next, which a shift would change.
             one = Space((candidate,))
             noise = np.diag(problem.noise_information(one, np.zeros(one.size))) * candidate.typical**2
             gain, least = gain - noise, np.maximum(least, NOISE_ERROR * noise)
-        if "@" not in candidate.place and np.all(gain < least):
+        if not candidate.state_chosen and np.all(gain < least):
             names.append(candidate.short)
     names += [f"{c.short} (as many values as the data have)" for c in found.untestable]
     return tuple(dict.fromkeys(names))
@@ -299,37 +309,36 @@ def _missing(problem: InstrumentProblem, found: Found) -> list[Candidate]:
     return [
         c
         for c, information in found.information.items()
-        if "@" not in c.place
-        and not c.effect.corrects_counts
+        if not c.state_chosen
+        and not isinstance(c.effect, CountsEffect)
         and np.all(np.diag(information) * c.typical**2 < SEEN)
-        and c.kind != "field_retardance"
+        and not isinstance(c.effect, FieldEffect)
     ]
 
 
 def _empirical(problem: InstrumentProblem, search: Search, found: Found) -> Empirical | None:
     """The best of: a gain for each state, an angle for each state, a bend of the response."""
-    best: tuple[float, Candidate, Array, float] | None = None
+    best: tuple[float, str, str, Array, float] | None = None
     fits = []
     for candidate in search.pool:
-        general = candidate.effect.per_state or candidate.kind == "detector_nonlinearity"
-        if not general or candidate in found.space.candidates:
+        if not isinstance(candidate.effect, GeneralEffect) or candidate in found.space.candidates:
             continue
         space = Space((*found.space.candidates, candidate))
         fit = minimize(problem, space, np.concatenate([found.fit.values, np.zeros(candidate.size)]))
         rms = float(np.sqrt(fit.sums.square.sum() / fit.sums.count.sum()))
         fits.append((candidate, fit.excess))
         if best is None or fit.excess < best[0]:
-            best = (fit.excess, candidate, fit.values[space.slices[-1]], rms)
+            unit = candidate.parameters[0].unit
+            best = (fit.excess, candidate.effect.describes, unit, fit.values[space.slices[-1]], rms)
     if best is None or best[0] > 0.9 * found.fit.excess:
         return None
-    excess, candidate, values, rms = best
-    names = {"source_flicker": "gain_per_state", "angle_per_state": "angle_per_state"}
+    excess, describes, unit, values, rms = best
     near = excess + 0.02 * (found.fit.excess - excess) + 3 * search.noise_of(found.after)
     return Empirical(
-        kind=names.get(candidate.kind, "response"),
+        kind=describes,
         rms_percent_in_sample=100 * rms,
         values=tuple(values.tolist()),
-        unit=candidate.parameters[0].unit,
+        unit=unit,
         would_also_fit=tuple(dict.fromkeys(c.short for c, e in fits if e <= near)),
     )
 

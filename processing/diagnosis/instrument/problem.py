@@ -31,8 +31,18 @@ from processing.diagnosis.instrument.projection import RANK, add_block, noise_in
 from processing.diagnosis.instrument.tile_sums import add_tiles, tile_columns
 from processing.diagnosis.search.candidate import Candidate, nominal_values, pool
 from processing.diagnosis.search.space import Space, Sums
+from processing.instrument.applied_effects import apply_to, changes_of
 from processing.instrument.changes import Changes
-from processing.instrument.effects.base import apply_to, changes_of, turned_by
+from processing.instrument.effects.base import (
+    CountsEffect,
+    FieldEffect,
+    FromAState,
+    ImageShift,
+    PointwiseEffect,
+    Switch,
+    ValuePerState,
+    turned_by,
+)
 from processing.instrument.model import InstrumentModel
 
 #: Makes A (..., L, K) of the changes of a capture.
@@ -125,7 +135,7 @@ class InstrumentProblem:
         if _distance(known.undone, space, values) < EXACT:
             return False
         undone = _exact(space, values)
-        bent = {c: v for c, v in undone.items() if c.effect.pointwise}
+        bent = {c: v for c, v in undone.items() if isinstance(c.effect, PointwiseEffect)}
         shifts = [own + self._shift_px(k, undone) for k, own in enumerate(self.own_px)]
         if not all(_movable(s) for s in shifts):
             return False
@@ -140,8 +150,8 @@ class InstrumentProblem:
     def _shift_px(self, capture: int, undone: Mapping[Candidate, Array]) -> Array:
         changes = Changes(self.captures[capture].conditions)
         for candidate, values in undone.items():
-            if candidate.effect.moves_image and candidate.capture in (None, capture):
-                candidate.effect.apply(changes, self.model, candidate.place, values)
+            if isinstance(candidate.effect, ImageShift) and candidate.capture in (None, capture):
+                candidate.apply(changes, self.model, values)
         return changes.shift_px / self.captures[capture].pitch
 
     def undivided(self) -> InstrumentProblem:
@@ -183,7 +193,7 @@ class InstrumentProblem:
         for candidate, part in zip(space.candidates, space.slices, strict=True):
             # At zero an effect does nothing: there is no need to ask it.
             if candidate.capture in (None, capture) and values[part].any():
-                candidate.effect.apply(changes, self.model, candidate.place, values[part])
+                candidate.apply(changes, self.model, values[part])
         return changes
 
     def columns(self, capture: int, changes: Changes) -> Array:
@@ -236,7 +246,7 @@ class InstrumentProblem:
         return out
 
     def _has_field(self, space: Space) -> bool:
-        return any(c.kind == "field_retardance" for c in space.candidates)
+        return any(isinstance(c.effect, FieldEffect) for c in space.candidates)
 
     def _block_sums(self, k: int, space: Space, values: Array, changes: Changes, out: Sums, derivatives: bool) -> None:
         a, c = self.columns(k, changes), self.coefficients(k, changes)
@@ -260,9 +270,9 @@ class InstrumentProblem:
         channels = len(conditions.channels)
         whole: dict[str, Array] = {}
         for candidate, part in self._active(k, space):
-            if candidate.effect.corrects_counts:
+            if isinstance(candidate.effect, CountsEffect):
                 continue
-            if candidate.effect.per_state:
+            if isinstance(candidate.effect, ValuePerState):
                 # Parameter n acts on state n alone: one step of all of them together gives every derivative.
                 moved = values.copy()
                 step = STEP * candidate.typical
@@ -272,10 +282,10 @@ class InstrumentProblem:
                     rows = slice(n * channels, (n + 1) * channels)
                     da[part.start + n, ..., rows, :] = slope[..., rows, :]
                 continue
-            first = candidate.effect.first_state(candidate.place)
-            if first and not values[part].any():
+            if isinstance(candidate.effect, FromAState) and not values[part].any():
                 # The same step of the same axis from another state on: one evaluation serves all of them.
-                axis = candidate.place.partition("@")[0]
+                axis = candidate.effect.axis(candidate.place)
+                first = candidate.effect.first_state(candidate.place)
                 if axis not in whole:
                     turned = self.changes(k, space, values)
                     turned.turn_axis(axis, np.full(conditions.states, STEP), turned_by(self.model, axis))
@@ -290,7 +300,7 @@ class InstrumentProblem:
         """Derivatives (values, F, L) of the coefficients c (F, L)."""
         dc = np.zeros((space.size, *c.shape))
         for candidate, part in self._active(k, space):
-            if candidate.effect.corrects_counts:
+            if isinstance(candidate.effect, CountsEffect):
                 for j, (moved, step) in enumerate(self._stepped(candidate, part, values)):
                     dc[part.start + j] = (self.coefficients(k, self.changes(k, space, moved)) - c) / step
         return dc
@@ -298,7 +308,7 @@ class InstrumentProblem:
     def _active(self, k: int, space: Space) -> list[tuple[Candidate, slice]]:
         """Candidates that act on capture k and have values to fit."""
         pairs = zip(space.candidates, space.slices, strict=True)
-        return [(c, part) for c, part in pairs if c.capture in (None, k) and not c.effect.switch]
+        return [(c, part) for c, part in pairs if c.capture in (None, k) and not isinstance(c.effect, Switch)]
 
     @staticmethod
     def _stepped(candidate: Candidate, part: slice, values: Array) -> Iterator[tuple[Array, float]]:
@@ -333,21 +343,27 @@ def _distance(undone: Mapping[Candidate, Array], space: Space, values: Array, *,
     """Largest distance of a correction from where it was undone, in typical sizes; of the `pointwise` ones alone."""
     away = [0.0]
     for candidate, part in zip(space.candidates, space.slices, strict=True):
-        if candidate.effect.pointwise or (candidate.effect.moves_image and not pointwise):
+        if _exactly_undone(candidate, pointwise):
             away.append(float(np.max(np.abs(values[part] - undone.get(candidate, 0.0)) / candidate.typical)))
     return max(away)
+
+
+def _exactly_undone(candidate: Candidate, pointwise: bool) -> bool:
+    """Whether a correction can be undone exactly; with `pointwise`, in each pixel by itself."""
+    return isinstance(candidate.effect, PointwiseEffect if pointwise else PointwiseEffect | ImageShift)
 
 
 def _exact(space: Space, values: Array, *, pointwise: bool = False) -> dict[Candidate, Array]:
     """Values of what can be undone exactly; of the `pointwise` corrections alone."""
     active = zip(space.candidates, space.slices, strict=True)
-    return {c: values[p] for c, p in active if c.effect.pointwise or (c.effect.moves_image and not pointwise)}
+    return {c: values[p] for c, p in active if _exactly_undone(c, pointwise)}
 
 
 def _undone(data: CaptureData, undone: Mapping[Candidate, Array]) -> tuple[Array, Array]:
     """Signal with the effects undone exactly, and its slope over the old one."""
     signal, slope = data.signal.astype(float), np.ones(())
     for candidate, values in undone.items():
-        signal, step = candidate.effect.undo(signal, data.conditions, values)
-        slope = slope * step
+        if isinstance(candidate.effect, PointwiseEffect):
+            signal, step = candidate.effect.undo(signal, data.conditions, values)
+            slope = slope * step
     return signal, slope

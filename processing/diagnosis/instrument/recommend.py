@@ -13,6 +13,7 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.rules import APART
 from processing.diagnosis.search.space import Space
+from processing.instrument.effects.base import CountsEffect, InstrumentEffect, ValuePerState
 from processing.polarization import mueller
 
 #: Samples that a lab has at hand, in the order of the trouble they make.
@@ -42,7 +43,7 @@ def _capture(
     problem: InstrumentProblem, space: Space, fit: Fit, rivals: Sequence[Candidate], unseen: Sequence[Candidate]
 ) -> str:
     """One sentence: the capture that separates the rivals, or shows the unseen, or that none of the usual does."""
-    rows_side = [c for c in rivals if not c.effect.corrects_counts and c.effect.group != "reflectance"]
+    rows_side = [c for c in rivals if not isinstance(c.effect, CountsEffect) and isinstance(c.effect, InstrumentEffect)]
     have = [c.sample for c in problem.captures]
     best, power = "", 0.0
     for name, sample in SAMPLES.items():
@@ -52,14 +53,14 @@ def _capture(
         # A simpler sample is preferred unless another one tells clearly more.
         if value > power + 0.15:
             best, power = name, value
-    if any(c.effect.corrects_counts for c in rivals):
+    if any(isinstance(c.effect, CountsEffect) for c in rivals):
         return (
             "A series of exposure times on an unpolarized, evenly lit target tells detector effects from optics; "
             "dark frames tell an offset."
         )
     if best and power >= APART:
         return f"Capture {best} with the same states."
-    if any(c.effect.per_state for c in rivals):
+    if any(isinstance(c.effect, ValuePerState) for c in rivals):
         return "Repeat the capture: what comes back is the mechanics, what does not is the source; or record a monitor."
     if rivals:
         return (

@@ -14,8 +14,7 @@ from processing.diagnosis.instrument.projection import add_response
 from processing.diagnosis.instrument.tile_sums import tile_columns
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.space import Space
-from processing.instrument.changes import Changes
-from processing.instrument.effects.field_retardance import terms
+from processing.instrument.changes import FIELD_TERMS, Changes, field_terms
 from processing.reduction.move_image import neighbour_noise
 
 #: Standard deviations beyond which a test says "structure".
@@ -231,7 +230,7 @@ def _correlates(r: NDArray[np.float32], signal: NDArray[np.float32], good: NDArr
     gy, gx = np.gradient(mean)
     ys, xs = np.mgrid[-1 : 1 : r.shape[1] * 1j, -1 : 1 : r.shape[2] * 1j]
     maps = {"brightness": mean, "gradient of the image": np.hypot(gx, gy)}
-    maps |= dict(zip(("x", "y", "x2", "xy", "y2"), terms(xs, ys), strict=True))
+    maps |= dict(zip(FIELD_TERMS, field_terms(xs, ys), strict=True))
     out = {}
     for name, image in maps.items():
         x, y = loud[good], image[good]

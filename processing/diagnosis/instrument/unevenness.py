@@ -9,7 +9,7 @@ from processing.diagnosis.instrument.problem import STEP, InstrumentProblem
 from processing.diagnosis.instrument.projection import RANK
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.space import Space
-from processing.instrument.effects.field_retardance import terms
+from processing.instrument.changes import field_terms
 
 
 def unevenness(problem: InstrumentProblem, candidate: Candidate, space: Space, values: Array) -> tuple[float, int]:
@@ -40,7 +40,7 @@ def unevenness(problem: InstrumentProblem, candidate: Candidate, space: Space, v
         # As in `add_tiles`: the slope of the excess of each tile by the size of the effect there, and its noise.
         slope = -np.sum(ps * b, axis=(1, 2)) + (tiles.noise[:, use] / sigma**2) @ np.diag(b)
         power = np.sum((b @ s) * b, axis=(1, 2))
-        smooth = np.vstack([np.ones(tiles.x.size), terms(tiles.x, tiles.y)])
+        smooth = np.vstack([np.ones(tiles.x.size), field_terms(tiles.x, tiles.y)])
         pull = smooth @ slope
         out += float(pull @ np.linalg.pinv((smooth * power) @ smooth.T, hermitian=True) @ pull)
         count += len(smooth)

@@ -9,9 +9,11 @@ from typing import ClassVar
 import numpy as np
 
 from processing.arrays import Array
+from processing.effect import Effect, Parameter
 from processing.errors import ProcessError
+from processing.instrument.applied_effects import instrument_effects
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter, all_effects
+from processing.instrument.effects.base import FromAState, FromFileOnly, InstrumentEffect, OfOneCapture
 from processing.instrument.model import InstrumentModel
 
 
@@ -41,12 +43,18 @@ class Candidate:
     @property
     def cost(self) -> float:
         """Parameters that a fit has to pay for; the state of a slip is chosen among many."""
-        return self.size + (3.0 if "@" in self.place else 0.0)
+        return self.size + (3.0 if self.state_chosen else 0.0)
+
+    @property
+    def state_chosen(self) -> bool:
+        """The state that it starts at is chosen among many."""
+        return isinstance(self.effect, FromAState)
 
     @property
     def family(self) -> str:
         """Name without the state that a slip starts at."""
-        return f"{self.kind}:{self.place.partition('@')[0]}:{self.capture}"
+        where = self.effect.axis(self.place) if isinstance(self.effect, FromAState) else self.place
+        return f"{self.kind}:{where}:{self.capture}"
 
     @property
     def short(self) -> str:
@@ -57,6 +65,11 @@ class Candidate:
     def label(self) -> str:
         """Name for people."""
         return self.short + (f" in capture {self.capture + 1}" if self.capture is not None else "")
+
+    def apply(self, changes: Changes, model: InstrumentModel, values: Array) -> None:
+        """Add the effect of these values to the changes of an instrument, if it is one of an instrument."""
+        if isinstance(self.effect, InstrumentEffect):
+            self.effect.apply(changes, model, self.place, values)
 
     @property
     def typical(self) -> Array:
@@ -74,10 +87,9 @@ class Candidate:
         return np.array([p.upper for p in self.parameters])
 
 
-class NominalValue(Effect):
+class NominalValue(InstrumentEffect):
     """A value of the train that the instrument file gives as only nominal (`calibrate`)."""
 
-    group = "optics"
     FIELDS: ClassVar[dict[str, Parameter]] = {
         "azimuth_deg": Parameter("azimuth", "degree", -400, 400, 30.0),
         "retardance_deg": Parameter("retardance", "degree", -200, 200, 30.0),
@@ -121,33 +133,22 @@ def nominal_values(model: InstrumentModel, conditions: Conditions) -> tuple[Cand
 
 
 def pool(model: InstrumentModel, conditions: Sequence[Conditions]) -> tuple[Candidate, ...]:
-    """Every effect at every place of the captures; what turns a whole train is part of an unknown sample."""
+    """Every effect of the instrument at every place of the captures.
+
+    What shifts a value that is fitted as nominal is left out: the same number under two names would be a false pair of
+    indistinguishable effects.
+    """
     found: dict[tuple[str, str, int | None], Candidate] = {}
-    fitted = _fitted_by_calibration(model)
-    for effect in all_effects().values():
-        if effect.group == "frame":
+    fitted = set(model.calibrate)
+    for effect in instrument_effects().values():
+        if isinstance(effect, FromFileOnly):
             continue
         for k, condition in enumerate(conditions):
-            number = k if effect.scope == "capture" else None
+            number = k if isinstance(effect, OfOneCapture) else None
             for place in effect.places(model, condition):
-                if (effect.kind, place) in fitted:
-                    continue
-                parameters = effect.parameters(model, condition, place)
-                starts = tuple(np.full(len(parameters), s) for s in getattr(effect, "starts", ()) if s)
-                found.setdefault((effect.kind, place, number), Candidate(effect, place, parameters, number, starts))
+                if fitted.isdisjoint(effect.shifts(model, place)):
+                    candidate = Candidate(
+                        effect, place, effect.parameters(model, condition, place), number, effect.starts()
+                    )
+                    found.setdefault((effect.kind, place, number), candidate)
     return tuple(found.values())
-
-
-def _fitted_by_calibration(model: InstrumentModel) -> set[tuple[str, str]]:
-    # The same number under two names would be a false pair of indistinguishable effects.
-    out = set()
-    generator = {e.name for e in model.generator}
-    for name in model.calibrate:
-        element, _, field_name = name.rpartition(".")
-        train = "psg" if element in generator else "psa"
-        out.add((f"{train}_{field_name.removesuffix('_deg')}", element))
-        if element not in generator and field_name == "azimuth_deg":
-            polarizer = next(e for e in model.elements() if e.name == element).kind == "polarizer"
-            if polarizer:
-                out |= {("analyzer_azimuth", ""), ("channel_azimuth", "")}
-    return out

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from processing.arrays import Array
 from processing.diagnosis.search.problem import Problem
 from processing.diagnosis.search.space import Space, Sums
+from processing.instrument.effects.base import ValuePerState
 
 #: The prior that keeps unseen parameters still is this many times wider than a typical size.
 PRIOR_WIDTH = 10.0
@@ -156,7 +157,7 @@ def held_out(problem: Problem, space: Space, full: Fit) -> HeldOut:
     by_state = problem.holds_out_states
     local = np.zeros(space.size, dtype=bool)
     for candidate, part in zip(space.candidates, space.slices, strict=True):
-        local[part] = candidate.effect.per_state and by_state
+        local[part] = isinstance(candidate.effect, ValuePerState) and by_state
     total = np.zeros(4)
     for fold in range(problem.folds):
         others = [f for f in range(problem.folds) if f != fold]

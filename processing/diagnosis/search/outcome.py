@@ -10,6 +10,7 @@ from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit, HeldOut
 from processing.diagnosis.search.space import Space
+from processing.instrument.effects.base import PointwiseEffect, Switch
 
 #: Growth of the unweighted residual that is still put down to noise.
 WORSE = 1.002
@@ -32,7 +33,7 @@ class Trial:
         lower, upper = self.space.joined("lower"), self.space.joined("upper")
         near = np.minimum(self.fit.values - lower, upper - self.fit.values) < 1e-3 * (upper - lower)
         for candidate, part in zip(self.space.candidates, self.space.slices, strict=True):
-            near[part] &= not candidate.effect.switch
+            near[part] &= not isinstance(candidate.effect, Switch)
         return bool(near.any())
 
     def sound(self, before: HeldOut) -> bool:
@@ -41,7 +42,8 @@ class Trial:
         What fits better only where the weights are large is not an explanation. A bend of the response changes the
         scale in which the residual is told, so it is not asked.
         """
-        return not self.at_bound and (self.candidate.effect.pointwise or self.out.rms <= WORSE * before.rms)
+        bends = isinstance(self.candidate.effect, PointwiseEffect)
+        return not self.at_bound and (bends or self.out.rms <= WORSE * before.rms)
 
 
 @dataclass

@@ -17,6 +17,7 @@ from processing.diagnosis.search.fit import Fit, HeldOut, held_out, minimize, pr
 from processing.diagnosis.search.outcome import Found, Trial
 from processing.diagnosis.search.problem import Problem
 from processing.diagnosis.search.space import Space
+from processing.instrument.effects.base import CountsEffect, FieldEffect, Switch, ValuePerState
 
 #: Called with a line that says what is being done.
 Say = Callable[[str], None]
@@ -97,7 +98,7 @@ class Search:
                     self.problem.adopt_noise(space, fit.values)
                     base_fit, fit, before, out = self._again(base_fit, space, fit)
                     continue
-            imitable |= best.candidate.effect.per_state
+            imitable |= isinstance(best.candidate.effect, ValuePerState)
             self.say(f"{best.candidate.label}: {100 * out.rms:.4g} % -> {100 * best.out.rms:.4g} % on held-out data")
             space, fit, out = best.space, best.fit, best.out
         found = Found(self.base, before, base_fit, space, fit, out, ranking=ranking, alone=alone, imitable=imitable)
@@ -119,13 +120,15 @@ class Search:
 
         So many values can imitate several plain effects at once, and are then the first to be added.
         """
-        plain = [c for c in self.pool if not c.effect.per_state]
+        plain = [c for c in self.pool if not isinstance(c.effect, ValuePerState)]
         self.say("the same without values for each state")
         other = self._greedy(base_fit, plain)
         # Each must beat chance by itself: a few unrelated effects could also nibble at random values.
         if other.effects and all(other.chance[c] < CHANCE for c in other.effects):
             rest = self._trials(other.space, other.fit, other.after, self.pool)
-            nothing_more = all(t.evidence < self.decisive for t in rest if t.candidate.effect.per_state)
+            nothing_more = all(
+                t.evidence < self.decisive for t in rest if isinstance(t.candidate.effect, ValuePerState)
+            )
         else:
             nothing_more = False
         # The noise may be another one since: what was found first is fitted to the same.
@@ -170,7 +173,7 @@ class Search:
         return self._power
 
     def _testable(self, candidate: Candidate, space: Space, excess: float) -> bool:
-        if not candidate.effect.per_state:
+        if not isinstance(candidate.effect, ValuePerState):
             return True
         _, visible = self.directions(excess)
         return candidate.size + space.size < 0.75 * visible
@@ -197,9 +200,9 @@ class Search:
             if candidate.family not in scored or rank < scored[candidate.family][0]:
                 scored[candidate.family] = (rank, candidate)
         order = [c for _, c in sorted(scored.values(), key=lambda item: item[0])]
-        chosen = [c for c in order if not c.effect.per_state][:leaders]
+        chosen = [c for c in order if not isinstance(c.effect, ValuePerState)][:leaders]
         # One step promises too little where there are many parameters: these are always fitted.
-        chosen += [c for c in order if c.effect.per_state]
+        chosen += [c for c in order if isinstance(c.effect, ValuePerState)]
         if _rms(fit) > FAR_OFF:
             chosen += [c for c in offered if c.starts and c not in chosen]
         trials = [self.trial(space, fit, out, c, weighty) for c in chosen]
@@ -208,14 +211,14 @@ class Search:
     def scores(self, space: Space, fit: Fit, offered: Sequence[Candidate]) -> dict[Candidate, tuple[float, Array]]:
         """Promised gain of each candidate and the information about it, all from one pass over the data."""
         out: dict[Candidate, tuple[float, Array]] = {}
-        tiled = [c for c in (*space.candidates, *offered) if c.kind == "field_retardance"]
-        plain = [c for c in offered if c.kind != "field_retardance" and not c.effect.switch]
-        counts = [c for c in plain if c.effect.corrects_counts]
+        tiled = [c for c in (*space.candidates, *offered) if isinstance(c.effect, FieldEffect)]
+        plain = [c for c in offered if not isinstance(c.effect, FieldEffect) and not isinstance(c.effect, Switch)]
+        counts = [c for c in plain if isinstance(c.effect, CountsEffect)]
         groups = [counts, [c for c in plain if c not in counts]]
         if any(c in tiled for c in space.candidates):
             # Every tile has its own matrix then: a part of the candidates at a time.
             groups = [groups[1][k : k + TOGETHER] for k in range(0, len(groups[1]), TOGETHER)] + [[c] for c in counts]
-        groups += [[c] for c in offered if c.kind == "field_retardance"]
+        groups += [[c] for c in offered if isinstance(c.effect, FieldEffect)]
         for group in groups:
             both = Space((*space.candidates, *group))
             values = np.concatenate([fit.values, np.zeros(both.size - space.size)])
@@ -224,12 +227,12 @@ class Search:
             for candidate, part in zip(group, both.slices[len(space.candidates) :], strict=True):
                 out[candidate] = score(sums, space.size, part, weak)
         for candidate in offered:
-            if candidate.effect.switch:
+            if isinstance(candidate.effect, Switch):
                 out[candidate] = (self._clipped_excess(space, fit), np.zeros((1, 1)))
         return out
 
     def _clipped_excess(self, space: Space, fit: Fit) -> float:
-        clipped = next(c for c in self.pool if c.effect.switch)
+        clipped = next(c for c in self.pool if isinstance(c.effect, Switch))
         both = Space((*space.candidates, clipped))
         with_all = self.problem.sums(both, np.append(fit.values, 0.0), derivatives=False).excess.sum()
         without = self.problem.sums(both, np.append(fit.values, 1.0), derivatives=False).excess.sum()
@@ -240,7 +243,7 @@ class Search:
         both = Space((*space.candidates, candidate))
         best: Fit | None = None
         for start in (np.zeros(candidate.size), *candidate.starts):
-            first = np.ones(1) if candidate.effect.switch else start
+            first = np.ones(1) if isinstance(candidate.effect, Switch) else start
             tried = minimize(self.problem, both, np.concatenate([fit.values, first]), expansions=0)
             if best is None or tried.excess < best.excess:
                 best = tried
@@ -354,7 +357,7 @@ class Search:
 
     def _observability(self, found: Found) -> None:
         """Information about every candidate that the nominal values leave."""
-        offered = [c for c in self.pool if not c.effect.switch]
+        offered = [c for c in self.pool if not isinstance(c.effect, Switch)]
         testable = [c for c in offered if self._testable(c, found.base, max(found.before.excess, 0.0))]
         untestable = [c for c in offered if c not in testable]
         found.information = {c: info for c, (_, info) in self.scores(found.base, found.before_fit, testable).items()}

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
+from processing.instrument.effects.base import Switch
 
 
 @dataclass
@@ -55,7 +56,7 @@ class Space:
     @property
     def fixed(self) -> NDArray[np.bool_]:
         """(K,) values that are on or off and not fitted."""
-        return np.array([c.effect.switch for c in self.candidates for _ in c.parameters], dtype=bool)
+        return np.array([isinstance(c.effect, Switch) for c in self.candidates for _ in c.parameters], dtype=bool)
 
     def joined(self, name: str) -> Array:
         """A property of all candidates, end to end."""

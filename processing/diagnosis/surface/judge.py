@@ -24,7 +24,7 @@ from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.diagnosis.surface.quantities import Quantities, quantities
 from processing.diagnosis.surface.recommend import recommended
-from processing.diagnosis.surface.search import SurfaceSearch
+from processing.diagnosis.surface.search import SurfaceSearch, roughness
 from processing.diagnosis.surface.standard_errors import standard_errors
 from processing.instrument.model import EffectParameter
 from processing.polarization.image_difference import rmsd
@@ -171,7 +171,7 @@ def _verdict(found: Found, before: Sequence[dict[str, float]], after: Sequence[d
     share = max(
         y[name] / max(x[name], LIMIT) for x, y in zip(before, after, strict=True) for name in x if y[name] > LIMIT
     )
-    rough = max(getattr(c.effect, "rough", 0.0) for c in found.effects)
+    rough = max(roughness(c) for c in found.effects)
     sure = all(found.chance.get(c, 1.0) < CHANCE for c in found.effects)
     return "partly_explained" if share <= max(1 - SHARE, rough) and sure else "unexplained"
 

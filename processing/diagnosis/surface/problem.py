@@ -8,7 +8,7 @@ is both coefficients, are free at every pixel and projected out, exactly as a fr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,20 +17,20 @@ from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.space import Space, Sums
 from processing.diagnosis.surface.data import FEWEST_PIXELS, FOLDS, SurfaceData
+from processing.effect import Parameter
 from processing.errors import ProcessError
+from processing.instrument.applied_effects import apply_to, instrument_effects
 from processing.instrument.changes import Changes
-from processing.instrument.effects.base import Parameter, all_effects, apply_to
+from processing.instrument.effects.base import OpticsEffect
 from processing.instrument.model import InstrumentModel
 from processing.reflectance.changes import ReflectanceChanges
-from processing.reflectance.effects.base import ReflectanceEffect, reflectance_effects
+from processing.reflectance.effects.base import MaterialEffect, ReflectanceEffect, reflectance_effects
 
 STEP = 1e-4
 #: Smooth patterns over an object that a misfit can have: up to second order in the position.
 PATTERNS = 6
 #: Part of the modelled light that has to be polarized before it counts as a second column.
 LEAST_MODULATION = 1e-6
-#: Varies over the image, which the projection of this module does not do.
-NOT_HERE = ("field_retardance",)
 
 
 @dataclass(frozen=True)
@@ -114,24 +114,18 @@ class SurfaceProblem:
         """The effects of the reflectance, and those of the optics: with m0 known, an unknown xi0 hides few of them."""
         conditions = self.captures[0].conditions
         out = []
-        for effect in (*all_effects().values(), *reflectance_effects().values()):
-            if isinstance(effect, ReflectanceEffect):
-                places = effect.places_on(self.shape)
-            elif effect.group in ("optics", "mosaic") and not effect.corrects_counts and effect.kind not in NOT_HERE:
-                places = effect.places(self.model, conditions)
-            else:
-                continue
-            for place in places:
-                parameters = effect.parameters(self.model, conditions, place)
-                out.append(Candidate(effect, place, self._physical(effect.kind, parameters)))
-        return tuple(out)
+        for effect in reflectance_effects().values():
+            out += [Candidate(effect, p, self._physical(effect, p)) for p in effect.places_on(self.shape)]
+        for optics in instrument_effects().values():
+            if isinstance(optics, OpticsEffect):
+                places = optics.places(self.model, conditions)
+                out += [Candidate(optics, p, optics.parameters(self.model, conditions, p)) for p in places]
+        return tuple(sorted(out, key=lambda candidate: candidate.kind))
 
-    def _physical(self, kind: str, parameters: tuple[Parameter, ...]) -> tuple[Parameter, ...]:
-        """Bounds that keep k and a of the material from becoming negative."""
-        view = self.captures[0].view
-        lowest = {"polarized_diffuse": {"a": -view.a - 1e-9}, "refractive_index": {"k": -view.index.imag - 1e-9}}
-        mine = lowest.get(kind, {})
-        return tuple(replace(p, lower=max(p.lower, mine[p.name])) if p.name in mine else p for p in parameters)
+    def _physical(self, effect: ReflectanceEffect, place: str) -> tuple[Parameter, ...]:
+        """The parameters, with bounds that keep k and a of the material from becoming negative."""
+        view, parameters = self.captures[0].view, effect.parameters(place)
+        return effect.physical(parameters, view.index, view.a) if isinstance(effect, MaterialEffect) else parameters
 
     def powers(self) -> list[tuple[int, Array]]:
         """Rows that the unknowns leave over, and equal power of the smooth patterns that a misfit can have."""
@@ -151,9 +145,9 @@ class SurfaceProblem:
         for candidate, part in zip(space.candidates, space.slices, strict=True):
             effect = candidate.effect
             if isinstance(effect, ReflectanceEffect):
-                effect.bend_at(surface, candidate.place, values[part])
+                effect.bend(surface, candidate.place, values[part])
             else:
-                effect.apply(optics, self.model, candidate.place, values[part])
+                candidate.apply(optics, self.model, values[part])
         return optics, surface
 
     def rows(self, capture: int, changes: Changes) -> Array:

@@ -12,6 +12,7 @@ from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.rules import APART
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.problem import SurfaceProblem
+from processing.reflectance.effects.base import ReflectanceEffect
 
 
 def recommended(
@@ -34,14 +35,11 @@ def recommended(
             "The dominant process, or the assumption that the other three are equal, does not hold in a way that is "
             "not in the list: take a full Mueller capture, look at its eigenvalues (`process xi0`) and at psi and |D|."
         )
-    kinds = {c.kind for c in rivals}
     if not rivals:
         return "None needed."
-    if "registration" in kinds:
-        return (
-            "Find the sphere's outline in the image (`process campaign --register`): it fixes the registration by "
-            "itself; a capture at another arm angle tells it from the arm's zero as well."
-        )
+    for candidate in rivals:
+        if isinstance(candidate.effect, ReflectanceEffect) and candidate.effect.advice:
+            return candidate.effect.advice
     if len(rivals) > 1 and _apart(problem, space, fit, rivals) >= APART:
         return "Their signatures differ: repeat the capture with more light or more frames."
     if np.linalg.matrix_rank(problem.rows(0, problem.changes(0, space, fit.values)[0]), rtol=1e-8) < 16:

@@ -12,7 +12,7 @@ from processing.diagnosis.search.fit import LEAST_GAIN, Fit, HeldOut, held_out, 
 from processing.diagnosis.search.outcome import Found, Trial
 from processing.diagnosis.search.search import DECISIVE_BESIDE, Search
 from processing.diagnosis.search.space import Space
-from processing.reflectance.effects.base import ReflectanceEffect
+from processing.reflectance.effects.base import BentValley, ReflectanceEffect
 
 #: Every effect of the pool is fitted, not only those that promise most: the model is far from linear in them.
 LEADERS = 12
@@ -64,7 +64,7 @@ class SurfaceSearch(Search):
         needed = LEAST_SHARE * (out.excess - 2 * self.noise_of(out))
         # Beside an effect whose form is rough, what its form leaves over must not get a name of its own; what both
         # together explain without a rest has one.
-        rough = max((_roughness(c) for c in space.candidates), default=0.0) * max(self._start - out.excess, 0.0)
+        rough = max((roughness(c) for c in space.candidates), default=0.0) * max(self._start - out.excess, 0.0)
         return [
             t
             for t in trials
@@ -88,9 +88,10 @@ class SurfaceSearch(Search):
 
 def bent(space: Space) -> NDArray[np.bool_]:
     """(K,) values of effects whose valley is bent."""
-    return np.array([getattr(c.effect, "bent", False) for c in space.candidates for _ in c.parameters], dtype=bool)
+    return np.array([isinstance(c.effect, BentValley) for c in space.candidates for _ in c.parameters], dtype=bool)
 
 
-def _roughness(candidate: Candidate) -> float:
+def roughness(candidate: Candidate) -> float:
+    """Part of what an effect explains that its simple form may leave over."""
     effect = candidate.effect
     return effect.rough if isinstance(effect, ReflectanceEffect) else 0.0

@@ -9,16 +9,12 @@ from pydantic import BaseModel
 
 from processing.diagnosis.instrument_file import WriteError, extended
 from processing.diagnosis.surface.judge import SurfaceDiagnosis
-from processing.geometry.sphere import Sphere
 from processing.geometry.viewing import ViewingGeometry
+from processing.instrument.applied_effects import instrument_effects
 from processing.instrument.model import InstrumentModel
 from processing.reflectance import first_surface, polarized_diffuse
+from processing.reflectance.effects.base import GeometryEffect, MaterialEffect, reflectance_effects
 from processing.yaml_file import dump_yaml
-
-MATERIAL = ("polarized_diffuse", "refractive_index")
-GEOMETRY = ("registration", "arm_zero")
-#: No file of `process` holds these.
-NOWHERE = ("interreflection", "volume_scattering")
 
 
 def corrected_material(
@@ -40,13 +36,9 @@ def corrected_geometry(view: ViewingGeometry, diagnosis: SurfaceDiagnosis) -> Vi
     """The geometry with the sphere and the arm's zero where they were found."""
     for effect in diagnosis.effects:
         values = {name: float(p.value) for name, p in effect.parameters.items() if not isinstance(p.value, tuple)}
-        if effect.kind == "arm_zero":
-            view = view.model_copy(update={"arm_zero_deg": view.arm_zero_deg + values["arm"]})
-        if effect.kind == "registration" and isinstance(view.shape, Sphere):
-            x, y, z = view.shape.centre_mm
-            radius = view.shape.radius_mm * (1 + values["scale"])
-            shape = Sphere(radius_mm=radius, centre_mm=(x + values["x"], y + values["y"], z))
-            view = view.model_copy(update={"shape": shape})
+        known = reflectance_effects().get(effect.kind)
+        if isinstance(known, GeometryEffect):
+            view = known.corrected(view, values)
     return view
 
 
@@ -65,12 +57,13 @@ def write_surface(
     WriteError : one of the files exists, or nothing was found that a file could hold.
     """
     kinds = {e.kind for e in diagnosis.effects}
-    of_instrument = tuple(e for e in diagnosis.effects if e.kind not in (*MATERIAL, *GEOMETRY, *NOWHERE))
+    of_surface = [effect for kind, effect in reflectance_effects().items() if kind in kinds]
+    of_instrument = tuple(e for e in diagnosis.effects if e.kind in instrument_effects())
     models: list[tuple[Path, BaseModel]] = []
     for_material, for_geometry, for_instrument = targets(path)
-    if kinds & set(MATERIAL):
+    if any(isinstance(e, MaterialEffect) for e in of_surface):
         models.append((for_material, corrected_material(material, diagnosis)))
-    if kinds & set(GEOMETRY):
+    if any(isinstance(e, GeometryEffect) for e in of_surface):
         models.append((for_geometry, corrected_geometry(view, diagnosis)))
     if of_instrument:
         models.append((for_instrument, extended(instrument, diagnosis.model_copy(update={"effects": of_instrument}))))

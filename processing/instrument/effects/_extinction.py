@@ -6,15 +6,15 @@ from collections.abc import Sequence
 from typing import ClassVar, Literal
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter
+from processing.instrument.effects.base import OpticsEffect
 from processing.instrument.model import InstrumentModel, Polarizer
 
 
-class Extinction(Effect):
+class Extinction(OpticsEffect):
     """The extinction (T_min over T_max) of each polarizer of a train is larger than in the model."""
 
-    group = "optics"
     train: ClassVar[Literal["generator", "analyzer"]]
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
@@ -26,3 +26,6 @@ class Extinction(Effect):
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         changes.extinction[place] = changes.extinction[place] + values[0]
+
+    def shifts(self, model: InstrumentModel, place: str) -> tuple[str, ...]:
+        return (f"{place}.extinction",)

@@ -8,15 +8,15 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter, retarders
+from processing.instrument.effects.base import OpticsEffect, retarders
 from processing.instrument.model import InstrumentModel
 
 
-class RetarderEffect(Effect):
+class RetarderEffect(OpticsEffect):
     """One number of each retarder of a train."""
 
-    group = "optics"
     train: ClassVar[Literal["generator", "analyzer"]]
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
@@ -32,6 +32,9 @@ class Retardance(RetarderEffect):
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         changes.retardance_rad[place] = changes.retardance_rad[place] + np.deg2rad(values[0])
 
+    def shifts(self, model: InstrumentModel, place: str) -> tuple[str, ...]:
+        return (f"{place}.retardance_deg",)
+
 
 class Azimuth(RetarderEffect):
     """The fast axis stands elsewhere than in the model."""
@@ -41,3 +44,6 @@ class Azimuth(RetarderEffect):
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         changes.azimuth_rad[place] = changes.azimuth_rad[place] + np.deg2rad(values[0])
+
+    def shifts(self, model: InstrumentModel, place: str) -> tuple[str, ...]:
+        return (f"{place}.azimuth_deg",)

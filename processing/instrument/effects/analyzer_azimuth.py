@@ -12,8 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter
+from processing.instrument.effects.base import OpticsEffect
 from processing.instrument.model import InstrumentModel, Polarizer
 
 
@@ -23,10 +24,8 @@ def polarizers(model: InstrumentModel) -> tuple[str, ...]:
     return tuple(e.name for e in elements if isinstance(e, Polarizer))
 
 
-class This(Effect):
+class AnalyzerAzimuth(OpticsEffect):
     """All polarizers behind the sample are turned together, in degrees."""
-
-    group = "optics"
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if polarizers(model) and model.mosaic is None else ()
@@ -37,3 +36,6 @@ class This(Effect):
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         for name in polarizers(model):
             changes.azimuth_rad[name] = changes.azimuth_rad[name] + np.deg2rad(values[0])
+
+    def shifts(self, model: InstrumentModel, place: str) -> tuple[str, ...]:
+        return tuple(f"{name}.azimuth_deg" for name in polarizers(model))

@@ -1,8 +1,8 @@
 """The whole analyzer, with the camera or without it, stands turned about the beam.
 
-Cause: camera body or analyzer unit put in askew; the polarization camera's mount is not level.
-Mend: level it against the source's polarizer with the arm at 180 degrees, or on a sphere seen near Omega 0, whose
-pattern of polarization is symmetric about the horizontal line.
+Found against a known reflectance (`processing.reflectance.effects.analyzer_roll`), it acts here.
+Cause: camera body or analyzer unit put in askew.
+Mend: level it against the source's polarizer with the arm at 180 degrees.
 """
 
 from __future__ import annotations
@@ -12,18 +12,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter
+from processing.instrument.effects.base import FromFileOnly
 from processing.instrument.model import InstrumentModel
 
 
-class This(Effect):
-    """Degrees by which every element of the analyzer is turned.
-
-    A known surface shows it; with an unknown sample it is a part of the Mueller matrix.
-    """
-
-    group = "frame"
+class AnalyzerRoll(FromFileOnly):
+    """Degrees by which every element of the analyzer is turned."""
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",)

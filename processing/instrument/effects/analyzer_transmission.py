@@ -15,7 +15,7 @@ from processing.instrument.effects.base import moving_axes
 from processing.instrument.model import InstrumentModel, Polarizer
 
 
-class This(Transmission):
+class AnalyzerTransmission(Transmission):
     """Transmission behind a turning polarizer."""
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:

@@ -10,17 +10,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter, moving_axes, turned_by
+from processing.instrument.effects.base import ValuePerState, moving_axes, turned_by
 from processing.instrument.model import InstrumentModel
 
 
-class This(Effect):
+class AnglePerState(ValuePerState):
     """Angle error of each state in degrees."""
 
-    group = "motion"
-    scope = "capture"
-    per_state = True
+    describes = "angle_per_state"
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return moving_axes(model, conditions)

@@ -1,81 +1,24 @@
-"""What an effect is: one thing that a model can lack, with parameters that do nothing at zero."""
+"""Effects of an instrument, and the families that the diagnosis asks for.
+
+An effect derives from every family that it belongs to; what belongs to none changes the rows of W and nothing else.
+"""
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache
-from importlib.metadata import entry_points
 from typing import ClassVar, Literal
 
 import numpy as np
 
 from processing.arrays import Array
-from processing.errors import ProcessError
+from processing.effect import Effect, Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.model import AppliedEffect, InstrumentModel, Retarder
-
-Group = Literal["optics", "frame", "motion", "source", "detector", "mosaic", "reflectance"]
-Scope = Literal["instrument", "capture"]
-
-ENTRY_POINT_GROUP = "umov.effects"
+from processing.instrument.model import InstrumentModel, Retarder
 
 
-class EffectError(ProcessError):
-    """An instrument file names an effect that does not exist or does not fit."""
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One number of an effect; at zero it does nothing.
-
-    Attributes
-    ----------
-    name, unit : as shown and stored.
-    lower, upper : bounds.
-    typical : a plausible size; sets steps and the weak prior (ten times this) that holds what data cannot see.
-    """
-
-    name: str
-    unit: str
-    lower: float
-    upper: float
-    typical: float
-
-
-class Effect(ABC):
-    """One effect. Its `kind` is the name of its file; the module's docstring says what causes and what mends it.
-
-    Attributes
-    ----------
-    group : where it happens; "frame" turns all of a train, which only a known surface shows.
-    scope : "capture" if another capture of the same instrument would have other values.
-    per_state : parameter k acts on state k alone (which also makes its derivative cheap).
-    corrects_counts : it is undone in the counts, not put into the rows of W.
-    pointwise : it is undone in each pixel by itself, by `undo`.
-    moves_image : it moves the image (`Changes.shift_px`); it is undone by moving the frames back.
-    switch : it is on or off; its parameter is not fitted.
-    """
-
-    kind: str = ""
-    group: ClassVar[Group]
-    scope: ClassVar[Scope] = "instrument"
-    per_state: ClassVar[bool] = False
-    corrects_counts: ClassVar[bool] = False
-    pointwise: ClassVar[bool] = False
-    moves_image: ClassVar[bool] = False
-    switch: ClassVar[bool] = False
-
-    def first_state(self, place: str) -> int:
-        """State from which on an axis error of one parameter acts; 0 for every other effect."""
-        return 0
-
-    def undo(self, signal: Array, conditions: Conditions, values: Array) -> tuple[Array, Array]:
-        """Signal (counts over full scale) without the effect, exactly, and its slope; of `pointwise` effects only."""
-        return signal, np.ones_like(signal)
+class InstrumentEffect(Effect, ABC):
+    """One thing that an instrument model can lack."""
 
     @abstractmethod
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
@@ -89,67 +32,75 @@ class Effect(ABC):
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         """Add the effect of `values`, one for each parameter, to the changes."""
 
+    def starts(self) -> tuple[Array, ...]:
+        """Values far from zero from which a fit starts as well."""
+        return ()
 
-@cache
-def all_effects() -> dict[str, Effect]:
-    """Effects by kind: each module of this folder that has a class `This`, then plug-ins."""
-    found = effects_in("processing.instrument.effects")
-    for entry in entry_points(group=ENTRY_POINT_GROUP):
-        found[entry.name] = entry.load()()
-        found[entry.name].kind = entry.name
-    return found
+    def shifts(self, model: InstrumentModel, place: str) -> tuple[str, ...]:
+        """Values of the train ("element.field") that it shifts and does nothing else."""
+        return ()
 
 
-def effects_in(package: str) -> dict[str, Effect]:
-    """Effects by kind: each module of a package that has a class `This`."""
-    found: dict[str, Effect] = {}
-    for info in sorted(pkgutil.iter_modules(importlib.import_module(package).__path__), key=lambda i: i.name):
-        module = importlib.import_module(f"{package}.{info.name}")
-        if hasattr(module, "This"):
-            found[info.name] = module.This()
-            found[info.name].kind = info.name
-    return found
+class OpticsEffect(InstrumentEffect):
+    """Changes the polarization elements or the detector channels; a known surface shows it too."""
 
 
-def apply_to(changes: Changes, model: InstrumentModel, applied: AppliedEffect) -> None:
-    """Add one effect of an instrument file to the changes.
-
-    Raises
-    ------
-    EffectError : no such kind, place or parameter.
-    """
-    effects = all_effects()
-    if applied.kind not in effects:
-        raise EffectError(f"effect {applied.kind!r} does not exist; there are: {', '.join(sorted(effects))}")
-    effect, place = effects[applied.kind], applied.element or ""
-    # An axis that stands still in this capture is no place to search, but what was found elsewhere holds there too.
-    turned = {axis: np.arange(8.0) ** 2 for axis in model.axes}
-    anywhere = effect.places(model, Conditions.of(turned, changes.conditions.channels)) if turned else ()
-    if place not in anywhere and place not in effect.places(model, changes.conditions):
-        raise EffectError(f"effect {applied.kind!r} cannot act on {place!r} in instrument {model.name!r}")
-    parameters = effect.parameters(model, changes.conditions, place)
-    if effect.per_state:
-        (entry,) = applied.parameters.values()
-        values = np.asarray(entry.value, dtype=float).reshape(-1)
-        if values.size != len(parameters):
-            raise EffectError(
-                f"effect {applied.kind!r} has {values.size} values and the capture has {len(parameters)} states"
-            )
-    else:
-        missing = [p.name for p in parameters if p.name not in applied.parameters]
-        if missing:
-            raise EffectError(f"effect {applied.kind!r} lacks: {', '.join(missing)}")
-        values = np.array([applied.parameters[p.name].value for p in parameters], dtype=float)
-    effect.apply(changes, model, place, values)
+class SourceEffect(InstrumentEffect):
+    """Changes the light of the source, by the same share in the whole image."""
 
 
-def changes_of(model: InstrumentModel, conditions: Conditions, capture: str | None = None) -> Changes:
-    """What the instrument's effects change; those of scope "capture" only if `capture` is among their captures."""
-    changes = Changes(conditions)
-    for applied in model.effects:
-        if applied.scope == "instrument" or (capture is not None and capture in applied.captures):
-            apply_to(changes, model, applied)
-    return changes
+class FieldEffect(InstrumentEffect):
+    """Varies over the image, so that every part of it has a W of its own."""
+
+
+class CountsEffect(InstrumentEffect):
+    """Undone in the counts; it does not change the rows of W."""
+
+
+class PointwiseEffect(CountsEffect):
+    """Undone in each pixel by itself; what `apply` adds is a series about the last point of `undo`."""
+
+    @abstractmethod
+    def undo(self, signal: Array, conditions: Conditions, values: Array) -> tuple[Array, Array]:
+        """Signal (counts over full scale) without the effect, exactly, and its slope."""
+
+
+class ImageShift(CountsEffect):
+    """Moves the image (`Changes.shift_px`); undone by moving the frames back."""
+
+
+class OfOneCapture(InstrumentEffect):
+    """Would have other values in another capture of the same instrument."""
+
+
+class Switch(OfOneCapture):
+    """On or off: its parameter is not fitted."""
+
+
+class FromAState(OfOneCapture):
+    """An axis stands wrong from one state on; the state is part of the place."""
+
+    @abstractmethod
+    def axis(self, place: str) -> str:
+        """The axis."""
+
+    @abstractmethod
+    def first_state(self, place: str) -> int:
+        """The state from which on it acts."""
+
+
+class GeneralEffect(InstrumentEffect):
+    """General enough to describe, without a cause, what no other effect explains."""
+
+    describes: ClassVar[str]
+
+
+class ValuePerState(GeneralEffect, OfOneCapture):
+    """Parameter k acts on state k alone (which also makes its derivative cheap)."""
+
+
+class FromFileOnly(InstrumentEffect):
+    """Holds where an instrument file names it, and is not looked for: an unknown sample would take it up."""
 
 
 def turned_by(model: InstrumentModel, axis: str) -> Mapping[str, float]:

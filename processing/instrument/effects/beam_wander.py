@@ -11,17 +11,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter, moving_axes
+from processing.instrument.effects.base import ImageShift, moving_axes
 from processing.instrument.model import InstrumentModel
 
 
-class This(Effect):
+class BeamWander(ImageShift):
     """Amplitudes in pixels of cos and sin of the turned angle, x to the right and y down."""
-
-    group = "detector"
-    corrects_counts = True
-    moves_image = True
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         axes = moving_axes(model, conditions)

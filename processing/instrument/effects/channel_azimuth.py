@@ -9,13 +9,13 @@ from __future__ import annotations
 import numpy as np
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects._channel import ChannelEffect, polarizer_of
-from processing.instrument.effects.base import Parameter
+from processing.instrument.effects._channel import ChannelEffect, channel_polarizers, polarizer_of
 from processing.instrument.model import InstrumentModel
 
 
-class This(ChannelEffect):
+class ChannelAzimuth(ChannelEffect):
     """Azimuth error of each channel's polarizer in degrees."""
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
@@ -26,3 +26,6 @@ class This(ChannelEffect):
             name = polarizer_of(model, k)
             if name is not None:
                 changes.azimuth_rad[name] = changes.azimuth_rad[name] + np.deg2rad(value)
+
+    def shifts(self, model: InstrumentModel, place: str) -> tuple[str, ...]:
+        return tuple(f"{name}.azimuth_deg" for name in channel_polarizers(model))

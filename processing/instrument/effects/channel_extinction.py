@@ -7,13 +7,13 @@ Mend: measure each channel behind a turning polarizer and put the extinctions in
 from __future__ import annotations
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects._channel import ChannelEffect, polarizer_of
-from processing.instrument.effects.base import Parameter
+from processing.instrument.effects._channel import ChannelEffect, channel_polarizers, polarizer_of
 from processing.instrument.model import InstrumentModel
 
 
-class This(ChannelEffect):
+class ChannelExtinction(ChannelEffect):
     """Extinction error (T_min over T_max) of each channel."""
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
@@ -24,3 +24,6 @@ class This(ChannelEffect):
             name = polarizer_of(model, k)
             if name is not None:
                 changes.extinction[name] = changes.extinction[name] + value
+
+    def shifts(self, model: InstrumentModel, place: str) -> tuple[str, ...]:
+        return tuple(f"{name}.extinction" for name in channel_polarizers(model))

@@ -9,13 +9,13 @@ from __future__ import annotations
 import numpy as np
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
 from processing.instrument.effects._channel import ChannelEffect
-from processing.instrument.effects.base import Parameter
 from processing.instrument.model import InstrumentModel
 
 
-class This(ChannelEffect):
+class ChannelGain(ChannelEffect):
     """Gain error of each channel but the first, relative to the first; a common factor is throughput."""
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:

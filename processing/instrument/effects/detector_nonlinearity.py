@@ -12,17 +12,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter
+from processing.instrument.effects.base import GeneralEffect, PointwiseEffect
 from processing.instrument.model import InstrumentModel
 
 
-class This(Effect):
+class DetectorNonlinearity(PointwiseEffect, GeneralEffect):
     """Fraction c of the signal that is lost at full scale."""
 
-    group = "detector"
-    corrects_counts = True
-    pointwise = True
+    describes = "response"
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",)

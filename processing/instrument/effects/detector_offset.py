@@ -12,17 +12,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter
+from processing.instrument.effects.base import PointwiseEffect
 from processing.instrument.model import InstrumentModel
 
 
-class This(Effect):
+class DetectorOffset(PointwiseEffect):
     """Counts that are left over in every pixel and state."""
-
-    group = "detector"
-    corrects_counts = True
-    pointwise = True
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",)

@@ -12,30 +12,22 @@ from collections.abc import Sequence
 import numpy as np
 
 from processing.arrays import Array
-from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter
+from processing.effect import Parameter
+from processing.instrument.changes import FIELD_TERMS, Changes, Conditions
+from processing.instrument.effects.base import FieldEffect
 from processing.instrument.model import InstrumentModel, Retarder
 
+
 #: x and y run from -1 to 1 over the image, to the right and down.
-TERMS = ("x", "y", "x2", "xy", "y2")
-
-
-def terms(x: Array, y: Array) -> Array:
-    """(5, ...) the smooth terms, each with mean zero over the image."""
-    return np.stack([x, y, x * x - 1 / 3, x * y, y * y - 1 / 3])
-
-
-class This(Effect):
+class FieldRetardance(FieldEffect):
     """Coefficients in degrees of x, y, x^2 - 1/3, x y, y^2 - 1/3."""
-
-    group = "optics"
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return tuple(e.name for e in model.elements() if isinstance(e, Retarder))
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return tuple(Parameter(n, "degree", -20, 20, 1.0) for n in TERMS)
+        return tuple(Parameter(n, "degree", -20, 20, 1.0) for n in FIELD_TERMS)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
-        old = changes.field_retardance_rad.get(place, np.zeros(len(TERMS)))
+        old = changes.field_retardance_rad.get(place, np.zeros(len(FIELD_TERMS)))
         changes.field_retardance_rad[place] = old + np.deg2rad(values)

@@ -11,16 +11,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter
+from processing.instrument.effects.base import OpticsEffect
 from processing.instrument.model import InstrumentModel, Polarizer
 from processing.polarization import mueller
 
 
-class This(Effect):
+class GeneratorEllipticity(OpticsEffect):
     """Ellipticity angle in degrees behind the generator's polarizer."""
-
-    group = "optics"
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return tuple(e.name for e in model.generator if isinstance(e, Polarizer)) if len(model.generator) > 1 else ()

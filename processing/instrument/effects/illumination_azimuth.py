@@ -1,5 +1,6 @@
-"""The polarization of the illumination is turned against the axes that the model takes.
+"""The polarization of the illumination is turned as a whole.
 
+Found against a known reflectance (`processing.reflectance.effects.illumination_azimuth`), it acts here.
 Cause: polarizer of the source not horizontal, arm or source rolled about the beam.
 Mend: level the source's polarizer against the camera's with the arm at 180 degrees.
 """
@@ -11,16 +12,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter
+from processing.instrument.effects.base import FromFileOnly
 from processing.instrument.model import InstrumentModel
 from processing.polarization import mueller
 
 
-class This(Effect):
-    """Degrees by which the generator azimuth is off; only a known surface shows it."""
-
-    group = "frame"
+class IlluminationAzimuth(FromFileOnly):
+    """Degrees by which the polarization behind the generator is turned."""
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",)

@@ -9,18 +9,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter
+from processing.instrument.effects.base import ImageShift, OfOneCapture
 from processing.instrument.model import InstrumentModel
 
 
-class This(Effect):
+class ImageDrift(ImageShift, OfOneCapture):
     """Pixels from the first to the last state, x to the right and y down."""
-
-    group = "detector"
-    corrects_counts = True
-    moves_image = True
-    scope = "capture"
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if conditions.states > 1 else ()

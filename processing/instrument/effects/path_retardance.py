@@ -12,16 +12,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter
+from processing.instrument.effects.base import OpticsEffect
 from processing.instrument.model import InstrumentModel
 from processing.polarization import mueller
 
 
-class This(Effect):
+class PathRetardance(OpticsEffect):
     """Two components of a linear retardance in degrees: fast axis at 0, and at 45 degrees."""
-
-    group = "optics"
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if len(model.generator) > 1 else ()

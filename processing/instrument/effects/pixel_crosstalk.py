@@ -12,8 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter
+from processing.instrument.effects.base import OpticsEffect
 from processing.instrument.model import InstrumentModel
 
 
@@ -30,10 +31,8 @@ def neighbours(mosaic: tuple[tuple[str, ...], ...], channels: Sequence[str]) -> 
     return out
 
 
-class This(Effect):
+class PixelCrosstalk(OpticsEffect):
     """Fraction of a pixel's light that its neighbours collect."""
-
-    group = "mosaic"
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if model.mosaic is not None else ()

@@ -7,7 +7,7 @@ Mend: home the axis, then calibrate its zero on air; mark the element's orientat
 from processing.instrument.effects._retarder import Azimuth
 
 
-class This(Azimuth):
+class PsaAzimuth(Azimuth):
     """Azimuth error in degrees."""
 
     train = "analyzer"

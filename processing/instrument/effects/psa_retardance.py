@@ -8,7 +8,7 @@ Mend: calibrate on air (`process calibrate`) at the temperature of the measureme
 from processing.instrument.effects._retarder import Retardance
 
 
-class This(Retardance):
+class PsaRetardance(Retardance):
     """Retardance error in degrees."""
 
     train = "analyzer"

@@ -8,7 +8,7 @@ Mend: measure the polarizer between crossed partners at this wavelength; use a c
 from processing.instrument.effects._extinction import Extinction
 
 
-class This(Extinction):
+class PsgExtinction(Extinction):
     """Extinction error, a ratio of intensities."""
 
     train = "generator"

@@ -11,16 +11,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter
+from processing.instrument.effects.base import OfOneCapture, OpticsEffect
 from processing.instrument.model import InstrumentModel, Retarder
 
 
-class This(Effect):
+class RetardanceDrift(OpticsEffect, OfOneCapture):
     """Degrees from the first to the last state, and the bends of its course, which are zero at both."""
-
-    group = "optics"
-    scope = "capture"
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return tuple(e.name for e in model.elements() if isinstance(e, Retarder)) if conditions.states > 4 else ()

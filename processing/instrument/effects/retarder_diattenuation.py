@@ -9,15 +9,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter
+from processing.instrument.effects.base import OpticsEffect
 from processing.instrument.model import InstrumentModel, Retarder
 
 
-class This(Effect):
+class RetarderDiattenuation(OpticsEffect):
     """(T_fast - T_slow) / (T_fast + T_slow) of the retarder."""
-
-    group = "optics"
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return tuple(e.name for e in model.elements() if isinstance(e, Retarder))
@@ -27,3 +26,6 @@ class This(Effect):
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         changes.diattenuation[place] = changes.diattenuation[place] + values[0]
+
+    def shifts(self, model: InstrumentModel, place: str) -> tuple[str, ...]:
+        return (f"{place}.diattenuation",)

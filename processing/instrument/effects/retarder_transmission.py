@@ -15,7 +15,7 @@ from processing.instrument.effects.base import moving_axes
 from processing.instrument.model import InstrumentModel, Retarder
 
 
-class This(Transmission):
+class RetarderTransmission(Transmission):
     """Transmission of a turning retarder."""
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:

@@ -11,8 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter, moving_axes, turned_by
+from processing.instrument.effects.base import InstrumentEffect, moving_axes, turned_by
 from processing.instrument.model import InstrumentModel
 
 
@@ -24,10 +25,8 @@ def direction(angle_deg: Array) -> Array:
     return np.asarray(step, dtype=float)
 
 
-class This(Effect):
+class RotationBacklash(InstrumentEffect):
     """Half of the play in degrees: angle = reading - backlash * direction."""
-
-    group = "motion"
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         axes = moving_axes(model, conditions)

@@ -11,15 +11,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter, moving_axes, turned_by
+from processing.instrument.effects.base import InstrumentEffect, moving_axes, turned_by
 from processing.instrument.model import InstrumentModel
 
 
-class This(Effect):
+class RotationEccentricity(InstrumentEffect):
     """Angle error in degrees: cos and sin of the axis angle, then of twice the angle."""
-
-    group = "motion"
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return moving_axes(model, conditions)

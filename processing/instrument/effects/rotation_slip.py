@@ -12,19 +12,20 @@ from collections.abc import Sequence
 import numpy as np
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter, moving_axes, turned_by
+from processing.instrument.effects.base import FromAState, moving_axes, turned_by
 from processing.instrument.model import InstrumentModel
 
 #: Positions tried along a capture; with more states the nearest of these is named.
 POSITIONS = 64
 
 
-class This(Effect):
+class RotationSlip(FromAState):
     """Angle error in degrees from the state on."""
 
-    group = "motion"
-    scope = "capture"
+    def axis(self, place: str) -> str:
+        return place.rpartition("@")[0]
 
     def first_state(self, place: str) -> int:
         return int(place.rpartition("@")[2])
@@ -39,6 +40,5 @@ class This(Effect):
         return (Parameter("slip", "degree", -45, 45, 1.0),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
-        axis, _, first = place.rpartition("@")
-        after = np.arange(changes.conditions.states) >= int(first)
-        changes.turn_axis(axis, values[0] * after, turned_by(model, axis))
+        after = np.arange(changes.conditions.states) >= self.first_state(place)
+        changes.turn_axis(self.axis(place), values[0] * after, turned_by(model, self.axis(place)))

@@ -10,17 +10,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter
+from processing.instrument.effects.base import Switch
 from processing.instrument.model import InstrumentModel
 
 
-class This(Effect):
+class Saturation(Switch):
     """1: pixels with a clipped state are left out; the level is found from the counts, not fitted."""
-
-    group = "detector"
-    scope = "capture"
-    switch = True
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",)

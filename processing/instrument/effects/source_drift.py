@@ -9,16 +9,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter
+from processing.instrument.effects.base import OfOneCapture, SourceEffect
 from processing.instrument.model import InstrumentModel
 
 
-class This(Effect):
+class SourceDrift(SourceEffect, OfOneCapture):
     """Relative change of the source from the first to the last state, and its departure from a straight line."""
-
-    group = "source"
-    scope = "capture"
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if conditions.states > 1 else ()

@@ -10,17 +10,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter
+from processing.instrument.effects.base import SourceEffect, ValuePerState
 from processing.instrument.model import InstrumentModel
 
 
-class This(Effect):
+class SourceFlicker(SourceEffect, ValuePerState):
     """Relative error of the gain of each state, common to all channels and pixels."""
 
-    group = "source"
-    scope = "capture"
-    per_state = True
+    describes = "gain_per_state"
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if conditions.states > 1 else ()

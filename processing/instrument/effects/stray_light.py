@@ -10,15 +10,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter
+from processing.instrument.effects.base import OpticsEffect
 from processing.instrument.model import InstrumentModel
 
 
-class This(Effect):
+class StrayLight(OpticsEffect):
     """Stray light over the mean signal that the same throughput gives without polarization."""
-
-    group = "optics"
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if model.axes else ()

@@ -11,20 +11,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from processing.arrays import Array
+from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, Parameter
+from processing.instrument.effects.base import PointwiseEffect
 from processing.instrument.model import InstrumentModel
 
 #: Signal over full scale below which the curve is taken as straight.
 TINY = 1e-6
 
 
-class This(Effect):
+class ToneCurve(PointwiseEffect):
     """gamma - 1; light = full scale * (counts / full scale)^gamma."""
-
-    group = "mosaic"
-    corrects_counts = True
-    pointwise = True
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",)

@@ -9,18 +9,20 @@ from __future__ import annotations
 import numpy as np
 
 from processing.arrays import Array
-from processing.instrument.changes import Conditions
-from processing.instrument.effects.base import Parameter
-from processing.instrument.model import InstrumentModel
+from processing.effect import Parameter
+from processing.geometry.viewing import ViewingGeometry
 from processing.reflectance.changes import ReflectanceChanges
-from processing.reflectance.effects.base import ReflectanceEffect
+from processing.reflectance.effects.base import GeometryEffect
 
 
-class This(ReflectanceEffect):
+class ArmZero(GeometryEffect):
     """Degrees by which the source stands further round than the arm reads."""
 
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+    def parameters(self, place: str) -> tuple[Parameter, ...]:
         return (Parameter("arm", "degree", -10, 10, 0.5),)
 
-    def bend(self, changes: ReflectanceChanges, values: Array) -> None:
+    def bend(self, changes: ReflectanceChanges, place: str, values: Array) -> None:
         changes.arm_rad += float(np.deg2rad(values[0]))
+
+    def corrected(self, view: ViewingGeometry, values: dict[str, float]) -> ViewingGeometry:
+        return view.model_copy(update={"arm_zero_deg": view.arm_zero_deg + values["arm"]})

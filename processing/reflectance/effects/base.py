@@ -1,54 +1,68 @@
-"""What effects of the reflectance model share: they bend the dominant process and have no place in an instrument."""
+"""Effects of the reflectance, and the families that the diagnosis asks for: they bend the dominant process."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import cache
 from typing import ClassVar
 
 from processing.arrays import Array
-from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import Effect, EffectError, effects_in
-from processing.instrument.model import InstrumentModel
+from processing.effect import Effect, Parameter, found_in
+from processing.geometry.viewing import ViewingGeometry
 from processing.reflectance.changes import ReflectanceChanges
 
+#: Entry points of packages outside that add effects.
+ENTRY_POINTS = "umov.reflectance_effects"
 
-class ReflectanceEffect(Effect):
-    """An effect of the paper's model in place of the instrument's.
+
+class ReflectanceEffect(Effect, ABC):
+    """One thing that the model of a surface can lack.
 
     Attributes
     ----------
     rough : part of what it explains (chi-square) that its simple form may leave over; beside it no effect is named
         that explains less.
-    bent : its values trade off along a bent valley, so that curvature at one point tells neither minimum nor error.
+    advice : the one look or capture that shows it, if there is one, in a sentence.
     """
 
-    group = "reflectance"
     rough: ClassVar[float] = 1e-3
-    bent: ClassVar[bool] = False
-
-    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
-        return ()
-
-    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
-        raise EffectError(f"effect {self.kind!r} belongs to a reflectance model, not to an instrument file")
+    advice: ClassVar[str] = ""
 
     def places_on(self, shape: str) -> Sequence[str]:
         """Where it can act on an object in front of a camera: `shape` is "sphere", "flat" or "mesh"."""
         return ("",)
 
-    def bend_at(self, changes: ReflectanceChanges, place: str, values: Array) -> None:
-        """`bend`, for an effect that has more than one place."""
-        self.bend(changes, values)
+    @abstractmethod
+    def parameters(self, place: str) -> tuple[Parameter, ...]:
+        """The parameters at a place."""
 
     @abstractmethod
-    def bend(self, changes: ReflectanceChanges, values: Array) -> None:
+    def bend(self, changes: ReflectanceChanges, place: str, values: Array) -> None:
         """Add the effect of `values` to the changes."""
+
+
+class BentValley(ReflectanceEffect):
+    """Its values trade off along a bent valley: curvature at one point tells neither minimum nor error."""
+
+
+class MaterialEffect(ReflectanceEffect):
+    """Corrected in the material file."""
+
+    @abstractmethod
+    def physical(self, parameters: tuple[Parameter, ...], index: complex, a: float) -> tuple[Parameter, ...]:
+        """The parameters, bounded by what a material of this index and diffuse weight allows."""
+
+
+class GeometryEffect(ReflectanceEffect):
+    """Corrected in the geometry file."""
+
+    @abstractmethod
+    def corrected(self, view: ViewingGeometry, values: dict[str, float]) -> ViewingGeometry:
+        """The geometry with the values found, by name of the parameter."""
 
 
 @cache
 def reflectance_effects() -> dict[str, ReflectanceEffect]:
-    """Effects of the reflectance by kind: each module of this folder that has a class `This`."""
-    found = effects_in("processing.reflectance.effects")
-    return {kind: effect for kind, effect in found.items() if isinstance(effect, ReflectanceEffect)}
+    """Effects of the reflectance by kind: the files of the folder, then plug-ins."""
+    return found_in("processing.reflectance.effects", ReflectanceEffect, ENTRY_POINTS)  # type: ignore[type-abstract]

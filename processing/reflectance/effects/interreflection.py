@@ -11,14 +11,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from processing.arrays import Array
-from processing.instrument.changes import Conditions
-from processing.instrument.effects.base import Parameter
-from processing.instrument.model import InstrumentModel
+from processing.effect import Parameter
 from processing.reflectance.changes import ReflectanceChanges
-from processing.reflectance.effects.base import ReflectanceEffect
+from processing.reflectance.effects.base import BentValley
 
 
-class This(ReflectanceEffect):
+class Interreflection(BentValley):
     """Weight of light that met two facets over that which met one; place "support": light from below.
 
     The support's light arrives depolarized from a level disc below, and the surface polarizes it as it does the
@@ -30,12 +28,11 @@ class This(ReflectanceEffect):
 
     # A support is no disc, and where its light is cut off by the object itself is not known.
     rough = 0.2
-    bent = True
 
     def places_on(self, shape: str) -> Sequence[str]:
         return ("", "support")
 
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+    def parameters(self, place: str) -> tuple[Parameter, ...]:
         if place == "support":
             form = (Parameter("reach", "degree", -30, 40, 10), Parameter("log_depth", "1", -0.6, 3.0, 0.3))
             # Typical sizes that keep what the data cannot see near zero.
@@ -43,18 +40,13 @@ class This(ReflectanceEffect):
             return (Parameter("support", "1", -0.05, 2.0, 0.02), *form, *more)
         return (Parameter("twice", "1", -0.05, 1.0, 0.05),)
 
-    def bend(self, changes: ReflectanceChanges, values: Array) -> None:
-        changes.twice += float(values[0])
-
-    def bend_at(self, changes: ReflectanceChanges, place: str, values: Array) -> None:
-        if place == "support":
-            changes.support += float(values[0])
-            changes.support_rad += float(np.deg2rad(values[1]))
-            changes.support_log_depth += float(values[2])
-            changes.support_slope = (
-                changes.support_slope[0] + float(values[3]),
-                changes.support_slope[1] + float(values[4]),
-            )
-            changes.support_law += float(values[5])
-        else:
-            self.bend(changes, values)
+    def bend(self, changes: ReflectanceChanges, place: str, values: Array) -> None:
+        if place != "support":
+            changes.twice += float(values[0])
+            return
+        changes.support += float(values[0])
+        changes.support_rad += float(np.deg2rad(values[1]))
+        changes.support_log_depth += float(values[2])
+        x, z = changes.support_slope
+        changes.support_slope = (x + float(values[3]), z + float(values[4]))
+        changes.support_law += float(values[5])

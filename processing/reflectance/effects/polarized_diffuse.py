@@ -6,22 +6,25 @@ Mend: use a `polarized_diffuse` material in place of `first_surface`; fit its a 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from processing.arrays import Array
-from processing.instrument.changes import Conditions
-from processing.instrument.effects.base import Parameter
-from processing.instrument.model import InstrumentModel
+from processing.effect import Parameter
 from processing.reflectance.changes import ReflectanceChanges
-from processing.reflectance.effects.base import ReflectanceEffect
+from processing.reflectance.effects.base import BentValley, MaterialEffect
 
 
-class This(ReflectanceEffect):
+class PolarizedDiffuse(BentValley, MaterialEffect):
     """Weight a sin^b(theta_h) of the diffuse term in the Jones matrix; log_b = ln b."""
 
-    bent = True
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+    def parameters(self, place: str) -> tuple[Parameter, ...]:
         return (Parameter("a", "1", -2.0, 2.0, 0.1), Parameter("log_b", "1", -1.5, 2.0, 0.5))
 
-    def bend(self, changes: ReflectanceChanges, values: Array) -> None:
+    def bend(self, changes: ReflectanceChanges, place: str, values: Array) -> None:
         changes.diffuse_a += float(values[0])
         changes.diffuse_log_b += float(values[1])
+
+    def physical(self, parameters: tuple[Parameter, ...], index: complex, a: float) -> tuple[Parameter, ...]:
+        # The weight of the material cannot become negative.
+        weight, log_b = parameters
+        return replace(weight, lower=max(weight.lower, -a - 1e-9)), log_b

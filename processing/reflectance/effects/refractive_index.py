@@ -6,21 +6,24 @@ Mend: fit it (`process fit-material`), or measure it on a polished piece with an
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from processing.arrays import Array
-from processing.instrument.changes import Conditions
-from processing.instrument.effects.base import Parameter
-from processing.instrument.model import InstrumentModel
+from processing.effect import Parameter
 from processing.reflectance.changes import ReflectanceChanges
-from processing.reflectance.effects.base import ReflectanceEffect
+from processing.reflectance.effects.base import BentValley, MaterialEffect
 
 
-class This(ReflectanceEffect):
+class RefractiveIndex(BentValley, MaterialEffect):
     """What has to be added to n and k; more than these bounds is another material, or no first surface at all."""
 
-    bent = True
-
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+    def parameters(self, place: str) -> tuple[Parameter, ...]:
         return (Parameter("n", "1", -0.3, 0.3, 0.05), Parameter("k", "1", -0.3, 0.3, 0.05))
 
-    def bend(self, changes: ReflectanceChanges, values: Array) -> None:
+    def bend(self, changes: ReflectanceChanges, place: str, values: Array) -> None:
         changes.index += complex(*values)
+
+    def physical(self, parameters: tuple[Parameter, ...], index: complex, a: float) -> tuple[Parameter, ...]:
+        # The material cannot amplify light.
+        n, k = parameters
+        return n, replace(k, lower=max(k.lower, -index.imag - 1e-9))

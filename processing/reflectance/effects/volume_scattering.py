@@ -8,18 +8,16 @@ Mend: take the material's dominant process from measurement; a first-surface ind
 from __future__ import annotations
 
 from processing.arrays import Array
-from processing.instrument.changes import Conditions
-from processing.instrument.effects.base import Parameter
-from processing.instrument.model import InstrumentModel
+from processing.effect import Parameter
 from processing.reflectance.changes import ReflectanceChanges
 from processing.reflectance.effects.base import ReflectanceEffect
 
 
-class This(ReflectanceEffect):
+class VolumeScattering(ReflectanceEffect):
     """Share of the dipole's Jones matrix beside the first surface's, both of unit strength; 1 is all dipole."""
 
-    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+    def parameters(self, place: str) -> tuple[Parameter, ...]:
         return (Parameter("share", "1", -1.0, 4.0, 0.2),)
 
-    def bend(self, changes: ReflectanceChanges, values: Array) -> None:
+    def bend(self, changes: ReflectanceChanges, place: str, values: Array) -> None:
         changes.volume += float(values[0])
