@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
+from drivers.clock import REAL, Clock
 from drivers.errors import ReplyError
 
 # On a line that changed something this short a time ago, two garbled replies may well be alike.
@@ -20,7 +20,8 @@ class AgreeingReadings:
     readings.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock = REAL) -> None:
+        self._clock = clock
         self._disturbed_s = -float("inf")
 
     def read(
@@ -45,13 +46,13 @@ class AgreeingReadings:
         try:
             return self._read(asked, read, is_moving, tolerance)
         except ReplyError:
-            self._disturbed_s = time.monotonic()
+            self._disturbed_s = self._clock.now_s()
             raise
 
     def _read(
         self, asked: str, read: Callable[[], float], is_moving: Callable[[], bool], tolerance: float
     ) -> tuple[float, bool]:
-        disturbed = time.monotonic() - self._disturbed_s < _MEMORY_S
+        disturbed = self._clock.now_s() - self._disturbed_s < _MEMORY_S
         alike = _DISTURBED if disturbed else _CALM
         seen, moving = [read()], 0
         while len(seen) < _TRIES * (alike - 1):
@@ -70,7 +71,7 @@ class AgreeingReadings:
             if moving == 3:
                 return middle, False
             if moving == 0 and abs(seen[-1] - seen[-2]) > tolerance:
-                self._disturbed_s = time.monotonic()
+                self._disturbed_s = self._clock.now_s()
                 alike = _DISTURBED
         raise ReplyError(
             asked,

@@ -6,11 +6,11 @@ import contextlib
 import logging
 import math
 import threading
-import time
 from abc import ABC, abstractmethod
 
 from drivers.agreed_reading import AgreeingReadings
 from drivers.axis_types import AxisConfig, AxisIdentity, Limits, Position
+from drivers.clock import REAL, Clock
 from drivers.errors import (
     CommandRejected,
     DeviceError,
@@ -53,7 +53,7 @@ class Motion:
         self.target_deg = target_deg
         self.expected_s = expected_s
         self.allowed_s = allowed_s
-        self._start_s = time.monotonic()
+        self._start_s = axis.clock.now_s()
         self._stops_before = axis._stops
         self._result: Position | None = None
         self._failure: MotionFailed | None = None
@@ -94,14 +94,14 @@ class Motion:
             has been sent a stop by then. `MotionStopped` if `stop()` ended it.
         """
         while not self.done():
-            time.sleep(self.axis.config.poll_s)
+            self.axis.clock.sleep_s(self.axis.config.poll_s)
         if self._result is None:
             raise RuntimeError("a motion that is done has a result")
         return self._result
 
     def _look(self) -> None:
         axis = self.axis
-        now_s = time.monotonic()
+        now_s = axis.clock.now_s()
         if axis.is_moving():
             self._idle_since_s = None
             if now_s - self._start_s > self.allowed_s:
@@ -134,7 +134,7 @@ class Motion:
 
     def _look_for_progress(self) -> None:
         position = self.axis.read_position()
-        now_s = time.monotonic()
+        now_s = self.axis.clock.now_s()
         self._next_progress_look_s = now_s + PROGRESS_EVERY_S
         stall_s = self.axis.config.stall_s
         if self._last is None or position.counts != self._last.counts:
@@ -143,7 +143,7 @@ class Motion:
             raise self._stop_and_describe(f"stalled: it says it moves but made no progress for {stall_s:.2f} s")
 
     def _figures(self) -> tuple[str, float | None, float | None, float, float]:
-        elapsed_s = time.monotonic() - self._start_s
+        elapsed_s = self.axis.clock.now_s() - self._start_s
         last_deg = None if self._last is None else self._last.deg
         return self.axis.name, self.target_deg, last_deg, elapsed_s, self.allowed_s
 
@@ -165,6 +165,8 @@ class MotionAxis(ABC):
     ----------
     can_stop_a_move : bool
         False where the hardware runs a started move to its end (Thorlabs Elliptec).
+    clock : Clock
+        What motions and their deadlines are counted by.
     may_move_on_connect : bool
         True where opening the device can move it. No driver here does.
     """
@@ -173,13 +175,14 @@ class MotionAxis(ABC):
     may_move_on_connect: bool = False
     _reads_while_moving: bool = True
 
-    def __init__(self, name: str, config: AxisConfig) -> None:
+    def __init__(self, name: str, config: AxisConfig, clock: Clock = REAL) -> None:
         self.name = name
         self.config = config
+        self.clock = clock
         self._stops = 0
         self._closed = False
         self._start_lock = threading.Lock()
-        self._readings = AgreeingReadings()
+        self._readings = AgreeingReadings(clock)
         # Set by the driver's open(), from what the controller reports.
         self.counts_per_deg: float = 1.0
         self.speed_deg_s: float = math.nan

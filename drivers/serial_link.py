@@ -15,6 +15,7 @@ from typing import Any, Protocol, Self, TypeVar
 
 import serial
 
+from drivers.clock import REAL, Clock
 from drivers.errors import DeviceError, PermissionRefused, PortBusy, PortLost, PortNotFound, ReplyError
 
 # A framer takes one whole frame off the front of the buffer, or returns None until there is one.
@@ -48,7 +49,7 @@ class Transcript:
         self._lock = threading.Lock()
 
     def note(self, mark: str, data: bytes) -> None:
-        """Add a line: monotonic time in seconds, `>>` sent or `<<` received, the bytes as text and hex."""
+        """Add a line: real time in seconds, `>>` sent or `<<` received, the bytes as text and hex."""
         text = data.decode("ascii", "backslashreplace").encode("unicode_escape").decode("ascii")
         with self._lock:
             self._file.write(f"{time.monotonic():.4f} {mark} {text} [{data.hex(' ')}]\n")
@@ -76,6 +77,8 @@ class SerialLink:
         Flow control.
     transcript : Transcript, optional
         Where to log the wire.
+    clock : Clock
+        What deadlines are counted by.
     held_by : str, optional
         Name of a program that may have the port open too: the simulator at the other end of a pseudo-terminal.
 
@@ -94,9 +97,11 @@ class SerialLink:
         xonxoff: bool = False,
         rtscts: bool = False,
         transcript: Transcript | None = None,
+        clock: Clock = REAL,
         held_by: str | None = None,
     ) -> None:
         self.port = port
+        self.clock = clock
         # One exchange at a time; a stop does not wait for it.
         self.lock = threading.RLock()
         self._write_lock = threading.Lock()
@@ -114,12 +119,12 @@ class SerialLink:
             self._serial.write(data)
 
     def read_frame(self, deadline_s: float) -> bytes | None:
-        """Return the next whole frame, or None if none is complete at `deadline_s` (monotonic time)."""
+        """Return the next whole frame, or None if none is complete when `clock` shows `deadline_s`."""
         while True:
             frame = self._framer(self._buffer)
             if frame is not None:
                 return frame
-            left_s = deadline_s - time.monotonic()
+            left_s = deadline_s - self.clock.now_s()
             with self._lost_port_named():
                 waiting = self._serial.in_waiting
                 if waiting == 0 and left_s <= 0:
@@ -131,13 +136,13 @@ class SerialLink:
 
     def purge(self, quiet_s: float = 0.05) -> None:
         """Drop everything received until the line has been quiet for `quiet_s` (at most ten times as long)."""
-        start_s = quiet_since_s = time.monotonic()
+        start_s = quiet_since_s = self.clock.now_s()
         with self._lost_port_named():
             self._serial.reset_input_buffer()
             self._buffer.clear()
-            while time.monotonic() - quiet_since_s < quiet_s and time.monotonic() - start_s < 10 * quiet_s:
+            while (now_s := self.clock.now_s()) - quiet_since_s < quiet_s and now_s - start_s < 10 * quiet_s:
                 if self._serial.read(max(1, self._serial.in_waiting)):
-                    quiet_since_s = time.monotonic()
+                    quiet_since_s = self.clock.now_s()
 
     def set_rts(self, level: bool) -> None:
         """Set the RTS line; a pseudo-terminal has none, which is fine."""
@@ -271,9 +276,12 @@ class LineRegistry:
     ----------
     transcript_folder : Path, optional
         Folder that gets one transcript of the wire for each port.
+    clock : Clock
+        What every driver on these lines counts its deadlines and pauses by.
     """
 
-    def __init__(self, transcript_folder: Path | None = None) -> None:
+    def __init__(self, transcript_folder: Path | None = None, clock: Clock = REAL) -> None:
+        self.clock = clock
         self._folder = transcript_folder
         self._lines: dict[str, tuple[Line, int]] = {}
         self._lock = threading.Lock()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from drivers.clock import REAL, Clock
 from drivers.motion import AxisConfig, MotionAxis
 
 
@@ -23,8 +24,8 @@ class SessionReferenceAxis(MotionAxis):
     controller was reset, or somebody turned it.
     """
 
-    def __init__(self, name: str, config: SessionReferenceConfig) -> None:
-        super().__init__(name, config)
+    def __init__(self, name: str, config: SessionReferenceConfig, clock: Clock = REAL) -> None:
+        super().__init__(name, config, clock)
         self._referenced = config.assume_homed
         self._homing = False
         # Set by the driver when the device was seen in motion or told of its end.

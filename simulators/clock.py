@@ -1,38 +1,102 @@
-"""Time for simulators: real, faster than real, or instant; and the trapezoid on which a motor moves."""
+"""Time for simulators: real or patient, faster, or instant; and the trapezoid on which a motor moves."""
 
 from __future__ import annotations
 
 import math
+import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
+
+from drivers import clock as driver_clock
+
+#: The patient clock looks at real time this often, and counts no more than this between two looks.
+BEAT_S = 0.005
+LONGEST_BEAT_S = 0.02
+
+
+class PatientClock:
+    """Real time without the gaps in which this process was kept from running.
+
+    Something has to look at it all the time (`beat`); where that comes late, only the first `LONGEST_BEAT_S` count. A
+    driver and the emulator that it talks to then lose the same time on a busy machine: what is in time on a quiet
+    one is in time there too, and a deadline that passes has really been missed.
+
+    Parameters
+    ----------
+    real_s : callable
+        Real time in seconds.
+    """
+
+    def __init__(self, real_s: Callable[[], float] = time.monotonic) -> None:
+        self._real_s = real_s
+        self._lock = threading.Lock()
+        self._counted_s = 0.0
+        self._beat_s = real_s()
+
+    def beat(self) -> None:
+        """Look at real time."""
+        with self._lock:
+            real_s = self._real_s()
+            self._counted_s += min(real_s - self._beat_s, LONGEST_BEAT_S)
+            self._beat_s = real_s
+
+    def now_s(self) -> float:
+        """Seconds counted since the clock was made."""
+        with self._lock:
+            return self._counted_s + min(self._real_s() - self._beat_s, LONGEST_BEAT_S)
+
+    def sleep_s(self, duration_s: float) -> None:
+        """Wait until so many seconds were counted; not at all if `duration_s` is not positive."""
+        end_s = self.now_s() + duration_s
+        while (left_s := end_s - self.now_s()) > 0:
+            time.sleep(left_s)
+
+
+@cache
+def patient_clock() -> PatientClock:
+    """The patient clock of this process, kept going by a thread."""
+    clock = PatientClock()
+
+    def keep_going() -> None:
+        while True:
+            time.sleep(BEAT_S)
+            clock.beat()
+
+    threading.Thread(target=keep_going, name="patient clock", daemon=True).start()
+    return clock
 
 
 class Clock:
-    """Simulated time that runs `speed` times as fast as real time.
+    """Simulated time that runs `speed` times as fast as the clock it is based on.
 
     Parameters
     ----------
     speed : float
-        Simulated seconds per real second.
+        Simulated seconds per second of `base`.
     instant : bool
         Motions take no time at all; the clock itself runs on.
+    base : drivers.clock.Clock
+        What the drivers that talk to this simulator count by; real time by default, for clients of any origin.
     """
 
-    def __init__(self, speed: float = 1.0, instant: bool = False) -> None:
+    def __init__(self, speed: float = 1.0, instant: bool = False, base: driver_clock.Clock = driver_clock.REAL) -> None:
         if not (math.isfinite(speed) and speed > 0):
             raise ValueError(f"clock speed must be positive and finite, not {speed}")
         self.speed = speed
         self.instant = instant
-        self._start_s = time.monotonic()
+        self.base = base
+        self._start_s = base.now_s()
 
     def now_s(self) -> float:
         """Simulated seconds since the clock was made."""
-        return (time.monotonic() - self._start_s) * self.speed
+        return (self.base.now_s() - self._start_s) * self.speed
 
     def sleep_s(self, duration_s: float) -> None:
         """Wait for `duration_s` simulated seconds."""
         if not self.instant:
-            time.sleep(max(0.0, duration_s) / self.speed)
+            self.base.sleep_s(duration_s / self.speed)
 
 
 class ManualClock(Clock):

@@ -179,7 +179,7 @@ class CampaignRun:
         for observer in self.observers:
             observer.warning("the door is open; going on when it is closed")
         while rig.source.interlock_open() and not self.stop.requested:
-            time.sleep(LOOK_S)
+            rig.clock.sleep_s(LOOK_S)
 
     def _take_once(self, capture: CampaignCapture, job: Job, rig: Rig) -> Result:
         final = self.folder.folder / capture.name
@@ -247,6 +247,7 @@ class CampaignRun:
             self.folder.log("closing the rig failed", error=str(failure))
 
     def _pause(self, seconds: float) -> None:
+        # Real time: the pause is for people and devices.
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s and not self.stop.requested:
             time.sleep(0.05)

@@ -98,7 +98,7 @@ class CaptureRunner:
         self.detector = detector
         self.stop = stop
         self.observers = observers
-        self.ledger = TimeLedger()
+        self.ledger = TimeLedger(rig.clock)
         self.messages = Messages()
         self.interlocks = Interlocks(rig, self.warn, continue_after_interlock)
         self._here: dict[str, float] = {}
@@ -193,7 +193,7 @@ class CaptureRunner:
         self._set_light(self.table.role[state] != "dark")
         settle_s = self.rig.config.settle_s if changed else 0.0
         with self.ledger.time("settling"):
-            time.sleep(settle_s)
+            self.rig.clock.sleep_s(settle_s)
         self.ledger.unavoidable_s += longest_s + settle_s
         return self._expose(state, targets, positions)
 
@@ -211,7 +211,7 @@ class CaptureRunner:
             settings = self.rig.set_exposure(asked_s, int(self.table.repeats[state]))
         # Cameras set exposures in steps; what counts is the exposure that was.
         exposure_s = settings.exposure_s or asked_s
-        start_s = time.monotonic()
+        start_s = self.rig.clock.now_s()
         with self.ledger.time("exposure"):
             try:
                 exposure = camera.trigger()
@@ -224,7 +224,7 @@ class CaptureRunner:
         light_s = exposure_s * float(self.table.repeats[state])
         # The camera's own: until it says that the exposure has ended, beyond the exposure itself. The pause between
         # two questions, a millisecond, is in it.
-        readout_s = max(0.0, time.monotonic() - start_s - light_s)
+        readout_s = max(0.0, self.rig.clock.now_s() - start_s - light_s)
         self.ledger.readout_s += readout_s
         self.ledger.unavoidable_s += light_s + readout_s
         positions = moved | still

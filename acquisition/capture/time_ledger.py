@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Literal
+
+from drivers.clock import REAL, Clock
 
 Entry = Literal[
     "homing",
@@ -29,10 +30,16 @@ class TimeLedger:
 
     `moving` is the time the thread waited for axes (parallel moves count once), so what overlaps a move costs
     nothing here. `overhead` is what no entry explains.
+
+    Parameters
+    ----------
+    clock : drivers.clock.Clock
+        What the rig's own waits are counted by.
     """
 
-    def __init__(self) -> None:
-        self._start_s = time.monotonic()
+    def __init__(self, clock: Clock = REAL) -> None:
+        self._clock = clock
+        self._start_s = self._clock.now_s()
         self.spent_s: dict[str, float] = {}
         self.states = 0
         # What physics asks for: per state the longest parallel move, settling, exposure and the camera's readout.
@@ -42,15 +49,15 @@ class TimeLedger:
     @contextmanager
     def time(self, entry: Entry) -> Iterator[None]:
         """Count the time inside the block."""
-        start_s = time.monotonic()
+        start_s = self._clock.now_s()
         try:
             yield
         finally:
-            self.spent_s[entry] = self.spent_s.get(entry, 0.0) + time.monotonic() - start_s
+            self.spent_s[entry] = self.spent_s.get(entry, 0.0) + self._clock.now_s() - start_s
 
     def total_s(self) -> float:
         """Seconds since the ledger was opened."""
-        return time.monotonic() - self._start_s
+        return self._clock.now_s() - self._start_s
 
     def summary(self) -> dict[str, float]:
         """Seconds of each entry, `overhead`, `total`, `unavoidable`, and `excess`.

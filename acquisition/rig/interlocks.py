@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 from acquisition.errors import InterlockOpened
@@ -74,7 +73,7 @@ class Interlocks:
         InterlockOpened
             The plan does not go on by itself, or waiting cannot help.
         """
-        start_s = time.monotonic()
+        start_s = self.rig.clock.now_s()
         self.rig.stop()
         event: dict[str, str | float] = {"state": float(state), "why": why}
         self.events.append(event)
@@ -87,6 +86,6 @@ class Interlocks:
                 "Remove the cause, then go on with --resume."
             )
         while self.open_now() is not None and not stop.requested:
-            time.sleep(LOOK_S)
-        event["duration_s"] = round(time.monotonic() - start_s, 3)
+            self.rig.clock.sleep_s(LOOK_S)
+        event["duration_s"] = round(self.rig.clock.now_s() - start_s, 3)
         self.warn(f"interlock: closed after {event['duration_s']} s, going on")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, Self
@@ -13,12 +12,14 @@ from acquisition.errors import AcquisitionError
 from acquisition.rig.config import RigConfig
 from acquisition.rig.way import concerned, find_homing_obstacle, find_obstacle
 from drivers.camera import Camera, CameraSettings
+from drivers.clock import REAL, Clock
 from drivers.errors import LimitError, MotionFailed
 from drivers.motion import Motion, MotionAxis, Position
 from drivers.registry import open_axis
 from drivers.serial_link import LineRegistry
 from drivers.source import LightSource
 from drivers.sources.manual import Ask, ManualSource
+from simulators.clock import patient_clock
 from simulators.rig.model import SCHEME
 from simulators.rig.rig import SimulatedRig
 
@@ -30,6 +31,11 @@ SHORTEST_LOOK_S = 0.002
 REST_WITHIN_S = 60.0
 
 
+def clock_of(config: RigConfig) -> Clock:
+    """The clock of a rig: real devices keep real time, emulators may be kept from running."""
+    return patient_clock() if config.simulated else REAL
+
+
 class Rig:
     """Named axes, a camera and a light source, opened from a rig file; a context manager.
 
@@ -39,6 +45,8 @@ class Rig:
     camera : Camera or None where it was not asked for
     source : LightSource or None where the rig has none
     simulation : SimulatedRig or None
+    clock : Clock
+        What every wait and deadline is counted by: real time, or with emulators the patient clock that they keep.
 
     Parameters
     ----------
@@ -61,7 +69,8 @@ class Rig:
         self._read_back = CameraSettings()
         self._with_camera = with_camera
         self._ask = ask
-        self._lines = LineRegistry(config.wire_log)
+        self.clock: Clock = clock_of(config)
+        self._lines = LineRegistry(config.wire_log, self.clock)
 
     def __enter__(self) -> Self:
         try:
@@ -124,7 +133,7 @@ class Rig:
         entry = self.config.camera
         if self.simulation is not None:
             entry = entry.model_copy(update={"device": self.simulation.camera_device()})
-        camera: Camera = _driver("drivers.cameras", entry.kind).open("camera", entry)
+        camera: Camera = _driver("drivers.cameras", entry.kind).open("camera", entry, self.clock)
         self.camera = camera
         return camera
 
@@ -222,7 +231,7 @@ class Rig:
         """
         left = dict(motions)
         positions: dict[str, Position] = {}
-        start_s = time.monotonic()
+        start_s = self.clock.now_s()
         try:
             while left:
                 for name, motion in list(left.items()):
@@ -230,7 +239,7 @@ class Rig:
                         positions[name] = motion.wait()
                         del left[name]
                 if left:
-                    time.sleep(self._next_look_s(left, time.monotonic() - start_s))
+                    self.clock.sleep_s(self._next_look_s(left, self.clock.now_s() - start_s))
         except MotionFailed as failure:
             others = self.stop()
             if others is not None:
@@ -244,12 +253,12 @@ class Rig:
     def rest(self) -> None:
         """Wait until no axis moves, for moves that nobody waits for any more."""
         for axis in self.axes.values():
-            end_s = time.monotonic() + REST_WITHIN_S
+            end_s = self.clock.now_s() + REST_WITHIN_S
             while axis.is_moving():
-                if time.monotonic() > end_s:
+                if self.clock.now_s() > end_s:
                     self.stop()
                     raise AcquisitionError(f"axis {axis.name} still moves after {REST_WITHIN_S:g} s; it was stopped")
-                time.sleep(axis.config.poll_s)
+                self.clock.sleep_s(axis.config.poll_s)
 
     def _next_look_s(self, left: Mapping[str, Motion], elapsed_s: float) -> float:
         """Pause before the next look at moving axes: short around the time at which the last should arrive."""

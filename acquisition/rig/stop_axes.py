@@ -16,6 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from acquisition.rig.config import RigConfig
+from acquisition.rig.rig import clock_of
 from drivers.errors import CommandRejected, DeviceError, PortBusy
 from drivers.motion import AxisConfig, MotionAxis
 from drivers.registry import open_axis
@@ -42,7 +43,7 @@ def stop_axes(config: RigConfig, tell: Tell) -> bool:
     for name, entry in config.axes.items():
         lines.setdefault(os.path.realpath(entry.port), {})[name] = entry
     told = _tell_running(list(lines), tell)
-    with LineRegistry() as registry, ThreadPoolExecutor(max(1, len(lines))) as threads:
+    with LineRegistry(clock=clock_of(config)) as registry, ThreadPoolExecutor(max(1, len(lines))) as threads:
         stopped = threads.map(lambda port: _stop_line(port, lines[port], registry, told, tell), lines)
         return all(list(stopped))
 
@@ -111,14 +112,14 @@ def _stop_axis(name: str, entry: AxisConfig, lines: LineRegistry) -> MotionAxis:
 
 
 def _stop_when_free(name: str, entry: AxisConfig, lines: LineRegistry) -> MotionAxis:
-    end_s = time.monotonic() + REST_UNSTOPPABLE_S
+    end_s = lines.clock.now_s() + REST_UNSTOPPABLE_S
     while True:
         try:
             return _stop_axis(name, entry, lines)
         except CommandRejected:
-            if time.monotonic() > end_s:
+            if lines.clock.now_s() > end_s:
                 raise
-            time.sleep(0.1)
+            lines.clock.sleep_s(0.1)
 
 
 def _tell_failed(name: str, error: DeviceError, tell: Tell) -> None:
@@ -127,6 +128,7 @@ def _tell_failed(name: str, error: DeviceError, tell: Tell) -> None:
 
 
 def _wait_let_go(port: str, told: set[int]) -> None:
+    # Real time: it is another program that lets go.
     end_s = time.monotonic() + LET_GO_S
     while time.monotonic() < end_s and any(pid in told for pid, _ in port_holders(port)):
         time.sleep(0.05)
@@ -134,13 +136,13 @@ def _wait_let_go(port: str, told: set[int]) -> None:
 
 def _rests(axis: MotionAxis, tell: Tell) -> bool:
     note = "" if axis.can_stop_a_move else " (this kind runs a started move to its end)"
-    end_s = time.monotonic() + (REST_S if axis.can_stop_a_move else REST_UNSTOPPABLE_S)
+    end_s = axis.clock.now_s() + (REST_S if axis.can_stop_a_move else REST_UNSTOPPABLE_S)
     try:
         while axis.is_moving():
-            if time.monotonic() > end_s:
+            if axis.clock.now_s() > end_s:
                 tell(f"{axis.name}: stop sent, STILL MOVING{note}. Switch its power off")
                 return False
-            time.sleep(axis.config.poll_s)
+            axis.clock.sleep_s(axis.config.poll_s)
         where = f"at {axis.read_position().deg:.4f} deg" if axis.is_homed() else "without a reference"
     except DeviceError as error:
         tell(f"{axis.name}: stop sent, then {error}")

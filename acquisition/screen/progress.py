@@ -24,6 +24,7 @@ class ConsoleProgress(Observer):
         self._task: Any = None
         self._done = self._pending = 0
         self._total = 0
+        # Real time, as everything that a person reads.
         self._start_s = self._line_s = time.monotonic()
         self._warned: set[str] = set()
 

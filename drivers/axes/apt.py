@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import logging
 import struct
-import time
 from dataclasses import dataclass
 from typing import Literal
 
 from pydantic import Field
 
 from drivers.apt_frames import REPLY_NAMES, apt_framer, long_message, short_message
+from drivers.clock import Clock
 from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
 from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
 from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed
@@ -59,14 +59,16 @@ class Config(AxisConfig):
 class APTLine:
     """The port of one APT unit."""
 
-    def __init__(self, port: str, reply_s: float, transcript: Transcript | None, held_by: str | None = None) -> None:
-        self.link = SerialLink(port, 115_200, apt_framer, transcript=transcript, held_by=held_by)
+    def __init__(
+        self, port: str, reply_s: float, transcript: Transcript | None, clock: Clock, held_by: str | None = None
+    ) -> None:
+        self.link = SerialLink(port, 115_200, apt_framer, transcript=transcript, clock=clock, held_by=held_by)
         self.reply_s = reply_s
         # The vendor's order of opening: a unit that is not reset so can stay silent.
         self.link.set_rts(True)
-        time.sleep(0.05)
+        clock.sleep_s(0.05)
         self.link.purge(0.0)
-        time.sleep(0.05)
+        clock.sleep_s(0.05)
         self.link.set_rts(False)
 
     def close(self) -> None:
@@ -86,7 +88,7 @@ class APTLine:
                 # Replies carry no id of their request: drop what waits, it was not asked for now.
                 self.link.purge(0.0)
                 self.link.write(request)
-                deadline_s = time.monotonic() + self.reply_s
+                deadline_s = self.link.clock.now_s() + self.reply_s
                 while (frame := self.link.read_frame(deadline_s)) is not None:
                     # All but the hardware information start with the channel, which is 1.
                     whole = reply_id == 0x0006 or frame[6:8] == b"\x01\x00"
@@ -105,7 +107,7 @@ class APTAxis(MotionAxis):
     """The motor of one APT unit, channel 1."""
 
     def __init__(self, name: str, config: Config, line: APTLine, lines: LineRegistry) -> None:
-        super().__init__(name, config)
+        super().__init__(name, config, lines.clock)
         self.config: Config = config
         self._line, self._lines = line, lines
         # Periodic messages of an earlier program would only disturb; this moves nothing.
@@ -206,12 +208,12 @@ class APTAxis(MotionAxis):
         )  # fmt: skip
         self._enable()
         self._line.link.write(short_message(0x0443, 1))
-        give_up_s = time.monotonic() + 0.3
-        while time.monotonic() < give_up_s:
+        give_up_s = self.clock.now_s() + 0.3
+        while self.clock.now_s() < give_up_s:
             bits = self._status_bits()
             if bits & HOMING or not bits & HOMED:
                 return
-            time.sleep(0.01)
+            self.clock.sleep_s(0.01)
 
     def _do_stop(self) -> None:
         self._line.link.write(short_message(0x0465, 1, 2))
@@ -236,7 +238,9 @@ class APTAxis(MotionAxis):
 def open(name: str, config: Config, lines: LineRegistry) -> APTAxis:
     """Open one unit; reads its identity, homing parameters and speed and moves nothing."""
     line = lines.take(
-        config.port, APTLine, lambda transcript: APTLine(config.port, config.reply_s or 0.5, transcript, config.held_by)
+        config.port,
+        APTLine,
+        lambda transcript: APTLine(config.port, config.reply_s or 0.5, transcript, lines.clock, config.held_by),
     )
     try:
         return APTAxis(name, config, line, lines)

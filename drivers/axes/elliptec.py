@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import logging
 import re
-import time
 from functools import partial
 from typing import Literal
 
 from pydantic import Field
 
+from drivers.clock import Clock
 from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
 from drivers.motion import AxisIdentity
 from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
@@ -64,12 +64,14 @@ class Config(SessionReferenceConfig):
 class ElliptecLine:
     """Up to 16 modules on one line; replies are sorted by address and letters."""
 
-    def __init__(self, port: str, reply_s: float, transcript: Transcript | None, held_by: str | None = None) -> None:
-        self.link = SerialLink(port, 9600, line_framer, transcript=transcript, held_by=held_by)
+    def __init__(
+        self, port: str, reply_s: float, transcript: Transcript | None, clock: Clock, held_by: str | None = None
+    ) -> None:
+        self.link = SerialLink(port, 9600, line_framer, transcript=transcript, clock=clock, held_by=held_by)
         self.reply_s = reply_s
         # Last message of each module that nobody had asked for: the end of its move.
         self.ended: dict[str, tuple[str, str]] = {}
-        self._last_sent_s = 0.0
+        self._last_sent_s = -float("inf")
 
     def close(self) -> None:
         """Close the port."""
@@ -78,12 +80,12 @@ class ElliptecLine:
     def send(self, address: str, command: str) -> None:
         """Write a command; takes no lock."""
         self.link.write(f"{address}{command}".encode("ascii"))
-        self._last_sent_s = time.monotonic()
+        self._last_sent_s = self.link.clock.now_s()
 
     def start(self, address: str, command: str, pause_s: float) -> None:
         """Start a move, whose reply comes when it ends."""
         with self.link.lock:
-            time.sleep(max(0.0, self._last_sent_s + pause_s - time.monotonic()))
+            self.link.clock.sleep_s(self._last_sent_s + pause_s - self.link.clock.now_s())
             self.drain()
             self.ended.pop(address, None)
             self.send(address, command)
@@ -116,7 +118,7 @@ class ElliptecLine:
             with self.link.lock:
                 self.drain()
                 self.send(address, command)
-                deadline_s = time.monotonic() + self.reply_s
+                deadline_s = self.link.clock.now_s() + self.reply_s
                 while (frame := self.link.read_frame(deadline_s)) is not None:
                     sender, said, data = _parse(frame)
                     if (sender, said) == (address, letters) and len(data) >= digits:
@@ -146,7 +148,7 @@ class ElliptecAxis(SessionReferenceAxis):
     _reads_while_moving = False
 
     def __init__(self, name: str, config: Config, line: ElliptecLine, lines: LineRegistry) -> None:
-        super().__init__(name, config)
+        super().__init__(name, config, lines.clock)
         self.config: Config = config
         self._line, self._lines = line, lines
         self._in_motion = False
@@ -263,7 +265,7 @@ def open(name: str, config: Config, lines: LineRegistry) -> ElliptecAxis:
     line = lines.take(
         config.port,
         ElliptecLine,
-        lambda transcript: ElliptecLine(config.port, config.reply_s or 0.6, transcript, config.held_by),
+        lambda transcript: ElliptecLine(config.port, config.reply_s or 0.6, transcript, lines.clock, config.held_by),
     )
     try:
         return ElliptecAxis(name, config, line, lines)

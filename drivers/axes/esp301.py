@@ -8,11 +8,11 @@ whether an axis is homed. Use RS-232: USB is reported unusable on Linux.
 from __future__ import annotations
 
 import re
-import time
 from typing import Literal
 
 from pydantic import Field
 
+from drivers.clock import Clock
 from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
 from drivers.motion import AxisIdentity
 from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
@@ -65,9 +65,12 @@ class ESP301Line:
         rtscts: bool,
         reply_s: float,
         transcript: Transcript | None,
+        clock: Clock,
         held_by: str | None = None,
     ) -> None:
-        self.link = SerialLink(port, baudrate, line_framer, rtscts=rtscts, transcript=transcript, held_by=held_by)
+        self.link = SerialLink(
+            port, baudrate, line_framer, rtscts=rtscts, transcript=transcript, clock=clock, held_by=held_by
+        )
         self.reply_s = reply_s
         # The controller has one error memory for all axes, and reading takes out: each axis's own are kept here.
         self._errors: dict[int, list[int]] = {}
@@ -92,7 +95,7 @@ class ESP301Line:
             with self.link.lock:
                 self.link.purge(0.0)
                 self.send(command)
-                deadline_s = time.monotonic() + self.reply_s
+                deadline_s = self.link.clock.now_s() + self.reply_s
                 while (frame := self.link.read_frame(deadline_s)) is not None:
                     text = frame.decode("ascii", "replace").strip()
                     if form.fullmatch(text):
@@ -122,7 +125,7 @@ class ESP301Axis(SessionReferenceAxis):
     """One axis of a controller."""
 
     def __init__(self, name: str, config: Config, line: ESP301Line, lines: LineRegistry) -> None:
-        super().__init__(name, config)
+        super().__init__(name, config, lines.clock)
         self.config: Config = config
         self._line, self._lines = line, lines
         version = line.ask("VE?", _VERSION)
@@ -226,7 +229,7 @@ def open(name: str, config: Config, lines: LineRegistry) -> ESP301Axis:
         config.port,
         ESP301Line,
         lambda transcript: ESP301Line(
-            config.port, config.baudrate, config.rtscts, config.reply_s or 2.0, transcript, config.held_by
+            config.port, config.baudrate, config.rtscts, config.reply_s or 2.0, transcript, lines.clock, config.held_by
         ),
     )
     try:

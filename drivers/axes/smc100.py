@@ -8,11 +8,11 @@ PR50CC as a member of it.
 from __future__ import annotations
 
 import re
-import time
 from typing import Literal
 
 from pydantic import Field
 
+from drivers.clock import Clock
 from drivers.errors import CommandRejected, DeviceError, NotHomedError, ReplyError, ReplyTimeout, WrongDevice
 from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
 from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
@@ -86,9 +86,17 @@ class SMC100Line:
     """One line of controllers; replies are matched by address and command letters."""
 
     def __init__(
-        self, port: str, baudrate: int, reply_s: float, transcript: Transcript | None, held_by: str | None = None
+        self,
+        port: str,
+        baudrate: int,
+        reply_s: float,
+        transcript: Transcript | None,
+        clock: Clock,
+        held_by: str | None = None,
     ) -> None:
-        self.link = SerialLink(port, baudrate, line_framer, xonxoff=True, transcript=transcript, held_by=held_by)
+        self.link = SerialLink(
+            port, baudrate, line_framer, xonxoff=True, transcript=transcript, clock=clock, held_by=held_by
+        )
         self.reply_s = reply_s
 
     def close(self) -> None:
@@ -127,7 +135,7 @@ class SMC100Line:
         # Replies carry no id: one that waits here already belongs to an earlier question.
         link.purge(0.0)
         self.send(address, command)
-        deadline_s = time.monotonic() + reply_s
+        deadline_s = link.clock.now_s() + reply_s
         start = f"{address}{command[:2]}"
         while (frame := link.read_frame(deadline_s)) is not None:
             text = frame.decode("ascii", "replace")
@@ -147,7 +155,7 @@ class SMC100Axis(MotionAxis):
     """The stage of one controller."""
 
     def __init__(self, name: str, config: Config, line: SMC100Line, lines: LineRegistry) -> None:
-        super().__init__(name, config)
+        super().__init__(name, config, lines.clock)
         self.config: Config = config
         self._line, self._lines = line, lines
         version = self._ask("VE", _TEXT)
@@ -241,8 +249,8 @@ class SMC100Axis(MotionAxis):
 
     def _restart(self) -> None:
         self._line.send(self.config.address, "RS")
-        give_up_s = time.monotonic() + RESTART_S
-        while time.monotonic() < give_up_s:
+        give_up_s = self.clock.now_s() + RESTART_S
+        while self.clock.now_s() < give_up_s:
             try:
                 if int(self._ask("TS", _STATE, 0.3)[4:], 16) in NOT_REFERENCED:
                     return
@@ -284,7 +292,9 @@ def open(name: str, config: Config, lines: LineRegistry) -> SMC100Axis:
     line = lines.take(
         config.port,
         SMC100Line,
-        lambda transcript: SMC100Line(config.port, config.baudrate, config.reply_s or 0.5, transcript, config.held_by),
+        lambda transcript: SMC100Line(
+            config.port, config.baudrate, config.reply_s or 0.5, transcript, lines.clock, config.held_by
+        ),
     )
     try:
         return SMC100Axis(name, config, line, lines)

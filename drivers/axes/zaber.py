@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import itertools
 import re
-import time
 from dataclasses import dataclass
 from typing import Literal
 
 from pydantic import Field
 
+from drivers.clock import Clock
 from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
 from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
 from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
@@ -111,9 +111,15 @@ class ZaberLine:
     """One chain of devices: sends commands, gives each reply to its request by address, axis and id."""
 
     def __init__(
-        self, port: str, baudrate: int, reply_s: float, transcript: Transcript | None, held_by: str | None = None
+        self,
+        port: str,
+        baudrate: int,
+        reply_s: float,
+        transcript: Transcript | None,
+        clock: Clock,
+        held_by: str | None = None,
     ) -> None:
-        self.link = SerialLink(port, baudrate, line_framer, transcript=transcript, held_by=held_by)
+        self.link = SerialLink(port, baudrate, line_framer, transcript=transcript, clock=clock, held_by=held_by)
         self.reply_s = reply_s
         # A stop from another thread takes an id at the same time: never the same one.
         self._message_ids = itertools.cycle(range(1, 100))
@@ -163,7 +169,7 @@ class ZaberLine:
     def _exchange(self, address: int, axis: int, words: str) -> tuple[Reply | None, list[bytes]]:
         seen: list[bytes] = []
         message_id = self.send(address, axis, words)
-        deadline_s = time.monotonic() + self.reply_s
+        deadline_s = self.link.clock.now_s() + self.reply_s
         while (frame := self.link.read_frame(deadline_s)) is not None:
             reply = parse_reply(frame)
             if (
@@ -182,12 +188,12 @@ class ZaberLine:
         replies: list[Reply] = []
         with self.link.lock:
             message_id = self.send(0, 0, words)
-            deadline_s = time.monotonic() + self.reply_s
+            deadline_s = self.link.clock.now_s() + self.reply_s
             while (frame := self.link.read_frame(deadline_s)) is not None:
                 reply = parse_reply(frame)
                 if reply is not None and reply.message_id == message_id:
                     replies.append(reply)
-                    deadline_s = time.monotonic() + quiet_s
+                    deadline_s = self.link.clock.now_s() + quiet_s
             return [reply for reply in replies if reply.summed or self._sends_no_checksums(reply.address)]
 
     def _sends_no_checksums(self, address: int) -> bool:
@@ -204,7 +210,7 @@ class ZaberAxis(MotionAxis):
     """One axis of a Zaber device."""
 
     def __init__(self, name: str, config: Config, line: ZaberLine, lines: LineRegistry) -> None:
-        super().__init__(name, config)
+        super().__init__(name, config, lines.clock)
         self.config: Config = config
         self._line, self._lines = line, lines
         self._address, serial_number = self._find()
@@ -317,7 +323,9 @@ def open(name: str, config: Config, lines: LineRegistry) -> ZaberAxis:
     line = lines.take(
         config.port,
         ZaberLine,
-        lambda transcript: ZaberLine(config.port, config.baudrate, config.reply_s or 0.5, transcript, config.held_by),
+        lambda transcript: ZaberLine(
+            config.port, config.baudrate, config.reply_s or 0.5, transcript, lines.clock, config.held_by
+        ),
     )
     try:
         return ZaberAxis(name, config, line, lines)

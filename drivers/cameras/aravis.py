@@ -18,6 +18,7 @@ from drivers.aravis_setup import Config, Setup
 from drivers.aravis_stream import Arrival, FrameStream
 from drivers.camera import Camera, CameraIdentity, CameraSettings, Frame, StreamStatistics
 from drivers.camera_clock import CameraClock
+from drivers.clock import REAL, Clock
 from drivers.errors import CameraError, FrameLost, UnknownPixelFormat
 from drivers.genicam import Features
 from drivers.pixel_formats import PixelFormat
@@ -35,8 +36,13 @@ _TRANSFER_MARGIN_S = 1.0
 _EARLY, _EARLY_S = 0.02, 1e-3
 
 
-def open(name: str, config: Config) -> AravisCamera:
+def open(name: str, config: Config, clock: Clock = REAL) -> AravisCamera:
     """Open the camera and take control of it; nothing is set and nothing is exposed.
+
+    Parameters
+    ----------
+    clock : Clock
+        What exposures and deadlines are counted by. Aravis' own time limits are always real time.
 
     Raises
     ------
@@ -44,21 +50,25 @@ def open(name: str, config: Config) -> AravisCamera:
         Not there (what is there is listed), controlled by another program, or Aravis is not installed.
     """
     aravis, glib_error = load_aravis()
-    return AravisCamera(name, config, aravis, glib_error, open_camera(name, config.device, aravis, glib_error))
+    camera = open_camera(name, config.device, aravis, glib_error)
+    return AravisCamera(name, config, aravis, glib_error, camera, clock)
 
 
 class AravisCamera(Camera):
     """A camera opened by `open`."""
 
-    def __init__(self, name: str, config: Config, aravis: Any, glib_error: Any, camera: Any) -> None:
+    def __init__(
+        self, name: str, config: Config, aravis: Any, glib_error: Any, camera: Any, clock: Clock = REAL
+    ) -> None:
         super().__init__(name, config.retakes)
+        self._clock = clock
         self._config = config
         self._aravis = aravis
         self._camera = camera
         self._features = Features(name, aravis, glib_error, camera)
         self._setup = Setup(name, config, aravis, camera, self._features)
         self._stream: FrameStream | None = None
-        self._clock = CameraClock(name)
+        self._camera_clock = CameraClock(name)
         self._counted: dict[str, int] = {}
         self._stale = 0
         self._asked_structure: tuple[object, ...] | None = None
@@ -148,7 +158,7 @@ class AravisCamera(Camera):
             )
             self._camera.start_acquisition()
         self._last_id = None
-        self._clock.forget()
+        self._camera_clock.forget()
 
     def _stop(self) -> None:
         if self._stream is None:
@@ -172,7 +182,7 @@ class AravisCamera(Camera):
             self._drain()
             self._camera.start_acquisition()
         self._last_id = None
-        self._clock.forget()
+        self._camera_clock.forget()
 
     def _live_stream(self) -> FrameStream:
         if self._stream is None:
@@ -198,8 +208,9 @@ class AravisCamera(Camera):
         self._discard_outstanding()
         self._drain()
         self._check_control("trigger")
+        # Real time: frames carry the time of day at which their first packet came.
         self._sent_unix_s = time.time()
-        self._sent_s = time.monotonic()
+        self._sent_s = self._clock.now_s()
         self._outstanding = True
         if not self._setup.hardware:
             self._features.command("TriggerSoftware")
@@ -222,24 +233,24 @@ class AravisCamera(Camera):
             return
         deadline_s = end_s + _TRANSFER_MARGIN_S
         while self._features.flag("AcquisitionStatus"):
-            if time.monotonic() > deadline_s:
+            if self._clock.now_s() > deadline_s:
                 self._restart()
                 raise self._frame_lost(
                     f"it still exposes {_TRANSFER_MARGIN_S:g} s after the exposure should have ended"
                 )
-            time.sleep(0.001)
+            self._clock.sleep_s(0.001)
 
     def _wait_for_hardware_trigger(self, stream: FrameStream) -> None:
         # The end of the exposure is not visible, so it counts as ended when the frame is there.
         deadline_s = self._sent_s + self._config.trigger_timeout_s + self._setup.exposure_s + self._transfer_s()
         while not stream.has_arrival():
-            if time.monotonic() > deadline_s:
+            if self._clock.now_s() > deadline_s:
                 self._restart()
                 raise self._frame_lost(
                     f"no signal at {self._config.trigger_line} within {self._config.trigger_timeout_s:g} s"
                 )
             self._check_control("wait for the hardware trigger")
-            time.sleep(0.001)
+            self._clock.sleep_s(0.001)
 
     def _do_frame(self) -> Frame:
         stream = self._live_stream()
@@ -250,10 +261,10 @@ class AravisCamera(Camera):
             arrival = stream.take(_SLICE_S)
             if arrival is None:
                 self._check_control("wait for the frame")
-                if time.monotonic() > deadline_s:
+                if self._clock.now_s() > deadline_s:
                     # A camera that is gone says so here, seconds before the heartbeat would.
                     self._restart()
-                    raise self._frame_lost(f"no frame within {time.monotonic() - self._sent_s:.2f} s of the trigger")
+                    raise self._frame_lost(f"no frame within {self._clock.now_s() - self._sent_s:.2f} s of the trigger")
                 continue
             if not self._is_ours(arrival):
                 self._throw_away(stream, arrival)
@@ -270,7 +281,7 @@ class AravisCamera(Camera):
     def _is_ours(self, arrival: Arrival) -> bool:
         """True unless the frame left the camera before the exposure under way can have ended, or has an old number."""
         exposure_s = self._setup.exposure_s
-        came_s = self._clock.came_s(arrival.camera_time_ns, arrival.first_packet_s, exposure_s)
+        came_s = self._camera_clock.came_s(arrival.camera_time_ns, arrival.first_packet_s, exposure_s)
         ended_s = self._sent_unix_s + exposure_s - max(_EARLY * exposure_s, _EARLY_S)
         # Without its first packet a frame has no time; it is not whole either.
         return arrival.follows(self._last_id) and (arrival.first_packet_s <= 0 or came_s >= ended_s)
@@ -312,7 +323,7 @@ class AravisCamera(Camera):
             return
         stream = self._live_stream()
         deadline_s = self._sent_s + self._setup.exposure_s + self._transfer_s()
-        while not self._setup.hardware and time.monotonic() < deadline_s:
+        while not self._setup.hardware and self._clock.now_s() < deadline_s:
             arrival = stream.take(_SLICE_S)
             if arrival is None:
                 self._check_control("wait for an abandoned exposure")
@@ -328,8 +339,8 @@ class AravisCamera(Camera):
         return self._pixel_format().payload_bytes(*self._setup.size) / _SLOWEST_BYTES_S + _TRANSFER_MARGIN_S
 
     def _sleep_until(self, end_s: float) -> None:
-        while (rest_s := end_s - time.monotonic()) > 0:
-            time.sleep(min(rest_s, _SLICE_S))
+        while (rest_s := end_s - self._clock.now_s()) > 0:
+            self._clock.sleep_s(min(rest_s, _SLICE_S))
             self._check_control("expose")
 
     def _check_control(self, what: str) -> None:

@@ -13,11 +13,11 @@ box: the exact text of `E?`, and the number format of `BP?`, which the adapter r
 from __future__ import annotations
 
 import re
-import time
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from drivers.clock import Clock
 from drivers.errors import CommandRejected, DeviceError, ReplyError, ReplyTimeout, WrongDevice
 from drivers.serial_link import LineRegistry, SerialLink, Transcript, line_framer
 from drivers.source import LightSource
@@ -233,7 +233,7 @@ class LedDriver(LightSource):
         with self._link.lock:
             for _ in range(2):
                 self._link.write(query.encode("ascii") + b"\r\n")
-                frame = self._link.read_frame(time.monotonic() + self.config.reply_s)
+                frame = self._link.read_frame(self._link.clock.now_s() + self.config.reply_s)
                 if frame is not None:
                     return frame.decode("ascii", "replace").strip()
                 self._link.purge()
@@ -255,7 +255,7 @@ class LedDriver(LightSource):
 
 def open(config: Config, lines: LineRegistry) -> LedDriver:
     """Open the LED driver; asks who it is and what it drives, and changes nothing."""
-    link = lines.take(config.port, SerialLink, lambda transcript: _link(config, transcript))
+    link = lines.take(config.port, SerialLink, lambda transcript: _link(config, transcript, lines.clock))
     try:
         return LedDriver(config, link, lines)
     except BaseException:
@@ -263,5 +263,5 @@ def open(config: Config, lines: LineRegistry) -> LedDriver:
         raise
 
 
-def _link(config: Config, transcript: Transcript | None) -> SerialLink:
-    return SerialLink(config.port, BAUDRATE, line_framer, transcript=transcript, held_by=config.held_by)
+def _link(config: Config, transcript: Transcript | None, clock: Clock) -> SerialLink:
+    return SerialLink(config.port, BAUDRATE, line_framer, transcript=transcript, clock=clock, held_by=config.held_by)

@@ -7,11 +7,11 @@ the interlock circuit is open (command names as in the public InstrumentKit driv
 
 from __future__ import annotations
 
-import time
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from drivers.clock import Clock
 from drivers.errors import CommandRejected, DeviceError, ReplyError, ReplyTimeout, WrongDevice
 from drivers.serial_link import LineRegistry, SerialLink, Transcript
 from drivers.source import LightSource
@@ -66,12 +66,12 @@ class Shutter(LightSource):
         # `ens` toggles: it is sent only after a fresh reading and never repeated.
         if self._flag("ens?") != on:
             self._tell("ens")
-        deadline_s = time.monotonic() + self.config.blade_s
+        deadline_s = self._link.clock.now_s() + self.config.blade_s
         while self._flag("closed?") == on:
-            if time.monotonic() > deadline_s:
+            if self._link.clock.now_s() > deadline_s:
                 state = "closed" if on else "open"
                 raise DeviceError(asked, f"the blade is still {state} after {self.config.blade_s:g} s", "Look at it")
-            time.sleep(0.005)
+            self._link.clock.sleep_s(0.005)
 
     def is_on(self) -> bool:
         """True if the blade is open."""
@@ -118,7 +118,7 @@ class Shutter(LightSource):
         asked = f"shutter on {self.config.port}, {text}"
         with self._link.lock:
             self._link.write(text.encode("ascii") + b"\r")
-            frame = self._link.read_frame(time.monotonic() + self.config.reply_s)
+            frame = self._link.read_frame(self._link.clock.now_s() + self.config.reply_s)
         if frame is None:
             raise ReplyTimeout(asked, f"no reply in {self.config.reply_s:g} s", "Check power, cable and baud rate")
         lines = frame.decode("ascii", "replace").replace("\n", "").split("\r")
@@ -132,7 +132,7 @@ class Shutter(LightSource):
 
 def open(config: Config, lines: LineRegistry) -> Shutter:
     """Open the shutter; sends one `id?` and changes nothing."""
-    link = lines.take(config.port, SerialLink, lambda transcript: _link(config, transcript))
+    link = lines.take(config.port, SerialLink, lambda transcript: _link(config, transcript, lines.clock))
     try:
         return Shutter(config, link, lines)
     except BaseException:
@@ -140,5 +140,5 @@ def open(config: Config, lines: LineRegistry) -> Shutter:
         raise
 
 
-def _link(config: Config, transcript: Transcript | None) -> SerialLink:
-    return SerialLink(config.port, BAUDRATE, prompt_framer, transcript=transcript, held_by=config.held_by)
+def _link(config: Config, transcript: Transcript | None, clock: Clock) -> SerialLink:
+    return SerialLink(config.port, BAUDRATE, prompt_framer, transcript=transcript, clock=clock, held_by=config.held_by)

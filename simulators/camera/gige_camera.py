@@ -13,7 +13,6 @@ import ctypes
 import struct
 import tempfile
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.aravis_library import load_aravis
+from drivers.clock import REAL, Clock
 from drivers.errors import CameraError
 from drivers.pixel_formats import PixelFormat, pixel_format
 from simulators.camera import gige_features as features
@@ -88,7 +88,9 @@ class GigeCamera:
     description : {"sfnc", "aravis"}
         Features under their SFNC names, or Aravis' own description with older names (ExposureTimeAbs, GainRaw).
     wait_s : float
-        How long to wait for the address if another simulated camera has it.
+        How long to wait for the address if another simulated camera has it; real time, as that one is another program.
+    clock : drivers.clock.Clock
+        What exposures are counted by; the driver's own.
     """
 
     def __init__(
@@ -102,6 +104,7 @@ class GigeCamera:
         address: str = "127.0.0.1",
         description: Literal["sfnc", "aravis"] = "sfnc",
         wait_s: float = 60.0,
+        clock: Clock = REAL,
     ) -> None:
         self.serial = serial
         self.address = address
@@ -111,6 +114,7 @@ class GigeCamera:
         self._lost_ratio = lost_ratio
         self._description = description
         self._wait_s = wait_s
+        self._clock = clock
         # Holds frames of exposures that start from now on back, as a busy host or a full link does.
         self.delivery_delay_s = 0.0
         self._error: BaseException | None = None
@@ -253,7 +257,7 @@ class GigeCamera:
     # --- the exposure, in the camera's own thread --------------------------------------------------------
 
     def _fill(self, buffer: int, _: int, exposure_us: int, gain_raw: int, code: int) -> None:
-        start_s, delay_s = time.monotonic(), self.delivery_delay_s
+        start_s, delay_s = self._clock.now_s(), self.delivery_delay_s
         camera = self._camera
         try:
             info = self._info(buffer, exposure_us, gain_raw)
@@ -268,7 +272,9 @@ class GigeCamera:
                 camera.set_property("gvsp-lost-ratio", 1.0)
         del camera
         # The frame is sent when this returns, and no frame leaves a camera before its exposure has ended.
-        self._gone.wait(max(0.0, start_s + exposure_us * 1e-6 + delay_s - time.monotonic()))
+        end_s = start_s + exposure_us * 1e-6 + delay_s
+        while (left_s := end_s - self._clock.now_s()) > 0 and not self._gone.wait(left_s):
+            pass
 
     def _info(self, buffer: int, exposure_us: int, gain_raw: int) -> ExposureInfo:
         sfnc = self._description == "sfnc"

@@ -32,6 +32,7 @@ class LoopbackAddress:
         """
         if self._held is not None:
             return
+        # Real time: whoever holds the address may be another program.
         deadline_s = time.monotonic() + wait_s
         while True:
             held = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)

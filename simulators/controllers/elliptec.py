@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -157,7 +156,7 @@ class ElliptecEmulator(Emulator):
         self._last_byte_s = 0.0
 
     def _do_receive(self, data: bytes) -> None:
-        now_s = time.monotonic()
+        now_s = self.clock.base.now_s()
         if now_s - self._last_byte_s > GAP_S:
             self._buffer = ""
         self._last_byte_s = now_s

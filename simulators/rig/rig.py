@@ -21,7 +21,7 @@ from simulators.bench.bench import SimulatedBench
 from simulators.bench.scene import Scene
 from simulators.camera.gige_camera import GigeCamera
 from simulators.camera.pixel_stamp import stamp
-from simulators.clock import Clock
+from simulators.clock import Clock, patient_clock
 from simulators.rig.controller_kinds import served_kinds
 from simulators.rig.model import SimulatorConfig
 from simulators.serial.emulator import Emulator
@@ -42,7 +42,7 @@ class SimulatedRig:
 
     def __init__(self, config: SimulatorConfig, *, with_camera: bool = True) -> None:
         self.config = config
-        self.clock = Clock(config.clock_speed)
+        self.clock = Clock(config.clock_speed, base=patient_clock())
         self.emulators: dict[str, Emulator] = {}
         self.bench: SimulatedBench | None = None
         self.camera: GigeCamera | None = None
@@ -107,6 +107,7 @@ class SimulatedRig:
             lost_ratio=config.packet_loss,
             address=config.camera_address,
             wait_s=config.camera_wait_s,
+            clock=self.clock.base,
         )
         self.camera.start()
 

@@ -6,7 +6,6 @@ import heapq
 import itertools
 import math
 import threading
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 
@@ -206,14 +205,14 @@ class Emulator(ABC):
         with self._lock:
             self._do_advance()
             due = b""
-            while self._queue and self._queue[0][0] <= time.monotonic():
+            while self._queue and self._queue[0][0] <= self.clock.base.now_s():
                 due += heapq.heappop(self._queue)[2]
             return due
 
     def next_output_s(self) -> float | None:
-        """Real seconds until more output can be due; None if only input can cause some."""
+        """Seconds of `clock.base` until more output can be due; None if only input can cause some."""
         with self._lock:
-            times = [self._queue[0][0] - time.monotonic()] if self._queue else []
+            times = [self._queue[0][0] - self.clock.base.now_s()] if self._queue else []
             event_s = self._do_next_event_s()
             if event_s is not None:
                 times.append((event_s - self.clock.now_s()) / self.clock.speed)
@@ -238,7 +237,7 @@ class Emulator(ABC):
         if "garbled" in active:
             data = self.faults.garble(data)
         delay_s = active["late"].size() if "late" in active else 0.0
-        heapq.heappush(self._queue, (time.monotonic() + delay_s, next(self._order), data))
+        heapq.heappush(self._queue, (self.clock.base.now_s() + delay_s, next(self._order), data))
 
     @abstractmethod
     def _do_receive(self, data: bytes) -> None:

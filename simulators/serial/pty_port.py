@@ -23,7 +23,7 @@ class SerialEmulator(Protocol):
         """Return the bytes that are due for the host now."""
 
     def next_output_s(self) -> float | None:
-        """Real seconds until more output can be due; None if only input can cause some."""
+        """Seconds until more output can be due, asked again when they are over; None if only input can cause some."""
 
 
 class PtyPort:
@@ -94,6 +94,7 @@ class PtyPort:
                     data = self._read()
                     if data is None:
                         # Nobody has the port open: what is not yet sent is lost, as on a cable without a host.
+                        # Real time: a program outside may open the port at any moment.
                         pending = b""
                         time.sleep(0.005)
                     else:

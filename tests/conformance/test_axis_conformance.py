@@ -29,7 +29,7 @@ from drivers.errors import (
 from drivers.motion import AxisConfig, MotionAxis
 from drivers.registry import axis_kinds, open_axis
 from drivers.serial_link import LineRegistry
-from simulators.clock import Clock
+from simulators.clock import Clock, patient_clock
 from simulators.rig.controller_kinds import axis_configs, served_kinds
 from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort
@@ -66,8 +66,8 @@ class Bench:
 def served(kind: str, homed: bool = True, speed: float = FAST, **options: object) -> Iterator[Bench]:
     """Serve one kind; homed by default, so that a test need not wait for homing."""
     options = {"limits_deg": WIDE, "faults": FaultSchedule(seed=7)} | options
-    emulator = served_kinds()[kind](ServeOptions(homed=homed, clock=Clock(speed), **options))  # type: ignore[arg-type]
-    with PtyPort(emulator) as port, LineRegistry() as lines:
+    emulator = served_kinds()[kind](ServeOptions(homed=homed, clock=Clock(speed, base=patient_clock()), **options))  # type: ignore[arg-type]
+    with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
         yield Bench(emulator, port, lines, axis_configs(emulator, port.path, homed=homed))
 
 
@@ -182,21 +182,27 @@ def test_two_moves_at_once_on_one_axis_are_refused(kind: str) -> None:
 def test_stop_from_another_thread(kind: str, caplog: pytest.LogCaptureFixture) -> None:
     with served(kind, speed=1.0) as bench:
         axis = bench.open()
-        motion = axis.start_move(120.0)
-        timer = threading.Timer(0.1, axis.stop)
-        timer.start()
-        start_s = time.monotonic()
+        # So far that nobody arrives before the stop, however late the thread gets to run.
+        far_deg = 900.0 if axis.can_stop_a_move else 120.0
+        motion = axis.start_move(far_deg)
+
+        def stop_on_the_way() -> None:
+            while bench.emulator.true_deg(0) < 5.0:
+                time.sleep(0.005)
+            axis.stop()
+
+        stopper = threading.Thread(target=stop_on_the_way)
+        stopper.start()
         if axis.can_stop_a_move:
             with pytest.raises(MotionStopped, match="stopped on request"):
                 motion.wait()
-            assert time.monotonic() - start_s < 0.5
             assert not axis.is_moving()
-            assert 0.0 < axis.read_position().deg < 100.0
+            assert 5.0 < axis.read_position().deg < far_deg / 2
         else:
             with caplog.at_level(logging.WARNING):
                 assert motion.wait().deg == pytest.approx(120.0, abs=0.05)
             assert "cannot be stopped" in caplog.text
-        timer.join()
+        stopper.join()
         # The axis is usable afterwards.
         assert axis.start_move(1.0).wait().deg == pytest.approx(1.0, abs=0.05)
 
@@ -254,7 +260,7 @@ def test_a_passing_fault_never_gives_a_wrong_position(kind: str, fault: str) -> 
             try:
                 position = axis.start_move(target_deg).wait()
             except DeviceError:
-                time.sleep(0.15)
+                patient_clock().sleep_s(0.15)
                 if not axis.is_homed():
                     break
                 continue
@@ -318,7 +324,7 @@ def test_a_port_that_another_program_holds_is_refused_by_name(kind: str) -> None
             process.communicate("\n")
         assert bench.emulator.faults.commands == 0
         bench.open()
-        with LineRegistry() as other, pytest.raises(PortBusy, match=rf"pid {os.getpid()}"):
+        with LineRegistry(clock=patient_clock()) as other, pytest.raises(PortBusy, match=rf"pid {os.getpid()}"):
             open_axis("second", bench.configs[0], other)
 
 

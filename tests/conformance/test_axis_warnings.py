@@ -9,7 +9,7 @@ from drivers.errors import MotionFailed, WrongDevice
 from drivers.motion import MotionAxis
 from drivers.registry import open_axis
 from drivers.serial_link import LineRegistry
-from simulators.clock import Clock
+from simulators.clock import Clock, patient_clock
 from simulators.rig.controller_kinds import axis_configs, served_kinds
 from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort
@@ -18,8 +18,8 @@ from simulators.serial.serve_options import ServeOptions
 
 @contextmanager
 def opened(kind: str, model: str | None = None, **changes: object) -> Iterator[tuple[Emulator, MotionAxis]]:
-    emulator = served_kinds()[kind](ServeOptions(homed=True, model=model, clock=Clock(100.0)))
-    with PtyPort(emulator) as port, LineRegistry() as lines:
+    emulator = served_kinds()[kind](ServeOptions(homed=True, model=model, clock=Clock(100.0, base=patient_clock())))
+    with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
         config = axis_configs(emulator, port.path, homed=True)[0].model_copy(update=changes)
         yield emulator, open_axis("axis", config, lines)
 

@@ -18,6 +18,7 @@ from drivers.cameras import aravis
 from drivers.errors import CameraBusy, CameraError, CameraLost, FrameLost
 from simulators.camera.gige_camera import ExposureInfo, GigeCamera
 from simulators.camera.pixel_stamp import read_stamp, stamp
+from simulators.clock import patient_clock
 
 SIZE = (128, 64)
 
@@ -42,10 +43,10 @@ class Scene:
 
 def expose_unasked(simulated: GigeCamera, scene: Scene) -> None:
     """Start an exposure behind the driver's back; returns when it has begun, however busy the machine is."""
-    before, deadline_s = scene.exposures, time.monotonic() + 10
+    before, deadline_s = scene.exposures, patient_clock().now_s() + 10
     simulated.fire()
     while scene.exposures == before:
-        assert time.monotonic() < deadline_s, "the camera did not start the exposure"
+        assert patient_clock().now_s() < deadline_s, "the camera did not start the exposure"
         time.sleep(0.001)
 
 
@@ -56,13 +57,13 @@ def scene() -> Scene:
 
 @pytest.fixture
 def simulated(scene: Scene) -> Iterator[GigeCamera]:
-    with GigeCamera("FAULT1", *SIZE, scene) as camera:
+    with GigeCamera("FAULT1", *SIZE, scene, clock=patient_clock()) as camera:
         yield camera
 
 
 @pytest.fixture
 def camera(simulated: GigeCamera) -> Iterator[aravis.AravisCamera]:
-    with aravis.open("camera", aravis.Config(device="127.0.0.1", packet_size=1500, bits=12)) as opened:
+    with aravis.open("camera", aravis.Config(device="127.0.0.1", packet_size=1500, bits=12), patient_clock()) as opened:
         opened.configure(CameraSettings(exposure_s=1e-3))
         yield opened
 
@@ -110,7 +111,7 @@ def test_a_split_exposure_is_never_retaken_by_itself(
 def test_two_percent_of_packets_lost_costs_time_and_nothing_else(scene: Scene, simulated: GigeCamera) -> None:
     # 14 packets a frame: one frame in four is hit, and that none of 40 is happens once in 80 000 runs.
     config = aravis.Config(device="127.0.0.1", packet_size=1500, bits=12, retakes=12)
-    with aravis.open("camera", config) as camera:
+    with aravis.open("camera", config, patient_clock()) as camera:
         camera.configure(CameraSettings(exposure_s=1e-3))
         simulated.lost_ratio = 0.02
         for state in range(40):
@@ -166,7 +167,7 @@ def test_a_stray_exposure_before_the_trigger_is_not_taken_for_its_own(
     camera.capture()
     scene.angle_deg = 1.0
     expose_unasked(simulated, scene)
-    time.sleep(pause_s)
+    patient_clock().sleep_s(pause_s)
     scene.angle_deg = 2.0
     frame = camera.capture()[0]
     assert read_stamp(frame.pixels)[0] == 2.0
@@ -184,7 +185,7 @@ def test_a_stray_frame_that_arrives_after_the_trigger_is_not_taken_for_its_own(
         scene.angle_deg = 1.0
         simulated.delivery_delay_s = 0.3
         expose_unasked(simulated, scene)
-        time.sleep(0.1)
+        patient_clock().sleep_s(0.1)
         scene.angle_deg = 2.0
         simulated.delivery_delay_s = 0.0 if number else 0.05
         frame = camera.capture()[0]
@@ -199,24 +200,24 @@ def test_a_camera_that_vanishes_is_noticed_and_can_be_opened_again(
     camera.capture(2)
     exposure = camera.trigger()
     simulated.vanish()
-    gone_s = time.monotonic()
+    gone_s = patient_clock().now_s()
     with pytest.raises(CameraLost, match=r"does not answer|obeys another"):
         exposure.frame()
-    assert time.monotonic() - gone_s < 10
+    assert patient_clock().now_s() - gone_s < 10
     with pytest.raises(CameraLost):
         camera.capture()
-    closing_s = time.monotonic()
+    closing_s = patient_clock().now_s()
     camera.close()
-    assert time.monotonic() - closing_s < 1
+    assert patient_clock().now_s() - closing_s < 1
     simulated.start()
-    with aravis.open("camera", aravis.Config(device="127.0.0.1", bits=12)) as again:
+    with aravis.open("camera", aravis.Config(device="127.0.0.1", bits=12), patient_clock()) as again:
         again.configure(CameraSettings(exposure_s=1e-3))
         assert read_stamp(again.capture()[0].pixels)[2] == scene.exposures
 
 
 def test_a_second_program_is_refused_and_the_first_goes_on(camera: aravis.AravisCamera) -> None:
     with pytest.raises(CameraBusy, match="another program controls it"):
-        aravis.open("second", aravis.Config(device="127.0.0.1"))
+        aravis.open("second", aravis.Config(device="127.0.0.1"), patient_clock())
     camera.capture()
 
 
@@ -231,13 +232,13 @@ def ctrl_c() -> Iterator[None]:
 @pytest.mark.usefixtures("ctrl_c")
 def test_ctrl_c_gets_through_a_long_wait(simulated: GigeCamera) -> None:
     config = aravis.Config(device="127.0.0.1", trigger_timeout_s=30.0)
-    with aravis.open("camera", config) as camera:
+    with aravis.open("camera", config, patient_clock()) as camera:
         camera.configure(CameraSettings(exposure_s=1e-3, trigger="hardware"))
         threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
-        start_s = time.monotonic()
+        start_s = patient_clock().now_s()
         with pytest.raises(KeyboardInterrupt):
             camera.capture()
-        assert time.monotonic() - start_s < 3
+        assert patient_clock().now_s() - start_s < 3
 
 
 def test_an_address_holds_one_simulated_camera(simulated: GigeCamera) -> None:
@@ -254,8 +255,8 @@ def test_an_error_of_the_pixel_source_is_raised_and_its_frame_not_sent() -> None
     def broken(info: ExposureInfo) -> NDArray[np.uint16]:
         raise ZeroDivisionError("the bench is broken")
 
-    simulated = GigeCamera("FAULT2", *SIZE, broken)
-    with simulated, aravis.open("camera", aravis.Config(device="127.0.0.1", retakes=0)) as camera:
+    simulated = GigeCamera("FAULT2", *SIZE, broken, clock=patient_clock())
+    with simulated, aravis.open("camera", aravis.Config(device="127.0.0.1", retakes=0), patient_clock()) as camera:
         camera.configure(CameraSettings(exposure_s=1e-3))
         with pytest.raises(FrameLost):
             camera.capture()
@@ -267,8 +268,8 @@ def test_an_error_of_the_pixel_source_is_raised_and_its_frame_not_sent() -> None
     "wrong", [np.zeros((64, 128)), np.zeros((2, 2), np.uint16), np.full((64, 128), 5000, np.uint16)]
 )
 def test_counts_that_the_camera_cannot_send_are_an_error_of_the_source(wrong: NDArray[np.uint16]) -> None:
-    simulated = GigeCamera("FAULT3", *SIZE, lambda _: wrong)
-    with simulated, aravis.open("camera", aravis.Config(device="127.0.0.1")) as camera:
+    simulated = GigeCamera("FAULT3", *SIZE, lambda _: wrong, clock=patient_clock())
+    with simulated, aravis.open("camera", aravis.Config(device="127.0.0.1"), patient_clock()) as camera:
         camera.configure(CameraSettings(exposure_s=1e-3))
         camera.trigger().wait_exposed()
         with pytest.raises(ValueError, match="the pixel source gave"):

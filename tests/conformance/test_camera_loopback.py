@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -18,15 +19,22 @@ from drivers.cameras import aravis
 from drivers.errors import CameraError, CameraNotFound, FrameLost, SettingRefused, UnknownPixelFormat
 from simulators.camera import gige_features
 from simulators.camera.gige_camera import ExposureInfo, GigeCamera
+from simulators.clock import patient_clock
 
 Bench = Callable[..., tuple[GigeCamera, aravis.AravisCamera]]
 DARK = CameraSettings(exposure_s=1e-4)
 
 
+@cache
+def _sevens(size: int) -> NDArray[np.uint16]:
+    # Made once for each size: the simulated camera answers nobody while it computes its picture.
+    return (np.arange(size) * 7 % 4096).astype(np.uint16)
+
+
 def counting(info: ExposureInfo) -> NDArray[np.uint16]:
     """A picture in which neighbours differ and each frame differs from the one before."""
-    size = info.width * info.height
-    return ((np.arange(size) * 7 + info.frame_id) % 4096).astype(np.uint16).reshape(info.height, info.width)
+    pixels = (_sevens(info.width * info.height) + np.uint16(info.frame_id % 4096)) & np.uint16(4095)
+    return pixels.reshape(info.height, info.width)
 
 
 @pytest.fixture
@@ -40,9 +48,9 @@ def bench() -> Iterator[Bench]:
             config: aravis.Config | None = None,
             **options: object,
         ) -> tuple[GigeCamera, aravis.AravisCamera]:
-            simulated = stack.enter_context(GigeCamera("LOOP1", *size, source, **options))  # type: ignore[arg-type]
+            simulated = stack.enter_context(GigeCamera("LOOP1", *size, source, clock=patient_clock(), **options))  # type: ignore[arg-type]
             config = config or aravis.Config(device="127.0.0.1", packet_size=9000, bits=12)
-            return simulated, stack.enter_context(aravis.open("camera", config))
+            return simulated, stack.enter_context(aravis.open("camera", config, patient_clock()))
 
         yield make
 
@@ -111,7 +119,7 @@ def test_gain_without_decibels_needs_its_scale(bench: Bench) -> None:
         camera.configure(CameraSettings(gain_db=3.0))
     camera.close()
     config = aravis.Config(device="127.0.0.1", bits=12, gain_raw_per_db=2.0)
-    with aravis.open("camera", config) as scaled:
+    with aravis.open("camera", config, patient_clock()) as scaled:
         assert scaled.configure(CameraSettings(gain_db=3.0)).gain_db == 3.0
         assert simulated.register(0x110) == 6
 
@@ -124,6 +132,7 @@ def test_settings_of_the_rig_file_fill_what_a_plan_leaves_open(bench: Bench) -> 
 
 
 def test_a_full_sensor_comes_through_exactly(bench: Bench) -> None:
+    _sevens(2448 * 2048)
     _, camera = bench(size=(2448, 2048))
     camera.configure(CameraSettings(exposure_s=1e-3, pixel_format="Mono16"))
     frames = camera.capture(3)
@@ -174,7 +183,7 @@ def test_left_aligned_counts_are_shifted_and_a_wrong_shift_is_noticed(bench: Ben
     assert camera.describe().shift == 4
     for bits, shift in ((12, 0), (8, 8), (10, 6)):
         camera.close()
-        with aravis.open("camera", aravis.Config(device="127.0.0.1", bits=bits, shift=shift)) as wrong:
+        with aravis.open("camera", aravis.Config(device="127.0.0.1", bits=bits, shift=shift), patient_clock()) as wrong:
             wrong.configure(DARK)
             with pytest.raises(UnknownPixelFormat, match="`bits` and `shift`"):
                 wrong.capture()
@@ -269,7 +278,7 @@ def test_a_camera_that_is_not_there_is_named_with_those_that_are() -> None:
         GigeCamera("LOOP1", 8, 4, counting),
         pytest.raises(CameraNotFound, match=r"WRONG7.*LOOP1.*127\.0\.0\.1"),
     ):
-        aravis.open("camera", aravis.Config(device="WRONG7"))
+        aravis.open("camera", aravis.Config(device="WRONG7"), patient_clock())
 
 
 def test_packets_larger_than_the_interface_takes_are_refused(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import ModuleType
@@ -16,7 +15,7 @@ from drivers.errors import CommandRejected, DeviceError, PortBusy, ReplyTimeout,
 from drivers.serial_link import LineRegistry
 from drivers.source import LightSource
 from drivers.sources import dc4100, manual, sc10
-from simulators.clock import Clock
+from simulators.clock import Clock, patient_clock
 from simulators.controllers.dc4100 import DC4100Emulator
 from simulators.controllers.sc10 import SC10Emulator
 from simulators.serial.emulator import Emulator
@@ -51,12 +50,12 @@ class Bench:
 @pytest.fixture(params=["sc10", "dc4100"])
 def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
     made: dict[str, tuple[ModuleType, Emulator]] = {
-        "sc10": (sc10, SC10Emulator(Clock())),
-        "dc4100": (dc4100, DC4100Emulator(Clock())),
+        "sc10": (sc10, SC10Emulator(Clock(base=patient_clock()))),
+        "dc4100": (dc4100, DC4100Emulator(Clock(base=patient_clock()))),
     }
     module, emulator = made[request.param]
     port = PtyPort(emulator)
-    with LineRegistry() as lines:
+    with LineRegistry(clock=patient_clock()) as lines:
         yield Bench(module, emulator, port, lines)
     port.close()
 
@@ -92,10 +91,10 @@ def test_it_says_what_it_is(bench: Bench) -> None:
 def test_a_silent_device_is_an_error_in_bounded_time(bench: Bench) -> None:
     source = bench.open()
     bench.emulator.faults.add(parse_fault("silent"))
-    start_s = time.monotonic()
+    start_s = patient_clock().now_s()
     with pytest.raises(ReplyTimeout, match=bench.port.path):
         source.set_light(True)
-    assert time.monotonic() - start_s < 3
+    assert patient_clock().now_s() - start_s < 3
 
 
 @pytest.mark.parametrize("fault", ["silent", "garbled", "foreign"])
@@ -142,9 +141,9 @@ def test_a_source_without_a_choice_says_so() -> None:
 
 @pytest.fixture
 def leds() -> Iterator[tuple[DC4100Emulator, str, LineRegistry]]:
-    emulator = DC4100Emulator(Clock(), wavelengths_nm=(455.0, 530.0, 660.0, None))
+    emulator = DC4100Emulator(Clock(base=patient_clock()), wavelengths_nm=(455.0, 530.0, 660.0, None))
     port = PtyPort(emulator)
-    with LineRegistry() as lines:
+    with LineRegistry(clock=patient_clock()) as lines:
         yield emulator, port.path, lines
     port.close()
 
@@ -194,7 +193,7 @@ def test_a_level_out_of_range_and_an_led_that_cannot_be_on(leds: tuple[DC4100Emu
 
 @given(data=st.binary(max_size=300))
 def test_noise_at_the_emulator_switches_nothing_on_by_accident(data: bytes) -> None:
-    emulator = DC4100Emulator(Clock())
+    emulator = DC4100Emulator(Clock(base=patient_clock()))
     emulator.receive(data)
     emulator.receive(b"\nE?\r\nO? 2\r\n")
     output = emulator.take_output()
@@ -233,7 +232,7 @@ def test_an_operator_who_says_no_or_is_not_there_stops_it() -> None:
 
 
 def test_yes_asks_nothing() -> None:
-    with LineRegistry() as lines:
+    with LineRegistry(clock=patient_clock()) as lines:
         source = manual.open(manual.Config(), lines, yes=True)
         source.select(662.0)
         source.set_light(False)

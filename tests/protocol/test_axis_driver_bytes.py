@@ -12,7 +12,7 @@ from drivers.apt_frames import apt_framer
 from drivers.axes import apt, elliptec, esp301, smc100, zaber
 from drivers.errors import CommandRejected, NotHomedError, ReplyError
 from drivers.serial_link import LONGEST_FRAME, LineRegistry, line_framer
-from simulators.clock import Clock
+from simulators.clock import Clock, patient_clock
 from simulators.controllers import esp301 as esp301_emulator
 from simulators.controllers import zaber as zaber_emulator
 from simulators.serial.pty_port import PtyPort
@@ -47,8 +47,8 @@ def scripted(*pairs: tuple[bytes, bytes]) -> Iterator[str]:
     script = Script(list(pairs))
     with PtyPort(script) as port:
         yield port.path
-        give_up_s = time.monotonic() + 1.0
-        while script.pairs and time.monotonic() < give_up_s:
+        give_up_s = patient_clock().now_s() + 1.0
+        while script.pairs and patient_clock().now_s() < give_up_s:
             time.sleep(0.01)
     assert (script.pairs, script.received) == ([], b"")
 
@@ -76,7 +76,7 @@ def test_zaber_exchange_sorts_out_what_is_not_its_reply() -> None:
         (b"/" + summed("2 1 02") + b"\n", b"@" + summed("02 1 02 OK BUSY WR 0") + b"\r\n"),
         (b"/" + summed("2 1 03 fly") + b"\n", b"@" + summed("02 1 03 RJ IDLE -- BADCOMMAND") + b"\r\n"),
     ) as path:
-        line = zaber.ZaberLine(path, 115200, 0.5, None)
+        line = zaber.ZaberLine(path, 115200, 0.5, None, patient_clock())
         assert line.ask(2, 1, "get pos", repeat=True).data == "-77"
         assert line.ask(2, 1, "", repeat=True).busy
         with pytest.raises(CommandRejected, match="BADCOMMAND"):
@@ -96,7 +96,7 @@ def test_elliptec_real_captures() -> None:
         (b"0gs", b"0GS09\r\n"),
         (b"0gs", b"0GS0D\r\n"),
     ]
-    with scripted(*pairs) as path, LineRegistry() as lines:
+    with scripted(*pairs) as path, LineRegistry(clock=patient_clock()) as lines:
         axis = elliptec.open("psg", elliptec.Config(port=path, address="0", serial_number="11400509"), lines)
         assert axis.counts_per_deg == pytest.approx(398.22, abs=0.01)
         position = axis.read_position()
@@ -110,7 +110,7 @@ def test_elliptec_real_captures() -> None:
 
 def test_elliptec_move_bytes() -> None:
     with scripted((b"0ma00008C00", b""), (b"0maFFFFE0E4", b"")) as path:
-        line = elliptec.ElliptecLine(path, 0.3, None)
+        line = elliptec.ElliptecLine(path, 0.3, None, patient_clock())
         for deg in (90.0, -20.0):
             line.start("0", f"ma{round(deg * 143360 / 360) & 0xFFFFFFFF:08X}", 0.0)
         line.close()
@@ -136,7 +136,7 @@ def test_smc100_open_and_refusals() -> None:
         (b"1ST\r\n", b""),
         (b"1TS\r\n", b"1TS010033\r\n"),
     ]
-    with scripted(*opening, *moving) as path, LineRegistry() as lines:
+    with scripted(*opening, *moving) as path, LineRegistry(clock=patient_clock()) as lines:
         arm = smc100.open("arm", smc100.Config(port=path, stage_id="PR50"), lines)
         assert arm.describe().firmware == "2.0.1"
         assert (arm.speed_deg_s, arm.acceleration_deg_s2, arm.limits.max_deg) == (20.0, 80.0, 90.0)
@@ -165,7 +165,7 @@ def test_apt_bytes() -> None:
         (bytes.fromhex("110401005001"), position),
         (bytes.fromhex("650401025001"), b""),
     ]
-    with scripted(*pairs) as path, LineRegistry() as lines:
+    with scripted(*pairs) as path, LineRegistry(clock=patient_clock()) as lines:
         axis = apt.open("psa", apt.Config(port=path, serial_number=27_000_001), lines)
         assert axis.speed_deg_s == pytest.approx(345_522 / 42941.66, rel=1e-4)
         assert axis.read_position().counts == -8
@@ -195,7 +195,7 @@ def test_esp301_bytes() -> None:
         (b"TE?\r", b"213\r\n"),
         (b"TE?\r", b"0\r\n"),
     ]
-    with scripted(*opening) as path, LineRegistry() as lines:
+    with scripted(*opening) as path, LineRegistry(clock=patient_clock()) as lines:
         axis = esp301.open("arm", esp301.Config(port=path, axis=2, stage_id="URS75CC, SN1263"), lines)
         assert axis.describe().serial_number == "SN1263"
         assert axis.read_position().counts == 30.0
@@ -214,7 +214,7 @@ def test_readings_that_disagree_are_no_position() -> None:
         (b"1ID?\r\n", b"1IDX\r\n"),
         *[(f"1{c}?\r\n".encode(), f"1{c}20\r\n".encode()) for c in ("VA", "VA", "AC", "AC", "SL", "SL", "SR", "SR")],
     ]
-    with scripted(*opening, *steps) as path, LineRegistry() as lines:
+    with scripted(*opening, *steps) as path, LineRegistry(clock=patient_clock()) as lines:
         arm = smc100.open("arm", smc100.Config(port=path), lines)
         with pytest.raises(ReplyError, match="contradict"):
             arm.read_position()
@@ -245,7 +245,7 @@ def test_elliptec_end_message_just_before_the_status_still_proves_the_homing() -
         (b"0gs", b"0GS00\r\n"),
         *[(b"0gp", b"0PO00000000\r\n")] * 2,
     ]
-    with scripted(*opening) as path, LineRegistry() as lines:
+    with scripted(*opening) as path, LineRegistry(clock=patient_clock()) as lines:
         config = elliptec.Config(port=path, address="0", pause_before_move_s=0.0)
         axis = elliptec.open("psg", config, lines)
         assert axis.home().wait().counts == 0
@@ -260,7 +260,7 @@ def test_zaber_replies_without_checksum_count_where_the_device_says_that_it_send
         # A checksum that is there must still be right.
         (b"/" + summed("1 1 05 get pos") + b"\n", b"@01 1 05 OK IDLE -- -77:00\r\n"),
     ) as path:
-        line = zaber.ZaberLine(path, 115200, 0.2, None)
+        line = zaber.ZaberLine(path, 115200, 0.2, None, patient_clock())
         assert [reply.data for reply in line.ask_all("get system.serial")] == ["4711"]
         assert line.ask(1, 1, "get pos", repeat=False).data == "-77"
         with pytest.raises(ReplyError):
@@ -275,7 +275,7 @@ def test_a_zaber_reply_that_lost_its_checksum_is_not_believed() -> None:
         (b"/" + summed("1 0 03 get comm.checksum") + b"\n", b"@" + summed("01 0 03 OK IDLE -- 1") + b"\r\n"),
         (b"/" + summed("1 1 04 get pos") + b"\n", b"@01 1 04 OK IDLE -- 7\r\n"),
     ) as path:
-        line = zaber.ZaberLine(path, 115200, 0.2, None)
+        line = zaber.ZaberLine(path, 115200, 0.2, None, patient_clock())
         assert line.ask_all("get system.serial") == []
         with pytest.raises(ReplyError):
             line.ask(1, 1, "get pos", repeat=False)
@@ -283,10 +283,10 @@ def test_a_zaber_reply_that_lost_its_checksum_is_not_believed() -> None:
 
 
 def test_zaber_homes_at_the_lesser_of_two_speeds() -> None:
-    emulator = zaber_emulator.make(ServeOptions(homed=True, clock=Clock(100.0)))
+    emulator = zaber_emulator.make(ServeOptions(homed=True, clock=Clock(100.0, base=patient_clock())))
     for device in emulator.devices:
         device.approach_deg_s = 10 * device.axis.speed_deg_s
-    with PtyPort(emulator) as port, LineRegistry() as lines:
+    with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
         axis = zaber.open("psg", zaber.Config(port=port.path, address=1), lines)
         motion = axis.home()
         assert motion.expected_s == pytest.approx(2 * 360.0 / axis.speed_deg_s, rel=1e-3)
@@ -294,8 +294,8 @@ def test_zaber_homes_at_the_lesser_of_two_speeds() -> None:
 
 
 def test_errors_of_one_esp301_axis_are_kept_while_another_is_asked() -> None:
-    emulator = esp301_emulator.make(ServeOptions(clock=Clock(100.0)))
-    with PtyPort(emulator) as port, LineRegistry() as lines:
+    emulator = esp301_emulator.make(ServeOptions(clock=Clock(100.0, base=patient_clock())))
+    with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
         first, second = (esp301.open(f"axis {k}", esp301.Config(port=port.path, axis=k), lines) for k in (1, 2))
         emulator.errors.extend([(204, 0), (7, 0), (120, 0)])
         with pytest.raises(CommandRejected, match=r"error 7: .*, error 120: homing aborted"):

@@ -10,6 +10,7 @@ import pytest
 from drivers.errors import CommandRejected
 from drivers.serial_link import LineRegistry
 from drivers.sources import dc4100
+from simulators.clock import patient_clock
 from simulators.serial.pty_port import PtyPort
 
 # Status 0xA80: no LED at channels 2, 3 and 4, so one LED is driven.
@@ -56,7 +57,7 @@ class Script:
 
 @pytest.fixture
 def lines() -> Iterator[LineRegistry]:
-    with LineRegistry() as registry:
+    with LineRegistry(clock=patient_clock()) as registry:
         yield registry
 
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from simulators.clock import Clock, ManualClock, TrapezoidMotion
+from simulators.clock import LONGEST_BEAT_S, Clock, ManualClock, PatientClock, TrapezoidMotion, patient_clock
 from simulators.serial.emulator import EmulatedAxis
 from simulators.serial.reply_faults import Fault, FaultSchedule, parse_fault
 
@@ -88,17 +88,43 @@ def test_without_a_reference_the_reported_angle_is_only_relative() -> None:
 
 
 def test_clocks_run_fast_or_jump() -> None:
-    fast = Clock(1000.0)
-    start_s = time.monotonic()
+    base = ManualClock()
+    fast = Clock(1000.0, base=base)
     fast.sleep_s(10.0)
-    assert time.monotonic() - start_s < 1.0
-    assert fast.now_s() >= 10.0
+    assert base.now_s() == pytest.approx(0.01)
+    assert fast.now_s() == pytest.approx(10.0)
     instant = EmulatedAxis(Clock(instant=True), homed=True)
     instant.move_to(1e5)
     assert not instant.is_moving()
     assert instant.position_deg() == 1e5
     with pytest.raises(ValueError, match="positive"):
         Clock(0.0)
+
+
+def test_a_patient_clock_leaves_out_the_time_in_which_it_was_not_looked_at() -> None:
+    real_s = [100.0]
+    clock = PatientClock(lambda: real_s[0])
+    for _ in range(100):
+        real_s[0] += LONGEST_BEAT_S / 2
+        clock.beat()
+    on_time_s = 50 * LONGEST_BEAT_S
+    assert clock.now_s() == pytest.approx(on_time_s)
+    # Kept from running for ten seconds.
+    real_s[0] += 10.0
+    assert clock.now_s() == pytest.approx(on_time_s + LONGEST_BEAT_S)
+    clock.beat()
+    real_s[0] += LONGEST_BEAT_S / 2
+    assert clock.now_s() == pytest.approx(on_time_s + 1.5 * LONGEST_BEAT_S)
+
+
+def test_the_patient_clock_of_this_process_goes_and_waits() -> None:
+    clock = patient_clock()
+    assert clock is patient_clock()
+    start_s, real_s = clock.now_s(), time.monotonic()
+    clock.sleep_s(0.05)
+    assert clock.now_s() - start_s >= 0.05
+    assert time.monotonic() - real_s >= 0.05
+    clock.sleep_s(-1.0)
 
 
 def test_faults_take_effect_when_they_are_due() -> None:

@@ -15,7 +15,7 @@ from drivers.axes import smc100, zaber
 from drivers.errors import PermissionRefused, PortBusy, PortNotFound
 from drivers.registry import axis_kinds, open_axis
 from drivers.serial_link import LineRegistry, SerialLink, line_framer
-from simulators.clock import Clock
+from simulators.clock import Clock, patient_clock
 from simulators.rig.controller_kinds import axis_configs, served_kinds
 from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort
@@ -23,7 +23,7 @@ from simulators.serial.serve_options import ServeOptions
 
 
 def zaber_emulator(**options: object):  # type: ignore[no-untyped-def]
-    return served_kinds()["zaber"](ServeOptions(homed=True, clock=Clock(100.0), **options))  # type: ignore[arg-type]
+    return served_kinds()["zaber"](ServeOptions(homed=True, clock=Clock(100.0, base=patient_clock()), **options))  # type: ignore[arg-type]
 
 
 def test_no_permission_names_the_group(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -76,8 +76,8 @@ def behind_tcp(emulator: Emulator, line_end: bytes = b"\r\n") -> Iterator[str]:
 @pytest.mark.parametrize("line_end", [b"\r\n", b"\r", b"\n"])
 @pytest.mark.parametrize("kind", ["zaber", "esp301", "smc100"])
 def test_an_axis_behind_tcp(kind: str, line_end: bytes) -> None:
-    emulator = served_kinds()[kind](ServeOptions(homed=True, clock=Clock(100.0)))
-    with behind_tcp(emulator, line_end) as port, LineRegistry() as lines:
+    emulator = served_kinds()[kind](ServeOptions(homed=True, clock=Clock(100.0, base=patient_clock())))
+    with behind_tcp(emulator, line_end) as port, LineRegistry(clock=patient_clock()) as lines:
         axis = open_axis("psg", axis_configs(emulator, port, homed=True)[0], lines)
         assert axis.start_move(45.0).wait().deg == pytest.approx(45.0, abs=0.01)
         axis.close()
@@ -93,7 +93,7 @@ def test_the_simulator_behind_a_pseudo_terminal_may_be_named_as_its_holder() -> 
                 SerialLink(port.path, 9600, line_framer)
             with pytest.raises(PortBusy, match="sleep"):
                 SerialLink(port.path, 9600, line_framer, held_by="cat")
-            with LineRegistry() as lines:
+            with LineRegistry(clock=patient_clock()) as lines:
                 config = zaber.Config(port=port.path, address=1, held_by="sleep")
                 assert open_axis("psg", config, lines).start_move(20.0).wait().deg == pytest.approx(20.0, abs=0.01)
         finally:
@@ -102,7 +102,7 @@ def test_the_simulator_behind_a_pseudo_terminal_may_be_named_as_its_holder() -> 
 
 
 def test_a_link_by_another_name_is_the_same_line(tmp_path: Path) -> None:
-    with PtyPort(zaber_emulator()) as port, LineRegistry() as lines:
+    with PtyPort(zaber_emulator()) as port, LineRegistry(clock=patient_clock()) as lines:
         link = tmp_path / "usb-Zaber_by_id"
         link.symlink_to(port.path)
         first = open_axis("psg", zaber.Config(port=str(link), address=1), lines)
@@ -115,7 +115,7 @@ def test_a_link_by_another_name_is_the_same_line(tmp_path: Path) -> None:
 
 
 def test_the_transcript_holds_every_byte(tmp_path: Path) -> None:
-    with PtyPort(zaber_emulator()) as port, LineRegistry(tmp_path / "wire") as lines:
+    with PtyPort(zaber_emulator()) as port, LineRegistry(tmp_path / "wire", patient_clock()) as lines:
         axis = open_axis("psg", zaber.Config(port=port.path, address=1), lines)
         axis.read_position()
         axis.close()
@@ -128,7 +128,7 @@ def test_the_transcript_holds_every_byte(tmp_path: Path) -> None:
 def test_an_emulator_outlives_its_clients() -> None:
     with PtyPort(zaber_emulator()) as port:
         for turn in range(3):
-            with LineRegistry() as lines:
+            with LineRegistry(clock=patient_clock()) as lines:
                 axis = open_axis("psg", axis_configs(port.emulator, port.path)[0], lines)  # type: ignore[arg-type]
                 assert axis.read_position().deg == pytest.approx(10.0 * turn, abs=0.01)
                 axis.start_move(10.0 * (turn + 1)).wait()

@@ -9,7 +9,7 @@ import pytest
 
 from drivers.registry import open_axis
 from drivers.serial_link import LineRegistry
-from simulators.clock import Clock
+from simulators.clock import Clock, patient_clock
 from simulators.rig.controller_kinds import axis_configs, served_kinds
 from simulators.serial.serve_options import ServeOptions
 
@@ -27,7 +27,7 @@ def test_first_line_is_the_port_and_sigterm_ends_it() -> None:
             assert process.stdout is not None
             path = process.stdout.readline().strip()
             emulator = served_kinds()[kind](ServeOptions())
-            with LineRegistry() as lines:
+            with LineRegistry(clock=patient_clock()) as lines:
                 axis = open_axis("axis", axis_configs(emulator, path, homed=True)[0], lines)
                 assert axis.is_homed()
                 # A full turn takes 1 to 2 seconds.
@@ -42,7 +42,7 @@ def test_options_reach_the_emulator() -> None:
         assert process.stdout is not None
         path = process.stdout.readline().strip()
         emulator = served_kinds()["smc100"](ServeOptions(axes=2))
-        with LineRegistry() as lines:
+        with LineRegistry(clock=patient_clock()) as lines:
             axis = open_axis("arm", axis_configs(emulator, path)[1], lines)
             assert (axis.limits.min_deg, axis.limits.max_deg, axis.speed_deg_s) == (-5.0, 95.0, 10.0)
             assert axis.describe().model.startswith("CONEX-CC")
@@ -76,7 +76,7 @@ def test_wrong_options_are_explained(arguments: list[str], message: str) -> None
 
 
 def test_defaults_are_those_that_the_documentation_names() -> None:
-    options = ServeOptions(clock=Clock())
+    options = ServeOptions(clock=Clock(base=patient_clock()))
     zaber = served_kinds()["zaber"](options)
     assert [(axis.min_deg, axis.max_deg) for axis in zaber.axes] == [(None, None), (None, None), (0.0, 190.0)]
     assert not any(axis.homed for axis in zaber.axes)
