@@ -12,11 +12,13 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, help="Emulated hardware that speaks the real bytes.")
+from processing.commands.command_line import Version, application
+
+app = application("simulate", "Emulated hardware that speaks the real bytes.")
 
 
-@app.callback()
-def _simulate() -> None:
+@app.callback(no_args_is_help=True)
+def _simulate(version: Version = False) -> None:
     """Emulated hardware: one controller, or a whole rig."""
 
 

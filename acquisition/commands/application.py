@@ -12,18 +12,12 @@ import typer
 
 from acquisition.commands import by_hand
 from acquisition.commands.defaults import INTERRUPTED, RigFile
+from processing.commands.command_line import Version, application
 
 if TYPE_CHECKING:
     from acquisition.stop_request import StopRequest
 
-app = typer.Typer(
-    name="acquire",
-    help="Take Mueller and Stokes captures.",
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
+app = application("acquire", "Take Mueller and Stokes captures.")
 
 Omega = Annotated[float | None, typer.Option("--omega", help="angle between source and camera, degrees")]
 ModeName = Annotated[str | None, typer.Option("--mode", help="drr (Mueller image) or stokes (one generator state)")]
@@ -49,6 +43,7 @@ def capture(
     resume: Annotated[Path | None, typer.Option(help="go on with this partial capture")] = None,
     live: Annotated[bool, typer.Option("--live", help="show the run on a local web page")] = False,
     yes: Annotated[bool, typer.Option("--yes", help="answer every question with yes")] = False,
+    version: Version = False,
 ) -> None:
     """Take a capture: `acquire --omega 35`."""
     if context.invoked_subcommand is not None:

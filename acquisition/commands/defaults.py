@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+#: In the checkout a link to `configs/`, in the wheel the files themselves.
+CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 DEFAULT_RIG = CONFIGS / "rigs" / "simulated.yaml"
 #: Exit code after Ctrl-C or the stop button.
 INTERRUPTED = 130

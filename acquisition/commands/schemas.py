@@ -12,10 +12,11 @@ from pydantic import BaseModel
 
 from acquisition.campaign.plan import Campaign
 from acquisition.capture.plan import MeasurementPlan
+from acquisition.commands.defaults import CONFIGS
 from acquisition.rig.config import RigConfig
 from processing.instrument.model import InstrumentModel
 
-FOLDER = Path(__file__).resolve().parents[2] / "configs" / "schemas"
+FOLDER = CONFIGS / "schemas"
 MODELS: dict[str, type[BaseModel]] = {
     "rig": RigConfig,
     "plan": MeasurementPlan,

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import typer
-
 from processing.commands import (
     axostep,
     calibrate,
@@ -21,16 +19,9 @@ from processing.commands import (
     tables,
     xi0,
 )
-from processing.commands.command_line import run
+from processing.commands.command_line import Version, application, run
 
-app = typer.Typer(
-    name="process",
-    help="Captures to Mueller and Stokes images, reflectance, coherency eigenvalues and reports.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-)
+app = application("process", "Captures to Mueller and Stokes images, reflectance, coherency eigenvalues and reports.")
 
 # One line a module that brings commands. It must not import anything heavy at its top: `--help` is fast.
 axostep.register(app)
@@ -48,9 +39,8 @@ tables.register(app)
 xi0.register(app)
 
 
-@app.callback()
-def _process() -> None:
-    # A callback keeps `process NAME` a group of commands even while there is only one of them.
+@app.callback(no_args_is_help=True)
+def _process(version: Version = False) -> None:
     pass
 
 

@@ -1,15 +1,40 @@
-"""Run a typer application: errors of the user become one message and an exit code, never a traceback."""
+"""What the four commands share: their look, `--version`, and errors of the user as one message, never a traceback."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
+from typing import Annotated
 
 import typer
 
 from processing.errors import ProcessError
 
 INTERRUPTED = 130
+
+
+def _tell_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"umov {version('umov')}")
+        raise typer.Exit()
+
+
+#: The option `--version` of an application's callback or only command.
+Version = Annotated[
+    bool, typer.Option("--version", help="print the version and stop", callback=_tell_version, is_eager=True)
+]
+
+
+def application(name: str, text: str) -> typer.Typer:
+    """An application with the look that all four share: plain help, also by -h, and shell completion."""
+    return typer.Typer(
+        name=name,
+        help=text,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
 
 
 def run(app: typer.Typer, argv: Sequence[str] | None = None) -> None:

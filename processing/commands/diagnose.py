@@ -9,15 +9,9 @@ from typing import Annotated
 
 import typer
 
-from processing.commands.command_line import run
+from processing.commands.command_line import Version, application, run
 
-app = typer.Typer(
-    name="diagnose",
-    help="Compare captures with an instrument model and find the effect that the model lacks.",
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-)
+app = application("diagnose", "Compare captures with an instrument model and find the effect that the model lacks.")
 
 
 @app.command()
@@ -33,6 +27,7 @@ def diagnose_command(
         Path | None, typer.Option(help="Material file: the sample is triply degenerate with this dominant process.")
     ] = None,
     geometry: Annotated[Path | None, typer.Option(help="Geometry file of the object, with --reflectance.")] = None,
+    version: Version = False,
 ) -> None:
     """Trace the residual between intensities and model to the effects that explain it; say so if none does."""
     # The problems are many and small: BLAS threads would only wait for one another.

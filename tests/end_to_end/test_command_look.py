@@ -1,0 +1,39 @@
+"""One look of the four commands: -h and --help everywhere, --version, completion."""
+
+from importlib.metadata import version
+
+import pytest
+from typer.testing import CliRunner
+
+from acquisition.commands.application import app as acquire
+from processing.commands.application import app as process
+from processing.commands.diagnose import app as diagnose
+from simulators.cli import app as simulate
+
+COMMANDS = {"acquire": acquire, "process": process, "diagnose": diagnose, "simulate": simulate}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_version_and_help(name):
+    run = CliRunner().invoke
+    assert run(COMMANDS[name], ["--version"]).output == f"umov {version('umov')}\n"
+    short, long = (run(COMMANDS[name], [option], prog_name=name) for option in ("-h", "--help"))
+    assert short.exit_code == long.exit_code == 0
+    assert short.output == long.output
+    assert short.output.startswith(f"Usage: {name} ")
+    assert "--show-completion" in short.output
+
+
+@pytest.mark.parametrize(
+    ("name", "command"),
+    [
+        (name, command.name or command.callback.__name__)
+        for name, app in COMMANDS.items()
+        for command in app.registered_commands
+        if name != "diagnose"
+    ],
+)
+def test_every_command_has_short_help(name, command):
+    done = CliRunner().invoke(COMMANDS[name], [command, "-h"], prog_name=name)
+    assert done.exit_code == 0
+    assert f"Usage: {name} {command}" in done.output
