@@ -3,77 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
-import pkgutil
-from functools import reduce
-from operator import or_
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import Any, Self
 
-from pydantic import Field, ModelWrapValidatorHandler, TypeAdapter, ValidationError, model_validator
+from pydantic import ModelWrapValidatorHandler, TypeAdapter, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from acquisition.rig.parts import ForbiddenPose, HomingPath, InterlockConfig, ModeConfig, Part, Range
-from acquisition.rig.solids import Solids
+from acquisition.rig.sections import AxisEntry, RigSections
 from acquisition.rig.soundness import Mistake, find_mistakes
-from drivers.motion import AxisConfig
-from processing.storage.capture_schema import Detector
 from processing.yaml_file import load_yaml, message_of
-from simulators.rig.model import SimulatorConfig
 
 
-def kinds(package: str) -> list[str]:
-    """Names of the driver modules in a folder, for instance of "drivers.axes": each is a kind in YAML."""
-    folder = importlib.import_module(package)
-    return sorted(m.name for m in pkgutil.iter_modules(folder.__path__) if not m.name.startswith("_"))
-
-
-def _entry(package: str) -> Any:
-    # Adding a controller is one new file: its Config class joins the union by being in the folder.
-    classes = [importlib.import_module(f"{package}.{kind}").Config for kind in kinds(package)]
-    return Annotated[reduce(or_, classes), Field(discriminator="kind")] if len(classes) > 1 else classes[0]
-
-
-if TYPE_CHECKING:
-    AxisEntry = AxisConfig
-    CameraEntry = Any
-    SourceEntry = Any
-else:
-    AxisEntry = _entry("drivers.axes")
-    CameraEntry = _entry("drivers.cameras")
-    SourceEntry = _entry("drivers.sources")
-
-
-class RigConfig(Part):
-    """A rig. Relative paths are relative to the rig file."""
-
-    kind: Literal["rig"] = "rig"
-    name: str
-    axes: dict[str, AxisEntry]
-    camera: CameraEntry
-    source: SourceEntry | None = None
-    detector: Detector
-    modes: dict[str, ModeConfig]
-    wavelengths_nm: tuple[Annotated[float, Field(gt=0)], ...]
-    home_at_start: bool = Field(default=False, description="home axes without a reference before the first move")
-    home_order: tuple[str, ...] = ()
-    homing: dict[str, HomingPath] = Field(default={}, description="what an axis may pass while it homes; default all")
-    park_deg: dict[str, float] = Field(default={}, description="where a run that is stopped leaves axes")
-    endless: tuple[str, ...] = Field(
-        default=(), description="axes that may go on to the next turn instead of unwinding between captures"
-    )
-    backlash_deg: dict[str, Annotated[float, Field(ge=0, le=90)]] = Field(
-        default={}, description="a downward move of the axis goes this far beyond its target and comes back up"
-    )
-    settle_s: float = Field(default=0.02, ge=0, le=600, description="wait after the last axis is idle")
-    exposure_s: Range = Field(default=(1e-5, 10.0), description="shortest and longest exposure")
-    retakes: int = Field(default=3, ge=0, le=1000, description="tries again for a state whose frame is incomplete")
-    wire_log: Path | None = Field(default=None, description="folder for a transcript of every byte on serial lines")
-    forbidden: tuple[ForbiddenPose, ...] = ()
-    solids: Solids | None = Field(default=None, description="arm, sample holder, ... that must keep apart")
-    interlocks: tuple[InterlockConfig, ...] = ()
-    simulated: bool = Field(default=False, description="the devices at these ports are emulators (simulate rig)")
-    simulator: SimulatorConfig | None = None
+class RigConfig(RigSections):
+    """A rig whose sections fit together. Relative paths are relative to the rig file."""
 
     @model_validator(mode="wrap")
     @classmethod

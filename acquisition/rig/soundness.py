@@ -14,20 +14,20 @@ from drivers.motion import AxisConfig
 from simulators.rig.model import SCHEME
 
 if TYPE_CHECKING:
-    from acquisition.rig.config import RigConfig
+    from acquisition.rig.sections import RigSections
 
 #: Keys that lead to the place in the file, and what is wrong there.
 Mistake = tuple[tuple[int | str, ...], str]
 
 
-def find_mistakes(rig: RigConfig) -> list[Mistake]:
+def find_mistakes(rig: RigSections) -> list[Mistake]:
     """Everything that the sections of a rig file say about each other and cannot be meant.
 
     Parameters
     ----------
     rig : may lack what could not be read; an axis that could not be read is None.
     """
-    looks: tuple[Callable[[RigConfig], Iterator[Mistake]], ...] = (
+    looks: tuple[Callable[[RigSections], Iterator[Mistake]], ...] = (
         _axis_names,
         _axes_given_twice,
         _shared_places,
@@ -41,7 +41,7 @@ def find_mistakes(rig: RigConfig) -> list[Mistake]:
     return [mistake for look in looks for mistake in look(rig)]
 
 
-def _named_axes(rig: RigConfig) -> Iterator[tuple[tuple[int | str, ...], str]]:
+def _named_axes(rig: RigSections) -> Iterator[tuple[tuple[int | str, ...], str]]:
     """Every place in the file that names an axis, with the name."""
     for section in ("park_deg", "backlash_deg", "homing"):
         for name in getattr(rig, section):
@@ -62,7 +62,7 @@ def _named_axes(rig: RigConfig) -> Iterator[tuple[tuple[int | str, ...], str]]:
         yield ("simulator", "axes", name), name
 
 
-def _axis_names(rig: RigConfig) -> Iterator[Mistake]:
+def _axis_names(rig: RigSections) -> Iterator[Mistake]:
     for where, name in _named_axes(rig):
         if name not in rig.axes:
             near = difflib.get_close_matches(name, rig.axes, n=1)
@@ -70,7 +70,7 @@ def _axis_names(rig: RigConfig) -> Iterator[Mistake]:
             yield where, f"there is no axis {name!r}, only {', '.join(rig.axes)}{hint}"
 
 
-def _axes_given_twice(rig: RigConfig) -> Iterator[Mistake]:
+def _axes_given_twice(rig: RigSections) -> Iterator[Mistake]:
     for section in ("home_order", "endless"):
         names = getattr(rig, section)
         for k, name in enumerate(names):
@@ -78,7 +78,7 @@ def _axes_given_twice(rig: RigConfig) -> Iterator[Mistake]:
                 yield (section, k), f"axis {name!r} is there twice"
 
 
-def _shared_places(rig: RigConfig) -> Iterator[Mistake]:
+def _shared_places(rig: RigSections) -> Iterator[Mistake]:
     """Two axes at one address, two kinds of device on one line, two rig axes on one emulated axis."""
     places: dict[tuple[str, str], str] = {}
     lines: dict[str, tuple[str, str]] = {}
@@ -99,14 +99,14 @@ def _shared_places(rig: RigConfig) -> Iterator[Mistake]:
             yield ("simulator", "axes", name), f"the same emulated axis as {other}"
 
 
-def _devices_with_port(rig: RigConfig) -> Iterator[tuple[tuple[str, ...], str, Any]]:
+def _devices_with_port(rig: RigSections) -> Iterator[tuple[tuple[str, ...], str, Any]]:
     yield from ((("axes", name), name, entry) for name, entry in rig.axes.items() if entry is not None)
     source = getattr(rig, "source", None)
     if getattr(source, "port", None) is not None:
         yield ("source",), "the source", source
 
 
-def _emulated_ports(rig: RigConfig) -> Iterator[Mistake]:
+def _emulated_ports(rig: RigSections) -> Iterator[Mistake]:
     if rig.simulator is None:
         return
     for where, _, entry in _devices_with_port(rig):
@@ -116,7 +116,7 @@ def _emulated_ports(rig: RigConfig) -> Iterator[Mistake]:
         yield ("simulator", "axes"), f"axis {name!r} of the rig is not there"
 
 
-def _angles_outside_limits(rig: RigConfig) -> Iterator[Mistake]:
+def _angles_outside_limits(rig: RigSections) -> Iterator[Mistake]:
     for where, name, angle in _given_angles(rig):
         low, high = getattr(rig.axes.get(name), "limits_deg", None) or (None, None)
         if (low is not None and angle < low) or (high is not None and angle > high):
@@ -124,7 +124,7 @@ def _angles_outside_limits(rig: RigConfig) -> Iterator[Mistake]:
             yield where, f"{angle:g} deg lies outside the limits of {name}, {ends} deg"
 
 
-def _given_angles(rig: RigConfig) -> Iterator[tuple[tuple[int | str, ...], str, float]]:
+def _given_angles(rig: RigSections) -> Iterator[tuple[tuple[int | str, ...], str, float]]:
     for name, angle in rig.park_deg.items():
         yield ("park_deg", name), name, angle
     for mode, config in rig.modes.items():
@@ -133,7 +133,7 @@ def _given_angles(rig: RigConfig) -> Iterator[tuple[tuple[int | str, ...], str, 
                 yield ("modes", mode, "pose_deg", name), name, angle
 
 
-def _wavelengths(rig: RigConfig) -> Iterator[Mistake]:
+def _wavelengths(rig: RigSections) -> Iterator[Mistake]:
     given = rig.wavelengths_nm
     for k, wavelength in enumerate(given):
         if wavelength in given[:k]:
@@ -142,7 +142,7 @@ def _wavelengths(rig: RigConfig) -> Iterator[Mistake]:
         yield ("exposure_s",), f"the shortest exposure must be positive, not {rig.exposure_s[0]:g} s"
 
 
-def _interlocks(rig: RigConfig) -> Iterator[Mistake]:
+def _interlocks(rig: RigSections) -> Iterator[Mistake]:
     kinds = [entry.kind for entry in rig.interlocks]
     for k, entry in enumerate(rig.interlocks):
         if entry.kind in kinds[:k]:
@@ -155,14 +155,14 @@ def _interlocks(rig: RigConfig) -> Iterator[Mistake]:
             yield ("interlocks", k), f"{entry.kind}: limit {entry.limit:g} is a fraction, less than 1"
 
 
-def _solids(rig: RigConfig) -> Iterator[Mistake]:
+def _solids(rig: RigSections) -> Iterator[Mistake]:
     names = [solid.name for solid in rig.solids.parts] if rig.solids else []
     for k, name in enumerate(names):
         if name in names[:k]:
             yield ("solids", "parts", k, "name"), f"a solid {name!r} is there already"
 
 
-def _ways(rig: RigConfig) -> Iterator[Mistake]:
+def _ways(rig: RigSections) -> Iterator[Mistake]:
     """Parking and homing against forbidden poses and solids; asked only of names that are all there."""
     if any(name not in rig.axes for _, name in _named_axes(rig)):
         return
@@ -175,7 +175,7 @@ def _ways(rig: RigConfig) -> Iterator[Mistake]:
         yield ("homing",), found
 
 
-def _park_meets(rig: RigConfig) -> str | None:
+def _park_meets(rig: RigSections) -> str | None:
     """What is met in the park pose wherever the axes stand that are not parked."""
     park = rig.park_deg
     changes: dict[str, Any] = {"forbidden": tuple(box for box in rig.forbidden if box.ranges_deg.keys() <= park.keys())}

@@ -10,13 +10,13 @@ from acquisition.rig import clearance, forbidden_poses
 from acquisition.rig.forbidden_poses import find_forbidden, spanned, touches
 
 if TYPE_CHECKING:
-    from acquisition.rig.config import RigConfig
+    from acquisition.rig.sections import RigSections
 
 ANYWHERE = (-math.inf, math.inf)
 
 
 def find_obstacle(
-    rig: RigConfig, start_deg: Mapping[str, float], end_deg: Mapping[str, float], moving: Iterable[str] | None = None
+    rig: RigSections, start_deg: Mapping[str, float], end_deg: Mapping[str, float], moving: Iterable[str] | None = None
 ) -> str | None:
     """What a move meets anywhere on its way, in words; None if the way is free.
 
@@ -37,12 +37,12 @@ def find_obstacle(
     return None if clash is None else clearance.describe(clash, rig.solids.margin_mm)
 
 
-def concerned(rig: RigConfig) -> set[str]:
+def concerned(rig: RigSections) -> set[str]:
     """Axes that forbidden poses or solids speak of."""
     return {axis for box in rig.forbidden for axis in box.ranges_deg} | _carriers(rig)
 
 
-def find_homing_obstacle(rig: RigConfig, names: Iterable[str], here_deg: Mapping[str, float]) -> str | None:
+def find_homing_obstacle(rig: RigSections, names: Iterable[str], here_deg: Mapping[str, float]) -> str | None:
     """What axes homed one after another could meet, in words; None if their way is free.
 
     Parameters
@@ -66,7 +66,7 @@ def find_homing_obstacle(rig: RigConfig, names: Iterable[str], here_deg: Mapping
     return None
 
 
-def _met_homing(rig: RigConfig, name: str, ways: Mapping[str, tuple[float, float]]) -> str | None:
+def _met_homing(rig: RigSections, name: str, ways: Mapping[str, tuple[float, float]]) -> str | None:
     for box in rig.forbidden:
         if name in box.ranges_deg and not box.homing_may_pass and touches(box, ways):
             return forbidden_poses.describe(box)
@@ -76,5 +76,5 @@ def _met_homing(rig: RigConfig, name: str, ways: Mapping[str, tuple[float, float
     return None if clash is None else clearance.describe(clash, rig.solids.margin_mm)
 
 
-def _carriers(rig: RigConfig) -> set[str]:
+def _carriers(rig: RigSections) -> set[str]:
     return {solid.turns_with for solid in rig.solids.parts if solid.turns_with} if rig.solids else set()
