@@ -7,6 +7,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from drivers import genicam
+from drivers.acquisition_status import AcquisitionStatus
 from drivers.aravis_library import interface_of
 from drivers.camera import CameraSettings
 from drivers.errors import CameraError, SettingRefused
@@ -51,6 +52,14 @@ class Config(BaseModel):
     trigger_line: str = Field(default="Line0", description="input of the hardware trigger")
     trigger_edge: Literal["RisingEdge", "FallingEdge"] = "RisingEdge"
     trigger_timeout_s: float = Field(default=10.0, gt=0, description="longest wait for a hardware trigger")
+    mosaic_binning: Literal["like_with_like"] | None = Field(
+        default=None, description="on a polarization mosaic the camera bins pixels behind the same polarizer alone"
+    )
+    answers_early: bool = Field(
+        default=False,
+        description="a simulated camera that sends its frame before the exposure time is over; stale frames are then "
+        "told by number and by the time of the trigger alone",
+    )
     trigger_latency_s: float = Field(default=0.002, ge=0, description="added to the exposure before the bench moves")
 
 
@@ -67,8 +76,8 @@ class Setup:
         Width and height of a frame as read back.
     hardware : bool
         True if an input line triggers.
-    has_exposure_status : bool
-        True if the camera tells when an exposure has ended.
+    status : AcquisitionStatus
+        What the camera tells of its trigger and its exposure.
     """
 
     def __init__(self, name: str, config: Config, aravis: Any, camera: Any, features: Features) -> None:
@@ -82,7 +91,7 @@ class Setup:
         self.exposure_s = 0.0
         self.size = (0, 0)
         self.hardware = False
-        self.has_exposure_status = False
+        self.status = AcquisitionStatus(None)
 
     def release(self) -> None:
         """Drop the reference to the camera."""
@@ -120,9 +129,11 @@ class Setup:
         if settings.pixel_format is not None:
             pixel_format(settings.pixel_format)
             features.set_choice("PixelFormat", settings.pixel_format)
-        if settings.binning is not None and (settings.binning != 1 or features.find(("BinningHorizontal",))):
-            features.set_number(("BinningHorizontal",), settings.binning)
-            features.set_number(("BinningVertical",), settings.binning)
+        self._clear_offsets()
+        self._set_both("Binning", settings.binning)
+        self._set_both("Decimation", settings.decimation)
+        self._set_reversed("ReverseX", settings.reverse_x)
+        self._set_reversed("ReverseY", settings.reverse_y)
         self._set_region(settings)
         if self.is_gige:
             self._set_packet_size(settings.packet_size or self._config.packet_size)
@@ -136,14 +147,35 @@ class Setup:
                 f"{fmt.name} holds {fmt.bits} bits",
             )
 
+    def _set_both(self, what: str, factor: int | None) -> None:
+        """Set the binning or decimation along both axes; 1 where the camera has none is no request."""
+        names = (f"{what}Horizontal", f"{what}Vertical")
+        if factor is None or (factor == 1 and self._features.find(names[:1]) is None):
+            return
+        for name in names:
+            self._features.set_number((name,), factor)
+
+    def _set_reversed(self, name: str, wanted: bool | None) -> None:
+        if not wanted:
+            self._features.switch_off(name)
+        elif self._features.find((name,)) is None:
+            raise self._refused(f"switch {name} on", "this camera has no such feature")
+        else:
+            self._features.set_flag(name, True)
+
+    def _clear_offsets(self) -> None:
+        # They limit the size. One at zero is left alone: while the size is too large for a new binning, zero is more
+        # than its limit.
+        for offset in ("OffsetX", "OffsetY"):
+            if self._features.number((offset,)):
+                self._features.set_number((offset,), 0)
+
     def _set_region(self, settings: CameraSettings) -> None:
-        # Offsets first to zero: they limit the size. Then the size, which limits the offsets.
+        # First the size, which limits the offsets.
         for offset, size, start, length in (
             ("OffsetX", "Width", settings.offset_x, settings.width),
             ("OffsetY", "Height", settings.offset_y, settings.height),
         ):
-            if self._features.find((offset,)) is not None:
-                self._features.set_number((offset,), 0)
             if length is None:
                 with self._features.asking(f"read the limits of {size}"):
                     length = self._camera.get_integer_bounds(size)[1] - (start or 0)
@@ -183,15 +215,7 @@ class Setup:
         if self.hardware and features.find(("TriggerActivation",)) is not None:
             features.set_choice("TriggerActivation", self._config.trigger_edge)
         features.set_choice("TriggerMode", "On")
-        self.has_exposure_status = (
-            features.find(("AcquisitionStatusSelector",)) is not None
-            and features.find(("AcquisitionStatus",)) is not None
-        )
-        if self.has_exposure_status:
-            try:
-                features.set_choice("AcquisitionStatusSelector", "ExposureActive")
-            except SettingRefused:
-                self.has_exposure_status = False
+        self.status = AcquisitionStatus(features)
 
     def set_light(self, settings: CameraSettings) -> None:
         """Exposure, gain and black level: no exposure is under way when this is called."""
@@ -222,6 +246,7 @@ class Setup:
             gain_db = raw / self._config.gain_raw_per_db
         self.exposure_s = (exposure_us or 0.0) * 1e-6
         binning = features.number(("BinningHorizontal",))
+        decimation = features.number(("DecimationHorizontal",))
         with features.asking("read the region"):
             left, top, width, height = self._camera.get_region()
         self.size = (int(width), int(height))
@@ -235,6 +260,9 @@ class Setup:
             offset_x=int(left),
             offset_y=int(top),
             binning=None if binning is None else int(binning),
+            decimation=None if decimation is None else int(decimation),
+            reverse_x=features.optional_flag("ReverseX"),
+            reverse_y=features.optional_flag("ReverseY"),
             packet_size=self.packet_size(),
             frame_average=frame_average or 1,
             trigger="hardware" if self.hardware else "software",

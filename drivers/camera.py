@@ -39,9 +39,14 @@ class CameraSettings(BaseModel):
     offset_x: int | None = Field(default=None, ge=0)
     offset_y: int | None = Field(default=None, ge=0)
     binning: int | None = Field(default=None, gt=0, description="the same along both axes")
+    decimation: int | None = Field(default=None, gt=0, description="every so many-th pixel, along both axes")
+    reverse_x: bool | None = Field(default=None, description="mirrored by the camera; none: switched off")
+    reverse_y: bool | None = Field(default=None, description="turned upside down by the camera; none: switched off")
     packet_size: int | None = Field(default=None, gt=0, description="GigE Vision packet with its headers, bytes")
     frame_average: int | None = Field(default=None, gt=0, description="exposures averaged into one frame")
-    trigger: Literal["software", "hardware"] | None = None
+    trigger: Literal["software", "hardware"] | None = Field(
+        default=None, description="hardware: the signal at trigger_line starts each exposure; software if never set"
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -229,6 +234,11 @@ class Camera(ABC):
         """Real bits of a pixel."""
 
     @property
+    def bins_like_with_like(self) -> bool:
+        """True where the camera is known to bin only pixels behind the same polarizer."""
+        return False
+
+    @property
     def full_scale(self) -> int:
         """Largest count a pixel can have; a pixel there is saturated."""
         return (1 << self.bits) - 1
@@ -316,7 +326,7 @@ class Camera(ABC):
         raise FrameLost(
             lost.asked,
             f"{lost.came_back}; {self._allowed_retakes + 1} tries in a row failed",
-            "Check cable, packet size and network load (acquire doctor measures the packet loss)",
+            lost.what_to_do,
         ) from lost
 
     # --- state -------------------------------------------------------------------------------------------

@@ -132,6 +132,7 @@ class Features:
                 low, high = self._camera.get_integer_bounds(name)
                 value, step = round(value), 0
                 self._check_limits(name, value, low, high)
+                self._check_increment(name, round(value), round(low))
                 self._camera.set_integer(name, value)
                 back = float(self._camera.get_integer(name))
         if not abs(back - value) <= step:
@@ -162,15 +163,39 @@ class Features:
         if isinstance(self._device.get_feature(name), self._aravis.GcEnumeration):
             self.set_choice(name, "Off")
             return
-        with self.asking(f"switch {name} off"):
-            self._camera.set_boolean(name, False)
-            if self._camera.get_boolean(name):
-                raise self._refused(f"switch {name} off", "it stays on")
+        self.set_flag(name, False)
+
+    def set_flag(self, name: str, on: bool) -> None:
+        """Switch a yes-or-no feature and read it back.
+
+        Raises
+        ------
+        SettingRefused
+            It stays as it was.
+        """
+        wanted = "on" if on else "off"
+        with self.asking(f"switch {name} {wanted}"):
+            if bool(self._camera.get_boolean(name)) == on:
+                return
+            self._camera.set_boolean(name, on)
+            if bool(self._camera.get_boolean(name)) != on:
+                raise self._refused(f"switch {name} {wanted}", f"it stays {'off' if on else 'on'}")
 
     def flag(self, name: str) -> bool:
         """Read a yes-or-no feature that the camera is known to have."""
         with self.asking(f"read {name}"):
             return bool(self._camera.get_boolean(name))
+
+    def optional_flag(self, name: str) -> bool | None:
+        """Read a yes-or-no feature; None where the camera has none of that name."""
+        return self.flag(name) if self.find((name,)) is not None else None
+
+    def choices(self, name: str) -> list[str]:
+        """Entries of an enumeration that can be chosen now; empty where the camera has none of that name."""
+        if self.find((name,)) is None:
+            return []
+        with self.asking(f"read the entries of {name}"):
+            return list(self._camera.dup_available_enumerations_as_strings(name))
 
     def command(self, name: str) -> None:
         """Execute a command feature."""
@@ -190,6 +215,12 @@ class Features:
     def _check_limits(self, name: str, value: float, low: float, high: float) -> None:
         if not low <= value <= high:
             raise self._refused(f"set {name} to {value:g}", f"its limits are {low:g} to {high:g} now")
+
+    def _check_increment(self, name: str, value: int, low: int) -> None:
+        step = max(1, round(self._camera.get_integer_increment(name)))
+        below = low + (value - low) // step * step
+        if below != value:
+            raise self._refused(f"set {name} to {value}", f"it goes in steps of {step}: {below} or {below + step}")
 
     def _refused(self, what: str, came_back: str) -> SettingRefused:
         return SettingRefused(

@@ -132,7 +132,7 @@ def check_devices(table: StateTable, rig: Rig) -> list[Check]:
             for target in column:
                 rig.axes[axis].check(float(target))
         except LimitError as error:
-            checks.append(Check(f"limits of {axis}", False, str(error)))
+            checks.append(Check(f"limits of {axis}", False, str(error) + _could_fold(axis, rig)))
         else:
             ends = f"{column.min():g} to {column.max():g} deg"
             checks.append(Check(f"limits of {axis}", True, ends))
@@ -154,6 +154,14 @@ def _check_park(rig: Rig) -> list[Check]:
         except LimitError as error:
             failures.append(Check(f"park_deg of {name}", False, str(error)))
     return failures
+
+
+def _could_fold(axis: str, rig: Rig) -> str:
+    if axis == ARM or axis in rig.config.fold_deg:
+        return ""
+    return (
+        f"; `fold_deg: {{{axis}: 180}}` there takes the same state half a turn away, as polarizers and retarders allow"
+    )
 
 
 def _member(what: str, value: str, known: list[str]) -> Check:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from acquisition.capture.job import Job
+from acquisition.rig.folded_angles import folded
 from acquisition.rig.rig import Rig
 
 #: Seconds that a frame takes to arrive and be written, where nothing overlaps it.
@@ -16,7 +17,7 @@ def capture_seconds(job: Job, rig: Rig, before_deg: Mapping[str, float] | None =
 
     An axis that may go on to the next turn is taken to go on by the shortest way up.
     """
-    table = job.table
+    table = folded(job.table, rig)
     first = {axis: float(column[0]) for axis, column in table.angles_deg.items()}
     here = before_deg or {}
     seconds = sum(_move_s(rig, axis, angle - here[axis]) for axis, angle in first.items() if axis in here)

@@ -39,6 +39,7 @@ def capture_header(
         devices_json=json.dumps(rig.describe(), default=str),
         versions=versions(),
         seed=seed,
+        folded_deg=dict(config.fold_deg),
     )
 
 

@@ -16,10 +16,12 @@ from acquisition.capture.checks import (
     refuse_failed,
     standing_pose_deg,
 )
+from acquisition.capture.mosaic_phase import seen_by_camera
 from acquisition.capture.plan import AutoExposure, MeasurementPlan
 from acquisition.capture.writer import bytes_needed, check_space
 from acquisition.errors import AcquisitionError
 from acquisition.rig.config import RigConfig
+from acquisition.rig.folded_angles import folded
 from acquisition.rig.rig import Rig
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import StateTable
@@ -78,12 +80,14 @@ def prepare(plan: MeasurementPlan, rig: RigConfig) -> Job:
 
 def check_with_devices(job: Job, rig: Rig, folder: Path) -> list[Check]:
     """Limits, door, exposure and disc, as the devices have them; nothing moves."""
-    checks = check_devices(job.table, rig)
+    checks = check_devices(folded(job.table, rig), rig)
     for exposure_s in np.unique(job.table.exposure_s)[::-1]:
         settings = rig.set_exposure(float(exposure_s), job.plan.repeats)
         read_back_s = settings.exposure_s or float(exposure_s)
         close = abs(read_back_s - exposure_s) <= max(0.02 * exposure_s, 5e-5)
         checks.append(Check("camera exposure", close, f"asked {exposure_s:g} s, read back {read_back_s:g} s"))
+    if job.instrument.mosaic is not None:
+        checks.append(_check_mosaic(job.instrument, rig))
     rows, columns = frame_shape(rig)
     needed = bytes_needed(len(job.table), 1, (rows, columns))
     try:
@@ -92,6 +96,14 @@ def check_with_devices(job: Job, rig: Rig, folder: Path) -> list[Check]:
     except AcquisitionError as error:
         checks.append(Check("disc", False, str(error)))
     return checks
+
+
+def _check_mosaic(instrument: InstrumentModel, rig: Rig) -> Check:
+    try:
+        mosaic = seen_by_camera(instrument, rig.require_camera()).mosaic or ()
+    except AcquisitionError as error:
+        return Check("mosaic", False, str(error))
+    return Check("mosaic", True, "from the top left: " + " / ".join(" ".join(line) for line in mosaic))
 
 
 def job_of(path: Path, rig: RigConfig | None = None) -> Job:

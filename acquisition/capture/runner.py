@@ -28,6 +28,7 @@ from drivers.errors import FrameLost
 from drivers.motion import Position
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import StateTable
+from processing.reduction.lit_darks import LitDarks
 from processing.storage.capture_schema import Detector
 
 log = logging.getLogger(__name__)
@@ -79,6 +80,7 @@ class CaptureRunner:
     detector : for the black level and full scale of the statistics.
     observers : told of everything; the simulated bench is one of them.
     saturation_limit : fraction of saturated pixels from which a state raises TooBright; None never.
+    mosaic : True for a polarization sensor.
     """
 
     def __init__(
@@ -91,6 +93,7 @@ class CaptureRunner:
         observers: Sequence[Observer] = (),
         continue_after_interlock: bool = False,
         saturation_limit: float | None = None,
+        mosaic: bool = False,
     ) -> None:
         self.rig = rig
         self.table = table
@@ -107,6 +110,8 @@ class CaptureRunner:
         self._pending: deque[int] = deque()
         self._full_scale = rig.require_camera().full_scale
         self._saturation_limit = saturation_limit
+        lights = sum(role != "dark" for role in table.role)
+        self._lit_darks = LitDarks(detector.black_level_counts, mosaic=mosaic, lights=lights)
 
     def run(self, pending: Iterable[int]) -> bool:
         """Take these states; True if all are done, False if a stop was asked for.
@@ -254,6 +259,7 @@ class CaptureRunner:
         if blocked is not None:
             self._discard(exposed.state, blocked)
             return
+        self._check_darks(report)
         columns = {
             "exposure_s": exposed.exposure_s,
             "host_time_s": frame.host_time_s,
@@ -285,6 +291,20 @@ class CaptureRunner:
         )
 
     # --- what can be wrong with it -----------------------------------------------------------------------
+
+    def _check_darks(self, report: StateReport) -> None:
+        exposure_s = float(self.table.exposure_s[report.state])
+        pose = tuple(float(column[report.state]) for column in self.table.angles_deg.values())
+        if report.role == "dark":
+            self._lit_darks.dark(exposure_s, pose, report.pixels)
+            return
+        wrong = self._lit_darks.light(exposure_s, pose, report.pixels)
+        if wrong is not None:
+            raise RunFailed(
+                f"state {report.state}: {wrong}. The light was not shut off for them, or the black level is wrong. "
+                "Make sure that the source darkens the sample, or correct detector.black_level_counts in the rig file, "
+                "and begin the capture again."
+            )
 
     def _again(self, state: int, error: FrameLost) -> None:
         tries = self._retakes.get(state, 0) + 1

@@ -11,12 +11,14 @@ import numpy as np
 
 from acquisition.capture.header import capture_header, now, title_of
 from acquisition.capture.job import Job, Result, frame_shape
+from acquisition.capture.mosaic_phase import seen_by_camera
 from acquisition.capture.plan import ARM, AutoExposure
 from acquisition.capture.runner import CaptureRunner, TooBright
 from acquisition.capture.writer import PARTIAL, CaptureWriter
 from acquisition.cleanup import run_all
 from acquisition.errors import AcquisitionError, Stopped
 from acquisition.rig.continuous_rotation import unwound
+from acquisition.rig.folded_angles import folded
 from acquisition.rig.rig import Rig
 from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
@@ -46,7 +48,11 @@ def take(
     """
     _require_reference(rig, home)
     place_sample(job, rig)
-    job = replace(job, table=unwound(job.table, rig))
+    job = replace(
+        job,
+        table=unwound(folded(job.table, rig), rig),
+        instrument=seen_by_camera(job.instrument, rig.require_camera()),
+    )
     header = capture_header(job.plan, job.rig, job.instrument, rig, job.seed)
     writer = CaptureWriter.create(path, header, job.table, frame_shape(rig), now())
     if not job.exposure_known:
@@ -66,6 +72,12 @@ def resume(
             raise AcquisitionError(
                 f"{partial} has frames of {capture.frame_shape}, the camera gives {frame_shape(rig)}. "
                 "Go on with the camera and the settings that began it."
+            )
+        job = replace(job, instrument=seen_by_camera(job.instrument, rig.require_camera()))
+        if capture.header.mosaic != job.instrument.mosaic:
+            raise AcquisitionError(
+                f"{partial} has the mosaic {capture.header.mosaic}, "
+                f"the camera's region now gives {job.instrument.mosaic}. Go on with the region that began it."
             )
     if not partial.name.endswith(PARTIAL):
         partial = partial.rename(partial.with_name(partial.name + PARTIAL))
@@ -117,6 +129,7 @@ def _run(
         watchers,
         continue_after_interlock=job.plan.continue_after_interlock,
         saturation_limit=1 - auto.percentile / 100 if isinstance(auto, AutoExposure) else None,
+        mosaic=job.instrument.mosaic is not None,
     )
     status: Status = "failed"
     failure: BaseException | None = None

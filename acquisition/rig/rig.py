@@ -280,7 +280,8 @@ class Rig:
 
     def set_exposure(self, exposure_s: float, repeats: int) -> CameraSettings:
         """Set exposure and averaging, unless they are set so already; returns the settings as read back."""
-        asked = CameraSettings(exposure_s=exposure_s, frame_average=repeats, trigger="software")
+        # The trigger is that of the rig file.
+        asked = CameraSettings(exposure_s=exposure_s, frame_average=repeats)
         if self._asked != asked:
             self._asked = None
             self._read_back = self.require_camera().configure(asked)

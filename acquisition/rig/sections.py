@@ -58,6 +58,11 @@ class RigSections(Part):
     endless: tuple[str, ...] = Field(
         default=(), description="axes that may go on to the next turn instead of unwinding between captures"
     )
+    fold_deg: dict[str, Literal[180, 360]] = Field(
+        default={},
+        description="targets outside the travel of these axes are moved into it by whole multiples; 180 for polarizers "
+        "and retarders, which look the same after half a turn but for a wedge",
+    )
     backlash_deg: dict[str, Annotated[float, Field(ge=0, le=90)]] = Field(
         default={}, description="a downward move of the axis goes this far beyond its target and comes back up"
     )

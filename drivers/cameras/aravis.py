@@ -13,6 +13,7 @@ import time
 from typing import Any, NoReturn
 
 from drivers import genicam
+from drivers.aravis_identity import identify
 from drivers.aravis_library import load_aravis, open_camera
 from drivers.aravis_setup import Config, Setup
 from drivers.aravis_stream import Arrival, FrameStream
@@ -34,6 +35,7 @@ _SLOWEST_BYTES_S = 10e6
 _TRANSFER_MARGIN_S = 1.0
 # How much shorter than it reads back an exposure may be.
 _EARLY, _EARLY_S = 0.02, 1e-3
+_CHECK_LINK = "Check cable, packet size and network load (acquire doctor measures the packet loss)"
 
 
 def open(name: str, config: Config, clock: Clock = REAL) -> AravisCamera:
@@ -77,6 +79,8 @@ class AravisCamera(Camera):
         self._outstanding = False
         self._sent_unix_s = 0.0
         self._sent_s = 0.0
+        # How long after the trigger a whole frame came that cannot be of this exposure.
+        self._early_s: float | None = None
         self._last_id: int | None = None
 
     # --- identity ----------------------------------------------------------------------------------------
@@ -86,34 +90,17 @@ class AravisCamera(Camera):
         """Real bits of a pixel: those of the format, or `bits` of the rig file for a wider container."""
         return self._config.bits or self._pixel_format().bits - self._config.shift
 
+    @property
+    def bins_like_with_like(self) -> bool:
+        """True where the rig file says that the camera bins only pixels behind the same polarizer."""
+        return self._config.mosaic_binning == "like_with_like"
+
     def describe(self) -> CameraIdentity:
         """Which camera this is and how it is connected."""
         self._require_open()
-        features, fmt = self._features, self._pixel_format()
-        with features.asking("describe itself"):
-            name, mtu = self._setup.interface or ("", None)
-            address = ""
-            if self._setup.is_gige:
-                address = self._camera.get_device().get_device_address().get_address().to_string()
-            return CameraIdentity(
-                kind=self._config.kind,
-                vendor=self._camera.get_vendor_name() or "",
-                model=self._camera.get_model_name() or "",
-                serial_number=features.text(genicam.SERIAL_NUMBER),
-                firmware=features.text(genicam.FIRMWARE),
-                address=address,
-                interface=name,
-                interface_mtu=mtu,
-                packet_size=self._setup.packet_size(),
-                sensor_width=int(features.number(genicam.SENSOR_WIDTH) or 0),
-                sensor_height=int(features.number(genicam.SENSOR_HEIGHT) or 0),
-                pixel_format=fmt.name,
-                pixel_format_code=fmt.code,
-                bits=self.bits,
-                shift=self._config.shift,
-                polarized=fmt.polarized,
-                library=f"Aravis {self._aravis._version}",
-            )
+        return identify(
+            self._config, self._aravis, self._camera, self._features, self._setup, self._pixel_format(), self.bits
+        )
 
     def temperature_c(self) -> float | None:
         """Temperature of the camera in degrees Celsius; None where it has no sensor."""
@@ -131,7 +118,7 @@ class AravisCamera(Camera):
         structure = (
             settings.pixel_format,
             (settings.width, settings.height, settings.offset_x, settings.offset_y),
-            settings.binning,
+            (settings.binning, settings.decimation, settings.reverse_x, settings.reverse_y),
             settings.packet_size,
             settings.trigger,
         )
@@ -200,6 +187,8 @@ class AravisCamera(Camera):
         self._last_id = arrival.frame_id or self._last_id
         if arrival.whole:
             self._stale += 1
+            if self._outstanding and arrival.first_packet_s >= self._sent_unix_s:
+                self._early_s = arrival.first_packet_s - self._sent_unix_s
             log.warning("camera %s: frame %d is stale and was discarded", self.name, arrival.frame_id)
 
     # --- exposures ---------------------------------------------------------------------------------------
@@ -208,12 +197,28 @@ class AravisCamera(Camera):
         self._discard_outstanding()
         self._drain()
         self._check_control("trigger")
+        if not self._setup.hardware:
+            self._wait_armed()
         # Real time: frames carry the time of day at which their first packet came.
         self._sent_unix_s = time.time()
         self._sent_s = self._clock.now_s()
         self._outstanding = True
+        self._early_s = None
         if not self._setup.hardware:
             self._features.command("TriggerSoftware")
+
+    def _wait_armed(self) -> None:
+        """Wait until the camera heeds a trigger: one that comes too early is ignored."""
+        deadline_s = self._clock.now_s() + self._setup.exposure_s + self._transfer_s()
+        while not self._setup.status.armed():
+            if self._clock.now_s() > deadline_s:
+                self._restart()
+                raise self._frame_lost(
+                    f"not ready for a trigger within {self._setup.exposure_s + self._transfer_s():.2f} s",
+                    "Is it in continuous acquisition with TriggerMode On? Another trigger selector may hold it back",
+                )
+            self._check_control("wait until the trigger is armed")
+            self._clock.sleep_s(0.001)
 
     def _do_wait_exposed(self) -> None:
         stream = self._live_stream()
@@ -228,11 +233,11 @@ class AravisCamera(Camera):
                 break
             self._throw_away(stream, arrival)
         self._sleep_until(end_s)
-        if not self._setup.has_exposure_status:
+        if not self._setup.status.tells_exposing:
             self._sleep_until(end_s + self._config.trigger_latency_s)
             return
         deadline_s = end_s + _TRANSFER_MARGIN_S
-        while self._features.flag("AcquisitionStatus"):
+        while self._setup.status.exposing():
             if self._clock.now_s() > deadline_s:
                 self._restart()
                 raise self._frame_lost(
@@ -247,7 +252,8 @@ class AravisCamera(Camera):
             if self._clock.now_s() > deadline_s:
                 self._restart()
                 raise self._frame_lost(
-                    f"no signal at {self._config.trigger_line} within {self._config.trigger_timeout_s:g} s"
+                    f"no signal at {self._config.trigger_line} within {self._config.trigger_timeout_s:g} s",
+                    "Check the trigger's cable and level, and trigger_line and trigger_edge in the rig file",
                 )
             self._check_control("wait for the hardware trigger")
             self._clock.sleep_s(0.001)
@@ -264,7 +270,7 @@ class AravisCamera(Camera):
                 if self._clock.now_s() > deadline_s:
                     # A camera that is gone says so here, seconds before the heartbeat would.
                     self._restart()
-                    raise self._frame_lost(f"no frame within {self._clock.now_s() - self._sent_s:.2f} s of the trigger")
+                    raise self._no_frame()
                 continue
             if not self._is_ours(arrival):
                 self._throw_away(stream, arrival)
@@ -280,7 +286,7 @@ class AravisCamera(Camera):
 
     def _is_ours(self, arrival: Arrival) -> bool:
         """True unless the frame left the camera before the exposure under way can have ended, or has an old number."""
-        exposure_s = self._setup.exposure_s
+        exposure_s = 0.0 if self._config.answers_early else self._setup.exposure_s
         came_s = self._camera_clock.came_s(arrival.camera_time_ns, arrival.first_packet_s, exposure_s)
         ended_s = self._sent_unix_s + exposure_s - max(_EARLY * exposure_s, _EARLY_S)
         # Without its first packet a frame has no time; it is not whole either.
@@ -347,8 +353,19 @@ class AravisCamera(Camera):
         if self._features.control_is_lost():
             raise self._features.lost(what, "its heartbeat stopped")
 
-    def _frame_lost(self, came_back: str) -> FrameLost:
-        return FrameLost(f"camera {self.name}, take a frame", came_back, "Capture the state again")
+    def _frame_lost(self, came_back: str, what_to_do: str = _CHECK_LINK) -> FrameLost:
+        return FrameLost(f"camera {self.name}, take a frame", came_back, what_to_do)
+
+    def _no_frame(self) -> FrameLost:
+        waited_s = self._clock.now_s() - self._sent_s
+        if self._early_s is None:
+            return self._frame_lost(f"no frame within {waited_s:.2f} s of the trigger")
+        return self._frame_lost(
+            f"the only frame came {self._early_s:.3f} s after the trigger, before the {self._setup.exposure_s:g} s of "
+            "its exposure were over, and was discarded as one of an earlier exposure",
+            "Does the camera expose as long as it says, and does nothing else trigger it? A simulated camera that does "
+            "not wait for its exposure needs `answers_early: true` in the rig file",
+        )
 
     # --- end ---------------------------------------------------------------------------------------------
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from processing.reduction.black import Black
 from processing.reduction.effects_of_capture import CountsCorrection
 from processing.reduction.flat import Flat
+from processing.reduction.lit_darks import lit_darks
 from processing.reduction.move_image import REACH, shifted_back
 from processing.storage.capture import Capture, CaptureError
 from processing.storage.pixel_mask import Mask
@@ -74,6 +75,9 @@ class Correction:
                 "no dark states and no black level in the capture: nothing was subtracted, and a pedestal would "
                 "show as depolarization. Take dark states, or import with --black-level."
             )
+        lit = None if dark_from else lit_darks(capture)
+        if lit is not None:
+            warnings.append(f"{lit}. Subtracting them leaves no signal: take the capture again with the light shut off")
         top = saturation(capture)
         flat = Flat.of(list(flat_from) or [capture], black, top)
         if flat is not None and flat.lost.any():

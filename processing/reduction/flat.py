@@ -97,7 +97,7 @@ class FlatCapture:
 
     path: Path
     simulated: bool
-    mosaic: bool
+    mosaic: tuple[tuple[str, ...], ...] | None
     wavelength_nm: float
     frame_shape: tuple[int, int]
     time_s: float
@@ -111,7 +111,7 @@ class FlatCapture:
         return cls(
             capture.path,
             capture.simulated,
-            bool(header.mosaic),
+            header.mosaic,
             header.wavelength_nm,
             capture.frame_shape,
             _time_s(capture),
@@ -134,7 +134,7 @@ def flat_captures(folder: Path) -> list[FlatCapture]:
 
 def nearest_flat(flats: Sequence[FlatCapture], capture: Capture) -> Path | None:
     """The flat of the same camera and wavelength that was taken nearest in time; None without any."""
-    kind = (capture.simulated, bool(capture.header.mosaic), capture.frame_shape)
+    kind = (capture.simulated, capture.header.mosaic, capture.frame_shape)
     same = [
         flat
         for flat in flats

@@ -83,6 +83,8 @@ class CaptureHeader(_Part):
     devices_json: str = "{}"
     versions: dict[str, str] = {}
     seed: int | None = None
+    #: Axes whose targets were moved into their travel by whole multiples of so many degrees.
+    folded_deg: dict[str, float] = {}
 
 
 def create_layout(

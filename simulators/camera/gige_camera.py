@@ -49,8 +49,10 @@ class ExposureInfo:
         As the driver set them; `black_level` in counts. `gain_db` holds GainRaw on the "aravis" description.
     frame_id : int
         1 to 65535, then again 1.
-    width, height, offset_x, offset_y, binning : int
-        Region in pixels as they are sent, after binning.
+    width, height, offset_x, offset_y, binning, decimation : int
+        Region in pixels as they are sent, after binning and decimation.
+    reverse_x, reverse_y : bool
+        Mirrored before the region is cut out.
     """
 
     exposure_s: float
@@ -62,6 +64,19 @@ class ExposureInfo:
     offset_x: int
     offset_y: int
     binning: int
+    decimation: int = 1
+    reverse_x: bool = False
+    reverse_y: bool = False
+
+    def region_of(self, sensor: NDArray[np.uint16]) -> NDArray[np.uint16]:
+        """What is sent of the counts of the whole sensor; binned pixels are averaged, whatever stands before them."""
+        b, d = self.binning, self.decimation
+        rows, columns = (size // b * b for size in sensor.shape)
+        blocks = sensor[:rows, :columns].reshape(rows // b, b, columns // b, b)
+        pixels = blocks.mean(axis=(1, 3)).round().astype(np.uint16) if b > 1 else sensor
+        pixels = pixels[::d, ::d][:: -1 if self.reverse_y else 1, :: -1 if self.reverse_x else 1]
+        cut = pixels[self.offset_y : self.offset_y + self.height, self.offset_x : self.offset_x + self.width]
+        return np.ascontiguousarray(cut)
 
 
 PixelSource = Callable[[ExposureInfo], NDArray[np.uint16]]
@@ -91,6 +106,8 @@ class GigeCamera:
         How long to wait for the address if another simulated camera has it; real time, as that one is another program.
     clock : drivers.clock.Clock
         What exposures are counted by; the driver's own.
+    arming_s : float
+        Time after an exposure in which a trigger is ignored.
     """
 
     def __init__(
@@ -105,6 +122,7 @@ class GigeCamera:
         description: Literal["sfnc", "aravis"] = "sfnc",
         wait_s: float = 60.0,
         clock: Clock = REAL,
+        arming_s: float = 0.0,
     ) -> None:
         self.serial = serial
         self.address = address
@@ -115,6 +133,10 @@ class GigeCamera:
         self._description = description
         self._wait_s = wait_s
         self._clock = clock
+        self._arming_s = arming_s
+        self._armed_at_s = 0.0
+        #: Triggers that came before the camera was armed.
+        self.ignored_triggers = 0
         # Holds frames of exposures that start from now on back, as a busy host or a full link does.
         self.delivery_delay_s = 0.0
         self._error: BaseException | None = None
@@ -216,6 +238,10 @@ class GigeCamera:
         self._write(features.TRIGGER_SOURCE, 1)
         self._write(features.SOFTWARE_TRIGGER, 1)
 
+    def write_register(self, address: int, value: int) -> None:
+        """Write a 32-bit register, behind the back of whoever controls the camera."""
+        self._write(address, value)
+
     def register(self, address: int) -> int:
         """Read a 32-bit register, as a look into the camera from behind."""
         return self._read(address)
@@ -233,6 +259,9 @@ class GigeCamera:
             (features.PIXEL_FORMAT, pixel_format("Mono16").code),
             (features.GAIN_AUTO, 2),
             (features.GAMMA_ENABLE, 1),
+            (features.DECIMATION_X, 1),
+            (features.DECIMATION_Y, 1),
+            (features.TRIGGER_ARMED, 1),
         ):
             self._write(address, value)
         for address, number in (
@@ -259,6 +288,10 @@ class GigeCamera:
     def _fill(self, buffer: int, _: int, exposure_us: int, gain_raw: int, code: int) -> None:
         start_s, delay_s = self._clock.now_s(), self.delivery_delay_s
         camera = self._camera
+        if start_s < self._armed_at_s and camera is not None:
+            self.ignored_triggers += 1
+            camera.set_property("gvsp-lost-ratio", 1.0)
+            return
         try:
             info = self._info(buffer, exposure_us, gain_raw)
             fmt = pixel_format(code)
@@ -271,10 +304,26 @@ class GigeCamera:
             if camera is not None:
                 camera.set_property("gvsp-lost-ratio", 1.0)
         del camera
+        self._arm_after(start_s + exposure_us * 1e-6)
         # The frame is sent when this returns, and no frame leaves a camera before its exposure has ended.
         end_s = start_s + exposure_us * 1e-6 + delay_s
         while (left_s := end_s - self._clock.now_s()) > 0 and not self._gone.wait(left_s):
             pass
+
+    def _arm_after(self, exposed_s: float) -> None:
+        if self._arming_s <= 0 or self._gone.is_set():
+            return
+        self._armed_at_s = exposed_s + self._arming_s
+        self._write(features.TRIGGER_ARMED, 0)
+        # A little late, so that what the register says holds.
+        wait_s = max(0.0, self._armed_at_s - self._clock.now_s() + 2e-3)
+        timer = threading.Timer(wait_s, self._arm)
+        timer.daemon = True
+        timer.start()
+
+    def _arm(self) -> None:
+        if self._memory is not None:
+            self._write(features.TRIGGER_ARMED, 1)
 
     def _info(self, buffer: int, exposure_us: int, gain_raw: int) -> ExposureInfo:
         sfnc = self._description == "sfnc"
@@ -288,6 +337,9 @@ class GigeCamera:
             offset_x=self._read(features.OFFSET_X),
             offset_y=self._read(features.OFFSET_Y),
             binning=self._read(features.BINNING_X),
+            decimation=self._read(features.DECIMATION_X) if sfnc else 1,
+            reverse_x=sfnc and bool(self._read(features.REVERSE_X)),
+            reverse_y=sfnc and bool(self._read(features.REVERSE_Y)),
         )
 
     def _checked(self, pixels: NDArray[np.uint16], info: ExposureInfo, fmt: PixelFormat) -> NDArray[np.uint16]:

@@ -15,17 +15,21 @@ EXPOSURE_US, PIXEL_FORMAT, OFFSET_X, OFFSET_Y = 0x120, 0x128, 0x130, 0x134
 GAIN_DB, BLACK_LEVEL, TEMPERATURE_C, GAMMA = 0x4000, 0x4008, 0x4010, 0x4018
 # Automatic modes and gamma are on at power-up, as they are on many cameras.
 GAIN_AUTO, GAMMA_ENABLE = 0x4020, 0x4024
+REVERSE_X, REVERSE_Y, DECIMATION_X, DECIMATION_Y = 0x4028, 0x402C, 0x4030, 0x4034
 TRIGGER_SOURCE = 0x304
 # Reads 1 from the trigger until the exposure has ended.
 SOFTWARE_TRIGGER = 0x30C
+# Reads 1 while a trigger would be heeded; the camera itself keeps it up to date.
+TRIGGER_ARMED = 0x4038
 
 # The camera answers no command while it exposes, and its controller gives up after 3 s without an answer.
 MAX_EXPOSURE_S = 2.0
 
 
-def _register(name: str, address: int, kind: str = "IntReg", access: str = "RW") -> str:
+def _register(name: str, address: int, kind: str = "IntReg", access: str = "RW", index: str = "") -> str:
     length, sign = (8, "") if kind == "FloatReg" else (4, "<Sign>Unsigned</Sign>")
-    index = '<pIndex Offset="0x20">TriggerSelectorValue</pIndex>' if 0x300 <= address < SOFTWARE_TRIGGER else ""
+    if 0x300 <= address < SOFTWARE_TRIGGER:
+        index = '<pIndex Offset="0x20">TriggerSelectorValue</pIndex>'
     return (
         f'<{kind} Name="{name}Register"><Address>{address:#x}</Address>{index}<Length>{length}</Length>'
         f"<AccessMode>{access}</AccessMode><pPort>Device</pPort><Cachable>NoCache</Cachable>{sign}"
@@ -72,10 +76,10 @@ def _formula(name: str, formula: str, **variables: str) -> str:
     return f'<IntSwissKnife Name="{name}" NameSpace="Standard">{listed}<Formula>{formula}</Formula></IntSwissKnife>'
 
 
-def _flag(name: str, address: int, access: str = "RW") -> str:
+def _flag(name: str, address: int, access: str = "RW", index: str = "") -> str:
     return (
         f'<Boolean Name="{name}" NameSpace="Standard"><pValue>{name}Register</pValue><OnValue>1</OnValue>'
-        f"<OffValue>0</OffValue></Boolean>{_register(name, address, access=access)}"
+        f"<OffValue>0</OffValue></Boolean>{_register(name, address, access=access, index=index)}"
     )
 
 
@@ -95,6 +99,7 @@ def _command(name: str, address: int, value: int) -> str:
 
 def sfnc_description(width: int, height: int) -> str:
     """Write the GenICam XML of a camera with an SFNC feature set and a sensor of the given size in pixels."""
+    selected, status = "AcquisitionStatusSelectorValue", TRIGGER_ARMED - SOFTWARE_TRIGGER
     features = [
         _text("DeviceVendorName", 0x48, 32),
         _text("DeviceModelName", 0x68, 32),
@@ -103,8 +108,8 @@ def sfnc_description(width: int, height: int) -> str:
         _float("DeviceTemperature", TEMPERATURE_C, -40.0, 100.0, "RO"),
         _integer("SensorWidth", SENSOR_WIDTH, 1, width, "RO"),
         _integer("SensorHeight", SENSOR_HEIGHT, 1, height, "RO"),
-        _formula("WidthMax", f"{width} / B", B="BinningHorizontal"),
-        _formula("HeightMax", f"{height} / B", B="BinningVertical"),
+        _formula("WidthMax", f"{width} / (B * D)", B="BinningHorizontal", D="DecimationHorizontal"),
+        _formula("HeightMax", f"{height} / (B * D)", B="BinningVertical", D="DecimationVertical"),
         _formula("OffsetXMax", "M - W", M="WidthMax", W="Width"),
         _formula("OffsetYMax", "M - H", M="HeightMax", H="Height"),
         _integer("Width", WIDTH, 1, "WidthMax"),
@@ -113,6 +118,10 @@ def sfnc_description(width: int, height: int) -> str:
         _integer("OffsetY", OFFSET_Y, 0, "OffsetYMax"),
         _integer("BinningHorizontal", BINNING_X, 1, 4),
         _integer("BinningVertical", BINNING_Y, 1, 4),
+        _integer("DecimationHorizontal", DECIMATION_X, 1, 4),
+        _integer("DecimationVertical", DECIMATION_Y, 1, 4),
+        _flag("ReverseX", REVERSE_X),
+        _flag("ReverseY", REVERSE_Y),
         _choice("PixelFormat", PIXEL_FORMAT, {fmt.name: fmt.code for fmt in PIXEL_FORMATS}),
         _choice("AcquisitionMode", 0x12C, {"Continuous": 1, "SingleFrame": 2, "MultiFrame": 3}),
         _command("AcquisitionStart", 0x124, 1),
@@ -123,8 +132,8 @@ def sfnc_description(width: int, height: int) -> str:
         _choice("TriggerSource", TRIGGER_SOURCE, {"Line0": 0, "Software": 1}),
         _choice("TriggerActivation", 0x308, {"RisingEdge": 0, "FallingEdge": 1}),
         _command("TriggerSoftware", SOFTWARE_TRIGGER, 1),
-        _selector("AcquisitionStatusSelector", ["ExposureActive"]),
-        _flag("AcquisitionStatus", SOFTWARE_TRIGGER, "RO"),
+        _selector("AcquisitionStatusSelector", ["ExposureActive", "FrameTriggerWait"]),
+        _flag("AcquisitionStatus", SOFTWARE_TRIGGER, "RO", f'<pIndex Offset="{status:#x}">{selected}</pIndex>'),
         f'<Float Name="ExposureTime" NameSpace="Standard"><pValue>ExposureTimeConverter</pValue><Min>10</Min>'
         f"<Max>{MAX_EXPOSURE_S * 1e6}</Max><Inc>1</Inc></Float>",
         '<Converter Name="ExposureTimeConverter"><FormulaTo>FROM</FormulaTo><FormulaFrom>TO</FormulaFrom>'

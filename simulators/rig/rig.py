@@ -19,7 +19,7 @@ from processing.instrument.model import InstrumentModel
 from processing.yaml_file import ConfigError
 from simulators.bench.bench import SimulatedBench
 from simulators.bench.scene import Scene
-from simulators.camera.gige_camera import GigeCamera
+from simulators.camera.gige_camera import ExposureInfo, GigeCamera
 from simulators.camera.pixel_stamp import stamp
 from simulators.clock import Clock, patient_clock
 from simulators.rig.controller_kinds import served_kinds
@@ -102,7 +102,7 @@ class SimulatedRig:
             "SIM-1",
             config.columns,
             config.rows,
-            lambda info: self.expose(info.exposure_s),
+            self.expose,
             bits=config.detector.bits or 12,
             lost_ratio=config.packet_loss,
             address=config.camera_address,
@@ -173,8 +173,8 @@ class SimulatedRig:
         wavelength_nm = math.nan if self.bench is None else self.bench.wavelength_nm
         return self.uncovered() * math.prod(e.light_at(wavelength_nm) for e in self.emulators.values())
 
-    def expose(self, exposure_s: float) -> NDArray[np.uint16]:
-        """Counts (rows, columns) of an exposure that happens now."""
+    def expose(self, info: ExposureInfo) -> NDArray[np.uint16]:
+        """Counts (rows, columns) of the camera's region in an exposure that happens now."""
         angles = self.true_angles_deg()
         light = self.light()
         with self._lock:
@@ -182,8 +182,8 @@ class SimulatedRig:
             self._next_index += 1
             if self.bench is None:
                 # Nobody has placed a sample: the camera looks into the dark.
-                return np.zeros((self.config.rows, self.config.columns), dtype=np.uint16)
-            counts = self.bench.expose(angles, exposure_s, index, light=light)
+                return np.zeros((info.height, info.width), dtype=np.uint16)
+            counts = info.region_of(self.bench.expose(angles, info.exposure_s, index, light=light))
         if self.config.stamp:
             stamp(counts, [angles[name] for name in sorted(angles)], bits=self.config.detector.bits or 12)
         return counts

@@ -311,3 +311,49 @@ def test_without_gi_the_driver_can_be_imported_and_opening_says_what_is_missing(
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "gir1.2-aravis-0.8" in run.stdout
+
+
+def sensor_positions(info: ExposureInfo) -> NDArray[np.uint16]:
+    """Every pixel shows its place on a sensor of 64 x 48, cut out and binned as the camera is set."""
+    return info.region_of((np.arange(48)[:, None] * 64 + np.arange(64)).astype(np.uint16))
+
+
+def test_binning_takes_a_full_sensor_and_a_region_beside_the_corner(bench: Bench) -> None:
+    _, camera = bench(sensor_positions)
+    camera.configure(CameraSettings(exposure_s=1e-4, width=20, height=10, offset_x=40, offset_y=30))
+    for binning, size in ((2, (24, 32)), (1, (48, 64)), (4, (12, 16))):
+        back = camera.configure(CameraSettings(binning=binning))
+        assert (back.binning, back.height, back.width, back.offset_x) == (binning, *size, 0)
+        assert camera.capture()[0].pixels.shape == size
+    camera.configure(CameraSettings(binning=2, width=4, height=4, offset_x=3))
+    # Means of 2 x 2 pixels, the first of columns 6, 7 and rows 0, 1: (6 + 7 + 70 + 71) / 4 = 38.5, to even.
+    assert camera.capture()[0].pixels[0].tolist() == [38, 40, 42, 44]
+
+
+def test_decimation_and_mirrors_are_set_and_read_back(bench: Bench) -> None:
+    simulated, camera = bench(sensor_positions)
+    back = camera.configure(CameraSettings(exposure_s=1e-4, decimation=2, reverse_x=True))
+    assert (back.decimation, back.reverse_x, back.reverse_y, back.width) == (2, True, False, 32)
+    assert camera.capture()[0].pixels[1, :3].tolist() == [128 + 62, 128 + 60, 128 + 58]
+    # Left on by another program, a mirror is switched off.
+    back = camera.configure(CameraSettings(decimation=1))
+    assert (back.decimation, back.reverse_x) == (1, False)
+    assert simulated.register(gige_features.REVERSE_X) == 0
+
+
+def test_a_trigger_is_sent_when_the_camera_is_armed(bench: Bench) -> None:
+    simulated, camera = bench(arming_s=0.15)
+    camera.configure(DARK)
+    ids = [frame.frame_id for frame in camera.capture(5)]
+    assert [b - a for a, b in pairwise(ids)] == [1, 1, 1, 1]
+    assert simulated.ignored_triggers == 0
+    assert camera.statistics().retakes == 0
+
+
+def test_a_camera_that_is_never_armed_says_so(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivers.cameras.aravis._TRANSFER_MARGIN_S", 0.1)
+    simulated, camera = bench(config=aravis.Config(device="127.0.0.1", retakes=0))
+    camera.configure(DARK)
+    simulated.write_register(gige_features.TRIGGER_ARMED, 0)
+    with pytest.raises(FrameLost, match="not ready for a trigger"):
+        camera.capture()

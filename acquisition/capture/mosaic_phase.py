@@ -1,0 +1,58 @@
+"""Which analyzer stands before the first pixel of a frame: the region's place on a polarization sensor decides."""
+
+from __future__ import annotations
+
+from acquisition.errors import AcquisitionError
+from drivers.camera import Camera, CameraSettings
+from processing.instrument.model import InstrumentModel
+
+
+def seen_by_camera(instrument: InstrumentModel, camera: Camera) -> InstrumentModel:
+    """The instrument with its mosaic as the camera's frames have it; the instrument file has that of the sensor.
+
+    Raises
+    ------
+    AcquisitionError
+        The camera mirrors, bins or leaves out pixels, so which analyzer a pixel has cannot be known, or the frames
+        hold parts of super-pixels.
+    """
+    if instrument.mosaic is None:
+        return instrument
+    settings = camera.settings
+    wrong = _unknown(settings, camera.bins_like_with_like) or _torn(instrument.mosaic, settings)
+    if wrong is not None:
+        raise AcquisitionError(wrong)
+    rows, columns = len(instrument.mosaic), len(instrument.mosaic[0])
+    top, left = settings.offset_y or 0, settings.offset_x or 0
+    mosaic = tuple(
+        tuple(instrument.mosaic[(top + r) % rows][(left + c) % columns] for c in range(columns)) for r in range(rows)
+    )
+    return instrument.model_copy(update={"mosaic": mosaic})
+
+
+def _unknown(settings: CameraSettings, bins_like_with_like: bool) -> str | None:
+    if settings.offset_x is None or settings.offset_y is None:
+        return "the camera does not tell where its region begins, so which analyzer a pixel has is not known"
+    if settings.reverse_x or settings.reverse_y:
+        return (
+            "the camera mirrors its frames (ReverseX or ReverseY), and makers differ in where the mosaic then begins. "
+            "Leave reverse_x and reverse_y off"
+        )
+    if (settings.decimation or 1) != 1:
+        return f"decimation {settings.decimation} leaves out pixels of every super-pixel. Set it to 1"
+    if (settings.binning or 1) != 1 and not bins_like_with_like:
+        return (
+            f"binning {settings.binning} adds up pixels behind different polarizers. Set it to 1; if the manual says "
+            "that this camera bins only pixels of one kind, write `mosaic_binning: like_with_like` at the camera"
+        )
+    return None
+
+
+def _torn(mosaic: tuple[tuple[str, ...], ...], settings: CameraSettings) -> str | None:
+    rows, columns = len(mosaic), len(mosaic[0])
+    if (settings.height or 0) % rows or (settings.width or 0) % columns:
+        return (
+            f"a region of {settings.width} x {settings.height} pixels holds no whole number of super-pixels of "
+            f"{columns} x {rows}. Change width and height"
+        )
+    return None

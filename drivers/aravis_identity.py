@@ -1,0 +1,39 @@
+"""Which camera answered through Aravis, over which link, and how its pixels are laid out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from drivers import genicam
+from drivers.aravis_setup import Config, Setup
+from drivers.camera import CameraIdentity
+from drivers.genicam import Features
+from drivers.pixel_formats import PixelFormat
+
+
+def identify(
+    config: Config, aravis: Any, camera: Any, features: Features, setup: Setup, fmt: PixelFormat, bits: int
+) -> CameraIdentity:
+    """Ask an open camera who it is; raises CameraLost if it does not answer."""
+    with features.asking("describe itself"):
+        name, mtu = setup.interface or ("", None)
+        address = camera.get_device().get_device_address().get_address().to_string() if setup.is_gige else ""
+        return CameraIdentity(
+            kind=config.kind,
+            vendor=camera.get_vendor_name() or "",
+            model=camera.get_model_name() or "",
+            serial_number=features.text(genicam.SERIAL_NUMBER),
+            firmware=features.text(genicam.FIRMWARE),
+            address=address,
+            interface=name,
+            interface_mtu=mtu,
+            packet_size=setup.packet_size(),
+            sensor_width=int(features.number(genicam.SENSOR_WIDTH) or 0),
+            sensor_height=int(features.number(genicam.SENSOR_HEIGHT) or 0),
+            pixel_format=fmt.name,
+            pixel_format_code=fmt.code,
+            bits=bits,
+            shift=config.shift,
+            polarized=fmt.polarized,
+            library=f"Aravis {aravis._version}",
+        )

@@ -1,0 +1,162 @@
+"""What the camera is set to and what a capture makes of it: region, mosaic, trigger, darks that are not dark."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.cameras.aravis import AravisCamera
+from processing.commands.application import main as process
+from processing.storage.capture import Capture
+from processing.storage.images import StokesImage
+from simulators.camera.gige_camera import GigeCamera
+from simulators.rig.rig import SimulatedRig
+
+Rig = Callable[..., Path]
+Acquire = Callable[..., tuple[int, str, str]]
+
+SENSOR = (("90", "45"), ("135", "0"))
+CAMERA = {"kind": "aravis", "bits": 12, "packet_size": 9000}
+THROUGH = ("--sample", "air", "--omega", 180)
+
+
+@pytest.fixture
+def short_plan(tmp_path: Path) -> Callable[[str], Path]:
+    """A plan of one dark and one light state of a mode."""
+
+    def make(mode: str, more: str = "") -> Path:
+        path = tmp_path / f"{mode}.yaml"
+        states = "states: {kind: fixed, states: 1}" if mode == "stokes" else ""
+        path.write_text(f"kind: plan\nmode: {mode}\ndarks: 1\nexposure_s: 0.005\n{states}\n{more}\n")
+        return path
+
+    return make
+
+
+@pytest.mark.parametrize(("offset_x", "offset_y"), [(0, 0), (1, 0), (0, 1), (1, 1)])
+def test_horizontal_light_reads_zero_degrees_wherever_the_region_begins(
+    acquire: Acquire,
+    small_rig: Rig,
+    short_plan: Callable[[str], Path],
+    tmp_path: Path,
+    offset_x: int,
+    offset_y: int,
+) -> None:
+    region = {"width": 40, "height": 24, "offset_x": offset_x, "offset_y": offset_y}
+    rig = small_rig(top={"camera": CAMERA | {"settings": region}})
+    out = tmp_path / "captures"
+    code, _, err = acquire("--rig", rig, "--plan", short_plan("stokes"), *THROUGH, "--out", out)
+    assert code == 0, err
+    (path,) = out.glob("*.h5")
+    with Capture(path) as capture:
+        rolled = np.roll(SENSOR, (-offset_y, -offset_x), axis=(0, 1))
+        assert capture.header.mosaic == tuple(map(tuple, rolled))
+        assert capture.instrument is not None
+        assert capture.instrument.mosaic == capture.header.mosaic
+    with pytest.raises(SystemExit) as end:
+        process(["reduce", str(path), "--out", str(tmp_path / "stokes.h5")])
+    assert not end.value.code
+    s0, s1, s2 = StokesImage.load(tmp_path / "stokes.h5").values[:, 4:-4, 4:-4]
+    assert np.median(np.hypot(s1, s2) / s0) == pytest.approx(1.0, abs=0.02)
+    aolp_deg = np.rad2deg(np.arctan2(s2, s1)) / 2
+    assert np.max(np.abs(aolp_deg)) < 3.0
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"binning": 2}, "mosaic_binning: like_with_like"),
+        ({"decimation": 2}, "leaves out pixels"),
+        ({"reverse_x": True}, "mirrors its frames"),
+        ({"width": 41, "height": 24}, "no whole number of super-pixels"),
+    ],
+)
+def test_a_mosaic_whose_analyzers_cannot_be_known_is_refused(
+    acquire: Acquire, small_rig: Rig, short_plan: Callable[[str], Path], tmp_path: Path, settings: dict, says: str
+) -> None:
+    rig = small_rig(top={"camera": CAMERA | {"settings": settings}})
+    code, _, err = acquire("--rig", rig, "--plan", short_plan("stokes"), *THROUGH, "--out", tmp_path / "captures")
+    assert code != 0
+    assert says in " ".join(err.split())
+    assert not list(tmp_path.glob("captures/*"))
+
+
+def test_a_camera_that_bins_like_with_like_may_bin_a_mosaic(
+    acquire: Acquire, small_rig: Rig, short_plan: Callable[[str], Path], tmp_path: Path
+) -> None:
+    rig = small_rig(top={"camera": CAMERA | {"settings": {"binning": 2}, "mosaic_binning": "like_with_like"}})
+    code, _, err = acquire("--rig", rig, "--plan", short_plan("stokes"), *THROUGH, "--dry-run")
+    assert code == 0, err
+
+
+@pytest.mark.parametrize("mode", ["stokes", "drr"])
+def test_darks_that_are_not_dark_end_the_capture(
+    acquire: Acquire,
+    small_rig: Rig,
+    short_plan: Callable[[str], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    mode: str,
+) -> None:
+    monkeypatch.setattr(SimulatedRig, "light", lambda self: 1.0)
+    code, _, err = acquire("--rig", small_rig(), "--plan", short_plan(mode), *THROUGH, "--out", tmp_path / "captures")
+    text = " ".join(err.split())
+    assert code != 0
+    assert "dark states of 0.005 s are as bright as a light state" in text
+    assert "source darkens the sample" in text
+    assert not list(tmp_path.glob("captures/*.h5"))
+
+
+def test_a_rig_with_a_hardware_trigger_captures_with_it(
+    acquire: Acquire,
+    small_rig: Rig,
+    short_plan: Callable[[str], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    cameras: list[GigeCamera] = []
+    start, arm = GigeCamera.start, AravisCamera._do_trigger
+
+    def started(self: GigeCamera) -> None:
+        start(self)
+        cameras.append(self)
+
+    def armed(self: AravisCamera) -> None:
+        arm(self)
+        cameras[-1].fire()
+
+    monkeypatch.setattr(GigeCamera, "start", started)
+    monkeypatch.setattr(AravisCamera, "_do_trigger", armed)
+    rig = small_rig(top={"camera": CAMERA | {"settings": {"trigger": "hardware"}}})
+    out = tmp_path / "captures"
+    code, _, err = acquire("--rig", rig, "--plan", short_plan("stokes"), *THROUGH, "--out", out)
+    assert code == 0, err
+    with Capture(next(out.glob("*.h5"))) as capture:
+        assert json.loads(capture.header.camera_settings_json)["trigger"] == "hardware"
+        assert capture.done.size == 2
+
+
+def test_a_rotator_of_limited_travel_takes_the_same_states_half_a_turn_away(
+    acquire: Acquire, small_rig: Rig, short_plan: Callable[[str], Path], tmp_path: Path
+) -> None:
+    limited = {
+        "psg": {"kind": "zaber", "port": "sim:rotators", "address": 1},
+        "psa": {"kind": "zaber", "port": "sim:rotators", "address": 2, "limits_deg": [-95, 95]},
+        "arm": {"kind": "smc100", "port": "sim:arm", "address": 1, "limits_deg": [0, 180]},
+    }
+    plan, out = short_plan("drr", "states: {kind: rotating_retarders, states: 20}"), tmp_path / "captures"
+    code, _, err = acquire("--rig", small_rig(top={"axes": limited}), "--plan", plan, *THROUGH, "--out", out)
+    assert code != 0
+    assert "fold_deg: {psa: 180}" in " ".join(err.split())
+    rig = small_rig("folded.yaml", top={"axes": limited, "fold_deg": {"psa": 180}})
+    code, _, err = acquire("--rig", rig, "--plan", plan, *THROUGH, "--out", out)
+    assert code == 0, err
+    with Capture(next(out.glob("*.h5"))) as capture:
+        targets = capture.planned_targets_deg()
+        assert capture.header.folded_deg == {"psa": 180}
+        np.testing.assert_allclose((targets["psa"] - 4.91 * targets["psg"] + 90) % 180, 90, atol=1e-6)
+        assert np.all(np.abs(capture.angles_deg["psa"]) <= 95)
