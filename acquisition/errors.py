@@ -25,3 +25,15 @@ class InterlockOpened(RunFailed):
 
 class Stopped(AcquisitionError):
     """The person at the bench asked for the end (Ctrl-C or the stop button)."""
+
+
+class Differs(AcquisitionError):
+    """What is there was begun with something else than what would go on now. Holds every difference."""
+
+    def __init__(self, what: str, found: list[str]) -> None:
+        super().__init__(
+            f"{what} was begun with something else:\n"
+            + "\n".join(f"  - {line}" for line in found)
+            + "\nNothing was moved or changed. Go on with what began it, or keep what comes now apart with --as-new."
+        )
+        self.found = found

@@ -5,9 +5,13 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType, TracebackType
 from typing import Any, Self
+
+#: Sent by a thread of this process to its main thread.
+FAILED = signal.SIGUSR1
 
 
 class StopRequest:
@@ -25,6 +29,8 @@ class StopRequest:
         self._patience = patience
         self._tell = tell
         self._count = 0
+        self._failing_here = False
+        self._failure: Exception | None = None
         self._previous: dict[int, Any] = {}
         self._lock = threading.Lock()
 
@@ -40,6 +46,26 @@ class StopRequest:
         else:
             self._add()
 
+    def fail(self, failure: Exception) -> None:
+        """End with this error what the main thread does within `failing_here`, from any thread."""
+        self._failure = failure
+        if self._failing_here and self._previous:
+            os.kill(os.getpid(), FAILED)
+
+    @contextmanager
+    def failing_here(self) -> Iterator[None]:
+        """Where `fail` interrupts; elsewhere clean-up is under way, which it must not cut short."""
+        self._failing_here = True
+        try:
+            yield
+        finally:
+            self._failing_here = False
+
+    def _failed(self, number: int, frame: FrameType | None) -> None:
+        if self._failing_here and self._failure is not None:
+            failure, self._failure = self._failure, None
+            raise failure
+
     def _add(self) -> int:
         with self._lock:
             self._count += 1
@@ -47,15 +73,17 @@ class StopRequest:
 
     def _heard(self, number: int, frame: FrameType | None) -> None:
         count = self._add()
-        if count == self._patience:
+        # Each further one interrupts as well: what hangs after the second must not hold the program.
+        if count >= self._patience:
             raise KeyboardInterrupt
-        if count < self._patience and self._tell is not None:
+        if self._tell is not None:
             self._tell("stopping after this state; once more stops at once")
 
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 self._previous[number] = signal.signal(number, self._heard)
+            self._previous[FAILED] = signal.signal(FAILED, self._failed)
         return self
 
     def __exit__(

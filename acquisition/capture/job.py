@@ -16,6 +16,7 @@ from acquisition.capture.checks import (
     refuse_failed,
     standing_pose_deg,
 )
+from acquisition.capture.identity import require_same
 from acquisition.capture.mosaic_phase import seen_by_camera
 from acquisition.capture.plan import AutoExposure, MeasurementPlan
 from acquisition.capture.writer import bytes_needed, check_space
@@ -106,31 +107,44 @@ def _check_mosaic(instrument: InstrumentModel, rig: Rig) -> Check:
     return Check("mosaic", True, "from the top left: " + " / ".join(" ".join(line) for line in mosaic))
 
 
-def job_of(path: Path, rig: RigConfig | None = None) -> Job:
+def job_of(path: Path, rig: RigConfig | None = None, plan: MeasurementPlan | None = None) -> Job:
     """The job that a partial, aborted or failed capture belongs to.
 
     Parameters
     ----------
-    rig : rig to use instead of the one stored in the file, for instance after a port has changed.
+    rig : the rig to go on with instead of the one stored in the file; only where its devices are plugged in may differ.
+    plan : what the capture should be of; None for what its file says.
 
     Raises
     ------
     CaptureError, AcquisitionError
         Not a capture, or complete already.
+    Differs
+        Begun with another plan, rig, instrument or program.
     """
     with Capture(path) as capture:
         if capture.status == "complete":
             raise AcquisitionError(f"{path} is complete; there is nothing to go on with.")
-        header, exposure_s = capture.header, capture.planned_column("exposure_s")
+        exposure_s = capture.planned_column("exposure_s")
         targets = capture.planned_targets_deg()
-    plan = parse_yaml(header.plan_yaml, MeasurementPlan, source=f"{path}: plan")
-    stored = parse_yaml(header.rig_yaml, RigConfig, source=f"{path}: rig")
-    job = prepare(plan, rig or stored)
+        plan = plan or stored_plan(capture)
+        job = prepare(plan, rig or stored_rig(capture))
+        require_same(capture, plan, job.rig, job.instrument)
     # The targets as they were: an endless axis may have begun some turns away from zero.
     table = replace(job.table, angles_deg=targets)
     if np.all(np.isfinite(exposure_s)):
         return replace(job, table=replace(table, exposure_s=exposure_s), exposure_known=True)
     return replace(job, table=table)
+
+
+def stored_plan(capture: Capture) -> MeasurementPlan:
+    """The plan that a capture was made from. Raises ConfigError."""
+    return parse_yaml(capture.header.plan_yaml, MeasurementPlan, source=f"{capture.path}: plan")
+
+
+def stored_rig(capture: Capture) -> RigConfig:
+    """The rig that a capture was begun with. Raises ConfigError."""
+    return parse_yaml(capture.header.rig_yaml, RigConfig, source=f"{capture.path}: rig")
 
 
 def frame_shape(rig: Rig) -> tuple[int, int]:

@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from acquisition.capture.closing import closing_record
 from acquisition.capture.header import capture_header, now, title_of
+from acquisition.capture.identity import require_same_devices
 from acquisition.capture.job import Job, Result, frame_shape
 from acquisition.capture.mosaic_phase import seen_by_camera
 from acquisition.capture.plan import ARM, AutoExposure
+from acquisition.capture.records import begin_record, end_record
 from acquisition.capture.runner import CaptureRunner, TooBright
-from acquisition.capture.writer import PARTIAL, CaptureWriter
+from acquisition.capture.writer import CaptureWriter, as_partial
 from acquisition.cleanup import run_all
 from acquisition.errors import AcquisitionError, Stopped
 from acquisition.rig.continuous_rotation import unwound
 from acquisition.rig.folded_angles import folded
+from acquisition.rig.interlocks import LightSoFar, light_so_far
 from acquisition.rig.rig import Rig
 from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
@@ -54,16 +58,23 @@ def take(
         instrument=seen_by_camera(job.instrument, rig.require_camera()),
     )
     header = capture_header(job.plan, job.rig, job.instrument, rig, job.seed)
-    writer = CaptureWriter.create(path, header, job.table, frame_shape(rig), now())
+    begin = begin_record(job, rig, 0)
+    writer = CaptureWriter.create(path, header, job.table, frame_shape(rig), now(), begin)
     if not job.exposure_known:
         writer.set_exposure(np.full(len(job.table), np.nan))
-    return _run(job, rig, writer, range(len(job.table)), stop, observers)
+    return _run(job, rig, writer, range(len(job.table)), stop, observers, None)
 
 
 def resume(
     job: Job, rig: Rig, partial: Path, stop: StopRequest, observers: Sequence[Observer] = (), home: bool = False
 ) -> Result:
-    """Go on with a capture: the first state not done, then the others. Raises as `take`."""
+    """Go on with a capture: the first state not done, then the others, as a new segment of it. Raises as `take`.
+
+    Raises
+    ------
+    Differs
+        The capture was begun with other devices or settings.
+    """
     _require_reference(rig, home)
     place_sample(job, rig)
     with Capture(partial) as capture:
@@ -79,11 +90,19 @@ def resume(
                 f"{partial} has the mosaic {capture.header.mosaic}, "
                 f"the camera's region now gives {job.instrument.mosaic}. Go on with the region that began it."
             )
-    if not partial.name.endswith(PARTIAL):
-        partial = partial.rename(partial.with_name(partial.name + PARTIAL))
-    writer = CaptureWriter.reopen(partial)
+        require_same_devices(capture, rig)
+        earlier = Earlier(len(capture.segments), light_so_far(capture))
+    writer = CaptureWriter(as_partial(partial))
     pending = [k for k in range(len(job.table)) if k not in done]
-    return _run(job, rig, writer, pending, stop, observers)
+    return _run(job, rig, writer, pending, stop, observers, earlier)
+
+
+@dataclass(frozen=True)
+class Earlier:
+    """What a capture that is gone on with brings along: its number of segments, and the light in them."""
+
+    segments: int
+    light: LightSoFar
 
 
 def place_sample(job: Job, rig: Rig) -> None:
@@ -115,6 +134,7 @@ def _run(
     pending: Sequence[int],
     stop: StopRequest,
     observers: Sequence[Observer],
+    earlier: Earlier | None,
 ) -> Result:
     watchers = list(observers)
     if rig.simulation is not None:
@@ -133,11 +153,16 @@ def _run(
     )
     status: Status = "failed"
     failure: BaseException | None = None
+    if earlier is not None:
+        _begin_segment(job, rig, runner, earlier)
+    writer.on_failure = stop.fail
     for observer in watchers:
         observer.run_started(title_of(job.plan), job.table, len(pending), job.instrument.mosaic)
     try:
-        _go_to_start(job, rig, runner)
-        if _take_states(job, runner, pending):
+        with stop.failing_here():
+            _go_to_start(job, rig, runner)
+            whole = _take_states(job, runner, pending)
+        if whole:
             status = "complete"
         else:
             status = "aborted"
@@ -153,9 +178,7 @@ def _run(
         light = run_all([("shut off the light", _shut(rig))])
         if light is not None:
             runner.warn(f"the light could not be shut off: {light}")
-    closing = _closing(runner, rig, status, failure)
-    # A run that can go on keeps its partial name, but for the orderly end after one Ctrl-C.
-    path = writer.seal(status, closing, keep_partial=failure is not None)
+    closing, path = _end_segment(runner, rig, status, failure)
     for observer in watchers:
         observer.run_ended(status, closing)
     if failure is not None:
@@ -223,23 +246,41 @@ def _shut(rig: Rig) -> Callable[[], None]:
     return shut
 
 
-def _closing(runner: CaptureRunner, rig: Rig, status: str, failure: BaseException | None) -> dict[str, Any]:
-    closing: dict[str, Any] = {
-        "end_time": now(),
-        "status": status,
-        "ledger": runner.ledger.summary(),
-        "messages": runner.messages.texts,
-        "messages_dropped": runner.messages.dropped,
-        "interlocks": runner.interlocks.events,
-        "camera_settings": rig.require_camera().settings.model_dump(exclude_none=True),
-    }
-    if failure is not None:
-        closing["failure"] = str(failure) or type(failure).__name__
+def _begin_segment(job: Job, rig: Rig, runner: CaptureRunner, earlier: Earlier) -> None:
+    """Say in the file who takes states of it from now on, and with what."""
+    writer = runner.writer
+    runner.interlocks.remember(earlier.light)
+    writer.segment = earlier.segments
+    runner.warn(f"gone on with as segment {writer.segment}")
     try:
-        closing["stream"] = asdict(rig.require_camera().statistics())
-    except DeviceError as error:
-        closing["stream"] = {"failure": str(error)}
-    return closing
+        writer.file.add_segment_record(begin_record(job, rig, writer.segment))
+    except BaseException:
+        writer.abandon()
+        raise
+
+
+def _end_segment(
+    runner: CaptureRunner, rig: Rig, status: Status, failure: BaseException | None
+) -> tuple[dict[str, Any], Path]:
+    """Write what became of the run, and seal the file. Returns the closing record and the file."""
+    writer = runner.writer
+    end = end_record(runner, rig, writer.segment, status, failure)
+    closing = closing_record([], end)
+    try:
+        writer.settle()
+        records = writer.file.segment_records()
+        closing = closing_record(records, end)
+        # Half of what is left, so that there is room for the next.
+        writer.file.add_segment_record(end, part=0.5)
+        # A run that can go on keeps its partial name, but for the orderly end after one Ctrl-C.
+        return closing, writer.seal(status, closing, keep_partial=failure is not None)
+    except (AcquisitionError, OSError) as error:
+        writer.abandon()
+        if failure is None:
+            raise
+        if str(error) != str(failure):
+            failure.add_note(f"the end of the run could not be recorded: {error}")
+        return closing, writer.path
 
 
 def _result(path: Path, status: Status, job: Job, runner: CaptureRunner) -> Result:

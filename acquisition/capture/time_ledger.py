@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Literal
 
@@ -71,9 +71,24 @@ class TimeLedger:
         summary = {f"{name}_s": round(value, 4) for name, value in sorted(self.spent_s.items())}
         summary |= {"overhead_s": round(total - known, 4), "total_s": round(total, 4), "states": float(self.states)}
         if self.unavoidable_s > 0:
-            states_s = total - sum(self.spent_s.get(entry, 0.0) for entry in BESIDES)
             summary["unavoidable_s"] = round(self.unavoidable_s, 4)
             summary["of_it_readout_s"] = round(self.readout_s, 4)
-            summary["excess"] = round(states_s / self.unavoidable_s - 1, 4)
-            summary["excess_with_readout"] = round(states_s / (self.unavoidable_s - self.readout_s) - 1, 4)
-        return summary
+        return _with_excess(summary)
+
+
+def summed(summaries: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """The summary of several runs that took one capture."""
+    total: dict[str, float] = {}
+    for summary in summaries:
+        for name, value in summary.items():
+            total[name] = round(total.get(name, 0.0) + value, 4)
+    return _with_excess(total)
+
+
+def _with_excess(summary: dict[str, float]) -> dict[str, float]:
+    unavoidable_s = summary.get("unavoidable_s", 0.0)
+    if unavoidable_s > 0:
+        states_s = summary["total_s"] - sum(summary.get(f"{entry}_s", 0.0) for entry in BESIDES)
+        summary["excess"] = round(states_s / unavoidable_s - 1, 4)
+        summary["excess_with_readout"] = round(states_s / (unavoidable_s - summary["of_it_readout_s"]) - 1, 4)
+    return summary

@@ -1,17 +1,17 @@
-"""Writes a capture state by state so that no crash can take a state that was marked done.
+"""Writes a capture state by state so that neither a crash nor a power cut takes a state that was marked done.
 
-All space is taken before the first motion. Each state is written, flushed, marked done and flushed again, by one
-thread, while the next state is under way. A finished file loses its `.partial` and is on the disc by then.
+All space is taken before the first motion. Each state is written, synced, marked done and synced again, by one thread,
+while the next state is under way. A finished file loses its `.partial` and is on the disc by then.
 """
 
 from __future__ import annotations
 
 import errno
 import os
-import queue
 import shutil
 import threading
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,15 +20,24 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from acquisition.capture.closing import closing_of_killed
+from acquisition.capture.state_file import StateFile
 from acquisition.errors import AcquisitionError
 from drivers.motion import Position
 from processing.instrument.states import StateTable
-from processing.storage.capture_schema import CaptureHeader, Status, create_layout, write_closing
+from processing.storage.capture import Capture
+from processing.storage.capture_schema import CaptureHeader, Status, create_layout, json_bytes, write_status
+from processing.storage.segments import encode_line
 
 PARTIAL = ".partial"
-#: Layout and notes besides the frames, and the columns of a state, generously.
-LAYOUT_BYTES = 1 << 20
+NEW = ".new"
+THREAD = "capture writer"
+#: How long the disc may take for one state before the run is ended.
+PATIENCE_S = 2.0
+#: Layout, notes and journals besides the frames, and the columns of a state, generously.
+LAYOUT_BYTES = 3 << 19
 COLUMN_BYTES = 512
+ROW_SUM_BYTES = 4
 
 
 @dataclass(frozen=True)
@@ -43,7 +52,9 @@ class StateRecord:
 
 def bytes_needed(states: int, channels: int, frame_shape: tuple[int, int], itemsize: int = 2) -> int:
     """Bytes of a capture file of this size."""
-    return states * (channels * frame_shape[0] * frame_shape[1] * itemsize + COLUMN_BYTES) + LAYOUT_BYTES
+    return (
+        states * (channels * frame_shape[0] * (frame_shape[1] * itemsize + ROW_SUM_BYTES) + COLUMN_BYTES) + LAYOUT_BYTES
+    )
 
 
 def check_space(folder: Path, needed: int) -> None:
@@ -59,24 +70,44 @@ def check_space(folder: Path, needed: int) -> None:
 class CaptureWriter:
     """An open `.partial` file and the thread that writes into it.
 
-    `put` hands over a state and returns at once; at most two states wait. An error of the writing thread is raised
-    by the next `put` or by `seal`.
+    `put` hands over a state once the one before is on the disc, and returns at once: a power cut takes one state at
+    most of those handed over. Whatever ends the writing thread is raised by the next `put` or by `seal`, and told to
+    `on_failure` at once.
+
+    Attributes
+    ----------
+    on_failure : called from the writing thread with what `put` would raise.
+    segment : number of the segment that the states written now belong to.
     """
 
-    def __init__(self, path: Path, h5: h5py.File) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
-        self._h5 = h5
-        self._queue: queue.Queue[StateRecord | None] = queue.Queue(maxsize=2)
+        self.file = StateFile(path)
+        self.segment = 0
+        self.on_failure: Callable[[AcquisitionError], None] | None = None
+        self._change = threading.Condition()
+        self._record: StateRecord | None = None
+        self._since_s = 0.0
         self._error: BaseException | None = None
-        self._closed = False
-        self._thread = threading.Thread(target=self._work, name="capture writer", daemon=True)
+        self._ending = False
+        self._thread = threading.Thread(target=self._work, name=THREAD, daemon=True)
         self._thread.start()
 
     @classmethod
     def create(
-        cls, path: Path, header: CaptureHeader, table: StateTable, frame_shape: tuple[int, int], start_time: str
+        cls,
+        path: Path,
+        header: CaptureHeader,
+        table: StateTable,
+        frame_shape: tuple[int, int],
+        start_time: str,
+        begin: Mapping[str, Any] | None = None,
     ) -> CaptureWriter:
         """Create `path` + ".partial" with everything allocated.
+
+        Parameters
+        ----------
+        begin : first line of the journal of segments; the file tells what it belongs to from the moment it is there.
 
         Raises
         ------
@@ -85,7 +116,7 @@ class CaptureWriter:
         """
         partial = path.with_name(path.name + PARTIAL)
         # A partial file is whole from the moment it has that name.
-        new = path.with_name(path.name + ".new")
+        new = path.with_name(path.name + NEW)
         needed = bytes_needed(len(table), len(header.channels), frame_shape)
         if path.exists() or partial.exists():
             raise AcquisitionError(f"{path if path.exists() else partial} exists already; nothing was changed")
@@ -93,7 +124,6 @@ class CaptureWriter:
             path.parent.mkdir(parents=True, exist_ok=True)
             check_space(path.parent, needed)
             _try_room(new, needed)
-            h5 = h5py.File(new, "w")
         except OSError as error:
             new.unlink(missing_ok=True)
             if error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT):
@@ -102,49 +132,48 @@ class CaptureWriter:
                 f"{partial} cannot be created ({error}). Choose another folder with --out."
             ) from error
         try:
-            create_layout(h5, header, dict(table.angles_deg), table.role, frame_shape, np.uint16, start_time)
-            h5["entry/states/exposure_s"][...] = table.exposure_s
-            h5["entry/states/repeats"][...] = table.repeats
-            h5.flush()
+            with h5py.File(new, "w") as h5:
+                create_layout(h5, header, dict(table.angles_deg), table.role, frame_shape, np.uint16, start_time)
+                h5["entry/states/exposure_s"][...] = table.exposure_s
+                h5["entry/states/repeats"][...] = table.repeats
+                if begin is not None:
+                    line = np.frombuffer(encode_line(json_bytes(begin)), np.uint8)
+                    h5["entry/segments/json"][: line.size] = line
             _reserve(new)
+            sync(new)
             os.rename(new, partial)
+            sync(partial.parent)
         except (OSError, RuntimeError) as error:
-            _close_quietly(h5)
             new.unlink(missing_ok=True)
             raise _no_room(path.parent, needed, error) from error
-        return cls(partial, h5)
-
-    @classmethod
-    def reopen(cls, partial: Path) -> CaptureWriter:
-        """Open a partial file to go on with it. Raises AcquisitionError."""
-        try:
-            h5 = h5py.File(partial, "r+")
-        except OSError as error:
-            raise AcquisitionError(
-                f"{partial} cannot be opened to go on ({error}). If another program has it open, end that one."
-            ) from error
-        return cls(partial, h5)
+        return cls(partial)
 
     def put(self, record: StateRecord) -> None:
-        """Hand over a state; waits only while two others wait already."""
-        self._raise_error()
-        self._queue.put(record)
+        """Hand over a state, when the one before is on the disc. Raises AcquisitionError after PATIENCE_S."""
+        self.settle()
+        with self._change:
+            self._record, self._since_s = record, time.monotonic()
+            self._change.notify_all()
 
     def set_exposure(self, exposure_s: NDArray[np.float64]) -> None:
-        """Write the exposure of every state; NaN while it is not known. No state may be waiting."""
-        self._drain()
-        self._h5["entry/states/exposure_s"][...] = exposure_s
-        self._h5.flush()
+        """Write the exposure of every state; NaN while it is not known."""
+        self._write_column("exposure_s", exposure_s)
 
     def forget(self) -> None:
         """Mark every state as not done."""
-        self._drain()
-        self._h5["entry/states/done"][...] = 0
-        self._h5.flush()
+        self._write_column("done", np.zeros(self.file.states))
 
-    def _drain(self) -> None:
-        self._queue.join()
-        self._raise_error()
+    def _write_column(self, name: str, values: NDArray[Any]) -> None:
+        self.settle()
+        try:
+            self.file.write_column(name, values)
+        except OSError as error:
+            raise self._failure(error) from error
+
+    def waiting_s(self) -> float:
+        """Seconds that the state in hand has been waiting for the disc."""
+        with self._change:
+            return time.monotonic() - self._since_s if self._record is not None else 0.0
 
     def seal(self, status: Status, closing: Mapping[str, Any], *, keep_partial: bool = False) -> Path:
         """Write what waits, the closing record and the status; give the file its final name.
@@ -162,67 +191,116 @@ class CaptureWriter:
         AcquisitionError
             A state could not be written.
         """
-        self._finish()
         try:
-            write_closing(self._h5, status, closing)
-            self._h5.flush()
+            self.settle()
+            self.file.write_closing(closing)
+        except OSError as error:
+            raise self._failure(error) from error
         finally:
-            self._h5.close()
-        self._raise_error()
-        _sync(self.path)
-        if keep_partial:
-            return self.path
-        final = self.path.with_name(self.path.name.removesuffix(PARTIAL))
-        os.rename(self.path, final)
-        _sync(final.parent)
-        self.path = final
-        return final
+            self.abandon()
+        self.path = finish(self.path, status, keep_name=keep_partial)
+        return self.path
 
     def abandon(self) -> None:
-        """Write what waits and close, without a closing record; never raises."""
-        self._finish()
-        _close_quietly(self._h5)
+        """Write what waits, if the disc takes it, and let go of the file; never raises."""
+        with self._change:
+            self._ending = True
+            self._change.notify_all()
+        self._thread.join(PATIENCE_S)
 
-    def _finish(self) -> None:
-        if not self._closed:
-            self._closed = True
-            self._queue.put(None)
-            self._thread.join()
+    def settle(self) -> None:
+        """Wait until every state handed over is on the disc. Raises AcquisitionError, after PATIENCE_S at most."""
+        with self._change:
+            while self._record is not None and self._error is None:
+                left_s = PATIENCE_S - (time.monotonic() - self._since_s)
+                if left_s <= 0:
+                    raise AcquisitionError(
+                        f"{self.path}: the disc has not taken state {self._record.state} for {PATIENCE_S:g} s. States "
+                        "done before it are intact; go on with --resume when the disc is well."
+                    )
+                self._change.wait(left_s)
+            if self._error is not None:
+                raise self._failure(self._error) from self._error
 
-    def _raise_error(self) -> None:
-        if self._error is not None:
-            raise AcquisitionError(
-                f"{self.path} could not be written ({self._error}). States done before it are intact; "
-                "go on with --resume when the disc is well."
-            ) from self._error
+    def _failure(self, error: BaseException) -> AcquisitionError:
+        why = str(error) or type(error).__name__
+        return AcquisitionError(
+            f"{self.path} could not be written ({why}). States done before it are intact; "
+            "go on with --resume when the disc is well."
+        )
 
     def _work(self) -> None:
-        while (record := self._queue.get()) is not None:
-            try:
-                if self._error is None:
-                    self._write(record)
-            except (OSError, RuntimeError, ValueError, TypeError) as error:
-                # Raised again in the measuring thread by put() or seal().
+        try:
+            while (record := self._next()) is not None:
+                self._write(record)
+                with self._change:
+                    self._record = None
+                    self._change.notify_all()
+        except BaseException as error:  # noqa: BLE001 - whatever it is, the measuring thread must hear of it
+            with self._change:
                 self._error = error
-            finally:
-                self._queue.task_done()
+                self._change.notify_all()
+            if self.on_failure is not None:
+                self.on_failure(self._failure(error))
+        finally:
+            self.file.close()
+
+    def _next(self) -> StateRecord | None:
+        with self._change:
+            while self._record is None and not self._ending:
+                self._change.wait()
+            return self._record
 
     def _write(self, record: StateRecord) -> None:
-        h5, k = self._h5, record.state
         pixels = record.pixels if record.pixels.ndim == 3 else record.pixels[np.newaxis]
-        for channel, image in enumerate(pixels):
-            # A chunk is a frame: written straight through, without the library's cache.
-            h5["entry/instrument/detector/data"].id.write_direct_chunk(
-                (k, channel, 0, 0), np.ascontiguousarray(image).tobytes()
-            )
-        for axis, position in record.positions.items():
-            h5[f"entry/instrument/{axis}/value"][k] = position.deg
-            h5[f"entry/instrument/{axis}/raw_value"][k] = position.counts
-        for name, value in record.columns.items():
-            h5[f"entry/states/{name}"][k] = value
-        h5.flush()
-        h5["entry/states/done"][k] = 1
-        h5.flush()
+        positions = {axis: (position.deg, position.counts) for axis, position in record.positions.items()}
+        self.file.write_state(record.state, pixels, positions, {**record.columns, "segment": self.segment})
+
+
+def finish(partial: Path, status: Status, *, keep_name: bool = False) -> Path:
+    """Write the status of a file whose closing record is there, and give it its final name; returns that.
+
+    Every step may be the last one and every step may be done again.
+    """
+    with h5py.File(partial, "r+") as h5:
+        write_status(h5, status)
+    sync(partial)
+    if keep_name:
+        return partial
+    final = partial.with_name(partial.name.removesuffix(PARTIAL))
+    os.rename(partial, final)
+    sync(final.parent)
+    return final
+
+
+def seal_whole(partial: Path) -> Path | None:
+    """Seal a file whose states are all there, but whose run was killed before its end; None if states are missing.
+
+    Raises
+    ------
+    AcquisitionError
+        Another program has the file open, or it is damaged.
+    """
+    with Capture(partial) as capture:
+        if len(capture.done) < capture.planned_states:
+            return None
+        complete = capture.status == "complete"
+    if not complete:
+        file = StateFile(partial)
+        try:
+            file.write_closing(closing_of_killed(file.segment_records()))
+        finally:
+            file.close()
+    return finish(partial, "complete")
+
+
+def as_partial(path: Path) -> Path:
+    """Give a file that ended in order, but with states missing, its partial name again; returns that."""
+    if path.name.endswith(PARTIAL):
+        return path
+    partial = path.rename(path.with_name(path.name + PARTIAL))
+    sync(partial.parent)
+    return partial
 
 
 def _try_room(path: Path, needed: int) -> None:
@@ -245,17 +323,10 @@ def _reserve(path: Path) -> None:
         os.posix_fallocate(file.fileno(), 0, size)
 
 
-def _sync(path: Path) -> None:
+def sync(path: Path) -> None:
+    """Return when a file, or the names in a folder, are on the disc."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _close_quietly(h5: h5py.File) -> None:
-    try:
-        h5.close()
-    except (OSError, RuntimeError):
-        # The file is lost already; the error that led here says why.
-        return

@@ -41,6 +41,9 @@ def capture(
     home: Annotated[bool, typer.Option("--home", help="home axes that have no reference")] = False,
     campaign: Annotated[Path | None, typer.Option(help="campaign file: run what is missing of it")] = None,
     resume: Annotated[Path | None, typer.Option(help="go on with this partial capture")] = None,
+    as_new: Annotated[
+        bool, typer.Option("--as-new", help="where what is there was begun with something else: begin anew beside it")
+    ] = False,
     live: Annotated[bool, typer.Option("--live", help="show the run on a local web page")] = False,
     yes: Annotated[bool, typer.Option("--yes", help="answer every question with yes")] = False,
     version: Version = False,
@@ -60,7 +63,7 @@ def capture(
     from acquisition.commands import single
 
     options = single.Options(
-        omega, mode, wavelength, sample, exposure, rig, plan, out, seed, dry_run, home, resume, live, yes
+        omega, mode, wavelength, sample, exposure, rig, plan, out, seed, dry_run, home, resume, as_new, live, yes
     )
     if campaign is None:
         raise typer.Exit(_stoppable(lambda stop: single.run(options, stop)))
@@ -89,13 +92,13 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     Exit codes: 0 done, 1 the run failed, 2 bad input, 130 interrupted.
     """
-    from acquisition.errors import AcquisitionError, PlanRefused, Stopped
+    from acquisition.errors import AcquisitionError, Differs, PlanRefused, Stopped
     from drivers.errors import DeviceError
     from processing.errors import ProcessError
 
     try:
         app(args=None if argv is None else list(argv))
-    except (PlanRefused, ProcessError) as error:
+    except (PlanRefused, Differs, ProcessError) as error:
         _report(error, 2)
     except Stopped as error:
         _report(error, INTERRUPTED)

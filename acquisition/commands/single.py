@@ -16,15 +16,17 @@ from acquisition.capture import session
 from acquisition.capture.checks import Check, refuse_failed
 from acquisition.capture.estimate import capture_seconds
 from acquisition.capture.header import default_name
-from acquisition.capture.job import Job, Result, check_with_devices, job_of, prepare
+from acquisition.capture.job import Job, Result, check_with_devices, job_of, prepare, stored_plan, stored_rig
 from acquisition.capture.operator import Operator
 from acquisition.capture.plan import MeasurementPlan
+from acquisition.capture.writer import PARTIAL, seal_whole
 from acquisition.commands.defaults import CONFIGS, DEFAULT_RIG, INTERRUPTED
 from acquisition.rig.config import RigConfig, load_rig
 from acquisition.rig.rig import Rig
 from acquisition.screen.observer import Observer
 from acquisition.screen.progress import ConsoleProgress
 from acquisition.stop_request import StopRequest
+from processing.storage.capture import Capture
 from processing.storage.capture_schema import Sample
 from processing.yaml_file import ConfigError
 
@@ -45,6 +47,7 @@ class Options:
     dry_run: bool
     home: bool
     resume: Path | None
+    as_new: bool
     live: bool
     yes: bool
 
@@ -52,12 +55,10 @@ class Options:
 def run(options: Options, stop: StopRequest) -> int:
     """Take or go on with one capture; returns the exit code. Raises the errors that `main` prints."""
     console = Console(stderr=True)
-    if options.resume is not None:
-        job = job_of(options.resume, load_rig(options.rig) if options.rig else None)
-        path = options.resume
-    else:
-        job = prepare(plan_of(options), rig_of(options))
-        path = options.out / default_name(job.plan)
+    if options.resume is not None and (sealed := _sealed(options.resume)) is not None:
+        typer.echo(f"every state was there already; sealed as {sealed}")
+        return 0
+    job, path, resuming = _job(options)
     say_simulated(console, job.rig)
     operator = Operator(console.print, stop, options.yes, job.rig.simulated)
     with Rig(job.rig, ask=operator.confirm) as rig:
@@ -70,11 +71,49 @@ def run(options: Options, stop: StopRequest) -> int:
         refuse_failed(checks)
         if stop.requested:
             return INTERRUPTED
-        take = session.take if options.resume is None else session.resume
+        take = session.resume if resuming else session.take
         with live_page(options.live, job.rig, stop, console) as page:
             result = take(job, rig, path, stop, [ConsoleProgress(console), *page], home=options.home)
     summarize(job, result)
     return INTERRUPTED if result.status == "aborted" else 0
+
+
+def _job(options: Options) -> tuple[Job, Path, bool]:
+    """The job, its file, and whether the file is gone on with."""
+    if options.resume is None:
+        job = prepare(plan_of(options), rig_of(options))
+        return job, options.out / default_name(job.plan), False
+    _refuse_with_resume(options)
+    rig = load_rig(options.rig) if options.rig else None
+    if not options.as_new:
+        return job_of(options.resume, rig), options.resume, True
+    with Capture(options.resume) as capture:
+        plan, rig = stored_plan(capture), rig or stored_rig(capture)
+    return prepare(plan, rig), beside(options.resume), False
+
+
+def _sealed(path: Path) -> Path | None:
+    return seal_whole(path) if path.name.endswith(PARTIAL) and path.exists() else None
+
+
+def _refuse_with_resume(options: Options) -> None:
+    """A capture that is gone on with has its plan in its file."""
+    given = [name for name in ("omega", "mode", "wavelength", "sample", "exposure", "plan", "seed") if
+             getattr(options, name) is not None]  # fmt: skip
+    if given:
+        raise ConfigError(
+            f"--{given[0]} has no meaning with --resume: the plan is in {options.resume}. Leave it out, or take a new "
+            "capture without --resume."
+        )
+
+
+def beside(path: Path) -> Path:
+    """A name for a new capture beside one that is kept: NAME-2.h5, or the next number that is free."""
+    stem = path.name.removesuffix(PARTIAL).removesuffix(".h5")
+    number = 2
+    while any((path.parent / f"{stem}-{number}.h5{end}").exists() for end in ("", PARTIAL)):
+        number += 1
+    return path.parent / f"{stem}-{number}.h5"
 
 
 def plan_of(options: Options) -> MeasurementPlan:

@@ -2,17 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
 
 from acquisition.errors import InterlockOpened
 from acquisition.rig.rig import Rig
 from acquisition.screen.observer import StateReport
 from acquisition.stop_request import StopRequest
+from processing.storage.capture import Capture
+
+#: Exposure in seconds, then the angles of the axes in the order of their names, whole turns apart the same.
+Pose = tuple[float, ...]
 
 #: How often an open interlock is looked at.
 LOOK_S = 0.05
 #: What an interlock's reason starts with where it can close by itself.
 WAITABLE = ("the door", "the camera")
+
+
+def _pose(exposure_s: float, angles_deg: Mapping[str, float]) -> Pose:
+    return (float(exposure_s), *(round(float(angles_deg[axis]) % 360, 2) % 360 for axis in sorted(angles_deg)))
+
+
+@dataclass(frozen=True)
+class LightSoFar:
+    """Counts per second of a capture's first light state, and of the first at each pose and exposure."""
+
+    first: float | None
+    at: Mapping[Pose, float]
+
+
+def light_so_far(capture: Capture) -> LightSoFar:
+    """The light that a partial capture has measured, as its interlocks saw it."""
+    exposure_s, monitor = capture.column("exposure_s"), capture.column("monitor")
+    shortest_s = 1.001 * np.nanmin(capture.planned_column("exposure_s"), initial=np.inf)
+    judged = [k for k, role in enumerate(capture.role) if role != "dark" and exposure_s[k] <= shortest_s]
+    at: dict[Pose, float] = {}
+    for k in judged:
+        pose = _pose(exposure_s[k], {axis: angles[k] for axis, angles in capture.angles_deg.items()})
+        at.setdefault(pose, float(monitor[k]))
+    return LightSoFar(float(monitor[judged[0]]) if judged else None, at)
 
 
 class Interlocks:
@@ -22,6 +53,9 @@ class Interlocks:
     ----------
     warn : told when one opens and closes.
     go_on : True if the plan lets the run go on by itself when it closes again.
+
+    What the lamp and the drift are held against is the light of the capture's first states, in whichever run they were
+    taken: `remember` brings it from the file.
     """
 
     def __init__(self, rig: Rig, warn: Callable[[str], None], go_on: bool) -> None:
@@ -31,7 +65,11 @@ class Interlocks:
         self.events: list[dict[str, str | float]] = []
         self._entries = {entry.kind: entry for entry in rig.config.interlocks}
         self._first_light: float | None = None
-        self._light_at: dict[tuple[float, ...], float] = {}
+        self._light_at: dict[Pose, float] = {}
+
+    def remember(self, light: LightSoFar) -> None:
+        """Hold what comes against the light of the states that the capture has already."""
+        self._first_light, self._light_at = light.first, dict(light.at)
 
     def open_now(self) -> str | None:
         """Why no state may be taken now, or None."""
@@ -59,7 +97,7 @@ class Interlocks:
         lamp, drift = self._entries.get("lamp"), self._entries.get("drift")
         if lamp is not None and report.monitor <= lamp.limit * self._first_light:
             return f"the light is {100 * report.monitor / self._first_light:.1f} % of that of the first state"
-        pose = (report.exposure_s, *(round(p.deg % 360, 2) % 360 for p in report.positions.values()))
+        pose = _pose(report.exposure_s, {axis: p.deg for axis, p in report.positions.items()})
         before = self._light_at.setdefault(pose, report.monitor)
         if drift is not None and abs(report.monitor - before) > drift.limit * abs(before):
             return f"the light has drifted by {100 * (report.monitor / before - 1):+.2f} % since the same pose before"

@@ -17,7 +17,12 @@ from pydantic import ValidationError
 from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture_schema import SCHEMA_VERSION, CaptureHeader
+from processing.storage.checksums import NONE, row_crc32, state_crc32
+from processing.storage.segments import Segment, decode_lines, segments_of
 from processing.yaml_file import parse_yaml
+
+#: Columns that are no part of a state's checksum: the mark that it is there, and the checksum itself.
+UNSUMMED = ("done", "crc32")
 
 
 class CaptureError(ProcessError):
@@ -26,6 +31,8 @@ class CaptureError(ProcessError):
 
 class Capture:
     """One capture file, open for reading. States not marked done do not exist for a reader.
+
+    Every state read is held against its checksum; CaptureError names one that was changed on the disc.
 
     Attributes
     ----------
@@ -61,7 +68,8 @@ class Capture:
         entry = self._h5["entry"]
         self.header = CaptureHeader.model_validate_json(entry.attrs["header_json"])
         self.simulated: bool = bool(entry.attrs["simulated"])
-        self.status: str = str(entry.attrs["status"])
+        status = entry.attrs["status"]
+        self.status: str = status.decode() if isinstance(status, bytes) else str(status)
         states = entry["states"]
         done = np.flatnonzero(states["done"][...])
         self.planned_states: int = states["done"].shape[0]
@@ -73,6 +81,38 @@ class Capture:
             if group.attrs.get("NX_class") == "NXpositioner"
         }
         self._frames: h5py.Dataset = entry["instrument/detector/data"]
+        self._sums = self._verified_sums(entry) if version > 1 else None
+
+    def _verified_sums(self, entry: h5py.Group) -> NDArray[np.uint32] | None:
+        """Checksums of the rows (states done, channels, rows), None without any; the states' own are verified here."""
+        columns = {name: column[...][self.done] for name, column in entry["states"].items() if name != "role"}
+        told = columns["crc32"]
+        if np.all(told == NONE):
+            return None
+        sums: NDArray[np.uint32] = entry["instrument/detector/row_crc32"][...][self.done]
+        for axis in self.angles_deg:
+            for name in ("value", "raw_value"):
+                columns[f"{axis}/{name}"] = entry[f"instrument/{axis}/{name}"][...][self.done]
+        for k in np.flatnonzero(told != NONE):
+            values = {name: column[k] for name, column in columns.items() if name not in UNSUMMED}
+            if state_crc32(sums[k], values) != told[k]:
+                raise self._changed(int(k), "its angles or columns")
+        return sums
+
+    def _verify(self, state: int, rows: slice, counts: NDArray[Any]) -> None:
+        if self._sums is not None and not np.array_equal(row_crc32(counts), self._sums[state, :, rows]):
+            raise self._changed(state, "its frame")
+
+    def _changed(self, state: int, what: str) -> CaptureError:
+        return CaptureError(
+            f"{self.path}: state {self.done[state]} was changed on the disc, {what} and the checksum differ. Take the "
+            "file from a copy; `acquire verify` tells what else is damaged."
+        )
+
+    @property
+    def checked(self) -> bool:
+        """Whether the file has checksums, so that a change on the disc is noticed."""
+        return self._sums is not None
 
     def column(self, name: str) -> NDArray[Any]:
         """A column of the state table (exposure_s, host_time_s, ...) for the states done."""
@@ -102,7 +142,9 @@ class Capture:
 
     def frames(self, state: int, rows: slice = slice(None)) -> NDArray[Any]:
         """Counts (channels, rows, columns) of one state done, as stored."""
-        return np.asarray(self._frames[int(self.done[state]), :, rows, :])
+        counts = np.asarray(self._frames[int(self.done[state]), :, rows, :])
+        self._verify(state, rows, counts)
+        return counts
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -119,6 +161,7 @@ class Capture:
         """Fill `out` (len(states), channels, rows, columns) with counts of states done, as stored."""
         for k, state in enumerate(states):
             self._frames.read_direct(out, np.s_[int(self.done[state]), :, rows, :], np.s_[k])
+            self._verify(int(state), rows, out[k])
 
     def row_blocks(self, pixels: int = 1 << 17) -> Iterator[slice]:
         """Row slices of about `pixels` pixels, an even number of rows each (mosaics stay whole)."""
@@ -134,6 +177,14 @@ class Capture:
             return None
         model = parse_yaml(self.header.instrument_yaml, InstrumentModel, source=f"{self.path}: instrument model")
         return model.at(self.header.wavelength_nm)
+
+    @cached_property
+    def segments(self) -> tuple[Segment, ...]:
+        """The runs that took states of this capture, one after another; the light may jump between them."""
+        if "segments" not in self._h5["entry"]:
+            return segments_of([], self.done)
+        records, _ = decode_lines(self._h5["entry/segments/json"][...].tobytes())
+        return segments_of(records, self.column("segment"))
 
     @cached_property
     def closing(self) -> dict[str, Any]:

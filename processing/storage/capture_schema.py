@@ -14,14 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-SCHEMA_VERSION = 1
+#: 2 added segments and checksums; a file of version 1 is read, but not gone on with.
+SCHEMA_VERSION = 2
 
 Status = Literal["running", "complete", "aborted", "failed"]
 SampleKind = Literal["air", "mirror", "mueller", "unknown"]
 
+#: The longest status; shorter ones are padded, so that a status is replaced in its place.
+STATUS_TYPE = h5py.string_dtype("ascii", 8)
+#: Bytes set aside for the closing record, and for the records of all segments.
+CLOSING_BYTES = 256 * 1024
+SEGMENTS_BYTES = 512 * 1024
+
 #: One row of /entry/states a state; filled when the state is taken.
 STATE_COLUMNS: dict[str, Any] = {
     "done": np.uint8,
+    "segment": np.int32,
+    "crc32": np.int64,
     "exposure_s": np.float64,
     "repeats": np.int32,
     "host_time_s": np.float64,
@@ -32,6 +41,8 @@ STATE_COLUMNS: dict[str, Any] = {
     "near_black_fraction": np.float64,
     "monitor": np.float64,
 }
+#: What a column holds before its state is taken, where it is not NaN or zero.
+EMPTY: dict[str, int] = {"repeats": 1, "crc32": -1}
 
 
 class _Part(BaseModel):
@@ -113,7 +124,7 @@ def create_layout(
     entry = _group(h5, "entry", "NXentry")
     entry.attrs["default"] = "data"
     entry.attrs["simulated"] = header.simulated
-    entry.attrs["status"] = "running"
+    entry.attrs.create("status", b"running", dtype=STATUS_TYPE)
     for key in ("title", "mode"):
         entry[key] = getattr(header, key)
     entry["start_time"] = start_time
@@ -133,6 +144,7 @@ def create_layout(
     detector = _group(instrument, "detector", "NXdetector")
     frames = _allocated(detector, "data", (n, c, *frame_shape), dtype, chunks=(1, 1, *frame_shape))
     frames.attrs["long_name"] = "counts (state, channel, row, column)"
+    _allocated(detector, "row_crc32", (n, c, frame_shape[0]), np.uint32, chunks=None)
     detector["channels"] = [name.encode() for name in header.channels]
     for key in ("black_level_counts", "gain_e_per_count", "read_noise_e", "full_well_e", "bits"):
         value = getattr(header.detector, key)
@@ -145,7 +157,7 @@ def create_layout(
     states = _group(entry, "states", "NXcollection")
     states["role"] = [r.encode() for r in role]
     for name, kind in STATE_COLUMNS.items():
-        empty = np.nan if np.issubdtype(kind, np.floating) else int(name == "repeats")
+        empty = np.nan if np.issubdtype(kind, np.floating) else EMPTY.get(name, 0)
         _column(states, name, n, kind, empty)
 
     for name, text in (
@@ -159,9 +171,10 @@ def create_layout(
     data = _group(entry, "data", "NXdata")
     data.attrs["signal"] = "data"
     data["data"] = h5py.SoftLink("/entry/instrument/detector/data")
-    # Written at sealing, in space that exists already: status, end time, ledger, statistics, messages.
-    closing = _group(entry, "closing", "NXcollection")
-    _allocated(closing, "json", (256 * 1024,), np.uint8, chunks=None)
+    # Written later, in space that exists already: a line for the begin and the end of each segment of the run, and at
+    # sealing end time, ledger, statistics and messages.
+    for name, size in (("segments", SEGMENTS_BYTES), ("closing", CLOSING_BYTES)):
+        _column(_group(entry, name, "NXcollection"), "json", size, np.uint8, 0)
 
 
 def write_closing(h5: h5py.File, status: Status, closing: Mapping[str, Any]) -> None:
@@ -171,18 +184,23 @@ def write_closing(h5: h5py.File, status: Status, closing: Mapping[str, Any]) -> 
     lists, and says so under `left_out`: a capture is sealed whatever happened in it.
     """
     box = h5["entry/closing/json"]
-    raw = _closing_json(closing, room=box.shape[0])
+    raw = fitted_json(closing, room=box.shape[0])
     padded = np.zeros(box.shape, dtype=np.uint8)
     padded[: len(raw)] = np.frombuffer(raw, dtype=np.uint8)
     box[...] = padded
-    h5["entry"].attrs.modify("status", status)
+    write_status(h5, status)
 
 
-def _closing_json(closing: Mapping[str, Any], room: int) -> bytes:
+def write_status(h5: h5py.File, status: Status) -> None:
+    """Replace the status in its place: nothing else of the file changes."""
+    h5["entry"].attrs.modify("status", np.array(status.encode(), dtype=STATUS_TYPE))
+
+
+def fitted_json(closing: Mapping[str, Any], room: int) -> bytes:
     """JSON in at most `room` bytes; `left_out` tells entries of lists, characters of texts and whole values cut."""
     record, left_out = dict(closing), dict[str, int]()
-    while len(raw := _json(record)) > room:
-        longest = max(set(record) - {"left_out"}, key=lambda name: len(_json(record[name])))
+    while len(raw := json_bytes(record)) > room:
+        longest = max(set(record) - {"left_out"}, key=lambda name: len(json_bytes(record[name])))
         value = record.pop(longest)
         cut = 1
         if isinstance(value, (list, str)) and len(value) > 1:
@@ -193,7 +211,8 @@ def _closing_json(closing: Mapping[str, Any], room: int) -> bytes:
     return raw
 
 
-def _json(value: Any) -> bytes:
+def json_bytes(value: Any) -> bytes:
+    """JSON of plain values; what is not plain becomes its text."""
     # A lone surrogate, from the name of a file, becomes an escape that JSON reads.
     return json.dumps(value, ensure_ascii=False, default=str).encode(errors="backslashreplace")
 

@@ -42,6 +42,6 @@ def test_a_kill_leaves_the_states_done_to_any_reader(spawn, partial_of, quick_ri
         done = file["entry/states/done"][...]
         assert done[:8].all()
         assert not done[-1]
-        assert file["entry"].attrs["status"] == "running"
+        assert file["entry"].attrs["status"] == b"running"
     # Nothing grew while it ran: the space was there before the first motion.
     assert partial.stat().st_size == size

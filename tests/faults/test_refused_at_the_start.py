@@ -7,6 +7,7 @@ import sys
 
 import pytest
 
+from acquisition.capture.writer import bytes_needed
 from drivers.errors import DeviceError
 from processing.storage.capture import Capture
 from simulators.rig.served_rig import serve
@@ -22,7 +23,7 @@ def test_disc_too_small_is_refused_before_any_motion(spawn, quick_rig, tmp_path)
     child = spawn("--omega", 35, "--rig", rig, "--out", tmp_path / "out", preexec_fn=starve)
     out, err = child.communicate(timeout=60)
     assert child.returncode == 1, out + err
-    needed = 44 * (64 * 80 * 2 + 512) + (1 << 20)
+    needed = bytes_needed(44, 1, (64, 80))
     assert f"needs {needed:,} bytes" in err
     assert "Nothing was moved" in err
     assert "homing" not in err

@@ -1,0 +1,47 @@
+"""The closing record of a capture, made of what its segments said at their ends."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from acquisition.capture.header import now
+from acquisition.capture.time_ledger import summed
+
+
+def closing_record(records: Sequence[dict[str, Any]], last: dict[str, Any]) -> dict[str, Any]:
+    """The closing record: the last segment's, with times, messages and interlocks of all of them.
+
+    Parameters
+    ----------
+    records : the journal of the segments before the last one ended.
+    """
+    ends = [record for record in records if record["event"] == "end"] + [last]
+    killed = sum(record["event"] == "begin" for record in records) - len(ends)
+    closing = {key: value for key, value in last.items() if key not in ("event", "segment", "time")}
+    closing["end_time"] = last["time"]
+    closing["segments"] = last["segment"] + 1
+    closing["segments_cut_off"] = killed
+    closing["ledger"] = summed([end["ledger"] for end in ends])
+    closing["messages"] = [text for end in ends for text in end["messages"]]
+    closing["messages_dropped"] = sum(end["messages_dropped"] for end in ends)
+    closing["interlocks"] = [event for end in ends for event in end["interlocks"]]
+    return closing
+
+
+def closing_of_killed(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The closing record of a capture with all its states, whose last run was killed before it wrote one."""
+    last = {
+        "event": "end",
+        "segment": sum(record["event"] == "begin" for record in records) - 1,
+        "time": now(),
+        "status": "complete",
+        "ledger": {},
+        "messages": ["every state was there, but the run was cut off before its end; sealed afterwards"],
+        "messages_dropped": 0,
+        "interlocks": [],
+    }
+    if records and records[-1]["event"] == "end":
+        last = dict(records[-1], status="complete")
+        records = records[:-1]
+    return closing_record(records, last)

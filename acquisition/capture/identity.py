@@ -1,0 +1,163 @@
+"""What a capture is made with, and in which way two runs that should belong together differ.
+
+Plan, rig, instrument, devices and program are the same in all parts of a capture. What may differ is where a device is
+plugged in, and how far its counters are.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from acquisition.capture.plan import MeasurementPlan
+from acquisition.errors import Differs
+from acquisition.rig.config import RigConfig
+from acquisition.rig.rig import Rig
+from drivers.camera import CameraSettings
+from processing.instrument.model import InstrumentModel
+from processing.storage.capture import Capture
+from processing.storage.segments import Identity
+from processing.yaml_file import parse_yaml
+
+#: Keys of a rig file that tell where something is, not what it is.
+PLACES = ("port", "device", "wire_log")
+#: Properties of a device that stay.
+LASTING = (
+    "kind", "vendor", "model", "serial_number", "firmware", "sensor_width", "sensor_height", "pixel_format", "bits",
+)  # fmt: skip
+#: Camera settings that the plan changes, or that concern the cable.
+PASSING = ("exposure_s", "frame_average", "packet_size", "trigger")
+
+
+def identity_of(plan: MeasurementPlan, config: RigConfig, instrument: InstrumentModel, rig: Rig | None) -> Identity:
+    """Digests of what a run is made with; without `rig`, what the files alone tell."""
+    return Identity(
+        simulated=config.simulated,
+        plan=digest(plain(plan)),
+        rig=digest(rig_content(config, plan.mode)),
+        instrument=digest(plain(instrument)),
+        software=f"umov {version('umov')}",
+        files=files_of(config, plan.mode),
+        devices={} if rig is None else lasting(rig.describe()),
+    )
+
+
+def lasting(devices: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, str]]:
+    """The properties of devices that stay, as text."""
+    return {name: {key: str(told[key]) for key in LASTING if key in told} for name, told in devices.items()}
+
+
+def places(devices: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+    """Port or address of each device."""
+    return {name: str(told.get("port", told.get("address", ""))) for name, told in devices.items()}
+
+
+def plain(model: BaseModel) -> Any:
+    """A model as plain values."""
+    return model.model_dump(mode="json", exclude_none=True)
+
+
+def rig_content(config: RigConfig, mode: str) -> Any:
+    """A rig file without places, files and the modes that this capture does not use."""
+    tree = config.model_dump(mode="python", exclude_none=True)
+    tree["modes"] = {mode: tree["modes"][mode]}
+    return json.loads(json.dumps(_without(tree), default=str))
+
+
+def files_of(config: RigConfig, mode: str) -> dict[str, str]:
+    """Digest of the content of each file that a rig file names, but for the instrument, which is compared in words."""
+    tree = config.model_dump(mode="python", exclude_none=True)
+    tree.pop("modes")
+    tree.pop("wire_log", None)
+    return {key: hashlib.sha256(path.read_bytes()).hexdigest() for key, path in _paths(tree, "") if path.is_file()}
+
+
+def _optics(instrument: InstrumentModel) -> Any:
+    """An instrument without its mosaic: that one is stored as the camera sees it and compared with the camera."""
+    return {key: value for key, value in plain(instrument).items() if key != "mosaic"}
+
+
+def digest(tree: Any) -> str:
+    """SHA-256 of plain values, whatever the order of their keys."""
+    return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()
+
+
+def require_same(capture: Capture, plan: MeasurementPlan, config: RigConfig, instrument: InstrumentModel) -> None:
+    """Refuse to go on with a capture that was begun with something else, as far as files tell.
+
+    Raises
+    ------
+    Differs
+        With every difference in words.
+    """
+    header, began = capture.header, capture.segments[0].identity
+    if began is None:
+        raise Differs(str(capture.path), ["it does not tell what it was made with: an older version or an import"])
+    mode = header.mode
+    then_rig = parse_yaml(header.rig_yaml, RigConfig, source=f"{capture.path}: rig")
+    then_plan = parse_yaml(header.plan_yaml, MeasurementPlan, source=f"{capture.path}: plan")
+    then_model = parse_yaml(header.instrument_yaml, InstrumentModel, source=f"{capture.path}: instrument model")
+    found = [*differences(plain(then_plan), plain(plan), "plan")]
+    if not found:
+        now = identity_of(plan, config, instrument, None)
+        found += differences(began.simulated, now.simulated, "simulated")
+        found += differences(rig_content(then_rig, mode), rig_content(config, mode), "rig")
+        found += differences(_optics(then_model), _optics(instrument), "instrument")
+        found += differences(began.files, now.files, "content of the file")
+        found += differences(began.software, now.software, "program")
+    if found:
+        raise Differs(str(capture.path), found)
+
+
+def require_same_devices(capture: Capture, rig: Rig) -> None:
+    """Refuse to go on with other devices, or a camera that is set otherwise. Raises Differs."""
+    began = capture.segments[0]
+    then = began.identity.devices if began.identity is not None else {}
+    settings = rig.require_camera().settings.model_dump(mode="json")
+    found = [*differences(then, lasting(rig.describe()), "device")]
+    for key in CameraSettings.model_fields:
+        if key not in PASSING:
+            found += differences(began.camera_settings.get(key), settings.get(key), f"camera setting.{key}")
+    if found:
+        raise Differs(str(capture.path), found)
+
+
+def differences(then: Any, now: Any, key: str) -> Iterator[str]:
+    """Where two trees of plain values differ, each in a line of words."""
+    if isinstance(then, dict) and isinstance(now, dict):
+        for name in [*then, *(name for name in now if name not in then)]:
+            yield from differences(then.get(name), now.get(name), f"{key}.{name}")
+    elif isinstance(then, list) and isinstance(now, list) and len(then) == len(now):
+        for number, (a, b) in enumerate(zip(then, now, strict=True)):
+            yield from differences(a, b, f"{key}[{number}]")
+    elif then != now:
+        yield f"{key}: {_said(then)} at the start, {_said(now)} now"
+
+
+def _said(value: Any) -> str:
+    text = "nothing" if value is None else str(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _without(tree: Any) -> Any:
+    if isinstance(tree, dict):
+        return {
+            str(key): _without(value)
+            for key, value in tree.items()
+            if key not in PLACES and not isinstance(value, Path)
+        }
+    return [_without(value) for value in tree] if isinstance(tree, list | tuple) else tree
+
+
+def _paths(tree: Any, key: str) -> Iterator[tuple[str, Path]]:
+    if isinstance(tree, Path):
+        yield key.lstrip("."), tree
+    elif isinstance(tree, dict):
+        for name, value in tree.items():
+            yield from _paths(value, f"{key}.{name}")

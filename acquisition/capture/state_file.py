@@ -1,0 +1,204 @@
+"""A capture file whose layout is there, written in its place with plain system calls.
+
+Every byte of a capture has its place before the first motion. A state is then a few writes at known places and two
+syncs: HDF5 has no part in it, so it cannot leave its own structures half written, and a disc that blocks holds neither
+its lock nor Python's.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from acquisition.errors import AcquisitionError
+from processing.storage.capture_schema import fitted_json, json_bytes
+from processing.storage.checksums import row_crc32, state_crc32
+from processing.storage.segments import decode_lines, encode_line
+
+#: Checksum, blank and line break of a line of the journal.
+LINE_BYTES = 10
+#: What a damaged file makes HDF5 and the look-ups in it raise.
+UNREADABLE = (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError)
+
+
+class _Place:
+    """Where a dataset without chunks lies in the file: its first byte, bytes of a row, type of a value.
+
+    Parameters
+    ----------
+    whole : the dataset is one row, a box of bytes.
+    """
+
+    def __init__(self, dataset: h5py.Dataset, whole: bool = False) -> None:
+        offset = dataset.id.get_offset()
+        if offset is None:
+            raise ValueError(f"{dataset.name} has no place of its own in the file")
+        self.offset: int = offset
+        self.dtype = dataset.dtype
+        self.step = self.dtype.itemsize * int(np.prod(dataset.shape if whole else dataset.shape[1:]))
+
+
+class StateFile:
+    """An open capture file in which states are written at their places.
+
+    Parameters
+    ----------
+    path : of a file with the layout of `capture_schema.create_layout`.
+
+    Raises
+    ------
+    AcquisitionError
+        Another program has the file open, or it is not a whole capture.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self._file = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+        except OSError as error:
+            raise AcquisitionError(f"{path} cannot be opened to go on ({error.strerror}).") from error
+        try:
+            self._find_places()
+            # The lock that HDF5 takes as well: nobody opens the file while it is written.
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(self._file)
+            raise AcquisitionError(
+                f"{path} cannot be opened to go on: another program has it open. End that one first."
+            ) from None
+        except UNREADABLE as error:
+            os.close(self._file)
+            raise AcquisitionError(
+                f"{path} cannot be opened to go on ({error}). If another program has it open, end that one; if the "
+                "file is damaged, begin a new capture."
+            ) from error
+
+    def _find_places(self) -> None:
+        with h5py.File(self.path, "r") as h5:
+            entry = h5["entry"]
+            states, detector = entry["states"], entry["instrument/detector"]
+            self.states: int = states["done"].shape[0]
+            self._columns = {name: _Place(states[name]) for name in states if name != "role"}
+            self._axes = {
+                axis: {name: _Place(group[name]) for name in ("value", "raw_value")}
+                for axis, group in entry["instrument"].items()
+                if group.attrs.get("NX_class") == "NXpositioner"
+            }
+            self._row_sums = _Place(detector["row_crc32"])
+            self._segments = _Place(entry["segments/json"], whole=True)
+            self._closing = _Place(entry["closing/json"], whole=True)
+            data = detector["data"]
+            self.frame_shape: tuple[int, int] = data.shape[2:]
+            self._frames = [
+                [data.id.get_chunk_info_by_coord((k, c, 0, 0)).byte_offset for c in range(data.shape[1])]
+                for k in range(data.shape[0])
+            ]
+            self._frame_type = data.dtype
+
+    def write_state(
+        self, state: int, pixels: NDArray[Any], positions: Mapping[str, tuple[float, float]], values: Mapping[str, Any]
+    ) -> None:
+        """Write a state and its checksum; it is on the disc, and then marked done there, when this returns.
+
+        Parameters
+        ----------
+        pixels : counts (channels, rows, columns).
+        positions : for each axis, degrees and the controller's own number.
+        values : of the state's columns; those that are not given stay as they are.
+        """
+        pixels = np.ascontiguousarray(pixels, dtype=self._frame_type)
+        for channel, image in enumerate(pixels):
+            self._write(self._frames[state][channel], image)
+        sums = row_crc32(pixels)
+        self._put(self._row_sums, state, sums)
+        for axis, (degrees, counts) in positions.items():
+            self._put(self._axes[axis]["value"], state, degrees)
+            self._put(self._axes[axis]["raw_value"], state, counts)
+        for name, value in values.items():
+            self._put(self._columns[name], state, value)
+        self._put(self._columns["crc32"], state, state_crc32(sums, self._stored(state)))
+        self.sync()
+        self._put(self._columns["done"], state, 1)
+        self.sync()
+
+    def _stored(self, state: int) -> dict[str, np.generic]:
+        """Values of a state as the file has them, but for its mark and its checksum."""
+        columns = {name: column for name, column in self._columns.items() if name not in ("done", "crc32")}
+        columns |= {f"{axis}/{name}": column for axis, pair in self._axes.items() for name, column in pair.items()}
+        return {name: self._get(column, state) for name, column in columns.items()}
+
+    def read_column(self, name: str) -> NDArray[Any]:
+        """A column of all planned states."""
+        column = self._columns[name]
+        raw = os.pread(self._file, self.states * column.step, column.offset)
+        return np.frombuffer(raw, column.dtype).copy()
+
+    def write_column(self, name: str, values: NDArray[Any]) -> None:
+        """Replace a column of all planned states."""
+        column = self._columns[name]
+        self._write(column.offset, np.ascontiguousarray(values, dtype=column.dtype))
+        self.sync()
+
+    def add_segment_record(self, record: Mapping[str, Any], part: float = 1.0) -> None:
+        """Add a line to the journal of segments, cut to this part of the room left. Raises AcquisitionError if full."""
+        end = self._journal()[1]
+        room = int(part * (self._segments.step - end)) - LINE_BYTES
+        raw = json_bytes(record) if part == 1 else fitted_json(record, max(room, 0))
+        if len(raw) > room:
+            raise AcquisitionError(
+                f"{self.path} was gone on with so often that its journal is full. Begin it anew with --as-new."
+            )
+        line = encode_line(raw)
+        # What a line that was cut off has left goes with it.
+        rest = np.zeros(self._segments.step - end, np.uint8)
+        rest[: len(line)] = np.frombuffer(line, np.uint8)
+        self._write(self._segments.offset + end, rest)
+        self.sync()
+
+    def segment_records(self) -> list[dict[str, Any]]:
+        """The lines of the journal of segments."""
+        return self._journal()[0]
+
+    def _journal(self) -> tuple[list[dict[str, Any]], int]:
+        return decode_lines(os.pread(self._file, self._segments.step, self._segments.offset))
+
+    def write_closing(self, record: Mapping[str, Any]) -> None:
+        """Replace the closing record; one that is too long loses what `fitted_json` leaves out."""
+        raw = fitted_json(record, self._closing.step)
+        box = np.zeros(self._closing.step, np.uint8)
+        box[: len(raw)] = np.frombuffer(raw, np.uint8)
+        self._write(self._closing.offset, box)
+        self.sync()
+
+    def sync(self) -> None:
+        """Return when all that was written is on the disc."""
+        os.fdatasync(self._file)
+
+    def close(self) -> None:
+        """Let go of the file; never raises."""
+        # The number may belong to another file from now on.
+        number, self._file = self._file, -1
+        with contextlib.suppress(OSError):
+            os.close(number)
+
+    def _put(self, column: _Place, state: int, value: Any) -> None:
+        self._write(column.offset + state * column.step, np.asarray(value, dtype=column.dtype))
+
+    def _get(self, column: _Place, state: int) -> np.generic:
+        raw = os.pread(self._file, column.step, column.offset + state * column.step)
+        value: np.generic = np.frombuffer(raw, column.dtype)[0]
+        return value
+
+    def _write(self, offset: int, values: NDArray[Any]) -> None:
+        raw = np.ascontiguousarray(values).reshape(-1).view(np.uint8).data
+        while raw:
+            written = os.pwrite(self._file, raw, offset)
+            raw, offset = raw[written:], offset + written

@@ -1,0 +1,32 @@
+"""Checksums of a capture: one for each row of each frame, one for everything else that a state says.
+
+They are written once, with the state, and verified wherever the state is read. A row has its own so that a reader of a
+few rows need not read the whole frame.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: In the column `crc32`: this state has none (imported by an older version, or synthetic).
+NONE = -1
+
+
+def row_crc32(frame: NDArray[Any]) -> NDArray[np.uint32]:
+    """CRC-32 of each row's bytes; `frame` is (..., rows, columns), the result (..., rows)."""
+    lines = np.ascontiguousarray(frame).reshape(-1, frame.shape[-1])
+    sums = np.fromiter((zlib.crc32(line.data) for line in lines), dtype=np.uint32, count=len(lines))
+    return sums.reshape(frame.shape[:-1])
+
+
+def state_crc32(row_sums: NDArray[np.uint32], values: Mapping[str, np.generic]) -> int:
+    """CRC-32 of a state: the checksums of its rows, then the bytes of its values in the order of their names."""
+    total = zlib.crc32(np.ascontiguousarray(row_sums).data)
+    for name in sorted(values):
+        total = zlib.crc32(values[name].tobytes(), zlib.crc32(name.encode(), total))
+    return total

@@ -1,0 +1,130 @@
+"""Promises 16 and 21: whatever ends or blocks the writer ends the run in order; a changed byte is found at reading."""
+
+import threading
+import time
+
+import h5py
+import pytest
+
+from acquisition.capture import writer
+from acquisition.capture.state_file import StateFile
+from acquisition.errors import AcquisitionError
+from acquisition.stop_request import StopRequest
+from processing.storage.capture import Capture, CaptureError
+
+SHORT = {"states": {"kind": "rotating_retarders", "states": 18, "step_deg": 20, "ratio": 4.91}, "darks": 1}
+
+
+def _failing_at(monkeypatch, number, fail):
+    write = StateFile.write_state
+
+    def write_state(self, state, *arguments):
+        if state == number:
+            fail()
+        write(self, state, *arguments)
+
+    monkeypatch.setattr(StateFile, "write_state", write_state)
+
+
+def _raise(kind):
+    raise kind("injected")
+
+
+@pytest.mark.parametrize("kind", [MemoryError, KeyError, SystemExit])
+def test_any_exception_in_the_writer_ends_the_run_and_it_goes_on(run_with, intact, monkeypatch, kind):
+    light = []
+    with monkeypatch.context() as patch:
+        _failing_at(patch, 5, lambda: _raise(kind))
+        error, path = run_with(lambda rig, *_: light.append(rig), plan=SHORT)
+    assert isinstance(error, AcquisitionError)
+    assert "injected" in str(error)
+    assert path.name == "run.h5.partial"
+    assert intact(path) == 5
+    assert not light[0].simulation.light()
+    error, final = run_with(resume=path, plan=SHORT)
+    assert error is None
+    assert intact(final) == 19
+
+
+def test_a_disc_that_takes_nothing_ends_the_run(run_with, intact, monkeypatch):
+    monkeypatch.setattr(writer, "PATIENCE_S", 0.3)
+    blocked = threading.Event()
+    _failing_at(monkeypatch, 5, lambda: blocked.wait(30))
+    start_s = time.monotonic()
+    error, path = run_with(plan=SHORT)
+    assert "the disc has not taken state 5" in str(error)
+    assert time.monotonic() - start_s < 30
+    blocked.set()
+    _let_go(path)
+    assert intact(path) >= 5
+
+
+def _let_go(path, timeout_s=10.0):
+    end_s = time.monotonic() + timeout_s
+    while time.monotonic() < end_s:
+        try:
+            Capture(path).close()
+            return
+        except CaptureError:
+            time.sleep(0.02)
+
+
+def test_a_failure_of_another_thread_reaches_the_main_thread_in_the_middle_of_a_wait():
+    with StopRequest() as stop:
+        threading.Timer(0.1, stop.fail, (AcquisitionError("told"),)).start()
+        start_s = time.monotonic()
+        with pytest.raises(AcquisitionError, match="told"), stop.failing_here():
+            time.sleep(30)
+        assert time.monotonic() - start_s < 10
+        # Outside, clean-up is under way: it is left alone.
+        stop.fail(AcquisitionError("not heard"))
+        assert not stop.requested
+
+
+def test_every_ctrl_c_after_the_second_interrupts_too():
+    with StopRequest() as stop:
+        stop.request()
+        for _ in range(2):
+            with pytest.raises(KeyboardInterrupt):
+                stop.request()
+
+
+def test_a_damaged_partial_file_is_refused_in_a_line(run_with, acquire, tmp_path):
+    _, path = run_with(plan=SHORT)
+    for name in ("entry/states/frame_id", "entry/instrument/psa/value", "entry/segments", "entry/closing/json"):
+        damaged = tmp_path / "damaged.h5.partial"
+        damaged.write_bytes(path.read_bytes())
+        with h5py.File(damaged, "r+") as h5:
+            h5["entry/states/done"][7] = 0
+            h5["entry"].attrs.modify("status", b"failed")
+            del h5[name]
+        code, _, err = acquire("--resume", damaged)
+        assert code in (1, 2)
+        assert "error:" in err
+        assert "Traceback" not in err
+
+
+def test_a_byte_changed_on_the_disc_is_found_at_reading(run_with):
+    _, path = run_with(plan=SHORT)
+    whole = path.read_bytes()
+    with Capture(path) as capture:
+        assert capture.checked
+        _read_all(capture)
+    for where in ("instrument/detector/data", "instrument/psg/value", "states/exposure_s"):
+        path.write_bytes(whole)
+        with h5py.File(path, "r+") as h5:
+            dataset = h5["entry"][where]
+            index = (9,) + (0,) * (dataset.ndim - 1)
+            dataset[index] = dataset[index] + 1
+        with pytest.raises(CaptureError, match="state 9 was changed on the disc"):
+            _open_and_read(path)
+
+
+def _open_and_read(path):
+    with Capture(path) as capture:
+        _read_all(capture)
+
+
+def _read_all(capture):
+    for state in range(len(capture.done)):
+        capture.frames(state, slice(0, 2))
