@@ -1,7 +1,11 @@
 """The distribution: four import names of ours, nothing else, and an environment that is not Debian's."""
 
 import importlib
+import os
+import subprocess
+import sys
 import tomllib
+import zipfile
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
@@ -36,3 +40,26 @@ def test_numpy_is_the_locked_one() -> None:
     locked = (ROOT / "requirements.lock").read_text()
     assert f"numpy=={np.__version__} " in locked
     assert "dist-packages" not in str(np.__file__)
+
+
+def test_the_wheel_works_where_there_is_no_checkout(tmp_path: Path) -> None:
+    build = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "--quiet", "-w", tmp_path, ROOT]
+    subprocess.run(build, check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("umov-*.whl")
+    with zipfile.ZipFile(wheel) as file:
+        file.extractall(tmp_path / "installed")
+    # The folder stands in for site-packages; the lines below fail where the checkout is imported instead.
+    code = (
+        "import acquisition, sys; assert acquisition.__file__.startswith(sys.argv[1]);"
+        "from acquisition.commands.application import main; main(['--omega', '35', '--dry-run'])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "installed")],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(tmp_path / "installed")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "nothing was moved" in done.stdout
