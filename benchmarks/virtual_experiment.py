@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from processing.campaign.executors import executor
-from processing.campaign.run import PAPER, CampaignResult, run_campaign
+from processing.campaign.run import PAPER, Campaign, CampaignResult
 from processing.commands.campaign import write_csv
 from processing.geometry.sphere import Sphere
 from processing.instrument.model import InstrumentModel
@@ -161,7 +161,8 @@ def main() -> None:
         take(case.scene(), folder, case.azimuth_deg)
         taken = time.perf_counter()
         with executor(given.workers) as pool:
-            result = run_campaign(folder, given.work / f"out_{name}", GEOMETRY, MATERIAL, pool, register=case.register)
+            out = given.work / f"out_{name}"
+            result = Campaign(folder, out, GEOMETRY, MATERIAL, register=case.register).run(pool)
         done = time.perf_counter()
         print(f"{case.title}: captures {taken - begin:.0f} s, campaign {done - taken:.0f} s", file=sys.stderr)
         text += [f"### {case.title}", "", *table(result)]

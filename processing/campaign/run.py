@@ -25,6 +25,7 @@ from processing.reduction.mueller import Progress
 from processing.reflectance.tables import ScatteringTable
 from processing.storage.capture import Capture, CaptureError
 from processing.storage.product import is_product
+from processing.storage.provenance import Step, file_identity
 
 #: The default demosaicing reaches so far across the outline (`processing.reduction.mosaic.methods.REACH`).
 BORDER_PX = 4
@@ -121,69 +122,70 @@ def find_captures(
     return found, next(iter(kinds.values())), left_out
 
 
-def run_campaign(
-    folder: Path,
-    out: Path,
-    geometry: Path,
-    material: Path,
-    pool: Executor,
-    stokes_geometry: Path | None = None,
-    register: bool = False,
-    border_px: int = BORDER_PX,
-    progress: Progress | None = None,
-) -> CampaignResult:
-    """Reduce every capture of a folder and compare the two instruments and the model.
+@dataclass(frozen=True)
+class Campaign:
+    """`process campaign`: every capture of a folder reduced, and the two instruments and the model compared.
 
     Each capture is divided by the flat field of its camera and wavelength that was taken nearest in time, if the
     folder has one.
 
-    Parameters
+    Attributes
     ----------
-    out : folder for products and tables.
+    folder : of the captures.
+    out : folder for products and tables; reduced captures that are there are found again by what they were made of.
     geometry, stokes_geometry : geometry files of the Mueller polarimeter and of the Stokes camera.
-    material : reflectance model.
-    pool : where the captures are worked on.
+    material : file of the reflectance model.
     register : take centre and scale of the sphere from the images instead of from the geometry file.
     border_px : pixels nearer than this to the outline do not count.
-
-    Raises
-    ------
-    ProcessError : see `find_captures`; two captures of the same kind, wavelength and angle.
     """
-    captures, simulated, left_out = find_captures(folder, out)
-    out.mkdir(parents=True, exist_ok=True)
+
+    folder: Path
+    out: Path
+    geometry: Path
+    material: Path
+    stokes_geometry: Path | None = None
+    register: bool = False
+    border_px: int = BORDER_PX
+
+    def run(self, pool: Executor, progress: Progress | None = None) -> CampaignResult:
+        """Work on the captures in `pool` and compare.
+
+        Raises
+        ------
+        ProcessError : see `find_captures`; two captures of the same kind, wavelength and angle.
+        """
+        captures, simulated, left_out = find_captures(self.folder, self.out)
+        self.out.mkdir(parents=True, exist_ok=True)
+        _refuse_twins(captures)
+        flats = _flats(self.folder, [path for path, *_ in captures])
+        tasks = [self._task(path, kind, flats.get(path)) for path, kind, _, _ in captures]
+        if self.register:
+            tasks = _registered(tasks, pool)
+        views = {task.kind: task_view(task) for task in tasks}
+        futures = [pool.submit(measure, task) for task in tasks]
+        measures = []
+        for done, future in enumerate(futures, 1):
+            measures.append(future.result())
+            if progress:
+                progress(done, len(futures))
+        tables = _merged_tables(measures, self.out)
+        rows = tuple(_rows(measures, tables, views))
+        names = {path.name: flat.name for path, flat in flats.items()}
+        return CampaignResult(rows, simulated, tuple(left_out), names, tables)
+
+    def _task(self, capture: Path, kind: str, flat: Path | None) -> CaptureTask:
+        geometry = self.geometry if kind == "mueller" else self.stokes_geometry or self.geometry
+        return CaptureTask(
+            str(capture), kind, str(self.out), str(geometry), str(self.material), self.border_px, flat=str(flat or "")
+        )
+
+
+def _refuse_twins(captures: Sequence[tuple[Path, str, float, float]]) -> None:
     seen: dict[tuple[str, float, float], Path] = {}
     for path, kind, nm, omega in captures:
         twin = seen.setdefault((kind, nm, round(omega, 2)), path)
         if twin != path:
             raise ProcessError(f"{twin.name} and {path.name} are both {kind} captures at {nm:g} nm, {omega:g} degrees.")
-    other = stokes_geometry or geometry
-    flats = _flats(folder, [path for path, *_ in captures])
-    tasks = [
-        CaptureTask(
-            str(p),
-            kind,
-            str(out),
-            str(geometry if kind == "mueller" else other),
-            str(material),
-            border_px,
-            flat=str(flats.get(p, "")),
-        )
-        for p, kind, _, _ in captures
-    ]
-    if register:
-        tasks = _registered(tasks, pool)
-    views = {task.kind: task_view(task) for task in tasks}
-    futures = [pool.submit(measure, task) for task in tasks]
-    measures = []
-    for done, future in enumerate(futures, 1):
-        measures.append(future.result())
-        if progress:
-            progress(done, len(futures))
-    tables = _merged_tables(measures, out)
-    rows = tuple(_rows(measures, tables, views))
-    names = {path.name: flat.name for path, flat in flats.items()}
-    return CampaignResult(rows, simulated, tuple(left_out), names, tables)
 
 
 def _flats(folder: Path, paths: Sequence[Path]) -> dict[Path, Path]:
@@ -223,7 +225,8 @@ def _merged_tables(measures: Sequence[CaptureMeasure], out: Path) -> dict[tuple[
                     merged.merge(table)
         if merged is not None:
             tables[key] = out / f"xi0_{key[0]}_{key[1]:g}nm.table.h5"
-            merged.save(tables[key])
+            parts = [file_identity(Path(m.table), "part") for m in measures if (m.kind, m.wavelength_nm) == key]
+            merged.save(tables[key], (Step("campaign", {"kind": key[0]}, tuple(parts)),))
     return tables
 
 

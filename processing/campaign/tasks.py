@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,14 +17,12 @@ from processing.maps.xi0 import estimate_from_stokes
 from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
 from processing.polarization.gradients import dominant
 from processing.polarization.image_difference import linear_diattenuation, magnitude, orientation_difference, rmsd
-from processing.reduction.counts_to_signal import Correction
-from processing.reduction.mueller import choose_model, reduce_mueller
-from processing.reduction.stokes import DEFAULT_METHOD, reduce_stokes
 from processing.reflectance.base import load_reflectance
 from processing.reflectance.tables import ScatteringTable
-from processing.storage.capture import Capture
+from processing.steps.maps import geometry_identities
+from processing.steps.reduction import Reduction
 from processing.storage.images import MuellerImage, StokesImage
-from processing.storage.product import Product, Step, file_identity
+from processing.storage.provenance import Step, file_identity
 
 #: Standard error of the Mueller image's xi0 above which a pixel does not count: beyond it the largest eigenvalue is
 #: noise's choice, and biased upwards.
@@ -71,7 +68,7 @@ class CaptureMeasure:
 
 
 def measure(task: CaptureTask) -> CaptureMeasure:
-    """Reduce a capture (unless its product is newer) and measure it."""
+    """Reduce a capture, unless its product is there, and measure it."""
     product = reduced_product(task)
     view = task_view(task)
     return (_measure_mueller if task.kind == "mueller" else _measure_stokes)(task, product, view)
@@ -100,28 +97,10 @@ def task_view(task: CaptureTask) -> ViewingGeometry:
 
 
 def reduced_product(task: CaptureTask) -> Path:
-    """The product of a capture in the task's folder, made now unless it is there, newer, and with the same flat."""
-    path, flat = Path(task.capture), Path(task.flat) if task.flat else None
-    target = Path(task.out) / f"{path.stem}.{task.kind}.h5"
-    if target.exists() and target.stat().st_mtime > path.stat().st_mtime and _flat_of(target) == task.flat:
-        return target
-    files = tuple(file_identity(p) for p in (path, flat) if p is not None)
-    step = Step("campaign", {"capture": path.name, "flat": task.flat}, files)
-    with ExitStack() as stack:
-        capture = stack.enter_context(Capture(path))
-        flats = [stack.enter_context(Capture(flat))] if flat else []
-        correction = Correction.of(capture, flat_from=flats)
-        model = choose_model(capture, None)
-        if task.kind == "stokes":
-            reduce_stokes(capture, model, target, (step,), DEFAULT_METHOD, correction, overwrite=True)
-        else:
-            reduce_mueller(capture, model, target, (step,), correction, overwrite=True)
-    return target
-
-
-def _flat_of(product: Path) -> str:
-    with Product(product) as there:
-        return str(there.steps[-1].arguments.get("flat", ""))
+    """The product of a capture in the task's folder, found or made."""
+    path = Path(task.capture)
+    reduction = Reduction(path, flat=(Path(task.flat),) if task.flat else ())
+    return reduction.found_or_made(Path(task.out) / f"{path.stem}.{task.kind}.h5").path
 
 
 def _measure_mueller(task: CaptureTask, product: Path, view: ViewingGeometry) -> CaptureMeasure:
@@ -149,7 +128,7 @@ def _measure_mueller(task: CaptureTask, product: Path, view: ViewingGeometry) ->
         wavelength_nm=image.header.wavelength_nm,
         omega_deg=float(image.header.omega_deg or 0.0),
         shape=(image.mask.shape[0], image.mask.shape[1]),
-        table=_table(task, geometry, xi0, stderr, good, image.header.wavelength_nm, image.simulated),
+        table=_table(task, product, geometry, (xi0, stderr, good), image.header.wavelength_nm, image.simulated),
         psi_deg=float(np.rad2deg(rmsd(psi))),
         magnitude_percent=100 * rmsd((magnitude(modelled) - magnitude(measured))[good]),
         eigenvalue_deviation=float(np.percentile(deviation, 99)) if good.any() else float("nan"),
@@ -188,7 +167,7 @@ def _measure_stokes(task: CaptureTask, product: Path, view: ViewingGeometry) -> 
         wavelength_nm=header.wavelength_nm,
         omega_deg=float(header.omega_deg or 0.0),
         shape=(image.mask.shape[0], image.mask.shape[1]),
-        table=_table(task, geometry, xi0, stderr, good, header.wavelength_nm, image.simulated),
+        table=_table(task, product, geometry, (xi0, stderr, good), header.wavelength_nm, image.simulated),
         psi_deg=float("nan"),
         magnitude_percent=float("nan"),
         eigenvalue_deviation=float("nan"),
@@ -206,17 +185,21 @@ def _inner(geometry: GeometryImage, border_px: int) -> NDArray[np.bool_]:
 
 def _table(
     task: CaptureTask,
+    product: Path,
     geometry: GeometryImage,
-    xi0: NDArray[np.floating],
-    stderr: NDArray[np.floating],
-    good: NDArray[np.bool_],
+    samples: tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.bool_]],
     wavelength_nm: float,
     simulated: bool,
 ) -> str:
+    # samples: xi0, its standard error, and which pixels count, all (N,).
+    xi0, stderr, good = samples
     table = ScatteringTable(("xi0", "xi0_variance"), wavelength_nm, simulated=simulated)
     spread = np.where(np.isfinite(stderr), stderr, 0.0) ** 2
     values = np.where(good, np.stack([xi0, spread]).astype(float), np.nan)
     table.add(geometry.points.angles, values, simulated)
-    path = Path(task.out) / f"{Path(task.capture).stem}.xi0.table.h5"
-    table.save(path)
+    material = file_identity(Path(task.material), "material")
+    inputs = (file_identity(product, "source"), *geometry_identities(Path(task.geometry)), material)
+    # Named after the product, whose name is its own even where two folders hold captures of one name.
+    path = product.with_name(f"{product.stem}.xi0.table.h5")
+    table.save(path, (Step("campaign-xi0", {"border_px": task.border_px, "view": task.view_json}, inputs),))
     return str(path)

@@ -57,16 +57,18 @@ def calibrate_mosaic_command(
 ) -> None:
     """Fit the analysis vector of every pixel of a polarization sensor (Powell and Gruev)."""
     from processing.calibration.mosaic import fit_response
-    from processing.commands.reduce import summary
+    from processing.commands.summary import summary
     from processing.reduction.mueller import choose_model
     from processing.storage.capture import Capture
     from processing.storage.product import Step, file_identity
 
     product = out or capture.with_suffix(".analyzers.h5")
     with Capture(capture) as source:
-        step = Step("calibrate-mosaic", {"capture": capture.name}, (file_identity(capture),))
-        facts = fit_response(source, choose_model(source, instrument), product, step, overwrite)
-        summary(product, facts, source.simulated)
+        files = {"capture": capture} if instrument is None else {"capture": capture, "instrument": instrument}
+        inputs = tuple(file_identity(path, role) for role, path in files.items())
+        step = Step("calibrate-mosaic", {"capture": capture.name}, inputs)
+        fit_response(source, choose_model(source, instrument), product, step, overwrite)
+    summary(product)
 
 
 def _region(text: str | None, shape: tuple[int, int]) -> tuple[slice, slice]:

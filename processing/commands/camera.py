@@ -24,12 +24,12 @@ def camera_command(
 ) -> None:
     """Photon transfer: gain and read noise from states that repeat each other, bad pixels from dark states."""
     from processing.calibration.photon_transfer import write_camera
-    from processing.commands.reduce import summary
+    from processing.commands.summary import summary
     from processing.storage.product import Step, file_identity
 
     product = out or captures[0].with_suffix(".camera.h5")
-    identities = tuple(file_identity(p) for p in captures if p.exists())
+    identities = tuple(file_identity(p, "capture") for p in captures if p.exists())
     step = Step("camera", {"captures": [p.name for p in captures]}, identities)
-    _, facts, simulated = write_camera(captures, product, step, overwrite)
-    summary(product, facts, simulated)
+    write_camera(captures, product, step, overwrite)
+    summary(product)
     draw(product, figure, no_figure)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -29,8 +30,10 @@ def campaign_command(
     scheduler: Annotated[str | None, typer.Option(help="Address of a dask.distributed scheduler.")] = None,
 ) -> None:
     """Reduce everything, compare DRR, Stokes and model: RMSD of psi, |D| and xi0 against Omega."""
+    # As `process reduce` does: the same captures give the same products, to the bit.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from processing.campaign.executors import executor
-    from processing.campaign.run import run_campaign
+    from processing.campaign.run import Campaign
     from processing.commands.progress_bar import progress_bar
     from processing.errors import ProcessError
     from processing.reports.reflectance_figures import campaign_figure
@@ -38,18 +41,9 @@ def campaign_command(
     if not folder.is_dir():
         raise ProcessError(f"{folder}: no such folder. Give the folder that holds the captures.")
     target = out or folder / "campaign"
+    step = Campaign(folder, target, geometry, material, stokes_geometry, registered, border)
     with executor(workers, scheduler) as pool, progress_bar("campaign", "captures") as tick:
-        result = run_campaign(
-            folder,
-            target,
-            geometry,
-            material,
-            pool,
-            stokes_geometry,
-            register=registered,
-            border_px=border,
-            progress=tick,
-        )
+        result = step.run(pool, tick)
     write_csv(result, target / "campaign.csv")
     campaign_figure(result, folder.name).savefig(target / "campaign.png", dpi=150)
     if result.simulated:

@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from processing.commands.drawing import FigureFile, NoFigure, draw
+from processing.commands.progress_bar import progress_bar
+from processing.commands.reduce import reduced_source
+from processing.commands.summary import summary
 
 if TYPE_CHECKING:
     from processing.polarization.quantities import State
@@ -34,23 +37,15 @@ def quantities_command(
 ) -> None:
     """Eigenvalues, depolarization, diattenuation, polarizance, retardance and their standard errors."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from processing.commands.progress_bar import progress_bar
-    from processing.commands.reduce import reduced, summary
-    from processing.maps.quantities import quantities_of_mueller
     from processing.polarization.quantities import PAPER_PAIRS
-    from processing.storage.product import Step, file_identity
+    from processing.steps.maps import Quantities
 
     pairs = {**PAPER_PAIRS, **dict(_pair(text) for text in pair or ())}
-    product = reduced(source, instrument)
-    target = out or product.with_name(product.name.removesuffix(".h5").rsplit(".", 1)[0] + ".quantities.h5")
-    step = Step("quantities", {"source": product.name, "also": also, "pairs": pairs}, (file_identity(product),))
+    step = Quantities(reduced_source(source, instrument), tuple(also or ()), pairs)
     with progress_bar("quantities", "rows") as tick:
-        facts = quantities_of_mueller(product, target, step, also or (), pairs, overwrite, tick)
-    from processing.storage.product import Product
-
-    with Product(target) as opened:
-        summary(target, facts, opened.simulated)
-    draw(target, figure, no_figure)
+        product = step.make(out, overwrite, tick)
+    summary(product)
+    draw(product, figure, no_figure)
 
 
 def _pair(text: str) -> tuple[str, tuple[State, State]]:

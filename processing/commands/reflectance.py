@@ -8,6 +8,8 @@ from typing import Annotated
 import typer
 
 from processing.commands.drawing import FigureFile, NoFigure, draw
+from processing.commands.reduce import reduced_source
+from processing.commands.summary import summary
 
 
 def register(app: typer.Typer) -> None:
@@ -60,14 +62,17 @@ def fit_material_command(
     geometry: Annotated[Path, typer.Option(help="Geometry file: camera, source, shape.")],
     out: Annotated[Path, typer.Option(help="Material file (YAML) to write.")],
     name: Annotated[str, typer.Option(help="Name of the material.")] = "fitted material",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file of that name.")] = False,
 ) -> None:
     """Fit n + i k, a and b to Mueller images, or to linear Stokes images by maximum linear correlation."""
-    from processing.maps.material_fit import fit_products
     from processing.reflectance.material_fit import NAMES
-    from processing.yaml_file import dump_yaml
+    from processing.steps.material import MaterialFitting
+    from processing.storage.product import refuse_existing
 
-    fit, nm, simulated = fit_products(sources, geometry)
-    if simulated:
+    refuse_existing(out, overwrite)
+    found = MaterialFitting(tuple(sources), geometry, name).fitted()
+    fit = found.fit
+    if found.simulated:
         typer.echo("SIMULATED data")
     for key, value, stderr in zip(NAMES, fit.constants, fit.stderr, strict=True):
         known = "" if fit.identified[key] else "   NOT IDENTIFIED by these data"
@@ -78,8 +83,7 @@ def fit_material_command(
         typer.echo(f"  mean linear correlation: {fit.correlation:.4f}")
     notes = fit.notes([p.name for p in sources])
     typer.echo("\n".join(f"  {note}" for note in notes[2:]))
-    header = "".join(f"# {note}\n" for note in notes)
-    out.write_text(header + dump_yaml(fit.model(name, nm)), encoding="utf-8")
+    found.save(out, overwrite)
     typer.echo(str(out))
 
 
@@ -93,15 +97,8 @@ def extrapolate_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
 ) -> None:
     """A full Mueller image from a linear Stokes capture: TD model with the estimated xi0 and M00."""
-    from processing.commands.reduce import reduced, summary
-    from processing.maps.extrapolation import extrapolate_mueller
-    from processing.storage.product import Product, Step, file_identity
+    from processing.steps.maps import Extrapolation
 
-    product = reduced(source, None)
-    target = out or product.with_name(product.name.removesuffix(".h5").rsplit(".", 1)[0] + ".extrapolated.h5")
-    with Product(product) as opened:
-        simulated = opened.simulated
-    given = {"source": product.name, "geometry": str(geometry), "material": str(material)}
-    step = Step("extrapolate", given, tuple(file_identity(p) for p in (product, geometry, material)))
-    summary(target, extrapolate_mueller(product, geometry, material, target, step, overwrite), simulated)
-    draw(target, figure, no_figure)
+    product = Extrapolation(reduced_source(source), geometry, material).make(out, overwrite)
+    summary(product)
+    draw(product, figure, no_figure)

@@ -22,19 +22,20 @@ def table_command(
     out: Annotated[Path, typer.Option(help="Table file (HDF5) to write.")],
     layout: Annotated[str, typer.Option(help="Bins: degree (1 degree each) or renderer.")] = "degree",
     append: Annotated[bool, typer.Option("--append", help="Add to the table if it exists.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a table of that name.")] = False,
 ) -> None:
     """Mean, variance and count over theta_h, theta_d, phi_d from any number of images."""
     from processing.commands.progress_bar import progress_bar
     from processing.errors import ProcessError
-    from processing.maps.tables import tabulate
     from processing.reflectance.tables import ScatteringTable
+    from processing.steps.table import Tabulation
 
     if layout not in ("degree", "renderer"):
         raise ProcessError(f"--layout {layout!r}: there are degree and renderer")
-    table = ScatteringTable.load(out) if append and out.exists() else None
+    step = Tabulation(tuple(sources), geometry, out, "renderer" if layout == "renderer" else "degree")
     with progress_bar("table", "images") as tick:
-        table = tabulate(sources, geometry, "renderer" if layout == "renderer" else "degree", table, tick)
-    table.save(out)
+        step.append(tick) if append else step.make(overwrite=overwrite, progress=tick)
+    table = ScatteringTable.load(out)
     if table.simulated:
         typer.echo("SIMULATED data")
     typer.echo(f"  {', '.join(table.quantities[:4])}{' ...' if len(table.quantities) > 4 else ''}")

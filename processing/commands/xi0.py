@@ -9,6 +9,9 @@ from typing import Annotated
 import typer
 
 from processing.commands.drawing import FigureFile, NoFigure, draw
+from processing.commands.progress_bar import progress_bar
+from processing.commands.reduce import reduced_source
+from processing.commands.summary import summary
 
 
 def register(app: typer.Typer) -> None:
@@ -32,28 +35,10 @@ def xi0_command(
 ) -> None:
     """xi0 from a Mueller capture (coherency eigenvalues) or a linear Stokes capture (two coefficients)."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from processing.commands.progress_bar import progress_bar
-    from processing.commands.reduce import reduced, summary
-    from processing.errors import ProcessError
-    from processing.maps.xi0 import xi0_of_mueller, xi0_of_stokes
-    from processing.storage.product import Product, Step, file_identity
+    from processing.steps.maps import Xi0
 
-    product = reduced(source, instrument)
-    target = out or product.with_name(product.name.removesuffix(".h5").rsplit(".", 1)[0] + ".xi0.h5")
-    with Product(product) as opened:
-        kind, simulated = opened.kind, opened.simulated
-    given = {"geometry": geometry and str(geometry), "material": material and str(material)}
-    inputs = [file_identity(p) for p in (product, geometry, material) if p is not None]
-    step = Step("xi0", {"source": product.name} | given, tuple(inputs))
-    if kind == "stokes":
-        if geometry is None or material is None:
-            raise ProcessError(
-                "a linear Stokes capture gives xi0 only with a model of the dominant process: "
-                "give --geometry FILE and --material FILE."
-            )
-        facts = xi0_of_stokes(product, geometry, material, target, step, overwrite)
-    else:
-        with progress_bar("xi0", "rows") as tick:
-            facts = xi0_of_mueller(product, target, step, overwrite, tick)
-    summary(target, facts, simulated)
-    draw(target, figure, no_figure)
+    step = Xi0(reduced_source(source, instrument), geometry, material)
+    with progress_bar("xi0", "rows") as tick:
+        product = step.make(out, overwrite, tick)
+    summary(product)
+    draw(product, figure, no_figure)

@@ -5,6 +5,7 @@ Sparse in memory and on disc: a capture of a sphere fills few of the three milli
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from processing.computing.threads import for_ranges
 from processing.errors import ProcessError
 from processing.geometry.rusinkiewicz import Angles
 from processing.reflectance.table_axes import SHAPE, Layout, TableAxes
+from processing.storage.provenance import Step, read_steps, sign, write_steps
 
 SCHEMA_VERSION = 1
 
@@ -140,8 +142,11 @@ class ScatteringTable:
             self.count = np.concatenate([self.count, np.zeros(new, dtype=np.int64)])
             self._sum, self._square = np.hstack([self._sum, grown]), np.hstack([self._square, grown])
 
-    def save(self, path: Path | str) -> None:
-        """Write the filled bins and the axes to HDF5. Sums are kept in double, so a table may go on growing."""
+    def save(self, path: Path | str, steps: Sequence[Step] = ()) -> None:
+        """Write the filled bins and the axes to HDF5, and the steps that led to them, oldest first.
+
+        Sums are kept in double, so a table may go on growing.
+        """
         path = Path(path)
         partial = path.with_name(path.name + ".partial")
         with h5py.File(partial, "w") as h5:
@@ -158,6 +163,8 @@ class ScatteringTable:
             h5.create_dataset("count", data=self.count, **options)
             h5.create_dataset("sum", data=self._sum, **options)
             h5.create_dataset("sum_of_squares", data=self._square, **options)
+            write_steps(h5, steps)
+            sign(h5, steps)
         partial.replace(path)
 
     @classmethod
@@ -192,6 +199,12 @@ def is_table(path: Path | str) -> bool:
             return "umov_table" in h5.attrs
     except OSError:
         return False
+
+
+def table_steps(path: Path | str) -> tuple[Step, ...]:
+    """Steps that led to a table, oldest first."""
+    with h5py.File(path, "r") as h5:
+        return read_steps(h5)
 
 
 def _kind(simulated: bool) -> str:

@@ -20,7 +20,8 @@ from processing.reports.mueller_maps import mueller_maps
 from processing.reports.tables import table_section
 from processing.reports.template import Figure, Section, render
 from processing.storage.capture import Capture, CaptureError
-from processing.storage.product import Product, Step, is_product, step_text
+from processing.storage.product import Product, is_product
+from processing.storage.provenance import Step, input_text, step_text
 
 #: File types that a report takes in.
 PICTURES = (".png", ".svg")
@@ -199,8 +200,7 @@ def _product(path: Path) -> Section:
 
 
 def _provenance(step: Step) -> list[str]:
-    inputs = [f"    from {i['path']} ({i['bytes']} bytes, {i['modified']})" for i in step.inputs]
-    return [step_text(step), *inputs]
+    return [step_text(step), *(f"    from {input_text(i)}" for i in step.inputs)]
 
 
 def _curve(path: Path) -> Section:

@@ -41,8 +41,11 @@ def product_of_axostep(
     rows, columns = image.mueller.shape[-2:]
     step = Step(
         "from-axostep",
-        {"source": source.name, "header_words": image.header_words, "metadata": image.metadata, "date": image.date},
-        (file_identity(source),),
+        {
+            **{"source": source.name, "wavelength_nm": nm, "omega_deg": omega_deg},
+            **{"header_words": image.header_words, "metadata": image.metadata, "date": image.date},
+        },
+        (file_identity(source, "source"),),
     )
     nothing = np.full((rows, columns), np.nan, np.float32)
     finite = np.isfinite(image.mueller).all(axis=(0, 1))

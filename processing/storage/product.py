@@ -22,8 +22,7 @@ from processing.errors import ProcessError
 from processing.storage.capture_schema import CaptureHeader
 from processing.storage.provenance import Step as Step
 from processing.storage.provenance import file_identity as file_identity
-from processing.storage.provenance import jsonable, read_steps, write_steps
-from processing.storage.provenance import step_text as step_text
+from processing.storage.provenance import jsonable, read_steps, sign, write_steps
 
 PRODUCT_VERSION = 1
 
@@ -76,13 +75,11 @@ class ProductWriter:
         overwrite: bool = False,
     ) -> None:
         self.path = path
-        if path.exists() and not overwrite:
-            raise ProductError(f"{path} exists. Give another --out, or --overwrite to replace it.")
+        refuse_existing(path, overwrite)
         self._partial = path.with_name(path.name + ".partial")
         #: Equal in two runs exactly if they would write the same values.
         self._signature = json.dumps(
-            [kind, header.model_dump_json(), shape, sorted(planes), [(s.name, s.arguments, s.inputs) for s in steps]],
-            default=str,
+            [kind, header.model_dump_json(), shape, sorted(planes), [s.made_of for s in steps]]
         )
         self.rows_done = 0
         if not self._reopen():
@@ -125,6 +122,7 @@ class ProductWriter:
                 dataset = _early(data, name, (*plane.leading, *shape), plane.dtype)
                 dataset.attrs.update({"units": plane.units, "long_name": plane.long_name})
             write_steps(entry, steps)
+            sign(self._h5, steps)
             self._h5.flush()
         except OSError as error:
             raise ProductError(f"{self._partial} cannot be written ({error}). Free space, or give --out.") from error
@@ -246,6 +244,12 @@ class Product:
 
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, tb: TracebackType | None) -> None:
         self.close()
+
+
+def refuse_existing(path: Path, overwrite: bool) -> None:
+    """Raise ProductError if a file of that name is there and may not be replaced."""
+    if path.exists() and not overwrite:
+        raise ProductError(f"{path} exists. Give another --out, or --overwrite to replace it.")
 
 
 def is_product(path: Path) -> bool:

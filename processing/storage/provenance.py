@@ -1,7 +1,8 @@
-"""Provenance of a product: the steps that led to it, with arguments, inputs, program and date."""
+"""Provenance of a product: the steps that led to it, with options, content of the inputs, program and date."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,10 +14,13 @@ from typing import Any
 import h5py
 import numpy as np
 
+#: Attribute of a product's root: `Step.made_of` of its last step.
+MADE_OF = "made_of"
+
 
 @dataclass(frozen=True)
 class Step:
-    """One step of the provenance: what ran, with which arguments, on which files, when (ISO 8601)."""
+    """One step: what runs, with which options, on which files (`file_identity`), by which program, when (ISO 8601)."""
 
     name: str
     arguments: dict[str, Any]
@@ -24,12 +28,44 @@ class Step:
     program: str = field(default_factory=lambda: f"umov {version('umov')}")
     date: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
 
+    @property
+    def made_of(self) -> str:
+        """SHA-256 (hex) of everything that decides the product: name, arguments, content of the inputs, program.
 
-def file_identity(path: Path) -> dict[str, Any]:
-    """Name, size and modification time of an input file, as the provenance keeps them."""
-    stat = path.stat()
-    changed = datetime.fromtimestamp(stat.st_mtime, UTC).isoformat(timespec="microseconds")
-    return {"path": str(path.resolve()), "bytes": stat.st_size, "modified": changed}
+        Date, and place and time stamp of the files, are not in it.
+        """
+        contents = [(i.get("role"), i.get("sha256") or i.get(MADE_OF)) for i in self.inputs]
+        text = json.dumps([self.name, self.arguments, contents, self.program], default=jsonable, sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def file_identity(path: Path, role: str = "") -> dict[str, Any]:
+    """What an input file is, as the provenance keeps it: role, path, size, and its content.
+
+    A product is known by what it was made of, any other file by the SHA-256 of its bytes.
+    """
+    identity = {"role": role, "path": str(path.resolve()), "bytes": path.stat().st_size}
+    known = made_of(path)
+    if known is not None:
+        return identity | {MADE_OF: known}
+    with path.open("rb") as file:
+        return identity | {"sha256": hashlib.file_digest(file, "sha256").hexdigest()}
+
+
+def made_of(path: Path) -> str | None:
+    """`Step.made_of` of a product; None for a file that is not there, or does not say."""
+    try:
+        with h5py.File(path, "r") as h5:
+            found = h5.attrs.get(MADE_OF)
+    except OSError:
+        return None
+    return None if found is None else str(found)
+
+
+def sign(h5: h5py.File, steps: Sequence[Step]) -> None:
+    """Store what a product was made of; nothing for a step that does not say its inputs."""
+    if steps and steps[-1].inputs:
+        h5.attrs[MADE_OF] = steps[-1].made_of
 
 
 def write_steps(entry: h5py.Group, steps: Sequence[Step]) -> None:
@@ -65,6 +101,15 @@ def step_text(step: Step) -> str:
     """One line for people: step and the arguments that were given."""
     given = ", ".join(f"{k}={v}" for k, v in step.arguments.items() if v is not None)
     return f"{step.date} {step.program}: {step.name}({given})"
+
+
+def input_text(identity: dict[str, Any]) -> str:
+    """One line for people about an input file: role, path, size and content."""
+    role = f"{identity['role']} " if identity.get("role") else ""
+    for kind, words in (("sha256", "SHA-256"), (MADE_OF, "made of")):
+        if kind in identity:
+            return f"{role}{identity['path']} ({identity['bytes']} bytes, {words} {identity[kind]})"
+    return f"{role}{identity['path']} ({identity['bytes']} bytes)"
 
 
 def jsonable(value: Any) -> Any:

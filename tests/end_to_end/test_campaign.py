@@ -10,7 +10,7 @@ import pytest
 from scipy.ndimage import binary_erosion
 
 from processing.campaign.executors import executor
-from processing.campaign.run import BORDER_PX, PAPER, CampaignResult, find_captures, run_campaign
+from processing.campaign.run import BORDER_PX, PAPER, Campaign, CampaignResult, find_captures
 from processing.campaign.tasks import CaptureTask, measure
 from processing.errors import ProcessError
 from processing.geometry.viewing import ViewingGeometry
@@ -46,7 +46,7 @@ def here(folder: Path, configs: Path, tmp_path_factory: pytest.TempPathFactory) 
     """The campaign worked out in this process."""
     files = configs / "geometries/one_inch_sphere.yaml", configs / "materials/red_print.yaml"
     with executor(1) as pool:
-        return run_campaign(folder, tmp_path_factory.mktemp("here"), *files, pool)
+        return Campaign(folder, tmp_path_factory.mktemp("here"), *files).run(pool)
 
 
 @pytest.fixture
@@ -138,7 +138,7 @@ def test_a_cluster_gives_the_same_numbers(folder, here, configs, tmp_path):
     settings = {"n_workers": 1, "threads_per_worker": 2, "processes": False, "dashboard_address": None}
     settings |= {"protocol": "tcp", "host": "127.0.0.1"}
     with distributed.LocalCluster(**settings) as cluster, executor(scheduler=cluster.scheduler_address) as pool:
-        there = run_campaign(folder, tmp_path, *files, pool)
+        there = Campaign(folder, tmp_path, *files).run(pool)
     assert here.rows == there.rows
 
 
@@ -154,8 +154,8 @@ def test_registering_finds_a_sphere_that_the_geometry_file_misses(folder, config
     wrong.write_text(text.replace("focal_length_mm: 60", "focal_length_mm: 61.5, centre_px: [1040.0, 1200.0]"))
     material = configs / "materials/red_print.yaml"
     with executor(1) as pool:
-        off = run_campaign(folder, tmp_path / "a", wrong, material, pool)
-        found = run_campaign(folder, tmp_path / "b", wrong, material, pool, register=True)
+        off = Campaign(folder, tmp_path / "a", wrong, material).run(pool)
+        found = Campaign(folder, tmp_path / "b", wrong, material, register=True).run(pool)
     for worse, better in zip(off.rows, found.rows, strict=True):
         assert better.psi_deg < 0.6 * worse.psi_deg
     product = next((tmp_path / "a").glob("drr_60.mueller.h5"))
@@ -185,16 +185,17 @@ def test_tables_and_material_and_extrapolation(folder, configs, process, tmp_pat
     assert code == 2
 
     for sources in (mueller, stokes):
-        target = tmp_path / "fit.yaml"
+        target = tmp_path / f"fit_{sources[0].stem}.yaml"
         code, _, err = process("fit-material", *sources, "--geometry", geometry, "--out", target)
         assert code == 0, err
         fitted = load_reflectance(target).constants[662.0]
         assert fitted.n == pytest.approx(1.3, abs=0.03)
         assert fitted.a == pytest.approx(0.17, abs=0.02)
         assert fitted.b == pytest.approx(2.0, abs=0.1)
-    code, _, err = process("fit-material", *products, "--geometry", geometry, "--out", target)
-    assert code == 2
-    assert "kinds" in err
+    for given, out, message in ((stokes, target, "exists"), (products, tmp_path / "both.yaml", "kinds")):
+        code, _, err = process("fit-material", *given, "--geometry", geometry, "--out", out)
+        assert code == 2
+        assert message in err
 
     code, _, err = process("extrapolate", stokes[0], *options(configs), "--out", tmp_path / "e.h5")
     assert code == 0, err
@@ -233,4 +234,4 @@ def test_what_cannot_be_a_campaign_is_refused(folder, configs, tmp_path):
     (tmp_path / "drr_60.h5").write_bytes((folder / "drr_35.h5").read_bytes())
     files = configs / "geometries/one_inch_sphere.yaml", configs / "materials/red_print.yaml"
     with executor(1) as pool, pytest.raises(ProcessError, match="are both"):
-        run_campaign(tmp_path, tmp_path / "out", *files, pool)
+        Campaign(tmp_path, tmp_path / "out", *files).run(pool)

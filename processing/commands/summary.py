@@ -1,0 +1,46 @@
+"""What a command prints about its product."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import typer
+
+#: Endings of the names of facts that are standard errors of other facts.
+ERRORS = ("_error", "_stderr")
+
+
+def summary(product: Path) -> None:
+    """Print facts, warnings (stderr) and the name of a product file."""
+    from processing.storage.product import Product
+
+    with Product(product) as opened:
+        facts, simulated = opened.facts, opened.simulated
+    if simulated:
+        typer.echo("SIMULATED data")
+    for name, value in facts.items():
+        if name not in ("warnings", "masked") and not name.endswith(ERRORS):
+            typer.echo(f"  {name.replace('_', ' ')}: {_shown(value)}{_with_error(name, facts)}")
+    for warning in facts["warnings"]:
+        typer.echo(f"warning: {warning}", err=True)
+    typer.echo(str(product))
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if value is None or value != value:
+        return "none"
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
+
+
+def _with_error(name: str, facts: dict[str, Any]) -> str:
+    """Standard error of a fact, in the same line: of one pixel for a median over pixels, else of the number."""
+    base = name.removesuffix("_e_per_count").removesuffix("_e")
+    for ending in ERRORS:
+        error = facts.get(f"{name}{ending}", facts.get(f"{base}{ending}"))
+        if error is not None:
+            text = "unknown" if error != error else f"{error:.2g}"
+            return f" (standard error of a pixel {text})" if name.startswith("median") else f" +- {text}"
+    return ""

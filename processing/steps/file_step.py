@@ -1,0 +1,72 @@
+"""A step whose product is one file, which is found again by what it was made of, never by its name or time stamp."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from processing.storage.product import refuse_existing
+from processing.storage.provenance import Step, made_of
+
+#: Called with (parts done, parts in all).
+Progress = Callable[[int, int], None]
+
+
+class Found(NamedTuple):
+    """A product, and whether it was there already."""
+
+    path: Path
+    was_there: bool
+
+
+class FileStep(ABC):
+    """A step as a value: subclasses are frozen dataclasses of input files and options."""
+
+    @abstractmethod
+    def record(self) -> Step:
+        """What is to be made: name, options and the content of every input. Reads the inputs."""
+
+    @property
+    @abstractmethod
+    def usual_path(self) -> Path:
+        """Where the product goes if nothing else is said."""
+
+    @abstractmethod
+    def _write(self, out: Path, record: Step, overwrite: bool, progress: Progress | None) -> None:
+        """Write the product that `record` asks for."""
+
+    def make(self, out: Path | None = None, overwrite: bool = False, progress: Progress | None = None) -> Path:
+        """Make the product, whatever is there; `overwrite` replaces a file of that name.
+
+        Raises
+        ------
+        ProductError : the file exists and `overwrite` is false.
+        """
+        out = out or self.usual_path
+        refuse_existing(out, overwrite)
+        self._write(out, self.record(), overwrite, progress)
+        return out
+
+    def found_or_made(self, path: Path | None = None, progress: Progress | None = None) -> Found:
+        """The product, made now unless `path` (default: the usual one) holds exactly it.
+
+        No file is ever replaced: where the name is taken by anything else, the product gets one of its own that ends
+        in the first digits of what it is made of.
+        """
+        path, record = path or self.usual_path, self.record()
+        wanted = record.made_of
+        own = path.with_name(f"{path.stem}-{wanted[:8]}{path.suffix}")
+        for candidate in (path, own):
+            if made_of(candidate) == wanted:
+                return Found(candidate, True)
+        out = own if path.exists() else path
+        refuse_existing(out, overwrite=False)
+        self._write(out, record, False, progress)
+        return Found(out, False)
+
+
+def beside(source: Path, kind: str) -> Path:
+    """Name of a product of this kind beside the product that it is made from: `NAME.kind.h5` for `NAME.other.h5`."""
+    return source.with_name(f"{source.name.removesuffix('.h5').rsplit('.', 1)[0]}.{kind}.h5")

@@ -1,0 +1,112 @@
+"""Maps of a reduced image: derived quantities, xi0, and the Mueller image that a model extrapolates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from processing.errors import ProcessError
+from processing.geometry.viewing import ViewingGeometry
+from processing.polarization.quantities import PAPER_PAIRS, State
+from processing.steps.file_step import FileStep, Progress, beside
+from processing.storage.product import Product
+from processing.storage.provenance import Step, file_identity
+
+
+@dataclass(frozen=True)
+class Quantities(FileStep):
+    """`process quantities`: every derived map of a Mueller product, see `processing.maps.quantities`."""
+
+    source: Path
+    also: tuple[str, ...] = ()
+    pairs: dict[str, tuple[State, State]] = field(default_factory=lambda: dict(PAPER_PAIRS))
+
+    @property
+    def usual_path(self) -> Path:
+        """Beside the source."""
+        return beside(self.source, "quantities")
+
+    def record(self) -> Step:
+        """Decompositions, pairs and the source."""
+        options = {"also": sorted(self.also), "pairs": self.pairs}
+        return Step("quantities", options, (file_identity(self.source, "source"),))
+
+    def _write(self, out: Path, record: Step, overwrite: bool, progress: Progress | None) -> None:
+        from processing.maps.quantities import quantities_of_mueller
+
+        quantities_of_mueller(self.source, out, record, self.also, self.pairs, overwrite, progress)
+
+
+@dataclass(frozen=True)
+class Xi0(FileStep):
+    """`process xi0` of a Mueller product, or of a Stokes product with a geometry and a material file."""
+
+    source: Path
+    geometry: Path | None = None
+    material: Path | None = None
+
+    @property
+    def usual_path(self) -> Path:
+        """Beside the source."""
+        return beside(self.source, "xi0")
+
+    def record(self) -> Step:
+        """The source; of a Stokes product geometry and material too, which a Mueller product does not need."""
+        if self._of_stokes():
+            return Step("xi0", {}, _modelled(self.source, *self._model()))
+        return Step("xi0", {}, (file_identity(self.source, "source"),))
+
+    def _of_stokes(self) -> bool:
+        with Product(self.source) as product:
+            product.require("mueller", "stokes")
+            return product.kind == "stokes"
+
+    def _model(self) -> tuple[Path, Path]:
+        if self.geometry is None or self.material is None:
+            raise ProcessError(
+                "a linear Stokes capture gives xi0 only with a model of the dominant process: "
+                "give --geometry FILE and --material FILE."
+            )
+        return self.geometry, self.material
+
+    def _write(self, out: Path, record: Step, overwrite: bool, progress: Progress | None) -> None:
+        from processing.maps.xi0 import xi0_of_mueller, xi0_of_stokes
+
+        if self._of_stokes():
+            xi0_of_stokes(self.source, *self._model(), out, record, overwrite)
+        else:
+            xi0_of_mueller(self.source, out, record, overwrite, progress)
+
+
+@dataclass(frozen=True)
+class Extrapolation(FileStep):
+    """`process extrapolate`: a Mueller image from a Stokes product and a model of the dominant process."""
+
+    source: Path
+    geometry: Path
+    material: Path
+
+    @property
+    def usual_path(self) -> Path:
+        """Beside the source."""
+        return beside(self.source, "extrapolated")
+
+    def record(self) -> Step:
+        """Source, geometry and material."""
+        return Step("extrapolate", {}, _modelled(self.source, self.geometry, self.material))
+
+    def _write(self, out: Path, record: Step, overwrite: bool, progress: Progress | None) -> None:
+        from processing.maps.extrapolation import extrapolate_mueller
+
+        extrapolate_mueller(self.source, self.geometry, self.material, out, record, overwrite)
+
+
+def geometry_identities(geometry: Path) -> list[dict[str, object]]:
+    """Identities of a geometry file and of the mesh that it names."""
+    found = [file_identity(geometry, "geometry")]
+    mesh = getattr(ViewingGeometry.load(geometry).shape, "file", None)
+    return found if mesh is None else [*found, file_identity(Path(mesh), "mesh")]
+
+
+def _modelled(source: Path, geometry: Path, material: Path) -> tuple[dict[str, object], ...]:
+    return file_identity(source, "source"), *geometry_identities(geometry), file_identity(material, "material")

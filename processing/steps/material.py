@@ -1,0 +1,51 @@
+"""Products to a material file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from processing.maps.material_fit import fit_products
+from processing.reflectance.material_fit import MaterialFit
+from processing.steps.maps import geometry_identities
+from processing.storage.product import refuse_existing
+from processing.storage.provenance import Step, file_identity, input_text
+from processing.yaml_file import dump_yaml
+
+
+@dataclass(frozen=True)
+class FittedMaterial:
+    """Constants at one wavelength, and the step that they come from."""
+
+    fit: MaterialFit
+    wavelength_nm: float
+    simulated: bool
+    name: str
+    record: Step
+
+    def save(self, out: Path, overwrite: bool = False) -> None:
+        """Write a material file (YAML); errors, correlations and provenance are comments at its top."""
+        refuse_existing(out, overwrite)
+        sources = [Path(i["path"]).name for i in self.record.inputs if i["role"] == "source"]
+        notes = [*self.fit.notes(sources), *map(input_text, self.record.inputs), f"made of {self.record.made_of}"]
+        header = "".join(f"# {note}\n" for note in notes)
+        out.write_text(header + dump_yaml(self.fit.model(self.name, self.wavelength_nm)), encoding="utf-8")
+
+
+@dataclass(frozen=True)
+class MaterialFitting:
+    """`process fit-material`: n + i k, a and b from products of one kind and one wavelength."""
+
+    sources: tuple[Path, ...]
+    geometry: Path
+    name: str = "fitted material"
+
+    def record(self) -> Step:
+        """Name, sources and geometry."""
+        inputs = [file_identity(source, "source") for source in self.sources]
+        return Step("fit-material", {"name": self.name}, (*inputs, *geometry_identities(self.geometry)))
+
+    def fitted(self) -> FittedMaterial:
+        """Fit, see `processing.maps.material_fit.fit_products`."""
+        fit, wavelength_nm, simulated = fit_products(self.sources, self.geometry)
+        return FittedMaterial(fit, wavelength_nm, simulated, self.name, self.record())

@@ -1,0 +1,132 @@
+"""A capture to its Mueller or Stokes image."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from processing.calibration.photon_transfer import read_camera
+from processing.errors import ProcessError
+from processing.reduction.counts_to_signal import Correction
+from processing.reduction.flat import flat_captures, nearest_flat
+from processing.reduction.mueller import Choice, choose_model, reduce_mueller
+from processing.steps.file_step import FileStep, Found, Progress
+from processing.storage.capture import Capture
+from processing.storage.product import is_product
+from processing.storage.provenance import Step, file_identity
+
+
+@dataclass(frozen=True)
+class Reduction(FileStep):
+    """`process reduce`.
+
+    Attributes
+    ----------
+    capture : to be reduced.
+    instrument : file to use instead of the model in the capture.
+    weighted, covariance, physical : see `processing.reduction.mueller.Choice`; for a Mueller capture.
+    camera : noise and bad pixels, a product of `process camera`.
+    dark : other capture whose dark states are subtracted.
+    flat : captures of the flat field, or folders of which the one that belongs to the capture is taken.
+    demosaic, analyzers : method (None: the default) and analysis vectors of the pixels; for a mosaic capture.
+    """
+
+    capture: Path
+    instrument: Path | None = None
+    weighted: bool = False
+    covariance: bool = False
+    physical: str | None = None
+    camera: Path | None = None
+    dark: Path | None = None
+    flat: tuple[Path, ...] = ()
+    demosaic: str | None = None
+    analyzers: Path | None = None
+
+    @property
+    def kind(self) -> str:
+        """Of the product: "mueller" or "stokes"."""
+        with Capture(self.capture) as capture:
+            return "stokes" if capture.header.mosaic else "mueller"
+
+    @property
+    def usual_path(self) -> Path:
+        """Beside the capture."""
+        return self.capture.with_suffix(f".{self.kind}.h5")
+
+    def record(self) -> Step:
+        """Options and contents; the capture's name is among the options, for effects of single captures go by it."""
+        with Capture(self.capture) as capture:
+            flats = [_flat_file(path, capture) for path in self.flat]
+            mosaic = capture.header.mosaic is not None
+        if mosaic:
+            self._refuse(
+                ("weighted", "covariance", "physical"), "a mosaic capture; its product holds the covariance of S always"
+            )
+            options: dict[str, Any] = {"demosaic": self.demosaic or _default_method()}
+        else:
+            self._refuse(("demosaic", "analyzers"), "not a mosaic capture")
+            options = {name: getattr(self, name) for name in ("weighted", "covariance", "physical")}
+        named = ("capture", "instrument", "camera", "dark", "analyzers")
+        files = [(role, getattr(self, role)) for role in named] + [("flat", path) for path in flats]
+        inputs = tuple(file_identity(path, role) for role, path in files if path is not None)
+        return Step("reduce", {"capture": self.capture.name} | options, inputs)
+
+    def _refuse(self, options: tuple[str, ...], why: str) -> None:
+        given = [f"--{name}" for name in options if getattr(self, name)]
+        if given:
+            raise ProcessError(f"{' '.join(given)}: {self.capture} is {why}.")
+
+    def _write(self, out: Path, record: Step, overwrite: bool, progress: Progress | None) -> None:
+        flats = [Path(i["path"]) for i in record.inputs if i["role"] == "flat"]
+        with ExitStack() as stack:
+            capture = stack.enter_context(Capture(self.capture))
+            dark = stack.enter_context(Capture(self.dark)) if self.dark else None
+            noise, bad = read_camera(self.camera) if self.camera else (None, None)
+            correction = Correction.of(capture, bad, dark, [stack.enter_context(Capture(path)) for path in flats])
+            model = choose_model(capture, self.instrument)
+            if not capture.header.mosaic:
+                choice = Choice(self.weighted, self.covariance, self.physical, noise)
+                reduce_mueller(capture, model, out, (record,), correction, choice, overwrite, progress)
+                return
+            # Imported here: OpenCV is not needed for a Mueller capture.
+            from processing.reduction.mosaic.pixel_response import read_response
+            from processing.reduction.stokes import reduce_stokes
+
+            response = read_response(self.analyzers, capture.frame_shape) if self.analyzers else None
+            method = record.arguments["demosaic"]
+            reduce_stokes(capture, model, out, (record,), method, correction, noise, response, overwrite, progress)
+
+
+def reduced(source: Path, instrument: Path | None = None, progress: Progress | None = None) -> Found:
+    """A product as it is; for a capture its plain product, found or made.
+
+    Raises
+    ------
+    ProcessError : an instrument file was given for a product.
+    """
+    if not is_product(source):
+        return Reduction(source, instrument).found_or_made(progress=progress)
+    if instrument is not None:
+        raise ProcessError(f"{source} is reduced already; --instrument is for a capture. Leave it away.")
+    return Found(source, True)
+
+
+def _default_method() -> str:
+    from processing.reduction.stokes import DEFAULT_METHOD
+
+    return DEFAULT_METHOD
+
+
+def _flat_file(path: Path, capture: Capture) -> Path:
+    """The flat capture itself, or the one of a folder that belongs to the capture."""
+    if not path.is_dir():
+        return path
+    found = nearest_flat(flat_captures(path), capture)
+    if found is None:
+        raise ProcessError(
+            f"{path} holds no flat field of the camera and wavelength of {capture.path.name}. "
+            "Take one (plan key `role: flat`), or leave --flat away."
+        )
+    return found

@@ -1,0 +1,73 @@
+"""Products to a table over scattering geometry."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from processing.errors import ProcessError
+from processing.maps.tables import tabulate
+from processing.reflectance.table_axes import Layout
+from processing.reflectance.tables import ScatteringTable, table_steps
+from processing.steps.file_step import FileStep, Progress
+from processing.steps.maps import geometry_identities
+from processing.storage.provenance import MADE_OF, Step, file_identity
+
+
+@dataclass(frozen=True)
+class Tabulation(FileStep):
+    """`process table`: all samples of Mueller or xi0 products of one wavelength.
+
+    Attributes
+    ----------
+    sources : products.
+    geometry : file of camera, source and shape.
+    out : the table; it has no other usual name.
+    layout : of the bins.
+    """
+
+    sources: tuple[Path, ...]
+    geometry: Path
+    out: Path
+    layout: Layout = "degree"
+
+    @property
+    def usual_path(self) -> Path:
+        """As given."""
+        return self.out
+
+    def record(self) -> Step:
+        """Layout, sources and geometry."""
+        inputs = [file_identity(source, "source") for source in self.sources]
+        return Step("table", {"layout": self.layout}, (*inputs, *geometry_identities(self.geometry)))
+
+    def _write(self, out: Path, record: Step, overwrite: bool, progress: Progress | None) -> None:
+        tabulate(self.sources, self.geometry, self.layout, progress=progress).save(out, (record,))
+
+    def append(self, progress: Progress | None = None) -> Path:
+        """Add the sources to the table that is there; without one, make it.
+
+        Raises
+        ------
+        ProcessError : a source is in the table already, and its samples would count twice.
+        """
+        if not self.out.exists():
+            return self.make(progress=progress)
+        record, before = self.record(), table_steps(self.out)
+        _refuse_twice(record, before)
+        grown = Step("table", record.arguments, (*record.inputs, file_identity(self.out, "table")))
+        table = ScatteringTable.load(self.out)
+        tabulate(self.sources, self.geometry, self.layout, table, progress).save(self.out, (*before, grown))
+        return self.out
+
+
+def _refuse_twice(record: Step, before: Sequence[Step]) -> None:
+    known = {_content(i) for step in before for i in step.inputs if i["role"] == "source"}
+    for source in record.inputs:
+        if source["role"] == "source" and _content(source) in known:
+            raise ProcessError(f"{source['path']} is in the table already; its samples would count twice.")
+
+
+def _content(identity: dict[str, object]) -> object:
+    return identity.get("sha256") or identity.get(MADE_OF)
