@@ -84,6 +84,10 @@ class Bench:
     order: NDArray[np.int64] | None = None
     shared_light: float = 0.0
     zigzag: bool = False
+    #: Axis that a fault of one axis acts on; drawn if None.
+    axis: str | None = None
+    #: (state) -> angle in radians by which the sample has turned about the line of sight.
+    turned: list[Callable[[int], float]] = field(default_factory=list)
 
     def generated(self, angles: dict[str, float], state: int) -> Array:
         """Stokes vectors (..., 4) of the light on the sample; leading axes if the retardance varies over the image."""
@@ -180,7 +184,9 @@ def expose(bench: Bench, scene: Scene, angles_deg: dict[str, Array]) -> Array:
     if bench.mosaic:
         # The lens is assumed to blur over a super-pixel: its four pixels see the same spot of the scene.
         ys, xs = ys // 2 * 2, xs // 2 * 2
-    still = None if bench.shift or bench.material_level else scene.at(xs / bench.columns, ys / bench.rows)
+    still = (
+        None if bench.shift or bench.material_level or bench.turned else scene.at(xs / bench.columns, ys / bench.rows)
+    )
     for k in range(n):
         angles = {axis: float(np.deg2rad(v[k])) for axis, v in angles_deg.items()}
         for hook in bench.angles:
@@ -193,6 +199,8 @@ def expose(bench: Bench, scene: Scene, angles_deg: dict[str, Array]) -> Array:
             for which, course in bench.material_level:
                 levels[which] *= course(k)
             m = scene.at((xs - dx) / bench.columns, (ys - dy) / bench.rows, levels)
+            if bench.turned:
+                m = _turned(scene, bench, xs - dx, ys - dy, sum(t(k) for t in bench.turned))
         g, a = bench.generated(angles, k), bench.analyzed(angles, k)
         light = np.einsum("ci,hwij,...j->chw", a, m, g) if g.ndim == 1 else np.einsum("ci,hwij,hwj->chw", a, m, g)
         out[k] = _on_mosaic(light) if bench.mosaic else light[0]
@@ -207,6 +215,19 @@ def expose(bench: Bench, scene: Scene, angles_deg: dict[str, Array]) -> Array:
         for change in bench.light:
             out[k] = change(k, out[k])
     return np.asarray(out)
+
+
+def _turned(scene: Scene, bench: Bench, xs: Array, ys: Array, angle: float) -> Array:
+    """Mueller matrices of the scene turned counter-clockwise by an angle (radians) about the middle of the image."""
+    c, s = np.cos(angle), np.sin(angle)
+    x, y = xs - (bench.columns - 1) / 2, ys - (bench.rows - 1) / 2
+    # Rows run downwards: counter-clockwise as seen is clockwise in (column, row).
+    back = scene.at(
+        (c * x - s * y + (bench.columns - 1) / 2) / bench.columns, (s * x + c * y + (bench.rows - 1) / 2) / bench.rows
+    )
+    c, s = np.cos(2 * angle), np.sin(2 * angle)
+    r = np.array([[1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1]])
+    return np.asarray(r @ back @ r.T)
 
 
 def _on_mosaic(light: Array) -> Array:
@@ -228,10 +249,19 @@ def digitize(bench: Bench, electrons: Array, random: np.random.Generator) -> NDA
 
 
 def write_capture(
-    path: Path, bench: Bench, counts: NDArray[np.uint16], angles_deg: dict[str, Array], sample: Sample, instrument: str
+    path: Path,
+    bench: Bench,
+    counts: NDArray[np.uint16],
+    angles_deg: dict[str, Array],
+    sample: Sample,
+    instrument: str,
+    detector: Detector | None = None,
 ) -> None:
-    """A capture file as the bench's own program would write it: the declared instrument, no word of the fault."""
-    detector = Detector(
+    """A capture file as the bench's own program would write it: the declared instrument, no word of the fault.
+
+    `detector` : as declared, if it is not the true one.
+    """
+    detector = detector or Detector(
         black_level_counts=BLACK,
         gain_e_per_count=bench.gain,
         read_noise_e=bench.read_noise,

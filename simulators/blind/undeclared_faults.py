@@ -1,13 +1,14 @@
 """Faults of a lab that a declared model does not know, by physics; each changes a Bench and says what it did.
 
-`LISTED` are causes that `processing/instrument/effects` knows, by its kinds; `UNLISTED` are causes that it does
-not know. A truth is (kind, place, parameters in the units of the effect): only what can be compared number by number.
+`LISTED` are causes that `processing/effects` knows, by its kinds; `UNLISTED` are causes that it does not know. A truth
+is (kind, place, parameters in the units of the effect): only what can be compared number by number.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -25,7 +26,17 @@ class Truth:
     parameters: dict[str, float] = field(default_factory=dict)
 
 
+#: Least and largest size; drawn evenly in the logarithm.
+Sizes = tuple[float, float]
+
+
 Fault = Callable[[Bench, np.random.Generator, int], Truth]
+
+
+class SizedFault(Protocol):
+    """A fault whose size can be drawn from elsewhere than the blind suite's own range."""
+
+    def __call__(self, bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = ...) -> Truth: ...
 
 
 def _signed(random: np.random.Generator, low: float, high: float) -> float:
@@ -37,38 +48,44 @@ def _size(random: np.random.Generator, low: float, high: float) -> float:
 
 
 def _axis(bench: Bench, random: np.random.Generator) -> str:
+    if bench.axis is not None:
+        return bench.axis
     return "psg" if bench.mosaic else str(random.choice(["psg", "psa"]))
 
 
-def _number(name: str, attribute: str, place: str, parameter: str, low: float, high: float) -> Fault:
-    def fault(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-        value = _signed(random, low, high)
+def _number(name: str, attribute: str, place: str, parameter: str, low: float, high: float) -> SizedFault:
+    def fault(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (low, high)) -> Truth:
+        value = _signed(random, *sizes)
         setattr(bench, attribute, getattr(bench, attribute) + np.deg2rad(value))
         return Truth(name, place, {parameter: value})
 
     return fault
 
 
-def _extinction(name: str, attribute: str, place: str) -> Fault:
-    def fault(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-        value = _size(random, 0.001, 0.03)
+def _extinction(name: str, attribute: str, place: str) -> SizedFault:
+    def fault(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.001, 0.03)) -> Truth:
+        value = _size(random, *sizes)
         setattr(bench, attribute, value)
         return Truth(name, place, {"extinction": value})
 
     return fault
 
 
-def retarder_diattenuation(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-    axis, d = _axis(bench, random), _signed(random, 0.002, 0.05)
+def retarder_diattenuation(
+    bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.002, 0.05)
+) -> Truth:
+    axis, d = _axis(bench, random), _signed(random, *sizes)
     setattr(bench, "fast_slow_g" if axis == "psg" else "fast_slow_a", (1 + d, 1 - d))
     return Truth("retarder_diattenuation", f"{axis}_retarder", {"diattenuation": d})
 
 
-def retarder_transmission(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def retarder_transmission(
+    bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.002, 0.03)
+) -> Truth:
     axis, order, size, phase = (
         _axis(bench, random),
         int(random.choice([1, 2])),
-        _size(random, 0.002, 0.03),
+        _size(random, *sizes),
         random.uniform(0, 2 * np.pi),
     )
     bench.level.append(lambda k, a: 1 + size * np.cos(order * a[axis] - phase))
@@ -76,9 +93,9 @@ def retarder_transmission(bench: Bench, random: np.random.Generator, states: int
     return Truth("retarder_transmission", f"{axis}_retarder", values)
 
 
-def field_retardance(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def field_retardance(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.3, 4.0)) -> Truth:
     # Rays at an angle: retardance grows with the squared tilt about a centre that need not be the image's.
-    size, x0, y0 = _signed(random, 0.3, 4.0), *random.uniform(-0.7, 0.7, 2)
+    size, x0, y0 = _signed(random, *sizes), *random.uniform(-0.7, 0.7, 2)
     y, x = np.mgrid[-1 : 1 : bench.rows * 1j, -1 : 1 : bench.columns * 1j]
     tilt = (x - x0) ** 2 + (y - y0) ** 2
     bench.field_retardance = np.deg2rad(size * (tilt - (2 / 3 + x0**2 + y0**2)))
@@ -86,9 +103,9 @@ def field_retardance(bench: Bench, random: np.random.Generator, states: int) -> 
     return Truth("field_retardance", "psg_retarder", values)
 
 
-def retardance_drift(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def retardance_drift(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.3, 4.0)) -> Truth:
     # A plate that warms up comes to rest like an exponential.
-    axis, size, rate = _axis(bench, random), np.deg2rad(_signed(random, 0.3, 4.0)), random.uniform(1, 3)
+    axis, size, rate = _axis(bench, random), np.deg2rad(_signed(random, *sizes)), random.uniform(1, 3)
 
     def warm(k: int) -> tuple[float, float]:
         change = float(size * (1 - np.exp(-rate * k / (states - 1))))
@@ -98,22 +115,22 @@ def retardance_drift(bench: Bench, random: np.random.Generator, states: int) -> 
     return Truth("retardance_drift", f"{axis}_retarder")
 
 
-def stray_light(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def stray_light(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.003, 0.05)) -> Truth:
     # Follows the scene's brightness (light past the analyzer), the same in every state.
-    size = _size(random, 0.003, 0.05)
+    size = _size(random, *sizes)
     bench.shared_light = size
     return Truth("stray_light", "", {"fraction": size})
 
 
-def path_retardance(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-    size, t = np.deg2rad(_size(random, 0.2, 4.0)), random.uniform(0, np.pi)
+def path_retardance(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.2, 4.0)) -> Truth:
+    size, t = np.deg2rad(_size(random, *sizes)), random.uniform(0, np.pi)
     bench.path = (size * np.cos(2 * t), size * np.sin(2 * t))
     a, b = np.rad2deg(bench.path)
     return Truth("path_retardance", "", {"at_0": float(a), "at_45": float(b)})
 
 
-def rotation_eccentricity(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-    axis, d, phase = _axis(bench, random), _size(random, 0.04, 1.0), random.uniform(0, 2 * np.pi)
+def rotation_eccentricity(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.04, 1.0)) -> Truth:
+    axis, d, phase = _axis(bench, random), _size(random, *sizes), random.uniform(0, 2 * np.pi)
     names = ("cos_1", "sin_1", "cos_2", "sin_2")
     if random.random() < 0.5:
         size = np.deg2rad(d)
@@ -136,14 +153,14 @@ def rotation_eccentricity(bench: Bench, random: np.random.Generator, states: int
     return Truth("rotation_eccentricity", axis, dict(zip(names, map(float, values), strict=True)))
 
 
-def rotation_ratio(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-    axis, size = _axis(bench, random), _signed(random, 1e-4, 2e-3)
+def rotation_ratio(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (1e-4, 2e-3)) -> Truth:
+    axis, size = _axis(bench, random), _signed(random, *sizes)
     bench.angles.append(lambda k, a: a | {axis: a[axis] * (1 + size)})
     return Truth("rotation_ratio", axis, {"relative": size})
 
 
-def rotation_backlash(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-    axis, play = _axis(bench, random), np.deg2rad(_size(random, 0.05, 0.5))
+def rotation_backlash(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.05, 0.5)) -> Truth:
+    axis, play = _axis(bench, random), np.deg2rad(_size(random, *sizes))
     last: dict[str, float] = {}
 
     def lag(k: int, a: dict[str, float]) -> dict[str, float]:
@@ -158,80 +175,82 @@ def rotation_backlash(bench: Bench, random: np.random.Generator, states: int) ->
     return Truth("rotation_backlash", axis, {"backlash": float(np.rad2deg(play))})
 
 
-def rotation_slip(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-    axis, size, first = _axis(bench, random), _signed(random, 0.1, 3.0), int(random.integers(4, states - 3))
+def rotation_slip(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.1, 3.0)) -> Truth:
+    axis, size, first = _axis(bench, random), _signed(random, *sizes), int(random.integers(4, states - 3))
     bench.angles.append(lambda k, a: a | {axis: a[axis] + np.deg2rad(size) * (k >= first)})
     return Truth("rotation_slip", f"{axis}@{first}", {"slip": size})
 
 
-def angle_per_state(bench: Bench, random: np.random.Generator, states: int) -> Truth:
+def angle_per_state(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.05, 0.5)) -> Truth:
     axis = _axis(bench, random)
-    error = np.deg2rad(_size(random, 0.05, 0.5)) * random.standard_normal(states)
+    error = np.deg2rad(_size(random, *sizes)) * random.standard_normal(states)
     bench.angles.append(lambda k, a: a | {axis: a[axis] + error[k]})
     return Truth("angle_per_state", axis)
 
 
-def source_drift(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-    size = _signed(random, 0.003, 0.1)
+def source_drift(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.003, 0.1)) -> Truth:
+    size = _signed(random, *sizes)
     bench.level.append(lambda k, a: 1 + size * (k / (states - 1) - 0.5))
     return Truth("source_drift", "", {"fraction": size})
 
 
-def source_flicker(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-    level = 1 + _size(random, 0.002, 0.02) * random.standard_normal(states)
+def source_flicker(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.002, 0.02)) -> Truth:
+    level = 1 + _size(random, *sizes) * random.standard_normal(states)
     bench.level.append(lambda k, a: float(level[k]))
     return Truth("source_flicker")
 
 
-def detector_nonlinearity(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-    c, top = _signed(random, 0.004, 0.06), 65435.0 * bench.gain
+def detector_nonlinearity(
+    bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.004, 0.06)
+) -> Truth:
+    c, top = _signed(random, *sizes), 65435.0 * bench.gain
     bench.transfer.append(lambda e: e * (1 - c * e / top))
     return Truth("detector_nonlinearity", "", {"lost_at_full_scale": c})
 
 
-def detector_offset(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-    counts = _signed(random, 30, 600)
+def detector_offset(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (30, 600)) -> Truth:
+    counts = _signed(random, *sizes)
     bench.transfer.append(lambda e: e + counts * bench.gain)
     return Truth("detector_offset", "", {"offset": counts})
 
 
-def saturation(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-    bench.electrons = bench.full_well * random.uniform(1.03, 1.4)
+def saturation(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (1.03, 1.4)) -> Truth:
+    bench.electrons = bench.full_well * random.uniform(*sizes)
     return Truth("saturation")
 
 
-def image_drift(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-    x, y = _signed(random, 0.1, 1.0), _signed(random, 0.1, 1.0)
+def image_drift(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.1, 1.0)) -> Truth:
+    x, y = _signed(random, *sizes), _signed(random, *sizes)
     bench.shift.append(lambda k, a: (x * (k / (states - 1) - 0.5), y * (k / (states - 1) - 0.5)))
     return Truth("image_drift", "", {"x": x, "y": y})
 
 
-def beam_wander(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-    axis, size, phase = _axis(bench, random), _size(random, 0.1, 1.0), random.uniform(0, 2 * np.pi)
+def beam_wander(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.1, 1.0)) -> Truth:
+    axis, size, phase = _axis(bench, random), _size(random, *sizes), random.uniform(0, 2 * np.pi)
     bench.shift.append(lambda k, a: (size * np.cos(a[axis] - phase), size * np.sin(a[axis] - phase)))
     s, c = size * np.sin(phase), size * np.cos(phase)
     return Truth("beam_wander", f"{axis}_retarder", {"x_cos": c, "x_sin": s, "y_cos": -s, "y_sin": c})
 
 
-def channel_gain(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-    bench.channel_gain = np.append(1.0, 1 + _size(random, 0.003, 0.05) * random.standard_normal(3))
+def channel_gain(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.003, 0.05)) -> Truth:
+    bench.channel_gain = np.append(1.0, 1 + _size(random, *sizes) * random.standard_normal(3))
     names = ("channel_45", "channel_90", "channel_135")
     return Truth("channel_gain", "", dict(zip(names, (bench.channel_gain[1:] - 1).tolist(), strict=True)))
 
 
-def channel_azimuth(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-    degrees = _size(random, 0.2, 2.0) * random.standard_normal(4)
+def channel_azimuth(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.2, 2.0)) -> Truth:
+    degrees = _size(random, *sizes) * random.standard_normal(4)
     bench.channel_azimuth = np.deg2rad(degrees)
     return Truth("channel_azimuth")
 
 
-def channel_extinction(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-    bench.channel_extinction = _size(random, 0.003, 0.04) * random.uniform(0.2, 1.8, 4)
+def channel_extinction(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.003, 0.04)) -> Truth:
+    bench.channel_extinction = _size(random, *sizes) * random.uniform(0.2, 1.8, 4)
     return Truth("channel_extinction")
 
 
-def pixel_crosstalk(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-    size = _size(random, 0.01, 0.1)
+def pixel_crosstalk(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.01, 0.1)) -> Truth:
+    size = _size(random, *sizes)
 
     def spread(k: int, e: Array) -> Array:
         p = np.pad(e, 1, mode="reflect")
@@ -242,13 +261,13 @@ def pixel_crosstalk(bench: Bench, random: np.random.Generator, states: int) -> T
     return Truth("pixel_crosstalk", "", {"fraction": size})
 
 
-def tone_curve(bench: Bench, random: np.random.Generator, states: int) -> Truth:
-    e, top = _signed(random, 0.01, 0.15), 65435.0 * bench.gain
+def tone_curve(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.01, 0.15)) -> Truth:
+    e, top = _signed(random, *sizes), 65435.0 * bench.gain
     bench.transfer.append(lambda x: top * (np.maximum(x, 0) / top) ** (1 / (1 + e)))
     return Truth("tone_curve", "", {"gamma_minus_1": e})
 
 
-LISTED: dict[str, Fault] = {
+LISTED: dict[str, SizedFault] = {
     "psg_retardance": _number("psg_retardance", "dg", "psg_retarder", "retardance", 0.1, 4.0),
     "psa_retardance": _number("psa_retardance", "da", "psa_retarder", "retardance", 0.1, 4.0),
     "psg_azimuth": _number("psg_azimuth", "og", "psg_retarder", "azimuth", 0.03, 1.0),
@@ -277,7 +296,7 @@ LISTED: dict[str, Fault] = {
     "beam_wander": beam_wander,
     "tone_curve": tone_curve,
 }
-MOSAIC: dict[str, Fault] = {
+MOSAIC: dict[str, SizedFault] = {
     "channel_gain": channel_gain,
     "channel_azimuth": channel_azimuth,
     "channel_extinction": channel_extinction,
