@@ -26,12 +26,17 @@ DETECTABLE = 50.0
 QUIET = 1e-6
 
 
-def expected(bench: Bench, electrons: Array) -> Array:
-    """Electrons (N, rows, columns) that the detector reports on average."""
+def expected_electrons(bench: Bench, electrons: Array) -> Array:
+    """Electrons (N, rows, columns) that the detector collects on average."""
     found = np.minimum(electrons, bench.full_well)
     for curve in bench.transfer:
         found = curve(found)
-    return np.asarray(found / bench.gain)
+    return found
+
+
+def expected(bench: Bench, electrons: Array) -> Array:
+    """Counts (N, rows, columns) above black that the detector reports on average."""
+    return np.asarray(expected_electrons(bench, electrons) / bench.gain)
 
 
 def evidence(

@@ -1,16 +1,17 @@
 """Real benches: six to ten small faults at once, the same in every capture of the bench, by other physics.
 
 A bench is three captures (sphere and flat, unknown; air), a fourth of another sample that no fit sees, and a truth file
-apart. Optics, mechanics and detector are the same in all; a source and what drifts are each capture's own. Of every capture there is a
-twin without noise, by which the systematic error of a correction is measured.
+apart. Optics, mechanics and detector are the same in all; a source and what drifts are each capture's own. Of every
+capture there is a twin without noise, by which the systematic error of a correction is measured.
 
-Seeds below 1000 are for development, those from 1000 on for one reported run each.
+Other groups have one thing wrong on such a bench, or nothing: `GROUPS`. Seeds below 1000 are for development, those
+from 1000 on for one reported run each.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -19,27 +20,43 @@ from numpy.typing import NDArray
 
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture_schema import Sample
-from simulators.blind.detectable import expected
+from simulators.blind.detectable import expected, expected_electrons
+from simulators.blind.detector_cases import DETECTOR
 from simulators.blind.lab_priors import PRIORS, draw_kinds
+from simulators.blind.outside_list import EVENTS, OUTSIDE
 from simulators.blind.suite import declared_bench, state_angles
-from simulators.blind.undeclared_captures import BLACK, Bench, Scene, digitize, expose, write_capture
-from simulators.blind.undeclared_faults import LISTED, Truth
+from simulators.blind.undeclared_captures import Bench, Scene, counted, digitize, expose, write_capture
+from simulators.blind.undeclared_faults import LISTED, UNLISTED, Fault, Truth
+from simulators.blind.wiring import MOSAIC_WIRING, WIRING
 
 Array = NDArray[np.float64]
 
-INSTRUMENT = "rgb950.yaml"
+INSTRUMENTS = {False: "rgb950.yaml", True: "mosaic_polarimeter.yaml"}
 #: Of even and of odd seeds.
 WAVELENGTHS_NM = (662.0, 451.0)
-STATES = 40
+MOSAIC_NM = 662.0
+STATES = {False: 40, True: 16}
 PIXELS = 64
 FITTED = ("sphere", "flat", "air")
 VALIDATION = "validation"
 #: Each capture has these of its own; the others belong to the bench.
 OF_THE_CAPTURE = frozenset(
-    {"source_drift", "source_flicker", "image_drift", "retardance_drift", "rotation_slip", "angle_per_state"}
+    {
+        *("source_drift", "source_flicker", "image_drift", "retardance_drift", "rotation_slip", "angle_per_state"),
+        *("bad_frame", *EVENTS),
+    }
 )
+#: One thing wrong: kind and how it is made; the seed goes through them in turn.
+GROUPS: dict[str, dict[str, Fault]] = {
+    "real": {},
+    "none": {},
+    "outside": {**UNLISTED, **OUTSIDE},
+    "detector": DETECTOR,
+    "wiring": WIRING,
+    "mosaic_wiring": MOSAIC_WIRING,
+}
 #: What happens once, in one of the captures.
-ONCE = frozenset({"rotation_slip"})
+ONCE = frozenset({"rotation_slip", "bad_frame"})
 #: Side of the squares of pixels whose mean decides whether a fault matters.
 PATCH = 8
 
@@ -62,7 +79,7 @@ def flat_mueller(random: np.random.Generator) -> Array:
 
 
 @dataclass(frozen=True)
-class Fault:
+class TrueFault:
     """One fault of a bench, as the truth file has it.
 
     `capture` is None for what belongs to the bench. `matters` is the largest, over the captures that it acts in, of the
@@ -81,10 +98,14 @@ class RealBench:
     """A bench of the suite, as the truth file has it."""
 
     name: str
+    group: str
     seed: int
     instrument: str
     wavelength_nm: float
-    faults: tuple[Fault, ...]
+    faults: tuple[TrueFault, ...]
+
+
+ONE_THING: dict[str, Fault] = {name: fault for group in GROUPS.values() for name, fault in group.items()}
 
 
 @dataclass(frozen=True)
@@ -96,30 +117,42 @@ class _Draw:
     axis: str
     once: str
 
-    def apply(self, bench: Bench, capture: str) -> Fault | None:
+    def apply(self, bench: Bench, capture: str) -> TrueFault | None:
         own = self.kind in OF_THE_CAPTURE
         # Another sample is measured later: what is a capture's own is not known of it, and does not act in it.
         if own and (capture == VALIDATION or (self.kind in ONCE and capture != self.once)):
             return None
         bench.axis = self.axis
         random = np.random.default_rng([self.seed, FITTED.index(capture)] if own else self.seed)
-        truth: Truth = LISTED[self.kind](bench, random, STATES, PRIORS[self.kind].sizes)
-        return Fault(truth.kind, truth.place, truth.parameters, capture if own else None)
+        states = STATES[bench.mosaic]
+        if self.kind in PRIORS:
+            truth: Truth = LISTED[self.kind](bench, random, states, PRIORS[self.kind].sizes)
+        else:
+            truth = ONE_THING[self.kind](bench, random, states)
+        return TrueFault(truth.kind, truth.place, truth.parameters, capture if own else None)
 
 
-def make_bench(folder: Path, seed: int, configs: Path, pixels: int = PIXELS) -> RealBench:
-    """Write the captures of one bench under `folder` and its truth under `folder/truth`; same seed, same files."""
+def make_bench(folder: Path, seed: int, configs: Path, group: str = "real", pixels: int = PIXELS) -> RealBench:
+    """Write the captures of one bench under `folder` and its truth under `folder/truth`; same seed, same files.
+
+    Parameters
+    ----------
+    group : one of `GROUPS`.
+    pixels : side of the images.
+    """
     random = np.random.default_rng([seed, 8128])
-    name = f"bench_{seed:04d}"
+    name, mosaic = f"{group}_{seed:04d}", group == "mosaic_wiring"
     own, away = folder / name, folder / "truth" / name
     own.mkdir(parents=True, exist_ok=True)
     away.mkdir(parents=True, exist_ok=True)
-    text = (configs / "instruments" / INSTRUMENT).read_text(encoding="utf-8")
-    model = InstrumentModel.load(configs / "instruments" / INSTRUMENT)
-    nm, electrons = WAVELENGTHS_NM[seed % 2], float(random.uniform(10_000, 25_000))
+    file = configs / "instruments" / INSTRUMENTS[mosaic]
+    text, model = file.read_text(encoding="utf-8"), InstrumentModel.load(file)
+    nm = MOSAIC_NM if mosaic else WAVELENGTHS_NM[seed % 2]
+    electrons = float(random.uniform(10_000, 25_000))
+    kinds = draw_kinds(random) if group == "real" else list(GROUPS[group])
     draws = [
         _Draw(kind, int(random.integers(1 << 31)), str(random.choice(["psg", "psa"])), str(random.choice(FITTED)))
-        for kind in draw_kinds(random)
+        for kind in (kinds if group == "real" else kinds[seed % len(kinds) :][:1] if kinds else [])
     ]
     scenes = {
         "sphere": Disc(random),
@@ -127,34 +160,58 @@ def make_bench(folder: Path, seed: int, configs: Path, pixels: int = PIXELS) -> 
         "air": Scene(random, np.eye(4)),
         VALIDATION: Scene(random),
     }
+    angles = state_angles(STATES[mosaic], mosaic, any(d.kind == "rotation_backlash" for d in draws))
+    if mosaic:
+        del angles["psa"]
 
-    def bench_with(capture: str, without: int | None = None) -> tuple[Bench, dict[int, Fault]]:
-        bench = declared_bench(model.at(nm), nm, pixels, False, electrons)
-        done = {i: d.apply(bench, capture) for i, d in enumerate(draws) if i != without}
-        return bench, {i: f for i, f in done.items() if f is not None}
+    def sound() -> Bench:
+        return declared_bench(model.at(nm), nm, pixels, mosaic, electrons)
 
-    zigzag = any(d.kind == "rotation_backlash" for d in draws)
-    angles = state_angles(STATES, False, zigzag)
-    w = model.at(nm).rows(angles).reshape(STATES, 16)
-    found: dict[tuple[int, str | None], Fault] = {}
+    found: dict[tuple[int, str | None], TrueFault] = {}
     for capture, scene in scenes.items():
-        bench, faults = bench_with(capture)
-        exposed = expose(bench, scene, angles)
+        taken = _Taken(sound, draws, capture, scene, angles)
+        bench, exposed, faults = taken.exposed()
         sample = Sample(kind="air" if capture == "air" else "unknown")
-        quiet = np.asarray(np.rint(expected(bench, exposed) + BLACK), dtype=np.uint16)
+        quiet = counted(bench, expected_electrons(bench, exposed))
         write_capture(away / f"{capture}.h5", bench, quiet, angles, sample, text)
         target = away / f"{capture}_noisy.h5" if capture == VALIDATION else own / f"{capture}.h5"
         write_capture(target, bench, digitize(bench, exposed, random), angles, sample, text)
         np.save(away / f"{capture}.npy", true_mueller(scene, pixels))
         for i, fault in faults.items():
-            others, _ = bench_with(capture, without=i)
-            change = _change(w, expected(bench, exposed), expected(others, expose(others, scene, angles)))
-            key = (i, fault.capture)
-            size = max(_in_errors(change, w, expected(bench, exposed), bench), found.get(key, fault).matters)
-            found[key] = replace(fault, matters=size)
-    truth = RealBench(name, seed, INSTRUMENT, nm, tuple(found[k] for k in sorted(found, key=str)))
+            key, size = (i, fault.capture), 0.0
+            if group in ("real", "outside"):
+                size = taken.matters(model.at(nm).rows(angles).reshape(-1, 16), i)
+            found[key] = replace(fault, matters=max(size, found.get(key, fault).matters))
+    truth = RealBench(name, group, seed, file.name, nm, tuple(found[k] for k in sorted(found, key=str)))
     (away / "truth.json").write_text(json.dumps(asdict(truth), indent=1), encoding="utf-8")
     return truth
+
+
+@dataclass(frozen=True)
+class _Taken:
+    """One capture of a bench: as it is, and as it would be without one of its faults."""
+
+    sound: Callable[[], Bench]
+    draws: Sequence[_Draw]
+    capture: str
+    scene: Scene
+    angles: dict[str, Array]
+
+    def exposed(self, without: int | None = None) -> tuple[Bench, Array, dict[int, TrueFault]]:
+        """The bench, electrons (N, rows, columns) without noise, and what was done to it."""
+        bench = self.sound()
+        done = {i: d.apply(bench, self.capture) for i, d in enumerate(self.draws) if i != without}
+        return bench, expose(bench, self.scene, self.angles), {i: f for i, f in done.items() if f is not None}
+
+    def matters(self, w: Array, fault: int) -> float:
+        """Change of M / m00 that one fault makes, in standard errors of a mean over a patch; rms over lit pixels."""
+        (bench, light, _), (others, without, _) = self.exposed(), self.exposed(fault)
+        counts = expected(bench, light)
+        change = _normalized(w, counts)[0] - _normalized(w, expected(others, without))[0]
+        variance = counts / bench.gain + (bench.read_noise / bench.gain) ** 2
+        errors = np.tensordot(np.linalg.pinv(w) ** 2, variance, 1) / _normalized(w, counts)[1] ** 2
+        lit = counts.mean(axis=0) > 0.1 * counts.mean(axis=0).max()
+        return float(PATCH * np.sqrt(np.mean((change**2 / errors)[1:, lit])))
 
 
 def true_mueller(scene: Scene, pixels: int) -> NDArray[np.float32]:
@@ -169,22 +226,9 @@ def _normalized(w: Array, counts: Array) -> tuple[Array, Array]:
     return m / m[0], m[0]
 
 
-def _change(w: Array, with_it: Array, without: Array) -> Array:
-    """Change (16, rows, columns) of M / m00, as the declared model reduces both."""
-    return np.asarray(_normalized(w, with_it)[0] - _normalized(w, without)[0])
-
-
-def _in_errors(change: Array, w: Array, counts: Array, bench: Bench) -> float:
-    """Root mean square of the change, in standard errors of a mean over a patch of pixels."""
-    variance = counts / bench.gain + (bench.read_noise / bench.gain) ** 2
-    errors = np.tensordot(np.linalg.pinv(w) ** 2, variance, 1) / _normalized(w, counts)[1] ** 2
-    lit = counts.mean(axis=0) > 0.1 * counts.mean(axis=0).max()
-    return float(PATCH * np.sqrt(np.mean((change**2 / errors)[1:, lit])))
-
-
 def read_truth(folder: Path) -> Iterator[RealBench]:
     """Truth of every bench under a folder, in order of its name."""
     for path in sorted(folder.glob("truth/*/truth.json")):
         raw = json.loads(path.read_text(encoding="utf-8"))
-        raw["faults"] = tuple(Fault(**f) for f in raw["faults"])
+        raw["faults"] = tuple(TrueFault(**f) for f in raw["faults"])
         yield RealBench(**raw)

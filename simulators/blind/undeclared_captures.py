@@ -88,6 +88,14 @@ class Bench:
     axis: str | None = None
     #: (state) -> angle in radians by which the sample has turned about the line of sight.
     turned: list[Callable[[int], float]] = field(default_factory=list)
+    #: (electrons of all states, random) -> electrons: noise that no model of the light has.
+    noise: list[Callable[[Array, np.random.Generator], Array]] = field(default_factory=list)
+    #: (counts of all states) -> counts, as a program stores them.
+    stored: list[Callable[[Array], Array]] = field(default_factory=list)
+    #: (true angles in degrees) -> angles as the capture file has them.
+    recorded: list[Callable[[dict[str, Array]], dict[str, Array]]] = field(default_factory=list)
+    #: What the capture file says of the detector, where it is not the truth.
+    declared: dict[str, float | None] = field(default_factory=dict)
 
     def generated(self, angles: dict[str, float], state: int) -> Array:
         """Stokes vectors (..., 4) of the light on the sample; leading axes if the retardance varies over the image."""
@@ -243,9 +251,17 @@ def digitize(bench: Bench, electrons: Array, random: np.random.Generator) -> NDA
     found = np.minimum(random.poisson(np.maximum(electrons, 0)).astype(float), bench.full_well)
     for curve in bench.transfer:
         found = curve(found)
-    found = found + bench.read_noise * random.standard_normal(found.shape)
-    counts = np.clip(np.rint(found / bench.gain + BLACK), 0, 2**BITS - 1)
-    return np.asarray(counts, dtype=np.uint16)
+    for add in bench.noise:
+        found = add(found, random)
+    return counted(bench, found + bench.read_noise * random.standard_normal(found.shape))
+
+
+def counted(bench: Bench, electrons: Array) -> NDArray[np.uint16]:
+    """Counts of collected electrons (N, rows, columns), as they are stored."""
+    counts = np.rint(electrons / bench.gain + BLACK)
+    for change in bench.stored:
+        counts = change(counts)
+    return np.asarray(np.clip(np.rint(counts), 0, 2**BITS - 1), dtype=np.uint16)
 
 
 def write_capture(
@@ -255,19 +271,17 @@ def write_capture(
     angles_deg: dict[str, Array],
     sample: Sample,
     instrument: str,
-    detector: Detector | None = None,
 ) -> None:
-    """A capture file as the bench's own program would write it: the declared instrument, no word of the fault.
-
-    `detector` : as declared, if it is not the true one.
-    """
-    detector = detector or Detector(
+    """A capture file as the bench's own program would write it: the declared instrument, no word of the fault."""
+    detector = Detector(
         black_level_counts=BLACK,
         gain_e_per_count=bench.gain,
         read_noise_e=bench.read_noise,
         full_well_e=bench.full_well,
         bits=BITS,
-    )
+    ).model_copy(update=bench.declared)
+    for change in bench.recorded:
+        angles_deg = change(angles_deg)
     layout = (("90", "45"), ("135", "0")) if bench.mosaic else None
     header = CaptureHeader(
         title=path.stem,

@@ -39,15 +39,15 @@ class SizedFault(Protocol):
     def __call__(self, bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = ...) -> Truth: ...
 
 
-def _signed(random: np.random.Generator, low: float, high: float) -> float:
+def draw_signed(random: np.random.Generator, low: float, high: float) -> float:
     return float(np.exp(random.uniform(np.log(low), np.log(high))) * random.choice([-1, 1]))
 
 
-def _size(random: np.random.Generator, low: float, high: float) -> float:
+def draw_size(random: np.random.Generator, low: float, high: float) -> float:
     return float(np.exp(random.uniform(np.log(low), np.log(high))))
 
 
-def _axis(bench: Bench, random: np.random.Generator) -> str:
+def draw_axis(bench: Bench, random: np.random.Generator) -> str:
     if bench.axis is not None:
         return bench.axis
     return "psg" if bench.mosaic else str(random.choice(["psg", "psa"]))
@@ -55,7 +55,7 @@ def _axis(bench: Bench, random: np.random.Generator) -> str:
 
 def _number(name: str, attribute: str, place: str, parameter: str, low: float, high: float) -> SizedFault:
     def fault(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (low, high)) -> Truth:
-        value = _signed(random, *sizes)
+        value = draw_signed(random, *sizes)
         setattr(bench, attribute, getattr(bench, attribute) + np.deg2rad(value))
         return Truth(name, place, {parameter: value})
 
@@ -64,7 +64,7 @@ def _number(name: str, attribute: str, place: str, parameter: str, low: float, h
 
 def _extinction(name: str, attribute: str, place: str) -> SizedFault:
     def fault(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.001, 0.03)) -> Truth:
-        value = _size(random, *sizes)
+        value = draw_size(random, *sizes)
         setattr(bench, attribute, value)
         return Truth(name, place, {"extinction": value})
 
@@ -74,7 +74,7 @@ def _extinction(name: str, attribute: str, place: str) -> SizedFault:
 def retarder_diattenuation(
     bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.002, 0.05)
 ) -> Truth:
-    axis, d = _axis(bench, random), _signed(random, *sizes)
+    axis, d = draw_axis(bench, random), draw_signed(random, *sizes)
     setattr(bench, "fast_slow_g" if axis == "psg" else "fast_slow_a", (1 + d, 1 - d))
     return Truth("retarder_diattenuation", f"{axis}_retarder", {"diattenuation": d})
 
@@ -83,9 +83,9 @@ def retarder_transmission(
     bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.002, 0.03)
 ) -> Truth:
     axis, order, size, phase = (
-        _axis(bench, random),
+        draw_axis(bench, random),
         int(random.choice([1, 2])),
-        _size(random, *sizes),
+        draw_size(random, *sizes),
         random.uniform(0, 2 * np.pi),
     )
     bench.level.append(lambda k, a: 1 + size * np.cos(order * a[axis] - phase))
@@ -95,7 +95,7 @@ def retarder_transmission(
 
 def field_retardance(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.3, 4.0)) -> Truth:
     # Rays at an angle: retardance grows with the squared tilt about a centre that need not be the image's.
-    size, x0, y0 = _signed(random, *sizes), *random.uniform(-0.7, 0.7, 2)
+    size, x0, y0 = draw_signed(random, *sizes), *random.uniform(-0.7, 0.7, 2)
     y, x = np.mgrid[-1 : 1 : bench.rows * 1j, -1 : 1 : bench.columns * 1j]
     tilt = (x - x0) ** 2 + (y - y0) ** 2
     bench.field_retardance = np.deg2rad(size * (tilt - (2 / 3 + x0**2 + y0**2)))
@@ -105,7 +105,7 @@ def field_retardance(bench: Bench, random: np.random.Generator, states: int, siz
 
 def retardance_drift(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.3, 4.0)) -> Truth:
     # A plate that warms up comes to rest like an exponential.
-    axis, size, rate = _axis(bench, random), np.deg2rad(_signed(random, *sizes)), random.uniform(1, 3)
+    axis, size, rate = draw_axis(bench, random), np.deg2rad(draw_signed(random, *sizes)), random.uniform(1, 3)
 
     def warm(k: int) -> tuple[float, float]:
         change = float(size * (1 - np.exp(-rate * k / (states - 1))))
@@ -117,20 +117,20 @@ def retardance_drift(bench: Bench, random: np.random.Generator, states: int, siz
 
 def stray_light(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.003, 0.05)) -> Truth:
     # Follows the scene's brightness (light past the analyzer), the same in every state.
-    size = _size(random, *sizes)
+    size = draw_size(random, *sizes)
     bench.shared_light = size
     return Truth("stray_light", "", {"fraction": size})
 
 
 def path_retardance(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.2, 4.0)) -> Truth:
-    size, t = np.deg2rad(_size(random, *sizes)), random.uniform(0, np.pi)
+    size, t = np.deg2rad(draw_size(random, *sizes)), random.uniform(0, np.pi)
     bench.path = (size * np.cos(2 * t), size * np.sin(2 * t))
     a, b = np.rad2deg(bench.path)
     return Truth("path_retardance", "", {"at_0": float(a), "at_45": float(b)})
 
 
 def rotation_eccentricity(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.04, 1.0)) -> Truth:
-    axis, d, phase = _axis(bench, random), _size(random, *sizes), random.uniform(0, 2 * np.pi)
+    axis, d, phase = draw_axis(bench, random), draw_size(random, *sizes), random.uniform(0, 2 * np.pi)
     names = ("cos_1", "sin_1", "cos_2", "sin_2")
     if random.random() < 0.5:
         size = np.deg2rad(d)
@@ -154,13 +154,13 @@ def rotation_eccentricity(bench: Bench, random: np.random.Generator, states: int
 
 
 def rotation_ratio(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (1e-4, 2e-3)) -> Truth:
-    axis, size = _axis(bench, random), _signed(random, *sizes)
+    axis, size = draw_axis(bench, random), draw_signed(random, *sizes)
     bench.angles.append(lambda k, a: a | {axis: a[axis] * (1 + size)})
     return Truth("rotation_ratio", axis, {"relative": size})
 
 
 def rotation_backlash(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.05, 0.5)) -> Truth:
-    axis, play = _axis(bench, random), np.deg2rad(_size(random, *sizes))
+    axis, play = draw_axis(bench, random), np.deg2rad(draw_size(random, *sizes))
     last: dict[str, float] = {}
 
     def lag(k: int, a: dict[str, float]) -> dict[str, float]:
@@ -176,26 +176,26 @@ def rotation_backlash(bench: Bench, random: np.random.Generator, states: int, si
 
 
 def rotation_slip(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.1, 3.0)) -> Truth:
-    axis, size, first = _axis(bench, random), _signed(random, *sizes), int(random.integers(4, states - 3))
+    axis, size, first = draw_axis(bench, random), draw_signed(random, *sizes), int(random.integers(4, states - 3))
     bench.angles.append(lambda k, a: a | {axis: a[axis] + np.deg2rad(size) * (k >= first)})
     return Truth("rotation_slip", f"{axis}@{first}", {"slip": size})
 
 
 def angle_per_state(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.05, 0.5)) -> Truth:
-    axis = _axis(bench, random)
-    error = np.deg2rad(_size(random, *sizes)) * random.standard_normal(states)
+    axis = draw_axis(bench, random)
+    error = np.deg2rad(draw_size(random, *sizes)) * random.standard_normal(states)
     bench.angles.append(lambda k, a: a | {axis: a[axis] + error[k]})
     return Truth("angle_per_state", axis)
 
 
 def source_drift(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.003, 0.1)) -> Truth:
-    size = _signed(random, *sizes)
+    size = draw_signed(random, *sizes)
     bench.level.append(lambda k, a: 1 + size * (k / (states - 1) - 0.5))
     return Truth("source_drift", "", {"fraction": size})
 
 
 def source_flicker(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.002, 0.02)) -> Truth:
-    level = 1 + _size(random, *sizes) * random.standard_normal(states)
+    level = 1 + draw_size(random, *sizes) * random.standard_normal(states)
     bench.level.append(lambda k, a: float(level[k]))
     return Truth("source_flicker")
 
@@ -203,13 +203,13 @@ def source_flicker(bench: Bench, random: np.random.Generator, states: int, sizes
 def detector_nonlinearity(
     bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.004, 0.06)
 ) -> Truth:
-    c, top = _signed(random, *sizes), 65435.0 * bench.gain
+    c, top = draw_signed(random, *sizes), 65435.0 * bench.gain
     bench.transfer.append(lambda e: e * (1 - c * e / top))
     return Truth("detector_nonlinearity", "", {"lost_at_full_scale": c})
 
 
 def detector_offset(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (30, 600)) -> Truth:
-    counts = _signed(random, *sizes)
+    counts = draw_signed(random, *sizes)
     bench.transfer.append(lambda e: e + counts * bench.gain)
     return Truth("detector_offset", "", {"offset": counts})
 
@@ -220,37 +220,37 @@ def saturation(bench: Bench, random: np.random.Generator, states: int, sizes: Si
 
 
 def image_drift(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.1, 1.0)) -> Truth:
-    x, y = _signed(random, *sizes), _signed(random, *sizes)
+    x, y = draw_signed(random, *sizes), draw_signed(random, *sizes)
     bench.shift.append(lambda k, a: (x * (k / (states - 1) - 0.5), y * (k / (states - 1) - 0.5)))
     return Truth("image_drift", "", {"x": x, "y": y})
 
 
 def beam_wander(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.1, 1.0)) -> Truth:
-    axis, size, phase = _axis(bench, random), _size(random, *sizes), random.uniform(0, 2 * np.pi)
+    axis, size, phase = draw_axis(bench, random), draw_size(random, *sizes), random.uniform(0, 2 * np.pi)
     bench.shift.append(lambda k, a: (size * np.cos(a[axis] - phase), size * np.sin(a[axis] - phase)))
     s, c = size * np.sin(phase), size * np.cos(phase)
     return Truth("beam_wander", f"{axis}_retarder", {"x_cos": c, "x_sin": s, "y_cos": -s, "y_sin": c})
 
 
 def channel_gain(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.003, 0.05)) -> Truth:
-    bench.channel_gain = np.append(1.0, 1 + _size(random, *sizes) * random.standard_normal(3))
+    bench.channel_gain = np.append(1.0, 1 + draw_size(random, *sizes) * random.standard_normal(3))
     names = ("channel_45", "channel_90", "channel_135")
     return Truth("channel_gain", "", dict(zip(names, (bench.channel_gain[1:] - 1).tolist(), strict=True)))
 
 
 def channel_azimuth(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.2, 2.0)) -> Truth:
-    degrees = _size(random, *sizes) * random.standard_normal(4)
+    degrees = draw_size(random, *sizes) * random.standard_normal(4)
     bench.channel_azimuth = np.deg2rad(degrees)
     return Truth("channel_azimuth")
 
 
 def channel_extinction(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.003, 0.04)) -> Truth:
-    bench.channel_extinction = _size(random, *sizes) * random.uniform(0.2, 1.8, 4)
+    bench.channel_extinction = draw_size(random, *sizes) * random.uniform(0.2, 1.8, 4)
     return Truth("channel_extinction")
 
 
 def pixel_crosstalk(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.01, 0.1)) -> Truth:
-    size = _size(random, *sizes)
+    size = draw_size(random, *sizes)
 
     def spread(k: int, e: Array) -> Array:
         p = np.pad(e, 1, mode="reflect")
@@ -262,7 +262,7 @@ def pixel_crosstalk(bench: Bench, random: np.random.Generator, states: int, size
 
 
 def tone_curve(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.01, 0.15)) -> Truth:
-    e, top = _signed(random, *sizes), 65435.0 * bench.gain
+    e, top = draw_signed(random, *sizes), 65435.0 * bench.gain
     bench.transfer.append(lambda x: top * (np.maximum(x, 0) / top) ** (1 / (1 + e)))
     return Truth("tone_curve", "", {"gamma_minus_1": e})
 
@@ -306,7 +306,7 @@ MOSAIC: dict[str, SizedFault] = {
 
 def etalon(bench: Bench, random: np.random.Generator, states: int) -> Truth:
     """Parallel faces between retarder and polarizer: fringes that run through many orders as the plate turns."""
-    size, order, phase = _size(random, 0.004, 0.03), random.uniform(3.3, 7.7), random.uniform(0, 6)
+    size, order, phase = draw_size(random, 0.004, 0.03), random.uniform(3.3, 7.7), random.uniform(0, 6)
     bench.level.append(lambda k, a: 1 / (1 + size * np.sin(order * a["psg"] + phase) ** 2))
     return Truth("etalon")
 
@@ -358,7 +358,7 @@ def broad_source(bench: Bench, random: np.random.Generator, states: int) -> Trut
 
 def drying_sample(bench: Bench, random: np.random.Generator, states: int) -> Truth:
     """One of the sample's materials gets brighter or darker while it is measured."""
-    size, which = _signed(random, 0.02, 0.2), int(random.integers(4))
+    size, which = draw_signed(random, 0.02, 0.2), int(random.integers(4))
     bench.material_level.append((which, lambda k: 1 + size * (1 - np.exp(-3 * k / states))))
     return Truth("drying_sample")
 
@@ -376,7 +376,7 @@ def defocus(bench: Bench, random: np.random.Generator, states: int) -> Truth:
 
 def lamp_beat(bench: Bench, random: np.random.Generator, states: int) -> Truth:
     """The lamp's ripple beats with the exposure. In truth a gain for each state: `source_flicker` is a right name."""
-    size, rate, phase = _size(random, 0.004, 0.03), random.uniform(0.3, 2.8), random.uniform(0, 6)
+    size, rate, phase = draw_size(random, 0.004, 0.03), random.uniform(0.3, 2.8), random.uniform(0, 6)
     bench.level.append(lambda k, a: 1 + size * np.sin(rate * k + phase))
     return Truth("lamp_beat")
 
