@@ -101,12 +101,10 @@ def bad_pixels(bench: Bench, random: np.random.Generator, states: int) -> Truth:
     kind = random.choice(4, size=(bench.rows, bench.columns), p=[0.997, 0.001, 0.001, 0.001])
 
     def spoil(e: Array, r: np.random.Generator) -> Array:
-        flicker = np.random.default_rng(0).uniform(0.5, 1.5, e.shape)
-        return np.asarray(
-            np.select([kind == 1, kind == 2, kind == 3], [0 * e + 50.0, e + 4000.0 * flicker, e * e / 2e4], e)
-        )
+        hot = e + 4000.0 * r.uniform(0.5, 1.5, e.shape)
+        return np.asarray(np.select([kind == 1, kind == 2, kind == 3], [0 * e + 50.0, hot, e / 2], e))
 
-    bench.noise.append(lambda e, r: spoil(e))
+    bench.noise.append(spoil)
     return Truth("bad_pixels")
 
 

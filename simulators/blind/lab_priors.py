@@ -20,6 +20,12 @@ class Prior:
     sizes: tuple[float, float]
     reason: str
 
+    @property
+    def rms(self) -> float:
+        """Root mean square of the sizes."""
+        low, high = self.sizes
+        return float(np.sqrt((high**2 - low**2) / (2 * np.log(high / low))))
+
 
 #: How many faults a bench has, least and most.
 FAULTS = (6, 10)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -82,15 +82,15 @@ def flat_mueller(random: np.random.Generator) -> Array:
 class TrueFault:
     """One fault of a bench, as the truth file has it.
 
-    `capture` is None for what belongs to the bench. `matters` is the largest, over the captures that it acts in, of the
-    rms change of M / m00 that it alone makes, in standard errors of a mean over `PATCH` x `PATCH` pixels.
+    `capture` is None for what belongs to the bench. `matters` is, for each capture that it acts in, the rms change of
+    M / m00 that it makes beside the others, in standard errors of a mean over `PATCH` x `PATCH` pixels.
     """
 
     kind: str
     place: str
     parameters: dict[str, float]
     capture: str | None
-    matters: float = 0.0
+    matters: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -178,10 +178,10 @@ def make_bench(folder: Path, seed: int, configs: Path, group: str = "real", pixe
         write_capture(target, bench, digitize(bench, exposed, random), angles, sample, text)
         np.save(away / f"{capture}.npy", true_mueller(scene, pixels))
         for i, fault in faults.items():
-            key, size = (i, fault.capture), 0.0
+            known = found.setdefault((i, fault.capture), fault)
             if group in ("real", "outside"):
-                size = taken.matters(model.at(nm).rows(angles).reshape(-1, 16), i)
-            found[key] = replace(fault, matters=max(size, found.get(key, fault).matters))
+                w = model.at(nm).rows(angles).reshape(-1, 16)
+                known.matters[capture] = taken.matters(w, i, expected(bench, exposed))
     truth = RealBench(name, group, seed, file.name, nm, tuple(found[k] for k in sorted(found, key=str)))
     (away / "truth.json").write_text(json.dumps(asdict(truth), indent=1), encoding="utf-8")
     return truth
@@ -203,11 +203,10 @@ class _Taken:
         done = {i: d.apply(bench, self.capture) for i, d in enumerate(self.draws) if i != without}
         return bench, expose(bench, self.scene, self.angles), {i: f for i, f in done.items() if f is not None}
 
-    def matters(self, w: Array, fault: int) -> float:
+    def matters(self, w: Array, fault: int, counts: Array) -> float:
         """Change of M / m00 that one fault makes, in standard errors of a mean over a patch; rms over lit pixels."""
-        (bench, light, _), (others, without, _) = self.exposed(), self.exposed(fault)
-        counts = expected(bench, light)
-        change = _normalized(w, counts)[0] - _normalized(w, expected(others, without))[0]
+        bench, without, _ = self.exposed(fault)
+        change = _normalized(w, counts)[0] - _normalized(w, expected(bench, without))[0]
         variance = counts / bench.gain + (bench.read_noise / bench.gain) ** 2
         errors = np.tensordot(np.linalg.pinv(w) ** 2, variance, 1) / _normalized(w, counts)[1] ** 2
         lit = counts.mean(axis=0) > 0.1 * counts.mean(axis=0).max()
@@ -226,9 +225,9 @@ def _normalized(w: Array, counts: Array) -> tuple[Array, Array]:
     return m / m[0], m[0]
 
 
-def read_truth(folder: Path) -> Iterator[RealBench]:
-    """Truth of every bench under a folder, in order of its name."""
-    for path in sorted(folder.glob("truth/*/truth.json")):
+def read_truth(folder: Path, name: str = "*") -> Iterator[RealBench]:
+    """Truth of the benches under a folder, in order of their names; or of one."""
+    for path in sorted(folder.glob(f"truth/{name}/truth.json")):
         raw = json.loads(path.read_text(encoding="utf-8"))
         raw["faults"] = tuple(TrueFault(**f) for f in raw["faults"])
         yield RealBench(**raw)

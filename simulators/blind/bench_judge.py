@@ -1,0 +1,176 @@
+"""What `diagnose` made of a real bench against its truth: the Mueller matrix of another sample, and the names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from simulators.blind.real_bench import FITTED, VALIDATION, RealBench, TrueFault
+
+Result = Mapping[str, Any]
+
+#: Captures that are given to `diagnose`, by name.
+GIVEN: dict[str, tuple[str, ...]] = {"joint": FITTED, **{name: (name,) for name in FITTED}}
+#: Names that are true as well: in the counts the fault is that.
+TRUE_AS_WELL = {
+    "lamp_beat": {"source_flicker"},
+    "lamp_jump": {"source_flicker"},
+    "psg_zero": {"psg_azimuth"},
+    "psa_zero": {"psa_azimuth"},
+    "analyzer_zero": {"analyzer_azimuth"},
+    "wavelength": {"psg_retardance", "psa_retardance"},
+}
+#: Probability of a cause that is called by a word alone.
+WORDS = {"sure": 0.99, "likely": 0.9, "one_of": 0.9, "unknown": 0.5}
+NAME = re.compile(r"(?P<kind>\w+)(?:\[(?P<place>[^\]]*)\])?")
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One cause that `diagnose` tells.
+
+    `certainty` is a word of `WORDS`; `probability` that one of the set is there; `right` says that the name is true,
+    `right_set` that it or another of its set is.
+    """
+
+    label: str
+    certainty: str
+    probability: float
+    right: bool
+    right_set: bool
+
+
+@dataclass(frozen=True)
+class Matter:
+    """A true fault, how much it matters (see `TrueFault`), and how it was told: "named", "in a set" or "missed"."""
+
+    label: str
+    size: float
+    told: str
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """One bench, diagnosed from the captures `given`.
+
+    Attributes
+    ----------
+    declared, corrected, oracle : rms error of M / m00 of the validation sample without noise, with the instrument as
+        declared, with the file that `diagnose` wrote, and with a fit of the true set; NaN where there is none.
+    own : the same of each capture that was given, as declared and corrected.
+    coverage_pixels, coverage_patches : of the validation sample with noise.
+    written : whether there is a file.
+    """
+
+    name: str
+    group: str
+    given: str
+    verdict: str
+    seconds: float
+    declared: float
+    corrected: float
+    oracle: float
+    own: dict[str, tuple[float, float]]
+    coverage_pixels: float
+    coverage_patches: float
+    written: bool
+    causes: tuple[Cause, ...] = ()
+    matters: tuple[Matter, ...] = ()
+    wiring: tuple[Cause, ...] = ()
+    noise: str = ""
+    left_out: tuple[Any, ...] = field(default=())
+
+
+def judgement_of(raw: Mapping[str, Any]) -> Judgement:
+    """A judgement from its JSON."""
+    return Judgement(
+        **{
+            **raw,
+            "own": {name: (pair[0], pair[1]) for name, pair in raw["own"].items()},
+            "causes": tuple(Cause(**c) for c in raw["causes"]),
+            "matters": tuple(Matter(**m) for m in raw["matters"]),
+            "wiring": tuple(Cause(**c) for c in raw["wiring"]),
+        }
+    )
+
+
+def names_of(result: Result, truth: RealBench, given: Sequence[str]) -> tuple[Cause, ...]:
+    """Every cause of a result, compared with the faults that act in the captures given."""
+    acting = active(truth, given)
+    return tuple(_cause(e, acting) for e in result["effects"])
+
+
+def active(truth: RealBench, given: Iterable[str]) -> list[TrueFault]:
+    """Faults that act in some of these captures."""
+    return [f for f in truth.faults if f.capture is None or f.capture in given]
+
+
+def _cause(effect: Mapping[str, Any], faults: Sequence[TrueFault]) -> Cause:
+    also = tuple(effect["indistinguishable_from"])
+    certainty = effect.get("certainty") or _word(bool(effect["confident"]), bool(also))
+    probability = effect.get("probability")
+    capture = effect.get("capture")
+    name = f"{effect['kind']}[{effect['element'] or ''}]"
+    right = _is_true(name, capture, faults)
+    return Cause(
+        name + (f" in {capture}" if capture else ""),
+        certainty,
+        WORDS[certainty] if probability is None else float(probability),
+        right,
+        right or any(_is_true(text, capture, faults) for text in also),
+    )
+
+
+def _word(confident: bool, has_set: bool) -> str:
+    if not confident:
+        return "unknown"
+    return "one_of" if has_set else "sure"
+
+
+def _is_true(text: str, capture: str | None, faults: Sequence[TrueFault]) -> bool:
+    return any(_names(text, capture, f) for f in faults)
+
+
+def _names(text: str, capture: str | None, fault: TrueFault) -> bool:
+    """Whether a name, "kind" or "kind[place]", is that of a fault."""
+    found = NAME.match(text)
+    if found is None:
+        return False
+    kind, place = found["kind"], found["place"]
+    if capture is not None and fault.capture is not None and not capture.startswith(f"{fault.capture} "):
+        return False
+    if kind in TRUE_AS_WELL.get(fault.kind, ()):
+        return True
+    return kind == fault.kind and (not place or not fault.place or place == fault.place)
+
+
+def told_of(result: Result, truth: RealBench, given: Sequence[str]) -> tuple[Matter, ...]:
+    """Of each fault that acts in the captures given: how much it matters, and how it was told."""
+    out = []
+    for fault in active(truth, given):
+        size = max((v for c, v in fault.matters.items() if c in (*given, VALIDATION)), default=0.0)
+        told = "missed"
+        for effect in result["effects"]:
+            certainty = effect.get("certainty") or _word(bool(effect["confident"]), False)
+            if certainty == "unknown":
+                continue
+            if _names(f"{effect['kind']}[{effect['element'] or ''}]", effect.get("capture"), fault):
+                told = "named"
+                break
+            if any(_names(text, effect.get("capture"), fault) for text in effect["indistinguishable_from"]):
+                told = "in a set"
+        label = f"{fault.kind}[{fault.place}]" + (f" in {fault.capture}" if fault.capture else "")
+        out.append(Matter(label, size, told))
+    return tuple(out)
+
+
+def wiring_of(result: Result, truth: RealBench) -> tuple[Cause, ...]:
+    """Mistakes of wiring that are told, against the truth."""
+    kinds = {f.kind for f in truth.faults}
+    return tuple(
+        Cause(w["name"], "sure" if w["probability"] >= WORDS["sure"] else "likely", w["probability"], good, good)
+        for w in result.get("wiring") or ()
+        for good in [w["name"] in kinds]
+    )

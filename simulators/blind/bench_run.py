@@ -1,0 +1,79 @@
+"""Diagnose one bench of `real_bench`, apply what was written to captures that no fit saw, and judge it."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from processing.diagnosis.instrument.run import diagnose_captures
+from processing.diagnosis.instrument.write import extended
+from processing.instrument.model import InstrumentModel
+from simulators.blind.bench_judge import GIVEN, Judgement, names_of, told_of, wiring_of
+from simulators.blind.mueller_error import Reduced, error_of
+from simulators.blind.real_bench import VALIDATION, RealBench
+
+
+def judge_bench(
+    folder: Path, truth: RealBench, configs: Path, given: str = "joint"
+) -> tuple[Judgement, dict[str, Any]]:
+    """Diagnose the captures of one bench and judge the answer; also the result as `diagnose` writes it.
+
+    Parameters
+    ----------
+    folder : as given to `make_bench`.
+    given : one of `GIVEN`.
+    """
+    declared = InstrumentModel.load(configs / "instruments" / truth.instrument)
+    captures = [folder / truth.name / f"{name}.h5" for name in GIVEN[given]]
+    begun = time.perf_counter()
+    result, corrected = _diagnosed(captures, declared)
+    seconds = time.perf_counter() - begun
+    away = folder / "truth" / truth.name
+    covered = Reduced.of(away / f"{VALIDATION}_noisy.h5", corrected).coverage(_truth(away, VALIDATION))
+    judgement = Judgement(
+        name=truth.name,
+        group=truth.group,
+        given=given,
+        verdict=result["verdict"],
+        seconds=round(seconds, 2),
+        declared=_error(away, VALIDATION, declared),
+        corrected=_error(away, VALIDATION, corrected),
+        oracle=float("nan"),
+        own={name: (_error(away, name, declared), _error(away, name, corrected)) for name in GIVEN[given]},
+        coverage_pixels=covered.pixels,
+        coverage_patches=covered.patches,
+        written=corrected is not declared,
+        causes=names_of(result, truth, GIVEN[given]),
+        matters=told_of(result, truth, GIVEN[given]),
+        wiring=wiring_of(result, truth),
+        noise=str((result.get("noise") or {}).get("verdict", "")),
+        left_out=tuple(result.get("left_out") or ()),
+    )
+    return judgement, result
+
+
+def _diagnosed(captures: Sequence[Path], declared: InstrumentModel) -> tuple[dict[str, Any], InstrumentModel]:
+    """The result as JSON has it, and the instrument as it would be written; as declared if nothing would be."""
+    try:
+        judged, _ = diagnose_captures(captures, declared)
+    except Exception as error:  # noqa: BLE001 - a crash is a wrong answer of this bench, not the end of the suite
+        return {"verdict": f"crashed: {type(error).__name__}: {error}", "effects": []}, declared
+    diagnosis = judged.diagnosis
+    if not diagnosis.effects and not diagnosis.calibrated:
+        corrected = declared
+    else:
+        corrected = extended(declared, diagnosis)
+    return json.loads(diagnosis.model_dump_json()), corrected
+
+
+def _truth(away: Path, capture: str) -> Any:
+    return np.load(away / f"{capture}.npy").astype(float)
+
+
+def _error(away: Path, capture: str, model: InstrumentModel) -> float:
+    return error_of(away / f"{capture}.h5", model, _truth(away, capture))

@@ -1,0 +1,130 @@
+"""Figures over many benches: how good M is, how often its intervals hold, how often a name is right."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from simulators.blind.bench_judge import Cause, Judgement
+
+#: Errors of M / m00 below this are the rounding of counts, not the instrument.
+FLOOR = 2e-5
+#: An error of M counts as reached up to this many times that of the fit with the true set.
+REACHED = 1.2
+#: A fault matters from so many standard errors of M on.
+MATTERS = 1.0
+#: Edges of the bins of probability in the reliability table.
+BINS = (0.0, 0.5, 0.7, 0.8, 0.9, 0.97, 0.99, 1.0)
+
+
+@dataclass(frozen=True)
+class Bin:
+    """Causes that were told with a probability in a range: how many, their mean probability, how many are true."""
+
+    low: float
+    high: float
+    count: int
+    told: float
+    true: float
+
+
+def is_worse(before: float, after: float) -> bool:
+    """Whether an error of M has grown by more than rounding."""
+    return after > before + FLOOR
+
+
+def sure_and_wrong(j: Judgement) -> list[Cause]:
+    """Causes, of the bench or of its wiring, that are called sure and are not there."""
+    return [c for c in (*j.causes, *j.wiring) if c.certainty == "sure" and not c.right]
+
+
+def reliability(judgements: Sequence[Judgement]) -> list[Bin]:
+    """Told against true, by probability; a cause is true if it or another of its set is there."""
+    causes = [c for j in judgements for c in j.causes if c.certainty != "unknown"]
+    told = np.array([c.probability for c in causes])
+    true = np.array([c.right_set for c in causes], dtype=float)
+    which = np.clip(np.digitize(told, BINS) - 1, 0, len(BINS) - 2)
+    bins = []
+    for k, (low, high) in enumerate(pairwise(BINS)):
+        here = which == k
+        if here.any():
+            bins.append(Bin(low, high, int(here.sum()), float(told[here].mean()), float(true[here].mean())))
+    return bins
+
+
+def _share(values: Sequence[bool]) -> str:
+    return f"{100 * float(np.mean(values)):.1f} % of {len(values)}" if values else "none"
+
+
+def _by(certainty: str, judgements: Sequence[Judgement], right: Callable[[Cause], bool]) -> str:
+    return _share([right(c) for j in judgements for c in j.causes if c.certainty == certainty])
+
+
+def table(judgements: Sequence[Judgement]) -> str:
+    """The figures of one group and one choice of captures, as text."""
+    crashed = [j for j in judgements if j.verdict.startswith("crashed")]
+    seconds = [j.seconds for j in judgements]
+    lines = [
+        f"benches: {len(judgements)}, crashed {len(crashed)}, nothing written {sum(not j.written for j in judgements)}",
+        f"time: median {np.median(seconds):.1f} s, at most {max(seconds):.1f} s",
+        *_matrix_lines(judgements),
+        *_name_lines(judgements),
+    ]
+    lines += [f"  {_line(j)}" for j in judgements]
+    return "\n".join(lines)
+
+
+def _matrix_lines(judgements: Sequence[Judgement]) -> list[str]:
+    known = [j for j in judgements if np.isfinite(j.oracle)]
+    lines = []
+    for name in ("declared", "corrected", "oracle"):
+        values = [getattr(j, name) for j in judgements]
+        if np.isfinite(values).any():
+            low, middle, high = np.nanpercentile(values, [10, 50, 90])
+            lines.append(f"error of M/m00, {name}: median {middle:.5f} ({low:.5f} to {high:.5f})")
+    reached = [j.corrected <= REACHED * j.oracle + FLOOR for j in known]
+    own = [any(is_worse(*pair) for pair in j.own.values()) for j in judgements]
+    patches, pixels = (
+        100 * np.nanmean([getattr(j, f"coverage_{n}") for j in judgements]) for n in ("patches", "pixels")
+    )
+    return [
+        *lines,
+        f"at most {REACHED} times the fit with the true set: {_share(reached)} (goal 90 %)",
+        f"M worse than uncorrected: {sum(is_worse(j.declared, j.corrected) for j in judgements)} (goal 0); "
+        f"of the captures themselves: {sum(own)}",
+        f"within 95 % intervals: {patches:.1f} % of means of patches, {pixels:.1f} % of pixels (goal 93 to 97 %)",
+    ]
+
+
+def _name_lines(judgements: Sequence[Judgement]) -> list[str]:
+    told = [m.told for j in judgements for m in j.matters if m.size > MATTERS]
+    lines = [
+        f"called sure, and right: {_by('sure', judgements, lambda c: c.right)} (goal 99 %)",
+        f"called likely, and right: {_by('likely', judgements, lambda c: c.right)}",
+        f"called one of a set, and right: {_by('one_of', judgements, lambda c: c.right_set)}",
+        f"benches without a sure wrong name: {_share([not sure_and_wrong(j) for j in judgements])}",
+        f"faults that matter: named {_share([t == 'named' for t in told])}, "
+        f"named or in a named set {_share([t != 'missed' for t in told])} (goal 80 %)",
+    ]
+    wired = [any(w.right for w in j.wiring) for j in judgements if "wiring" in j.group]
+    if wired:
+        lines.append(f"mistake of wiring told: {_share(wired)}")
+    lines += [
+        f"told with {100 * b.low:.0f} to {100 * b.high:.0f} %: {b.count}, on average {100 * b.told:.1f} %, "
+        f"true {100 * b.true:.1f} %"
+        for b in reliability(judgements)
+    ]
+    return lines
+
+
+def _line(j: Judgement) -> str:
+    wrong = ", ".join(c.label for c in sure_and_wrong(j))
+    missed = ", ".join(f"{m.label} {m.size:.1f}" for m in j.matters if m.size > MATTERS and m.told == "missed")
+    return (
+        f"{j.name} {j.given:6s} {j.verdict:16s} {j.seconds:6.1f} s  M {j.declared:.5f} -> {j.corrected:.5f} "
+        f"(true set {j.oracle:.5f}){' WORSE' if is_worse(j.declared, j.corrected) else ''}"
+        f"{f'; sure and wrong: {wrong}' if wrong else ''}{f'; missed: {missed}' if missed else ''}"
+    )

@@ -1,0 +1,28 @@
+"""Reliability diagram: of causes that were told with a probability, how many are true."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from simulators.blind.bench_judge import Judgement
+from simulators.blind.bench_table import reliability
+
+
+def draw(judgements: Sequence[Judgement], path: Path) -> None:
+    """Write the diagram; bars are one standard error of a share (Wilson's interval), numbers are the causes told."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.5, 4.5), layout="constrained")
+    axes = figure.add_subplot()
+    axes.plot([0, 1], [0, 1], color="0.6", linewidth=1, label="calibrated")
+    for b in reliability(judgements):
+        n, p = b.count, b.true
+        middle, half = (p + 0.5 / n) / (1 + 1 / n), np.sqrt(p * (1 - p) / n + 0.25 / n**2) / (1 + 1 / n)
+        axes.errorbar(b.told, middle, yerr=half, marker="o", color="C0", capsize=3)
+        axes.annotate(str(n), (b.told, middle), xytext=(5, -12), textcoords="offset points", fontsize=8)
+    axes.set(xlabel="probability told", ylabel="share that is true", xlim=(0, 1.02), ylim=(0, 1.02), aspect="equal")
+    axes.legend(loc="upper left", frameon=False)
+    figure.savefig(path, dpi=150)

@@ -1,0 +1,174 @@
+"""Benches with many small faults: what is written, what the judge says of answers that are known, and one diagnosis.
+
+`python benchmarks/real_benches.py DIR` runs the suite.
+"""
+
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
+from simulators.blind.bench_judge import Judgement, names_of, told_of
+from simulators.blind.bench_oracle import known_oracle
+from simulators.blind.bench_table import is_worse, reliability, table
+from simulators.blind.mueller_error import Reduced
+from simulators.blind.real_bench import GROUPS, INSTRUMENTS, STATES, RealBench, TrueFault, make_bench, read_truth
+from simulators.blind.suite import declared_bench, state_angles
+from simulators.blind.undeclared_captures import Scene, digitize, expose
+
+SMALL = 24
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    from tests.conftest import ROOT
+
+    folder = tmp_path_factory.mktemp("benches")
+    return folder, make_bench(folder, 7, ROOT / "configs", pixels=SMALL)
+
+
+def counts(path):
+    with h5py.File(path) as h5:
+        return h5["entry/instrument/detector/data"][:, 0].astype(float)
+
+
+def test_bench_has_its_faults_in_every_capture_and_its_truth_apart(bench):
+    folder, truth = bench
+    assert 6 <= len({f.kind for f in truth.faults}) <= 10
+    assert next(read_truth(folder)) == truth
+    own = {f.capture for f in truth.faults if f.kind == "source_flicker"}
+    assert own == {"sphere", "flat", "air"}
+    assert len({str(f.parameters) for f in truth.faults if f.kind == "source_drift"}) == 3
+    for path in (folder / truth.name).iterdir():
+        with h5py.File(path) as h5:
+            told = h5["entry"].attrs["header_json"]
+        assert not any(f.kind in told for f in truth.faults)
+
+
+def test_same_seed_gives_the_same_bench(bench, tmp_path, configs):
+    folder, truth = bench
+    assert make_bench(tmp_path, 7, configs, pixels=SMALL) == truth
+    np.testing.assert_array_equal(
+        counts(tmp_path / truth.name / "sphere.h5"), counts(folder / truth.name / "sphere.h5")
+    )
+
+
+def test_noise_is_the_difference_from_the_twin_without_noise(bench):
+    folder, truth = bench
+    noisy, quiet = (counts(f / truth.name / "air.h5") for f in (folder, folder / "truth"))
+    gain = 0.5
+    expected = (quiet - 100) / gain + (3.0 / gain) ** 2
+    assert np.mean((noisy - quiet) ** 2 / expected) == pytest.approx(1.0, abs=0.02)
+
+
+def test_true_values_mend_the_validation_sample(bench, configs):
+    folder, truth = bench
+    away = folder / "truth" / truth.name
+    declared = InstrumentModel.load(configs / "instruments" / truth.instrument)
+    exact = np.load(away / "validation.npy").astype(float)
+    effects = tuple(
+        AppliedEffect(
+            kind=f.kind,
+            element=f.place or None,
+            parameters={n: EffectParameter(value=v, unit="1") for n, v in f.parameters.items()},
+            wavelength_nm=truth.wavelength_nm,
+        )
+        for f in truth.faults
+        if f.capture is None
+    )
+    before = Reduced.of(away / "validation.h5", declared).error(exact)
+    mended = declared.model_copy(update={"effects": effects})
+    assert before > 3e-3
+    assert Reduced.of(away / "validation.h5", mended).error(exact) < before / 20
+    covered = Reduced.of(away / "validation_noisy.h5", mended).coverage(exact)
+    assert covered.patches == pytest.approx(0.95, abs=0.04)
+    assert Reduced.of(away / "validation_noisy.h5", declared).coverage(exact).patches < 0.8
+
+
+@pytest.mark.parametrize(
+    ("group", "kind"), [(group, kind) for group, kinds in GROUPS.items() for kind in kinds], ids=lambda name: name
+)
+def test_every_fault_changes_what_a_capture_file_says(group, kind, configs):
+    mosaic = group == "mosaic_wiring"
+    model = InstrumentModel.load(configs / "instruments" / INSTRUMENTS[mosaic]).at(662)
+    angles = state_angles(STATES[mosaic], mosaic, False)
+
+    def stored(faults):
+        bench = declared_bench(model, 662.0, 16, mosaic, 15_000.0)
+        truths = [fault(bench, np.random.default_rng(3), STATES[mosaic]) for fault in faults]
+        light = expose(bench, Scene(np.random.default_rng(4)), angles)
+        told = angles
+        for change in bench.recorded:
+            told = change(told)
+        return truths, digitize(bench, light, np.random.default_rng(5)), told, bench.declared
+
+    (truth,), *changed = stored([GROUPS[group][kind]])
+    assert truth.kind == kind
+    _, counts, told, declared = stored([])
+    same = [np.array_equal(counts, changed[0]), str(told) == str(changed[1]), declared == changed[2]]
+    assert not all(same)
+
+
+def test_fit_of_the_truth_is_far_better_than_the_declared_instrument(bench, configs):
+    folder, truth = bench
+    away = folder / "truth" / truth.name
+    declared = InstrumentModel.load(configs / "instruments" / truth.instrument)
+    exact = np.load(away / "validation.npy").astype(float)
+    reached = known_oracle(folder, truth, configs, "joint")
+    assert reached < Reduced.of(away / "validation.h5", declared).error(exact) / 3
+    assert known_oracle(folder, truth, configs, "joint") == reached
+
+
+def truth_of(*faults):
+    return RealBench("real_0000", "real", 0, "rgb950.yaml", 662.0, faults)
+
+
+def effect(kind, element=None, capture=None, also=(), **more):
+    return {
+        "kind": kind,
+        "element": element,
+        "capture": capture,
+        "indistinguishable_from": also,
+        "confident": True,
+    } | more
+
+
+def test_a_name_is_right_at_its_place_and_in_its_capture():
+    truth = truth_of(
+        TrueFault("rotation_slip", "psa@11", {"slip": 0.3}, "air", {"air": 4.0}),
+        TrueFault("psg_extinction", "psg_polarizer", {}, None, {"sphere": 0.2, "validation": 2.0}),
+    )
+    result = {
+        "effects": [
+            effect("rotation_slip", "psa@11", "air (air.h5)"),
+            effect("rotation_slip", "psa@11", "flat (flat.h5)"),
+            effect("rotation_slip", "psg@11", "air (air.h5)", certainty="likely", probability=0.93),
+            effect("stray_light", also=("psg_extinction[psg_polarizer]",)),
+            effect("source_drift", confident=False),
+        ]
+    }
+    causes = names_of(result, truth, ("flat", "air"))
+    assert [c.right for c in causes] == [True, False, False, False, False]
+    assert [c.right_set for c in causes] == [True, False, False, True, False]
+    assert [c.certainty for c in causes] == ["sure", "sure", "likely", "one_of", "unknown"]
+    assert [m.told for m in told_of(result, truth, ("flat", "air"))] == ["named", "in a set"]
+    # What acts in another capture only is not asked of these.
+    assert [m.label for m in told_of(result, truth, ("sphere",))] == ["psg_extinction[psg_polarizer]"]
+
+
+def test_table_counts_what_is_worse_and_what_is_sure_and_wrong():
+    good = Judgement(
+        "a", "real", "joint", "explained", 2.0, 4e-3, 1e-3, 0.9e-3, {"air": (3e-3, 1e-3)}, 0.95, 0.95, True
+    )
+    truth = truth_of(TrueFault("source_drift", "", {}, "air", {"air": 2.0}))
+    wrong = names_of({"effects": [effect("tone_curve")]}, truth, ("air",))
+    bad = replace(good, name="b", corrected=5e-3, causes=wrong)
+    text = table([good, bad])
+    assert "M worse than uncorrected: 1 " in text
+    assert "at most 1.2 times the fit with the true set: 50.0 % of 2" in text
+    assert "sure and wrong: tone_curve[]" in text
+    (only,) = reliability([good, bad])
+    assert (only.count, only.true) == (1, 0.0)
+    assert not is_worse(1e-3, 1e-3)
