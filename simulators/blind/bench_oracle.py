@@ -12,21 +12,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from processing.diagnosis.instrument.capture_data import read_capture
+from processing.arrays import Array
+from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import PRIOR_WIDTH, minimize
 from processing.diagnosis.search.space import Space
+from processing.instrument.effects.base import OfOneCapture, ValuePerState
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
 from processing.storage.capture import Capture
 from simulators.blind.bench_judge import GIVEN, active
 from simulators.blind.lab_priors import PRIORS
 from simulators.blind.mueller_error import error_of
 from simulators.blind.real_bench import VALIDATION, RealBench, TrueFault
-
-Array = NDArray[np.float64]
 
 
 def fit_of_the_truth(
@@ -73,7 +72,7 @@ def _as_drawn(candidate: Candidate) -> Candidate:
 
 def _applied(candidate: Candidate, values: Array, names: tuple[str, ...], wavelength_nm: float) -> AppliedEffect:
     unit = candidate.parameters[0].unit
-    if candidate.effect.per_state:
+    if isinstance(candidate.effect, ValuePerState):
         parameters = {"states": EffectParameter(value=tuple(map(float, values)), unit=unit)}
     else:
         pairs = zip(candidate.parameters, values, strict=True)
@@ -83,6 +82,6 @@ def _applied(candidate: Candidate, values: Array, names: tuple[str, ...], wavele
         element=candidate.place or None,
         parameters=parameters,
         captures=names if candidate.capture is None else (names[candidate.capture],),
-        scope=candidate.effect.scope,
+        scope="capture" if isinstance(candidate.effect, OfOneCapture) else "instrument",
         wavelength_nm=wavelength_nm,
     )

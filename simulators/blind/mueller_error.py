@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
+from processing.arrays import Array
 from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
 from processing.reduction.mueller import reduce_mueller
@@ -17,8 +18,6 @@ from processing.storage.capture import Capture
 from processing.storage.images import MuellerImage
 from processing.storage.product import Product
 from simulators.blind.real_bench import PATCH
-
-Array = NDArray[np.float64]
 
 #: Standard errors of M / m00 times m00 that come from the instrument, where the product has them.
 SYSTEMATIC = "mueller_systematic_errors"

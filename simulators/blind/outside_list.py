@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from simulators.blind.undeclared_captures import Array, Bench
+from processing.arrays import Array
+from simulators.blind.undeclared_captures import Bench
 from simulators.blind.undeclared_faults import Fault, Truth, draw_axis, draw_signed, draw_size
 
 

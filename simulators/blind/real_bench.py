@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture_schema import Sample
 from simulators.blind.detectable import expected, expected_electrons
@@ -28,8 +29,6 @@ from simulators.blind.suite import declared_bench, state_angles
 from simulators.blind.undeclared_captures import Bench, Scene, counted, digitize, expose, write_capture
 from simulators.blind.undeclared_faults import LISTED, UNLISTED, Fault, Truth
 from simulators.blind.wiring import MOSAIC_WIRING, WIRING
-
-Array = NDArray[np.float64]
 
 INSTRUMENTS = {False: "rgb950.yaml", True: "mosaic_polarimeter.yaml"}
 #: Of even and of odd seeds.

@@ -10,7 +10,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from simulators.blind.undeclared_captures import Array, Bench
+from processing.arrays import Array
+from simulators.blind.undeclared_captures import Bench
 from simulators.blind.undeclared_faults import Fault, Truth
 
 Angles = dict[str, Array]
