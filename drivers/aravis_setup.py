@@ -12,7 +12,7 @@ from drivers.aravis_library import interface_of
 from drivers.camera import CameraSettings
 from drivers.errors import CameraError, SettingRefused
 from drivers.genicam import Features
-from drivers.pixel_formats import PixelFormat, pixel_format
+from drivers.pixel_formats import PixelFormat, pixel_format, pixel_format_of
 
 # Fits every Ethernet; jumbo frames have to be asked for, because a switch in between may drop them.
 _DEFAULT_PACKET_BYTES = 1500
@@ -52,6 +52,9 @@ class Config(BaseModel):
     trigger_line: str = Field(default="Line0", description="input of the hardware trigger")
     trigger_edge: Literal["RisingEdge", "FallingEdge"] = "RisingEdge"
     trigger_timeout_s: float = Field(default=10.0, gt=0, description="longest wait for a hardware trigger")
+    features: dict[str, bool | int | float | str] = Field(
+        default={}, description="any GenICam features by name, set in this order and read back; they win over settings"
+    )
     mosaic_binning: Literal["like_with_like"] | None = Field(
         default=None, description="on a polarization mosaic the camera bins pixels behind the same polarizer alone"
     )
@@ -100,7 +103,7 @@ class Setup:
     def pixel_format(self) -> PixelFormat:
         """The pixel format that the camera is set to now; raises UnknownPixelFormat if it is not known here."""
         with self._features.asking("read PixelFormat"):
-            return pixel_format(int(self._camera.get_pixel_format()))
+            return pixel_format_of(int(self._camera.get_pixel_format()), self._camera.get_pixel_format_as_string())
 
     def packet_size(self) -> int | None:
         """Bytes of a GigE Vision packet with its headers; None for another kind of link."""
@@ -123,8 +126,13 @@ class Setup:
         """Pixel format, region, binning, packets and trigger: the acquisition must be stopped."""
         features = self._features
         for name in _SWITCHED_OFF:
-            features.switch_off(name)
-        if features.find(("GammaEnable",)) is None and features.find(("Gamma",)) is not None:
+            if name not in self._config.features:
+                features.switch_off(name)
+        if (
+            not {"Gamma", "GammaEnable"} & self._config.features.keys()
+            and features.find(("GammaEnable",)) is None
+            and features.find(("Gamma",)) is not None
+        ):
             features.set_number(("Gamma",), 1.0, floor=1e-3)
         if settings.pixel_format is not None:
             pixel_format(settings.pixel_format)
@@ -135,6 +143,8 @@ class Setup:
         self._set_reversed("ReverseX", settings.reverse_x)
         self._set_reversed("ReverseY", settings.reverse_y)
         self._set_region(settings)
+        for name, value in self._config.features.items():
+            features.set_value(name, value)
         if self.is_gige:
             self._set_packet_size(settings.packet_size or self._config.packet_size)
         elif settings.packet_size is not None:
@@ -171,17 +181,23 @@ class Setup:
                 self._features.set_number((offset,), 0)
 
     def _set_region(self, settings: CameraSettings) -> None:
-        # First the size, which limits the offsets.
+        # First the size, which limits the offsets. Rows and columns are those of the frames.
+        scale = self.pixel_format().scale
         for offset, size, start, length in (
             ("OffsetX", "Width", settings.offset_x, settings.width),
             ("OffsetY", "Height", settings.offset_y, settings.height),
         ):
             if length is None:
                 with self._features.asking(f"read the limits of {size}"):
-                    length = self._camera.get_integer_bounds(size)[1] - (start or 0)
-            self._features.set_number((size,), length)
+                    length = scale * self._camera.get_integer_bounds(size)[1] - (start or 0)
+            self._features.set_number((size,), self._whole(size, length, scale))
             if start:
-                self._features.set_number((offset,), start)
+                self._features.set_number((offset,), self._whole(offset, start, scale))
+
+    def _whole(self, name: str, pixels: int, scale: int) -> int:
+        if pixels % scale:
+            raise self._refused(f"set {name} to {pixels}", f"this format has {scale} x {scale} of them together")
+        return pixels // scale
 
     def _set_packet_size(self, packet_size: int | None) -> None:
         interface, mtu = self.interface or ("", None)
@@ -249,16 +265,16 @@ class Setup:
         decimation = features.number(("DecimationHorizontal",))
         with features.asking("read the region"):
             left, top, width, height = self._camera.get_region()
-        self.size = (int(width), int(height))
+        self.size, fmt = (int(width), int(height)), self.pixel_format()
         return CameraSettings(
             exposure_s=self.exposure_s or None,
             gain_db=gain_db,
             black_level=features.number(genicam.BLACK_LEVEL),
-            pixel_format=self.pixel_format().name,
-            width=int(width),
-            height=int(height),
-            offset_x=int(left),
-            offset_y=int(top),
+            pixel_format=fmt.name,
+            width=fmt.scale * int(width),
+            height=fmt.scale * int(height),
+            offset_x=fmt.scale * int(left),
+            offset_y=fmt.scale * int(top),
             binning=None if binning is None else int(binning),
             decimation=None if decimation is None else int(decimation),
             reverse_x=features.optional_flag("ReverseX"),

@@ -118,7 +118,7 @@ class CameraIdentity:
     sensor_width: int
     sensor_height: int
     pixel_format: str
-    pixel_format_code: int
+    pixel_format_code: int | None
     bits: int
     shift: int
     polarized: bool
@@ -334,6 +334,10 @@ class Camera(ABC):
     @abstractmethod
     def describe(self) -> CameraIdentity:
         """Which camera this is and how it is connected."""
+
+    def node_map(self) -> dict[str, str]:
+        """Every feature of the camera with its value as text; empty for a kind that has no such list."""
+        return {}
 
     def statistics(self) -> StreamStatistics:
         """What became of the frames since the camera was opened."""

@@ -181,6 +181,45 @@ class Features:
             if bool(self._camera.get_boolean(name)) != on:
                 raise self._refused(f"switch {name} {wanted}", f"it stays {'off' if on else 'on'}")
 
+    def set_value(self, name: str, value: bool | int | float | str) -> None:
+        """Set any feature to a value of its own kind and read it back.
+
+        Raises
+        ------
+        SettingRefused
+            No such feature, not of that kind, out of its limits, or read back different.
+        """
+        if self.find((name,)) is None:
+            raise self._refused(f"set {name} to {value}", "this camera has no such feature now")
+        if isinstance(value, bool):
+            self.set_flag(name, value)
+        elif isinstance(value, str):
+            self.set_choice(name, value)
+        else:
+            self.set_number((name,), value)
+
+    def dump(self) -> dict[str, str]:
+        """Every feature under the root category that can be read now, as text, in the order of the node map."""
+        nodes = self._device.get_genicam()
+        found: dict[str, str] = {}
+        self._dump(nodes, "Root", found)
+        return found
+
+    def _dump(self, nodes: Any, name: str, found: dict[str, str]) -> None:
+        node = nodes.get_node(name)
+        if isinstance(node, self._aravis.GcCategory):
+            for entry in node.get_features():
+                self._dump(nodes, entry, found)
+            return
+        if not isinstance(node, self._aravis.GcFeatureNode) or isinstance(node, self._aravis.GcCommand):
+            return
+        try:
+            if node.is_available():
+                found[name] = str(node.get_value_as_string())
+        except self._glib_error as error:
+            # One feature that cannot be read, such as a write-only one, must not cost the others.
+            found[name] = f"not readable: {error.message}"
+
     def flag(self, name: str) -> bool:
         """Read a yes-or-no feature that the camera is known to have."""
         with self.asking(f"read {name}"):

@@ -2,12 +2,12 @@
 
 Codes are those of the GenICam Pixel Format Naming Convention (PFNC) and, for the polarization cameras whose
 makers have their own, of public code that uses them. In every code bits 16 to 23 hold the bits that a pixel
-occupies. A code that is not listed here is refused: the layout would be a guess.
+occupies. A format that is not listed here is refused: the layout would be a guess.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -28,26 +28,44 @@ class PixelFormat:
     ----------
     name : str
         The camera's name for it (SFNC `PixelFormat` entry).
-    code : int
-        32-bit PFNC code.
+    code : int or None
+        32-bit PFNC code; None where it is not published: the camera's own node map then tells it.
     bits : int
         Bits that carry the value: 8, 10, 12, 14 or 16.
     layout : {"plain", "p", "packed"}
         How pixels share bytes.
     polarized : bool
-        True where the maker marks the format as the raw mosaic of a polarization sensor.
+        True where the maker marks the format as that of a polarization sensor.
+    colour : bool
+        True for the raw mosaic of a colour filter, alone or over a polarization mosaic.
+    angles : bool
+        True where each pixel is sent as four counts, those behind 0, 45, 90 and 135 degrees. `decode` lays them out as
+        the super-pixel of the raw mosaic, so a frame has twice as many rows and columns.
     """
 
     name: str
-    code: int
+    code: int | None
     bits: int
     layout: Layout = "plain"
     polarized: bool = False
+    colour: bool = False
+    angles: bool = False
 
     @property
     def bits_in_memory(self) -> int:
-        """Bits that one pixel occupies: bits 16 to 23 of the code."""
-        return self.code >> 16 & 0xFF
+        """Bits that one pixel occupies, which are bits 16 to 23 of the code."""
+        count = {"plain": 8 if self.bits == 8 else 16, "p": self.bits, "packed": 12}[self.layout]
+        return count * self.counts_per_pixel
+
+    @property
+    def counts_per_pixel(self) -> int:
+        """Counts that the camera sends for each of its pixels."""
+        return 4 if self.angles else 1
+
+    @property
+    def scale(self) -> int:
+        """Rows and columns of a decoded frame for each row and column that the camera announces."""
+        return 2 if self.angles else 1
 
     def payload_bytes(self, width: int, height: int) -> int:
         """Bytes of an image without padding."""
@@ -67,7 +85,7 @@ class PixelFormat:
 
         Returns
         -------
-        ndarray of uint16, shape (height, width)
+        ndarray of uint16, shape (scale * height, scale * width)
             New memory that shares nothing with the buffer.
 
         Raises
@@ -78,9 +96,11 @@ class PixelFormat:
         size = self.payload_bytes(width, height)
         if memory.size < size:
             raise ValueError(f"{self.name}, {width} x {height}: needs {size} bytes, the buffer has {memory.size}")
-        pixels = _decode(self, memory[:size], width * height)
+        pixels = _decode(self, memory[:size], width * height * self.counts_per_pixel)
         if shift:
             pixels >>= np.uint16(shift)
+        if self.angles:
+            return _super_pixels(pixels.reshape(height, width, 4))
         return pixels.reshape(height, width)
 
     def misalignment(self, memory: NDArray[np.uint8], pixels: NDArray[np.uint16], bits: int, shift: int) -> str:
@@ -91,7 +111,7 @@ class PixelFormat:
         if bits < self.bits - shift and int(pixels.max()) >> bits:
             return f"a count of {int(pixels.max())} needs more than {bits} bits"
         if shift and self.layout == "plain" and self.bits_in_memory == 16:
-            size = self.payload_bytes(pixels.shape[1], pixels.shape[0])
+            size = 2 * pixels.size
             if int(np.bitwise_or.reduce(memory[:size].view("<u2"))) & ((1 << shift) - 1):
                 return f"the {shift} low bits are not empty"
         return ""
@@ -104,15 +124,28 @@ class PixelFormat:
         ValueError
             A value needs more than `bits` bits.
         """
+        if self.angles:
+            pixels = np.stack([pixels[r::2, c::2] for r, c in _SUPER_PIXEL], axis=-1)
         flat = np.ascontiguousarray(pixels, dtype=np.uint16).ravel()
         if flat.size and int(flat.max()) >> self.bits:
             raise ValueError(f"{self.name} holds {self.bits} bits, the image has a value of {int(flat.max())}")
         return _encode(self, flat)
 
 
+# Where 0, 45, 90 and 135 degrees stand in the super-pixel of the polarization sensors, (row, column).
+_SUPER_PIXEL = ((1, 1), (0, 1), (0, 0), (1, 0))
+
+
+def _super_pixels(counts: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    out = np.empty((2 * counts.shape[0], 2 * counts.shape[1]), np.uint16)
+    for k, (r, c) in enumerate(_SUPER_PIXEL):
+        out[r::2, c::2] = counts[:, :, k]
+    return out
+
+
 def _decode(fmt: PixelFormat, memory: NDArray[np.uint8], count: int) -> NDArray[np.uint16]:
     if fmt.layout == "plain":
-        source = memory if fmt.bits_in_memory == 8 else memory.view("<u2")
+        source = memory if fmt.bits == 8 else memory.view("<u2")
         return source.astype(np.uint16)
     if fmt.bits == 12:
         return _decode_12(memory, count, gigevision=fmt.layout == "packed")
@@ -159,8 +192,8 @@ def _decode_12(memory: NDArray[np.uint8], count: int, *, gigevision: bool) -> ND
 
 def _encode(fmt: PixelFormat, flat: NDArray[np.uint16]) -> NDArray[np.uint8]:
     if fmt.layout == "plain":
-        return flat.astype(np.uint8) if fmt.bits_in_memory == 8 else flat.astype("<u2").view(np.uint8)
-    size = fmt.payload_bytes(flat.size, 1)
+        return flat.astype(np.uint8) if fmt.bits == 8 else flat.astype("<u2").view(np.uint8)
+    size = (flat.size * fmt.bits_in_memory // fmt.counts_per_pixel + 7) // 8
     if fmt.layout == "p":
         bits = flat[:, np.newaxis] >> np.arange(fmt.bits, dtype=np.uint16) & 1
         return np.packbits(bits.astype(np.uint8).ravel(), bitorder="little")[:size]
@@ -185,6 +218,14 @@ PIXEL_FORMATS: tuple[PixelFormat, ...] = (
     PixelFormat("Mono12p", 0x010C0047, 12, "p"),
     PixelFormat("Mono14", 0x01100025, 14),
     PixelFormat("Mono16", 0x01100007, 16),
+    PixelFormat("BayerRG8", 0x01080009, 8, colour=True),
+    PixelFormat("BayerRG10", 0x0110000D, 10, colour=True),
+    PixelFormat("BayerRG10Packed", 0x010C0027, 10, "packed", colour=True),
+    PixelFormat("BayerRG10p", 0x010A0058, 10, "p", colour=True),
+    PixelFormat("BayerRG12", 0x01100011, 12, colour=True),
+    PixelFormat("BayerRG12Packed", 0x010C002B, 12, "packed", colour=True),
+    PixelFormat("BayerRG12p", 0x010C0059, 12, "p", colour=True),
+    PixelFormat("BayerRG16", 0x0110002F, 16, colour=True),
     # Lucid, from one public header that lists its codes; the layout is that of the Mono format of the same name
     # (unverified on hardware).
     PixelFormat("PolarizeMono8", 0x81080001, 8, polarized=True),
@@ -192,14 +233,43 @@ PIXEL_FORMATS: tuple[PixelFormat, ...] = (
     PixelFormat("PolarizeMono12Packed", 0x810C0006, 12, "packed", polarized=True),
     PixelFormat("PolarizeMono12p", 0x810C0047, 12, "p", polarized=True),
     PixelFormat("PolarizeMono16", 0x81100007, 16, polarized=True),
+    # Lucid, four counts a pixel: codes of the same header, the order of the angles by name. Not raw: how the camera
+    # makes them of the mosaic is not published (unverified on hardware).
+    PixelFormat("PolarizedAngles_0d_45d_90d_135d_Mono8", 0x8220000F, 8, polarized=True, angles=True),
+    PixelFormat("PolarizedAngles_0d_45d_90d_135d_Mono12p", 0x8230001F, 12, "p", polarized=True, angles=True),
+    PixelFormat("PolarizedAngles_0d_45d_90d_135d_Mono16", 0x8240002F, 16, polarized=True, angles=True),
+    # FLIR, named in Spinnaker's public interface without codes; layout by the rule of the names (unverified).
+    PixelFormat("Polarized8", None, 8, polarized=True),
+    PixelFormat("Polarized10p", None, 10, "p", polarized=True),
+    PixelFormat("Polarized12p", None, 12, "p", polarized=True),
+    PixelFormat("Polarized16", None, 16, polarized=True),
+    PixelFormat("BayerRGPolarized8", None, 8, polarized=True, colour=True),
+    PixelFormat("BayerRGPolarized10p", None, 10, "p", polarized=True, colour=True),
+    PixelFormat("BayerRGPolarized12p", None, 12, "p", polarized=True, colour=True),
+    PixelFormat("BayerRGPolarized16", None, 16, polarized=True, colour=True),
     # The Imaging Source, from its own public IC4 bindings and its Aravis example.
     PixelFormat("PolarizedMono8", 0x8108000A, 8, polarized=True),
     PixelFormat("PolarizedMono12p", 0x810C000B, 12, "p", polarized=True),
     PixelFormat("PolarizedMono12Packed", 0x810C0010, 12, "packed", polarized=True),
     PixelFormat("PolarizedMono16", 0x8110000C, 16, polarized=True),
 )
-_BY_CODE = {fmt.code: fmt for fmt in PIXEL_FORMATS}
+_BY_CODE = {fmt.code: fmt for fmt in PIXEL_FORMATS if fmt.code is not None}
 _BY_NAME = {fmt.name: fmt for fmt in PIXEL_FORMATS}
+
+
+def pixel_format_of(code: int, name: str) -> PixelFormat:
+    """The format that a camera is set to, by the code and the name that it tells; the code decides.
+
+    Raises
+    ------
+    UnknownPixelFormat
+        As `pixel_format`; also where the name is known, but the code says another size of a pixel.
+    """
+    code &= 0xFFFFFFFF
+    named = _BY_NAME.get(name)
+    if code not in _BY_CODE and named is not None and named.code is None and named.bits_in_memory == code >> 16 & 0xFF:
+        return replace(named, code=code)
+    return pixel_format(code)
 
 
 def pixel_format(name_or_code: str | int) -> PixelFormat:
@@ -208,8 +278,8 @@ def pixel_format(name_or_code: str | int) -> PixelFormat:
     Raises
     ------
     UnknownPixelFormat
-        Not in `PIXEL_FORMATS`, including the processed outputs (angle, degree of polarization, colour) of
-        polarization cameras, which are not intensities.
+        Not in `PIXEL_FORMATS`, including the processed outputs (angle and degree of polarization, Stokes, full
+        colour) of cameras, which are not raw intensities.
     """
     code = name_or_code & 0xFFFFFFFF if isinstance(name_or_code, int) else None
     found = _BY_NAME.get(str(name_or_code)) if code is None else _BY_CODE.get(code)

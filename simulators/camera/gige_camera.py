@@ -10,14 +10,13 @@ with `ip addr add 127.0.0.2/8 dev lo`.
 from __future__ import annotations
 
 import ctypes
-import struct
 import tempfile
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,14 +24,11 @@ from numpy.typing import NDArray
 from drivers.aravis_library import load_aravis
 from drivers.clock import REAL, Clock
 from drivers.errors import CameraError
-from drivers.pixel_formats import PixelFormat, pixel_format
+from drivers.pixel_formats import PixelFormat, pixel_format, pixel_format_of
 from simulators.camera import gige_features as features
+from simulators.camera.camera_memory import CameraMemory
 from simulators.camera.loopback_address import LoopbackAddress
-
-# Frames start on this grid. A finer one shortens the wait, but Aravis spins through the last millisecond of each.
-_GRID_HZ = 100.0
-# Registers of Aravis' own description that give GainRaw.
-_GAIN_RAW = 0x110
+from simulators.camera.node_map import node_map
 
 _FillPattern = ctypes.CFUNCTYPE(
     None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32
@@ -100,14 +96,14 @@ class GigeCamera:
         Part of the packets that are lost, 0 to 1; may be changed at any time.
     address : str
         Loopback address to occupy.
-    description : {"sfnc", "aravis"}
-        Features under their SFNC names, or Aravis' own description with older names (ExposureTimeAbs, GainRaw).
+    description : str
+        Name of a table in `node_maps/`, or "aravis" for Aravis' own description with older names (ExposureTimeAbs).
     wait_s : float
         How long to wait for the address if another simulated camera has it; real time, as that one is another program.
     clock : drivers.clock.Clock
         What exposures are counted by; the driver's own.
     arming_s : float
-        Time after an exposure in which a trigger is ignored.
+        Time after an exposure in which a trigger is ignored; None for that of the table.
     """
 
     def __init__(
@@ -119,21 +115,21 @@ class GigeCamera:
         bits: int = 12,
         lost_ratio: float = 0.0,
         address: str = "127.0.0.1",
-        description: Literal["sfnc", "aravis"] = "sfnc",
+        description: str = "loopback",
         wait_s: float = 60.0,
         clock: Clock = REAL,
-        arming_s: float = 0.0,
+        arming_s: float | None = None,
     ) -> None:
         self.serial = serial
         self.address = address
         self._size = (width, height)
         self._source = pixel_source
-        self._bits = bits
+        self.bits = bits
         self._lost_ratio = lost_ratio
-        self._description = description
+        self._table = None if description == "aravis" else node_map(description)
         self._wait_s = wait_s
         self._clock = clock
-        self._arming_s = arming_s
+        self._arming_s = arming_s if arming_s is not None else self._table.arming_s if self._table else 0.0
         self._armed_at_s = 0.0
         #: Triggers that came before the camera was armed.
         self.ignored_triggers = 0
@@ -142,7 +138,7 @@ class GigeCamera:
         self._error: BaseException | None = None
         self._gone = threading.Event()
         self._camera: Any = None
-        self._memory: Any = None
+        self._memory: CameraMemory | None = None
         self._loopback = LoopbackAddress(address)
         self._library = ctypes.CDLL("libaravis-0.8.so.0")
         self._library.arv_buffer_get_data.restype = ctypes.c_void_p
@@ -178,9 +174,9 @@ class GigeCamera:
         self._loopback.take(self._wait_s)
         with tempfile.TemporaryDirectory() as folder:
             path = None
-            if self._description == "sfnc":
+            if self._table is not None:
                 path = Path(folder) / "camera.xml"
-                path.write_text(features.sfnc_description(*self._size))
+                path.write_text(features.description(self._table, *self._size))
             camera = aravis.GvFakeCamera.new_full(self.address, self.serial, None if path is None else str(path))
         # It also says that it runs where it could not bind its port, which is why the address was taken first.
         if not camera.is_running():
@@ -191,10 +187,10 @@ class GigeCamera:
                 f"Add it: ip addr add {self.address}/8 dev lo",
             )
         self._gone.clear()
-        self._camera, self._memory = camera, camera.get_fake_camera()
-        self._power_up()
+        self._camera, self._memory = camera, CameraMemory(camera.get_fake_camera())
+        self._memory.power_up(*self._size, self._table)
         # hash() of a GObject wrapper is the object's address.
-        self._library.arv_fake_camera_set_fill_pattern(hash(self._memory), self._callback, None)
+        self._library.arv_fake_camera_set_fill_pattern(self._memory.address, self._callback, None)
         self.lost_ratio = self._lost_ratio
 
     def stop(self) -> None:
@@ -207,12 +203,12 @@ class GigeCamera:
 
         The address stays ours until `stop`: a driver that does not know yet must not talk to another camera there.
         """
-        if self._camera is None:
+        if self._camera is None or self._memory is None:
             return
         self._gone.set()
         # No frame must leave with Aravis' own pattern, and no Python may run while its thread is joined.
         self._camera.set_property("gvsp-lost-ratio", 1.0)
-        self._library.arv_fake_camera_set_fill_pattern(hash(self._memory), _FillPattern(), None)
+        self._library.arv_fake_camera_set_fill_pattern(self._memory.address, _FillPattern(), None)
         self._camera = self._memory = None
 
     def check(self) -> None:
@@ -235,53 +231,21 @@ class GigeCamera:
     def fire(self) -> None:
         """Start an exposure from outside, as a pulse on the trigger line does."""
         # Aravis knows software triggers alone, so the source changes behind the driver's back.
-        self._write(features.TRIGGER_SOURCE, 1)
-        self._write(features.SOFTWARE_TRIGGER, 1)
+        self._live_memory().write(features.TRIGGER_SOURCE, 1)
+        self._live_memory().write(features.SOFTWARE_TRIGGER, 1)
+
+    def _live_memory(self) -> CameraMemory:
+        if self._memory is None:
+            raise CameraError(f"look into the camera at {self.address}", "it is not running", "Start it first")
+        return self._memory
 
     def write_register(self, address: int, value: int) -> None:
         """Write a 32-bit register, behind the back of whoever controls the camera."""
-        self._write(address, value)
+        self._live_memory().write(address, value)
 
     def register(self, address: int) -> int:
         """Read a 32-bit register, as a look into the camera from behind."""
-        return self._read(address)
-
-    # --- registers ---------------------------------------------------------------------------------------
-
-    def _power_up(self) -> None:
-        width, height = self._size
-        self._memory.set_trigger_frequency(_GRID_HZ)
-        for address, value in (
-            (features.SENSOR_WIDTH, width),
-            (features.SENSOR_HEIGHT, height),
-            (features.WIDTH, width),
-            (features.HEIGHT, height),
-            (features.PIXEL_FORMAT, pixel_format("Mono16").code),
-            (features.GAIN_AUTO, 2),
-            (features.GAMMA_ENABLE, 1),
-            (features.DECIMATION_X, 1),
-            (features.DECIMATION_Y, 1),
-            (features.TRIGGER_ARMED, 1),
-        ):
-            self._write(address, value)
-        for address, number in (
-            (features.GAIN_DB, 0.0),
-            (features.BLACK_LEVEL, 0.0),
-            (features.TEMPERATURE_C, 38.5),
-            (features.GAMMA, 0.45),
-        ):
-            high, low = struct.unpack(">II", struct.pack(">d", number))
-            self._write(address, high)
-            self._write(address + 4, low)
-
-    def _write(self, address: int, value: int) -> None:
-        self._memory.write_register(address, value)
-
-    def _read(self, address: int) -> int:
-        return int(self._memory.read_register(address)[1])
-
-    def _read_float(self, address: int) -> float:
-        return float(struct.unpack(">d", struct.pack(">II", self._read(address), self._read(address + 4)))[0])
+        return self._live_memory().read(address)
 
     # --- the exposure, in the camera's own thread --------------------------------------------------------
 
@@ -294,7 +258,7 @@ class GigeCamera:
             return
         try:
             info = self._info(buffer, exposure_us, gain_raw)
-            fmt = pixel_format(code)
+            fmt = self._format(code)
             data = fmt.encode(self._checked(self._source(info), info, fmt))
             ctypes.memmove(self._library.arv_buffer_get_data(buffer, None), data.ctypes.data, data.nbytes)
             if camera is not None and not self._gone.is_set():
@@ -314,7 +278,7 @@ class GigeCamera:
         if self._arming_s <= 0 or self._gone.is_set():
             return
         self._armed_at_s = exposed_s + self._arming_s
-        self._write(features.TRIGGER_ARMED, 0)
+        self._live_memory().write(features.TRIGGER_ARMED, 0)
         # A little late, so that what the register says holds.
         wait_s = max(0.0, self._armed_at_s - self._clock.now_s() + 2e-3)
         timer = threading.Timer(wait_s, self._arm)
@@ -323,32 +287,45 @@ class GigeCamera:
 
     def _arm(self) -> None:
         if self._memory is not None:
-            self._write(features.TRIGGER_ARMED, 1)
+            self._memory.write(features.TRIGGER_ARMED, 1)
 
     def _info(self, buffer: int, exposure_us: int, gain_raw: int) -> ExposureInfo:
-        sfnc = self._description == "sfnc"
-        return ExposureInfo(
+        memory, table = self._live_memory(), self._table
+        info = ExposureInfo(
             exposure_s=exposure_us * 1e-6,
-            gain_db=self._read_float(features.GAIN_DB) if sfnc else float(gain_raw),
-            black_level=self._read_float(features.BLACK_LEVEL) if sfnc else 0.0,
+            gain_db=float(gain_raw),
+            black_level=0.0,
             frame_id=int(self._library.arv_buffer_get_frame_id(buffer)),
-            width=self._read(features.WIDTH),
-            height=self._read(features.HEIGHT),
-            offset_x=self._read(features.OFFSET_X),
-            offset_y=self._read(features.OFFSET_Y),
-            binning=self._read(features.BINNING_X),
-            decimation=self._read(features.DECIMATION_X) if sfnc else 1,
-            reverse_x=sfnc and bool(self._read(features.REVERSE_X)),
-            reverse_y=sfnc and bool(self._read(features.REVERSE_Y)),
+            width=memory.read(features.WIDTH),
+            height=memory.read(features.HEIGHT),
+            offset_x=memory.read(features.OFFSET_X),
+            offset_y=memory.read(features.OFFSET_Y),
+            binning=memory.read(features.BINNING_X),
+        )
+        if table is None:
+            return info
+        return replace(
+            info,
+            gain_db=memory.number(table.gain),
+            black_level=memory.number(table.black_level),
+            decimation=memory.read(features.DECIMATION_X),
+            reverse_x=bool(memory.read(features.REVERSE_X)),
+            reverse_y=bool(memory.read(features.REVERSE_Y)),
         )
 
+    def _format(self, code: int) -> PixelFormat:
+        if self._table is None:
+            return pixel_format(code)
+        names = {value: name for name, value in self._table.codes().items()}
+        return pixel_format_of(code, names[code & 0xFFFFFFFF])
+
     def _checked(self, pixels: NDArray[np.uint16], info: ExposureInfo, fmt: PixelFormat) -> NDArray[np.uint16]:
-        if pixels.shape != (info.height, info.width) or pixels.dtype != np.uint16:
+        if pixels.shape != (fmt.scale * info.height, fmt.scale * info.width) or pixels.dtype != np.uint16:
             raise ValueError(
                 f"the pixel source gave {pixels.dtype} {pixels.shape}, not uint16 {(info.height, info.width)}"
             )
-        if self._bits < fmt.bits and int(pixels.max()) >> self._bits:
-            raise ValueError(f"the pixel source gave {int(pixels.max())}, more than {self._bits} bits hold")
-        if fmt.bits < self._bits:
-            return pixels >> np.uint16(self._bits - fmt.bits)
+        if self.bits < fmt.bits and int(pixels.max()) >> self.bits:
+            raise ValueError(f"the pixel source gave {int(pixels.max())}, more than {self.bits} bits hold")
+        if fmt.bits < self.bits:
+            return pixels >> np.uint16(self.bits - fmt.bits)
         return pixels

@@ -1,4 +1,4 @@
-"""The GenICam description of the simulated camera: a small SFNC camera whose registers are Aravis' fake memory.
+"""The GenICam description of the simulated camera: features of a table, registers in the memory of Aravis' fake camera.
 
 Aravis serves any description over the wire; its fake camera gives meaning to the registers below 0x310 (size,
 exposure, trigger, pixel format), the others are plain memory here.
@@ -6,7 +6,10 @@ exposure, trigger, pixel format), the others are plain memory here.
 
 from __future__ import annotations
 
-from drivers.pixel_formats import PIXEL_FORMATS
+import re
+from collections.abc import Sequence
+
+from simulators.camera.node_map import NodeMap
 
 SENSOR_HEIGHT, SENSOR_WIDTH = 0x118, 0x11C
 WIDTH, HEIGHT, BINNING_X, BINNING_Y = 0x100, 0x104, 0x108, 0x10C
@@ -21,6 +24,9 @@ TRIGGER_SOURCE = 0x304
 SOFTWARE_TRIGGER = 0x30C
 # Reads 1 while a trigger would be heeded; the camera itself keeps it up to date.
 TRIGGER_ARMED = 0x4038
+GAIN_RAW, BLACK_LEVEL_RAW, FRAME_RATE_ENABLE, PTP_ENABLE, PTP_STATUS = 0x4040, 0x4044, 0x4048, 0x404C, 0x4050
+# Texts of the GigE Vision bootstrap registers, 32 bytes each.
+VENDOR_NAME, MODEL_NAME = 0x48, 0x68
 
 # The camera answers no command while it exposes, and its controller gives up after 3 s without an answer.
 MAX_EXPOSURE_S = 2.0
@@ -37,11 +43,15 @@ def _register(name: str, address: int, kind: str = "IntReg", access: str = "RW",
     )
 
 
-def _integer(name: str, address: int, low: int, high: int | str, access: str = "RW") -> str:
+def _integer(name: str, address: int, low: int, high: int | str, access: str = "RW", step: int = 1) -> str:
+    return _number(name, f"{name}Register", low, high, step) + _register(name, address, access=access)
+
+
+def _number(name: str, register: str, low: int, high: int | str, step: int = 1) -> str:
     top = f"<Max>{high}</Max>" if isinstance(high, int) else f"<pMax>{high}</pMax>"
     return (
-        f'<Integer Name="{name}" NameSpace="Standard"><pValue>{name}Register</pValue><Min>{low}</Min>{top}<Inc>1</Inc>'
-        f"</Integer>{_register(name, address, access=access)}"
+        f'<Integer Name="{name}" NameSpace="Standard"><pValue>{register}</pValue><Min>{low}</Min>{top}'
+        f"<Inc>{step}</Inc></Integer>"
     )
 
 
@@ -63,7 +73,7 @@ def _choice(name: str, address: int, entries: dict[str, int]) -> str:
     )
 
 
-def _selector(name: str, entries: list[str]) -> str:
+def _selector(name: str, entries: Sequence[str]) -> str:
     listed = "".join(f'<EnumEntry Name="{e}"><Value>{i}</Value></EnumEntry>' for i, e in enumerate(entries))
     return (
         f'<Integer Name="{name}Value"><Value>0</Value></Integer><Enumeration Name="{name}">{listed}'
@@ -97,32 +107,68 @@ def _command(name: str, address: int, value: int) -> str:
     )
 
 
-def sfnc_description(width: int, height: int) -> str:
-    """Write the GenICam XML of a camera with an SFNC feature set and a sensor of the given size in pixels."""
-    selected, status = "AcquisitionStatusSelectorValue", TRIGGER_ARMED - SOFTWARE_TRIGGER
+def description(table: NodeMap, width: int, height: int) -> str:
+    """Write the GenICam XML of a camera with the features of a table and a sensor of the given size in pixels."""
     features = [
-        _text("DeviceVendorName", 0x48, 32),
-        _text("DeviceModelName", 0x68, 32),
+        *_identity(table),
+        *_region(table, width, height),
+        _choice("PixelFormat", PIXEL_FORMAT, table.codes()),
+        *_acquisition(table),
+        *_light(table),
+        *_clock(table),
+        _formula("PayloadSize", "W * H * ((F &gt;&gt; 16) &amp; 0xFF) / 8", W="Width", H="Height", F="PixelFormat"),
+    ]
+    names = re.findall(r'<\w+ Name="(\w+)" NameSpace="Standard">', "".join(features))
+    listed = "".join(f"<pFeature>{name}</pFeature>" for name in names)
+    return (
+        f'<?xml version="1.0" encoding="utf-8"?>\n<RegisterDescription ModelName="{table.model}" VendorName="umov"'
+        ' StandardNameSpace="None" SchemaMajorVersion="1" SchemaMinorVersion="0" SchemaSubMinorVersion="1"'
+        ' MajorVersion="1" MinorVersion="0" SubMinorVersion="0" ProductGuid="0" VersionGuid="0"'
+        ' xmlns="http://www.genicam.org/GenApi/Version_1_0">\n'
+        f'<Category Name="Root" NameSpace="Standard">{listed}</Category>\n'
+        + "\n".join([*features, '<Port Name="Device"/>'])
+        + "\n</RegisterDescription>\n"
+    )
+
+
+def _identity(table: NodeMap) -> list[str]:
+    texts = [
+        _text("DeviceVendorName", VENDOR_NAME, 32),
+        _text("DeviceModelName", MODEL_NAME, 32),
         _text("DeviceVersion", 0x88, 32),
         _text("DeviceSerialNumber", 0xD8, 16),
-        _float("DeviceTemperature", TEMPERATURE_C, -40.0, 100.0, "RO"),
+    ]
+    return texts + ([_float(table.temperature, TEMPERATURE_C, -40.0, 100.0, "RO")] if table.temperature else [])
+
+
+def _region(table: NodeMap, width: int, height: int) -> list[str]:
+    features = [
         _integer("SensorWidth", SENSOR_WIDTH, 1, width, "RO"),
         _integer("SensorHeight", SENSOR_HEIGHT, 1, height, "RO"),
-        _formula("WidthMax", f"{width} / (B * D)", B="BinningHorizontal", D="DecimationHorizontal"),
-        _formula("HeightMax", f"{height} / (B * D)", B="BinningVertical", D="DecimationVertical"),
+        _formula("WidthMax", f"{width} / (B * D)", B="BinningXRegister", D="DecimationXRegister"),
+        _formula("HeightMax", f"{height} / (B * D)", B="BinningYRegister", D="DecimationYRegister"),
         _formula("OffsetXMax", "M - W", M="WidthMax", W="Width"),
         _formula("OffsetYMax", "M - H", M="HeightMax", H="Height"),
-        _integer("Width", WIDTH, 1, "WidthMax"),
-        _integer("Height", HEIGHT, 1, "HeightMax"),
-        _integer("OffsetX", OFFSET_X, 0, "OffsetXMax"),
-        _integer("OffsetY", OFFSET_Y, 0, "OffsetYMax"),
-        _integer("BinningHorizontal", BINNING_X, 1, 4),
-        _integer("BinningVertical", BINNING_Y, 1, 4),
-        _integer("DecimationHorizontal", DECIMATION_X, 1, 4),
-        _integer("DecimationVertical", DECIMATION_Y, 1, 4),
-        _flag("ReverseX", REVERSE_X),
-        _flag("ReverseY", REVERSE_Y),
-        _choice("PixelFormat", PIXEL_FORMAT, {fmt.name: fmt.code for fmt in PIXEL_FORMATS}),
+        _register("BinningX", BINNING_X),
+        _register("BinningY", BINNING_Y),
+        _register("DecimationX", DECIMATION_X),
+        _register("DecimationY", DECIMATION_Y),
+    ]
+    for name, address, largest in (("Width", WIDTH, "WidthMax"), ("Height", HEIGHT, "HeightMax")):
+        features.append(_integer(name, address, table.step.get(name, 1), largest, step=table.step.get(name, 1)))
+    for name, address in (("OffsetX", OFFSET_X), ("OffsetY", OFFSET_Y)):
+        features.append(_integer(name, address, 0, f"{name}Max", step=table.step.get(name, 1)))
+    for name, highest in (("Binning", table.binning), ("Decimation", table.decimation)):
+        if highest > 1:
+            for axis, short in (("Horizontal", "X"), ("Vertical", "Y")):
+                features.append(_number(f"{name}{axis}", f"{name}{short}Register", 1, highest))
+    if table.reverse:
+        features += [_flag("ReverseX", REVERSE_X), _flag("ReverseY", REVERSE_Y)]
+    return features
+
+
+def _acquisition(table: NodeMap) -> list[str]:
+    features = [
         _choice("AcquisitionMode", 0x12C, {"Continuous": 1, "SingleFrame": 2, "MultiFrame": 3}),
         _command("AcquisitionStart", 0x124, 1),
         '<Command Name="AcquisitionStop" NameSpace="Standard"><pValue>AcquisitionStartRegister</pValue>'
@@ -132,25 +178,48 @@ def sfnc_description(width: int, height: int) -> str:
         _choice("TriggerSource", TRIGGER_SOURCE, {"Line0": 0, "Software": 1}),
         _choice("TriggerActivation", 0x308, {"RisingEdge": 0, "FallingEdge": 1}),
         _command("TriggerSoftware", SOFTWARE_TRIGGER, 1),
-        _selector("AcquisitionStatusSelector", ["ExposureActive", "FrameTriggerWait"]),
-        _flag("AcquisitionStatus", SOFTWARE_TRIGGER, "RO", f'<pIndex Offset="{status:#x}">{selected}</pIndex>'),
-        f'<Float Name="ExposureTime" NameSpace="Standard"><pValue>ExposureTimeConverter</pValue><Min>10</Min>'
-        f"<Max>{MAX_EXPOSURE_S * 1e6}</Max><Inc>1</Inc></Float>",
-        '<Converter Name="ExposureTimeConverter"><FormulaTo>FROM</FormulaTo><FormulaFrom>TO</FormulaFrom>'
-        "<pValue>ExposureTimeRegister</pValue></Converter>",
-        _register("ExposureTime", EXPOSURE_US),
-        _float("Gain", GAIN_DB, 0.0, 24.0),
-        _choice("GainAuto", GAIN_AUTO, {"Off": 0, "Once": 1, "Continuous": 2}),
-        _float("BlackLevel", BLACK_LEVEL, 0.0, 511.0),
-        _float("Gamma", GAMMA, 0.25, 4.0),
-        _flag("GammaEnable", GAMMA_ENABLE),
-        _formula("PayloadSize", "W * H * ((F &gt;&gt; 16) &amp; 0xFF) / 8", W="Width", H="Height", F="PixelFormat"),
-        '<Port Name="Device" NameSpace="Standard"/>',
     ]
-    return (
-        '<?xml version="1.0" encoding="utf-8"?>\n<RegisterDescription ModelName="Loopback" VendorName="umov"'
-        ' StandardNameSpace="None" SchemaMajorVersion="1" SchemaMinorVersion="0" SchemaSubMinorVersion="1"'
-        ' MajorVersion="1" MinorVersion="0" SubMinorVersion="0" ProductGuid="0" VersionGuid="0"'
-        ' xmlns="http://www.genicam.org/GenApi/Version_1_0">\n'
-        '<Category Name="Root" NameSpace="Standard"/>\n' + "\n".join(features) + "\n</RegisterDescription>\n"
-    )
+    if "TriggerArmed" in table.status:
+        features.append(_flag("TriggerArmed", TRIGGER_ARMED, "RO"))
+    statuses = [status for status in ("ExposureActive", "FrameTriggerWait") if status in table.status]
+    if statuses:
+        first, apart = SOFTWARE_TRIGGER, TRIGGER_ARMED - SOFTWARE_TRIGGER
+        index = f'<pIndex Offset="{apart:#x}">AcquisitionStatusSelectorValue</pIndex>'
+        features.append(_selector("AcquisitionStatusSelector", statuses))
+        features.append(_flag("AcquisitionStatus", first, "RO", index))
+    if table.frame_rate:
+        features.append(_flag(table.frame_rate, FRAME_RATE_ENABLE))
+    return features
+
+
+def _light(table: NodeMap) -> list[str]:
+    low, high = table.exposure_us
+    features = [
+        f'<Float Name="{table.exposure}" NameSpace="Standard"><pValue>ExposureConverter</pValue><Min>{low}</Min>'
+        f"<Max>{min(high, MAX_EXPOSURE_S * 1e6)}</Max><Inc>1</Inc></Float>",
+        '<Converter Name="ExposureConverter"><FormulaTo>FROM</FormulaTo><FormulaFrom>TO</FormulaFrom>'
+        "<pValue>ExposureRegister</pValue></Converter>",
+        _register("Exposure", EXPOSURE_US),
+        _choice("GainAuto", GAIN_AUTO, {"Off": 0, "Once": 1, "Continuous": 2}),
+    ]
+    for name, number, raw, limits in (
+        (table.gain, GAIN_DB, GAIN_RAW, table.gain_range),
+        (table.black_level, BLACK_LEVEL, BLACK_LEVEL_RAW, table.black_level_range),
+    ):
+        if name.endswith("Raw"):
+            features.append(_integer(name, raw, int(limits[0]), int(limits[1])))
+        else:
+            features.append(_float(name, number, *limits))
+    if table.gamma is not None:
+        features.append(_float("Gamma", GAMMA, 0.25, 4.0))
+    if table.gamma == "GammaEnable":
+        features.append(_flag("GammaEnable", GAMMA_ENABLE))
+    return features
+
+
+def _clock(table: NodeMap) -> list[str]:
+    if table.ptp is None:
+        return []
+    status = "PtpStatus" if table.ptp == "PtpEnable" else "GevIEEE1588Status"
+    states = {"Disabled": 0, "Listening": 1, "Slave": 2, "Master": 3}
+    return [_flag(table.ptp, PTP_ENABLE), _choice(status, PTP_STATUS, states)]

@@ -55,7 +55,7 @@ def bench() -> Iterator[Bench]:
         yield make
 
 
-@pytest.mark.parametrize("description", ["sfnc", "aravis"])
+@pytest.mark.parametrize("description", ["loopback", "aravis"])
 def test_settings_are_read_back(bench: Bench, description: str) -> None:
     _, camera = bench(description=description)
     region = {"width": 32, "height": 20, "offset_x": 8, "offset_y": 4}
@@ -66,11 +66,11 @@ def test_settings_are_read_back(bench: Bench, description: str) -> None:
     assert camera.settings == back
     assert camera.capture(1)[0].pixels.shape == (20, 32)
     # No region asked for is the full sensor again, and a setting left open stays.
-    back = camera.configure(CameraSettings(gain_db=6.5) if description == "sfnc" else CameraSettings())
+    back = camera.configure(CameraSettings(gain_db=6.5) if description == "loopback" else CameraSettings())
     assert (back.width, back.height, back.offset_x) == (64, 48, 0)
     assert back.exposure_s == pytest.approx(0.0123, abs=1e-6)
-    assert back.gain_db == (6.5 if description == "sfnc" else None)
-    assert camera.temperature_c() == (38.5 if description == "sfnc" else None)
+    assert back.gain_db == (6.5 if description == "loopback" else None)
+    assert camera.temperature_c() == (38.5 if description == "loopback" else None)
 
 
 def test_what_makes_counts_non_linear_is_switched_off(bench: Bench) -> None:

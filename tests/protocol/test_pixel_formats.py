@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.errors import UnknownPixelFormat
-from drivers.pixel_formats import PIXEL_FORMATS, PixelFormat, pixel_format
+from drivers.pixel_formats import PIXEL_FORMATS, PixelFormat, pixel_format, pixel_format_of
 from simulators.camera.pixel_stamp import read_stamp, stamp
 
 
@@ -27,6 +27,9 @@ from simulators.camera.pixel_stamp import read_stamp, stamp
         ("Mono12Packed", "ab 3c 12", [0xABC, 0x123]),
         ("PolarizedMono12Packed", "ab 3c 12", [0xABC, 0x123]),
         ("Mono10Packed", "ff 13 00", [0x3FF, 0x001]),
+        ("BayerRG12p", "bc 3a 12", [0xABC, 0x123]),
+        ("Polarized10p", "ff 03 00 00 80", [0x3FF, 0x000, 0x000, 0x200]),
+        ("BayerRGPolarized8", "00 7f ff", [0, 0x7F, 0xFF]),
     ],
 )
 def test_bytes_become_counts(name: str, memory: str, counts: list[int]) -> None:
@@ -41,7 +44,8 @@ def test_bytes_become_counts(name: str, memory: str, counts: list[int]) -> None:
     seed=st.integers(0, 2**32 - 1),
 )
 def test_an_image_survives_the_wire(fmt: PixelFormat, width: int, height: int, seed: int) -> None:
-    pixels = np.random.default_rng(seed).integers(0, 1 << fmt.bits, (height, width)).astype(np.uint16)
+    shape = (fmt.scale * height, fmt.scale * width)
+    pixels = np.random.default_rng(seed).integers(0, 1 << fmt.bits, shape).astype(np.uint16)
     memory = fmt.encode(pixels)
     assert memory.size == fmt.payload_bytes(width, height)
     assert np.array_equal(fmt.decode(memory, width, height), pixels)
@@ -49,9 +53,25 @@ def test_an_image_survives_the_wire(fmt: PixelFormat, width: int, height: int, s
 
 def test_bits_in_memory_are_in_the_code() -> None:
     for fmt in PIXEL_FORMATS:
-        packed = {"plain": 8 if fmt.bits == 8 else 16, "p": fmt.bits, "packed": 12}
-        assert fmt.bits_in_memory == packed[fmt.layout], fmt
-    assert len({fmt.code for fmt in PIXEL_FORMATS}) == len({fmt.name for fmt in PIXEL_FORMATS}) == len(PIXEL_FORMATS)
+        assert fmt.code is None or fmt.bits_in_memory == fmt.code >> 16 & 0xFF, fmt
+    codes = [fmt.code for fmt in PIXEL_FORMATS if fmt.code is not None]
+    assert len(set(codes)) == len(codes)
+    assert len({fmt.name for fmt in PIXEL_FORMATS}) == len(PIXEL_FORMATS)
+
+
+def test_four_counts_a_pixel_become_the_super_pixel_of_the_sensor() -> None:
+    fmt = pixel_format("PolarizedAngles_0d_45d_90d_135d_Mono8")
+    memory = np.array([0, 45, 90, 135, 1, 46, 91, 136], np.uint8)
+    assert fmt.decode(memory, 2, 1).tolist() == [[90, 45, 91, 46], [135, 0, 136, 1]]
+
+
+def test_a_format_without_a_published_code_is_known_by_the_name_that_the_camera_tells() -> None:
+    fmt = pixel_format_of(0x810C0099, "Polarized12p")
+    assert (fmt.code, fmt.bits, fmt.layout, fmt.polarized) == (0x810C0099, 12, "p", True)
+    with pytest.raises(UnknownPixelFormat):
+        pixel_format_of(0x81100099, "Polarized12p")
+    # A code that is known decides, whatever it is called.
+    assert pixel_format_of(0x01080001, "Polarized8").name == "Mono8"
 
 
 def test_a_shift_takes_empty_low_bits_away() -> None:
@@ -68,7 +88,7 @@ def test_decoded_counts_share_nothing_with_the_buffer() -> None:
 
 
 # The last one is a degree of polarization that a camera computed itself, not an intensity.
-@pytest.mark.parametrize("unknown", ["Bayer", 0x02180014, 0x8220000F, "PolarizedDolp_Mono8"])
+@pytest.mark.parametrize("unknown", ["Bayer", 0x02180014, 0x8218003F, "PolarizedDolp_Mono8"])
 def test_an_unknown_format_is_refused_and_named(unknown: str | int) -> None:
     with pytest.raises(UnknownPixelFormat) as refused:
         pixel_format(unknown)

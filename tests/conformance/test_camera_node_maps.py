@@ -1,0 +1,130 @@
+"""The driver on the feature tables of makers' cameras: names, steps, formats and arming differ, the promises do not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.camera import CameraSettings
+from drivers.cameras import aravis
+from drivers.errors import SettingRefused
+from drivers.pixel_formats import pixel_format
+from simulators.camera.gige_camera import ExposureInfo, GigeCamera
+from simulators.camera.node_map import NodeMap, node_map, node_maps
+
+SIZE = (64, 48)
+
+
+class MakersCamera:
+    """A simulated camera of a maker and the driver that opened it; `bits` are those of the format that it shows."""
+
+    def __init__(self, name: str, stack: ExitStack) -> None:
+        self.table: NodeMap = node_map(name)
+        self.scale = 1
+        self.simulated = stack.enter_context(GigeCamera("MAKER1", *SIZE, self.show, bits=16, description=name))
+        self._stack = stack
+
+    def show(self, info: ExposureInfo) -> NDArray[np.uint16]:
+        """Neighbours differ, each frame differs, the lowest eight bits hold it all."""
+        shape = (self.scale * info.height, self.scale * info.width)
+        return ((np.arange(shape[0] * shape[1]) * 7 + info.frame_id) % 251).astype(np.uint16).reshape(shape)
+
+    def open(self, **config: object) -> aravis.AravisCamera:
+        return self._stack.enter_context(
+            aravis.open("camera", aravis.Config(device="127.0.0.1", packet_size=9000, **config))  # type: ignore[arg-type]
+        )
+
+
+@pytest.fixture(params=node_maps())
+def maker(request: pytest.FixtureRequest) -> Iterator[MakersCamera]:
+    with ExitStack() as stack:
+        yield MakersCamera(request.param, stack)
+
+
+def test_the_table_names_its_sources_and_known_formats(maker: MakersCamera) -> None:
+    assert maker.table.sources
+    assert maker.table.codes().keys() == set(maker.table.pixel_formats)
+
+
+def test_identity_light_and_trigger(maker: MakersCamera) -> None:
+    table = maker.table
+    camera = maker.open(gain_raw_per_db=10.0 if table.gain == "GainRaw" else None, bits=8)
+    back = camera.configure(CameraSettings(exposure_s=2e-3, gain_db=3.0, black_level=12.0))
+    assert (back.exposure_s, back.gain_db, back.black_level) == (2e-3, 3.0, 12.0)
+    identity = camera.describe()
+    assert (identity.vendor, identity.model) == (table.vendor, table.model)
+    assert camera.temperature_c() == (None if table.temperature is None else 38.5)
+    ids = [frame.frame_id for frame in camera.capture(4)]
+    assert [b - a for a, b in pairwise(ids)] == [1, 1, 1]
+    assert maker.simulated.ignored_triggers == 0
+    assert camera.statistics().retakes == 0
+
+
+def test_every_format_of_the_maker_gives_its_counts(maker: MakersCamera) -> None:
+    camera = maker.open()
+    for name in maker.table.pixel_formats:
+        fmt = pixel_format(name)
+        maker.scale = fmt.scale
+        maker.simulated.bits = fmt.bits
+        back = camera.configure(CameraSettings(exposure_s=1e-4, pixel_format=name))
+        assert (back.width, back.height) == (fmt.scale * SIZE[0], fmt.scale * SIZE[1])
+        frame = camera.capture()[0]
+        expected = (np.arange(frame.pixels.size) * 7 + frame.frame_id) % 251
+        assert np.array_equal(frame.pixels.ravel(), expected), name
+        identity = camera.describe()
+        assert (identity.bits, identity.pixel_format, identity.polarized) == (fmt.bits, name, fmt.polarized)
+        assert identity.pixel_format_code == maker.table.codes()[name]
+
+
+def test_the_region_keeps_to_the_steps_of_the_maker(maker: MakersCamera) -> None:
+    step = maker.table.step
+    camera = maker.open(bits=8)
+    x, y = step.get("OffsetX", 1), step.get("OffsetY", 1)
+    back = camera.configure(CameraSettings(exposure_s=1e-4, width=32, height=16, offset_x=3 * x, offset_y=y))
+    assert (back.width, back.height, back.offset_x, back.offset_y) == (32, 16, 3 * x, y)
+    assert camera.capture()[0].pixels.shape == (16, 32)
+    if x > 1:
+        with pytest.raises(SettingRefused, match=f"steps of {x}: 0 or {x}"):
+            camera.configure(CameraSettings(width=32, offset_x=1))
+    if maker.table.binning > 1:
+        assert camera.configure(CameraSettings(binning=2)).width == SIZE[0] // 2
+    else:
+        with pytest.raises(SettingRefused, match="no such feature"):
+            camera.configure(CameraSettings(binning=2))
+
+
+def test_features_of_the_rig_file_are_set_and_the_node_map_tells_them(maker: MakersCamera) -> None:
+    table = maker.table
+    if table.ptp is None or table.gamma is None:
+        pytest.skip("this camera has neither clock synchronization nor gamma")
+    wanted = {table.ptp: True, "GammaEnable": True, "Gamma": 0.5, "TriggerActivation": "FallingEdge"}
+    camera = maker.open(features=wanted, bits=8)
+    camera.configure(CameraSettings(exposure_s=1e-3))
+    found = camera.node_map()
+    assert found[table.ptp] == "true"
+    assert (found["GammaEnable"], float(found["Gamma"])) == ("true", 0.5)
+    assert found["TriggerActivation"] == "FallingEdge"
+    assert found["DeviceModelName"] == table.model
+    assert float(found[table.exposure]) == pytest.approx(1000.0)
+    assert {"PtpStatus", "GevIEEE1588Status"} & found.keys()
+    assert "TriggerSoftware" not in found
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"NoSuchFeature": 1}, "no such feature"),
+        ({"Gamma": 77.0}, "limits"),
+        ({"TriggerActivation": "Sideways"}, "this camera offers"),
+    ],
+)
+def test_a_feature_that_is_not_taken_is_refused(wrong: dict[str, object], says: str) -> None:
+    with ExitStack() as stack:
+        camera = MakersCamera("loopback", stack).open(features=wrong)
+        with pytest.raises(SettingRefused, match=says):
+            camera.configure(CameraSettings(exposure_s=1e-3))
