@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import datetime
 import json
+import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import filelock
+import numpy as np
 
-from acquisition.campaign.plan import Campaign
+from acquisition.campaign.identity import IDENTITY
+from acquisition.campaign.plan import Campaign, CampaignCapture
+from acquisition.capture.writer import sync
 from acquisition.errors import AcquisitionError
+from processing.storage.capture import Capture
 from processing.yaml_file import dump_yaml
+
+log = logging.getLogger(__name__)
 
 LOG = "log.jsonl"
 INDEX = "index.json"
@@ -48,9 +55,12 @@ class CampaignFolder:
             )
         if not plan.exists():
             self._write_whole(plan, text)
-        self.index: dict[str, dict[str, Any]] = {}
-        if (folder / INDEX).exists():
-            self.index = json.loads((folder / INDEX).read_text(encoding="utf-8"))
+        self.index = read_index(folder)
+
+    def begin_with(self, identity: Mapping[str, Any]) -> None:
+        """Note what the campaign is taken with, once."""
+        if not (self.folder / IDENTITY).exists():
+            self._write_whole(self.folder / IDENTITY, json.dumps(identity, indent=1))
 
     def log(self, event: str, **details: Any) -> None:
         """Add a line to the log; it is on the disc when this returns."""
@@ -79,6 +89,7 @@ class CampaignFolder:
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(new, path)
+            sync(path.parent)
 
     @contextmanager
     def _room_for(self, path: Path) -> Iterator[None]:
@@ -93,3 +104,31 @@ class CampaignFolder:
     def close(self) -> None:
         """Let another program run the campaign."""
         self._lock.release()
+
+
+def read_index(folder: Path) -> dict[str, dict[str, Any]]:
+    """The index of a campaign, empty where there is none or it is damaged: a run writes what it finds into it anew."""
+    path = folder / INDEX
+    if not path.exists():
+        return {}
+    try:
+        index = json.loads(path.read_text(encoding="utf-8"))
+        if isinstance(index, dict) and all(isinstance(entry, dict) for entry in index.values()):
+            return index
+    except (OSError, ValueError, RecursionError) as error:
+        log.warning("%s cannot be read (%s)", path, error)
+    log.warning("%s is damaged: it is made anew from the captures", path)
+    return {}
+
+
+def entry_of(capture: CampaignCapture, path: Path) -> dict[str, Any]:
+    """What the index says of a capture whose file is there. Raises CaptureError."""
+    plan = capture.plan
+    with Capture(path) as there:
+        saturated = float(np.max(there.column("saturated_fraction"), initial=0.0))
+        status, states = there.status, len(there.done)
+    return {
+        "status": status, "states": states, "file": path.name, "reference": capture.reference, "role": plan.role,
+        "omega_deg": plan.omega_deg, "wavelength_nm": plan.wavelength_nm, "mode": plan.mode, "sample": plan.sample.name,
+        "saturated_fraction": saturated, "error": None,
+    }  # fmt: skip

@@ -7,16 +7,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from acquisition.campaign.log import CampaignFolder
+from acquisition.campaign.identity import require_same_campaign, with_devices
+from acquisition.campaign.log import CampaignFolder, entry_of
 from acquisition.campaign.plan import Campaign, CampaignCapture, captures
 from acquisition.capture import session
 from acquisition.capture.checks import Check, refuse_failed
 from acquisition.capture.estimate import capture_seconds, last_pose_deg
+from acquisition.capture.identity import require_same
 from acquisition.capture.job import Job, Result, check_with_devices, existing, job_of
 from acquisition.capture.job import prepare as prepare_job
 from acquisition.capture.operator import Operator
-from acquisition.capture.writer import PARTIAL, bytes_needed, check_space
-from acquisition.errors import AcquisitionError, InterlockOpened, PlanRefused, Stopped
+from acquisition.capture.writer import PARTIAL, bytes_needed, check_space, seal_whole
+from acquisition.errors import AcquisitionError, Differs, InterlockOpened, PlanRefused, Stopped
 from acquisition.rig.config import RigConfig
 from acquisition.rig.interlocks import LOOK_S
 from acquisition.rig.rig import Rig
@@ -116,7 +118,7 @@ class CampaignRun:
             for number, (capture, job) in enumerate(jobs):
                 for observer in self.observers:
                     observer.campaign_progress(number, len(jobs), capture.name)
-                if self._complete(capture):
+                if self._complete(capture, job):
                     self._catch_up(capture)
                     continue
                 result = self._take(capture, job)
@@ -153,7 +155,7 @@ class CampaignRun:
                 self.folder.log("capture failed", capture=capture.name, error=str(error), tries=failures)
                 self.folder.record(capture.name, status="failed", error=str(error))
                 # An interlock is nothing to try again: whether the run goes on by itself is for the plan to say.
-                if failures > self.campaign.retries or isinstance(error, InterlockOpened):
+                if failures > self.campaign.retries or isinstance(error, InterlockOpened | Differs):
                     raise
                 self._close_rig()
                 for observer in self.observers:
@@ -164,7 +166,7 @@ class CampaignRun:
                 "capture ended", capture=capture.name, status=result.status, states=result.states_done,
                 saturated_fraction=result.saturated_fraction, ledger=result.ledger, messages=result.messages,
             )  # fmt: skip
-            self._record_end(capture, result.status, result.states_done, result.path.name, result.saturated_fraction)
+            self.folder.record(capture.name, **entry_of(capture, result.path))
             return result
 
     def _wait_for_door(self, rig: Rig, capture: CampaignCapture) -> None:
@@ -188,34 +190,28 @@ class CampaignRun:
             # Aborted by Ctrl-C: sealed, but with states missing.
             partial = final
         if partial.exists():
-            job = job_of(partial, self.config)
+            job = job_of(partial, self.config, capture.plan)
             refuse_failed(check_with_devices(job, rig, final.parent))
             return session.resume(job, rig, partial, self.stop, self.observers, self.home)
         refuse_failed(check_with_devices(job, rig, final.parent))
         return session.take(job, rig, final, self.stop, self.observers, self.home)
 
-    def _complete(self, capture: CampaignCapture) -> bool:
+    def _complete(self, capture: CampaignCapture, job: Job) -> bool:
+        """Whether a capture is there, whole, and of this campaign. Raises Differs."""
         path = self.folder.folder / capture.name
+        partial = path.with_name(path.name + PARTIAL)
+        if partial.exists() and seal_whole(partial) is not None:
+            self.folder.log("sealed", capture=capture.name, why="its run was killed after the last state")
         if not path.exists():
             return False
         with Capture(path) as there:
+            require_same(there, capture.plan, self.config, job.instrument)
             return there.status == "complete"
 
     def _catch_up(self, capture: CampaignCapture) -> None:
         """Put a complete capture into the index, where a kill or a full disc has kept it out."""
-        if self.folder.index.get(capture.name, {}).get("status") == "complete":
-            return
-        with Capture(self.folder.folder / capture.name) as there:
-            saturated = float(there.column("saturated_fraction").max())
-            self._record_end(capture, "complete", len(there.done), capture.name, saturated)
-
-    def _record_end(self, capture: CampaignCapture, status: str, states: int, file: str, saturated: float) -> None:
-        plan = capture.plan
-        self.folder.record(
-            capture.name, status=status, states=states, file=file, reference=capture.reference, role=plan.role,
-            omega_deg=plan.omega_deg, wavelength_nm=plan.wavelength_nm, mode=plan.mode, sample=plan.sample.name,
-            saturated_fraction=saturated, error=None,
-        )  # fmt: skip
+        if self.folder.index.get(capture.name, {}).get("status") != "complete":
+            self.folder.record(capture.name, **entry_of(capture, self.folder.folder / capture.name))
 
     def _states_done(self, capture: CampaignCapture) -> int:
         final = self.folder.folder / capture.name
@@ -238,6 +234,8 @@ class CampaignRun:
             rig = Rig(self.config, ask=self.operator.confirm)
             rig.__enter__()
             self._rig = rig
+            # A device may have been changed between two tries.
+            require_same_campaign(self.folder.folder, with_devices({}, rig))
         return self._rig
 
     def _close_rig(self) -> None:

@@ -132,9 +132,13 @@ def job_of(path: Path, rig: RigConfig | None = None, plan: MeasurementPlan | Non
         require_same(capture, plan, job.rig, job.instrument)
     # The targets as they were: an endless axis may have begun some turns away from zero.
     table = replace(job.table, angles_deg=targets)
-    if np.all(np.isfinite(exposure_s)):
-        return replace(job, table=replace(table, exposure_s=exposure_s), exposure_known=True)
-    return replace(job, table=table)
+    known = np.isfinite(exposure_s)
+    if not known.any():
+        return replace(job, table=table)
+    # The exposure of a state whose record was damaged: as the plan has it to that of the others.
+    factor = float(np.median(exposure_s[known] / table.exposure_s[known]))
+    exposure_s = np.where(known, exposure_s, factor * table.exposure_s)
+    return replace(job, table=replace(table, exposure_s=exposure_s), exposure_known=True)
 
 
 def stored_plan(capture: Capture) -> MeasurementPlan:

@@ -11,7 +11,7 @@ import os
 import shutil
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -292,6 +292,20 @@ def seal_whole(partial: Path) -> Path | None:
         finally:
             file.close()
     return finish(partial, "complete")
+
+
+def mark_not_taken(path: Path, states: Sequence[int]) -> Path:
+    """Have states of a capture taken again: not done, the capture failed and partial. Returns its name."""
+    partial = as_partial(path)
+    file = StateFile(partial)
+    try:
+        for name, value in (("done", 0), ("exposure_s", np.nan)):
+            column = file.read_column(name)
+            column[list(states)] = value
+            file.write_column(name, column)
+    finally:
+        file.close()
+    return finish(partial, "failed", keep_name=True)
 
 
 def as_partial(path: Path) -> Path:

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from acquisition.campaign import run as campaign_run
+from acquisition.campaign.identity import campaign_identity, folder_for, require_same_campaign, with_devices
 from acquisition.campaign.log import CampaignFolder
 from acquisition.campaign.plan import Campaign
 from acquisition.campaign.run import CampaignRun, Planned
@@ -29,11 +30,15 @@ def run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Obs
     """Run a campaign or, with --dry-run, only check it; returns the exit code."""
     console = Console(stderr=True)
     campaign = Campaign.load(file)
-    rig_config = seeded(load_rig(options.rig or campaign.rig or DEFAULT_RIG), options.seed)
+    rig_file = options.rig or campaign.rig or DEFAULT_RIG
+    rig_config = seeded(load_rig(rig_file), options.seed)
     jobs = campaign_run.prepare(campaign, rig_config)
-    folder = options.out / campaign.name
+    identity = campaign_identity(campaign, jobs, rig_config, rig_file.resolve())
+    folder = folder_for(options.out / campaign.name, identity, options.as_new)
     say_simulated(console, rig_config)
     with Rig(rig_config) as rig, console.status(f"checking {len(jobs)} captures"):
+        identity = with_devices(identity, rig)
+        require_same_campaign(folder, identity)
         planned, checks = campaign_run.check_all(jobs, rig, folder)
     if options.dry_run:
         _show(planned, checks, folder)
@@ -41,6 +46,7 @@ def run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Obs
         return 0
     refuse_failed(checks)
     held = CampaignFolder(folder, campaign)
+    held.begin_with(identity)
     try:
         operator = Operator(console.print, stop, options.yes, rig_config.simulated)
         with live_page(options.live, rig_config, stop, console) as page:

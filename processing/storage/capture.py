@@ -34,6 +34,10 @@ class Capture:
 
     Every state read is held against its checksum; CaptureError names one that was changed on the disc.
 
+    Parameters
+    ----------
+    verify : False to look at damaged states as well, for `damaged_states`.
+
     Attributes
     ----------
     header : CaptureHeader
@@ -41,8 +45,9 @@ class Capture:
     angles_deg : dict of axis name to array (states,), degrees as read back
     """
 
-    def __init__(self, path: Path | str) -> None:
+    def __init__(self, path: Path | str, *, verify: bool = True) -> None:
         self.path = Path(path)
+        self._verifying = verify
         self._h5 = _open(self.path)
         try:
             self._read()
@@ -81,6 +86,7 @@ class Capture:
             if group.attrs.get("NX_class") == "NXpositioner"
         }
         self._frames: h5py.Dataset = entry["instrument/detector/data"]
+        self._contradictory: list[int] = []
         self._sums = self._verified_sums(entry) if version > 1 else None
 
     def _verified_sums(self, entry: h5py.Group) -> NDArray[np.uint32] | None:
@@ -96,12 +102,25 @@ class Capture:
         for k in np.flatnonzero(told != NONE):
             values = {name: column[k] for name, column in columns.items() if name not in UNSUMMED}
             if state_crc32(sums[k], values) != told[k]:
-                raise self._changed(int(k), "its angles or columns")
+                self._contradictory.append(int(k))
+        if self._verifying and self._contradictory:
+            raise self._changed(self._contradictory[0], "its angles or columns")
         return sums
 
     def _verify(self, state: int, rows: slice, counts: NDArray[Any]) -> None:
-        if self._sums is not None and not np.array_equal(row_crc32(counts), self._sums[state, :, rows]):
+        if self._verifying and not self._rows_agree(state, rows, counts):
             raise self._changed(state, "its frame")
+
+    def _rows_agree(self, state: int, rows: slice, counts: NDArray[Any]) -> bool:
+        return self._sums is None or np.array_equal(row_crc32(counts), self._sums[state, :, rows])
+
+    def damaged_states(self) -> list[int]:
+        """States done, by their number in the plan, that differ from their checksums; reads every frame."""
+        return [
+            int(self.done[k])
+            for k in range(len(self.done))
+            if k in self._contradictory or not self._rows_agree(k, slice(None), self._frames[int(self.done[k])])
+        ]
 
     def _changed(self, state: int, what: str) -> CaptureError:
         return CaptureError(

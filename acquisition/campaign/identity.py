@@ -1,0 +1,117 @@
+"""What a campaign is taken with: the same rig, plans, instruments, devices and program in each of its runs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from acquisition.campaign.plan import Campaign, CampaignCapture
+from acquisition.capture.identity import differences, files_of, lasting, plain, rig_content
+from acquisition.capture.job import Job
+from acquisition.errors import AcquisitionError, Differs
+from acquisition.rig.config import RigConfig
+from acquisition.rig.rig import Rig
+
+IDENTITY = "identity.json"
+#: Differences that are told one by one.
+SHOWN = 20
+
+
+def campaign_identity(
+    campaign: Campaign, jobs: Sequence[tuple[CampaignCapture, Job]], config: RigConfig, rig_file: Path
+) -> dict[str, Any]:
+    """What a campaign is taken with, as plain values; the devices come with `with_devices`.
+
+    Parameters
+    ----------
+    rig_file : where the rig's file is, to be named to whoever forgets it.
+    """
+    modes = {capture.plan.mode: job.instrument for capture, job in jobs}
+    facts = {
+        "rig_file": str(rig_file),
+        "simulated": config.simulated,
+        "program": f"umov {version('umov')}",
+        "campaign": plain(campaign),
+        "rig": {mode: rig_content(config, mode) for mode in modes},
+        "files": {key: text for mode in modes for key, text in files_of(config, mode).items()},
+        "instrument": {mode: plain(instrument) for mode, instrument in modes.items()},
+        "plan": {capture.name: plain(capture.plan) for capture, _ in jobs},
+    }
+    plain_facts: dict[str, Any] = json.loads(json.dumps(facts))
+    return plain_facts
+
+
+def with_devices(identity: dict[str, Any], rig: Rig) -> dict[str, Any]:
+    """The same with the devices of the rig, which is open."""
+    return {**identity, "device": lasting(rig.describe())}
+
+
+def require_same_campaign(folder: Path, now: dict[str, Any]) -> None:
+    """Refuse to go on with a campaign that was begun with something else.
+
+    Raises
+    ------
+    Differs
+        With every difference in words, each once.
+    """
+    then = read_identity(folder)
+    if then is None:
+        return
+    found = list(dict.fromkeys(_found(then, now)))
+    if found:
+        started = f"it was started with --rig {then.get('rig_file')}"
+        raise Differs(
+            str(folder), [*found[:20], *([f"and {len(found) - 20} more"] if len(found) > 20 else []), started]
+        )
+
+
+def _found(then: dict[str, Any], now: dict[str, Any]) -> Iterator[str]:
+    for key in now:
+        if key not in then and key == "device":
+            continue
+        if key in ("rig", "plan", "instrument"):
+            # The same of several modes and captures is said once.
+            for name in now[key]:
+                yield from differences(then.get(key, {}).get(name), now[key][name], key)
+        elif key != "rig_file":
+            yield from differences(then.get(key), now[key], key)
+
+
+def read_identity(folder: Path) -> dict[str, Any] | None:
+    """What the campaign in a folder was begun with; None if it has not begun. Raises AcquisitionError."""
+    path = folder / IDENTITY
+    if not path.exists():
+        return None
+    try:
+        facts = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise AcquisitionError(
+            f"{path} cannot be read ({error}). It says what the campaign was begun with; take it from a copy."
+        ) from error
+    if not isinstance(facts, dict):
+        raise AcquisitionError(f"{path} does not say what the campaign was begun with; take it from a copy.")
+    return facts
+
+
+def folder_for(base: Path, now: dict[str, Any], as_new: bool) -> Path:
+    """The folder to take a campaign into: `base`, or with `as_new` the first of base, base-2, ... that it may go on in.
+
+    Raises
+    ------
+    Differs
+        `base` was begun with something else.
+    """
+    folder, number = base, 1
+    while True:
+        try:
+            require_same_campaign(folder, now)
+            if not as_new or read_identity(folder) is not None or not folder.exists():
+                return folder
+        except Differs:
+            if not as_new:
+                raise
+        number += 1
+        folder = base.with_name(f"{base.name}-{number}")

@@ -1,0 +1,136 @@
+"""`acquire verify` and `acquire repair`: what a folder of captures holds, what is damaged and what half done."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from acquisition.campaign.log import INDEX, PLAN, CampaignFolder, entry_of, read_index
+from acquisition.campaign.plan import Campaign, CampaignCapture, captures
+from acquisition.capture.writer import NEW, PARTIAL, mark_not_taken, seal_whole
+from acquisition.commands.doctor import Finding
+from acquisition.errors import AcquisitionError
+from processing.errors import ProcessError
+from processing.storage.capture import Capture, CaptureError
+from processing.yaml_file import load_yaml
+
+
+def verify(folder: Path) -> Iterator[Finding]:
+    """Read every frame of every capture in a folder, and name what is left over; changes nothing.
+
+    A finding is not well where something is damaged or contradicts the index, None where something is unfinished.
+    """
+    for path in sorted(folder.iterdir()):
+        if path.name.endswith(NEW):
+            yield Finding(path.name, None, "left by a program that was killed while it made a file; repair removes it")
+        elif path.name.endswith((".h5", PARTIAL)):
+            yield _capture(path)
+    if (folder / PLAN).exists():
+        yield from _index(folder)
+
+
+def _capture(path: Path) -> Finding:
+    try:
+        with Capture(path, verify=False) as capture:
+            damaged = capture.damaged_states()
+            done, planned, status = len(capture.done), capture.planned_states, capture.status
+            summed, runs = capture.checked or done == 0, len(capture.segments)
+    except CaptureError as error:
+        return Finding(path.name, False, str(error))
+    if damaged:
+        states = ", ".join(map(str, damaged))
+        return Finding(path.name, False, f"DAMAGED: state {states}; repair marks it as not taken, then --resume")
+    text = f"{done} of {planned} states, {status}"
+    text += f", {runs} runs" if runs > 1 else ""
+    text += "" if summed else "; without checksums, so a change on the disc would not show"
+    if path.name.endswith(PARTIAL):
+        text += "; repair seals it" if done == planned else "; go on with acquire --resume"
+    return Finding(path.name, True if status == "complete" and not path.name.endswith(PARTIAL) else None, text)
+
+
+def _planned(folder: Path) -> list[CampaignCapture]:
+    return list(captures(load_yaml(folder / PLAN, Campaign)))
+
+
+def _index(folder: Path) -> Iterator[Finding]:
+    try:
+        planned = _planned(folder)
+    except ProcessError as error:
+        yield Finding(PLAN, False, str(error))
+        return
+    index = read_index(folder)
+    names = {capture.name for capture in planned}
+    wrong = []
+    for capture in planned:
+        path = folder / capture.name
+        told = index.get(capture.name, {})
+        try:
+            wrong += [capture.name] if path.exists() and entry_of(capture, path) != told else []
+        except CaptureError:
+            # Named above.
+            continue
+        if told.get("status") == "complete" and not path.exists():
+            yield Finding(capture.name, False, f"{INDEX} has it as complete, but the file is not there")
+    for path in sorted(folder.glob("*.h5*")):
+        if path.name.removesuffix(NEW).removesuffix(PARTIAL) not in names:
+            yield Finding(path.name, None, "is no capture of this campaign")
+    yield Finding(INDEX, not wrong, "as the files are" if not wrong else f"differs for {', '.join(wrong)}; repair")
+
+
+def repair(folder: Path) -> Iterator[Finding]:
+    """Finish what was left half done: seal whole captures, remove strays, make the index of a campaign from its files.
+
+    No state is removed. A damaged one is marked as not taken, and its capture is partial again; a file that is no
+    capture any more is named and left as it is.
+
+    Raises
+    ------
+    AcquisitionError
+        Another program runs the campaign in the folder.
+    """
+    campaign = load_yaml(folder / PLAN, Campaign) if (folder / PLAN).exists() else None
+    held = CampaignFolder(folder, campaign) if campaign is not None else None
+    try:
+        for path in sorted(folder.iterdir()):
+            if path.name.endswith(NEW):
+                path.unlink()
+                yield Finding(path.name, True, "removed")
+            elif path.name.endswith((".h5", PARTIAL)):
+                yield _mended(path)
+        if held is not None:
+            yield from _rebuilt(held)
+    finally:
+        if held is not None:
+            held.close()
+
+
+def _mended(path: Path) -> Finding:
+    try:
+        with Capture(path, verify=False) as capture:
+            damaged, summed = capture.damaged_states(), capture.checked
+        if damaged:
+            partial = mark_not_taken(path, damaged)
+            return Finding(path.name, None, f"state {', '.join(map(str, damaged))} marked as not taken; {partial.name}")
+        if not path.name.endswith(PARTIAL):
+            return Finding(path.name, True, "whole" if summed else "whole, as far as a file without checksums tells")
+        final = seal_whole(path)
+    except (CaptureError, AcquisitionError) as error:
+        return Finding(path.name, False, str(error))
+    if final is None:
+        return Finding(path.name, None, "states are missing; go on with acquire --resume")
+    return Finding(path.name, True, f"sealed as {final.name}")
+
+
+def _rebuilt(held: CampaignFolder) -> Iterator[Finding]:
+    for capture in _planned(held.folder):
+        path = held.folder / capture.name
+        try:
+            if path.exists():
+                held.record(capture.name, **entry_of(capture, path))
+            elif held.index.get(capture.name, {}).get("status") == "complete":
+                held.record(capture.name, status="missing", error="the file is not there")
+        except CaptureError as error:
+            held.record(capture.name, status="damaged", error=str(error))
+            yield Finding(path.name, False, str(error))
+    held.log("index made from the files")
+    yield Finding(INDEX, True, f"made from the files: {len(held.index)} captures")
