@@ -121,7 +121,7 @@ def test_port_held_by_another_program_names_it(refused, small_rig):
     master, slave = pty.openpty()
     path = os.ttyname(slave)
     holder = subprocess.Popen(
-        [sys.executable, "-c", f"import time; f=open({path!r}); print('x', flush=True); time.sleep(60)"],
+        [sys.executable, "-c", f"import time; f=open({path!r}); print('x', flush=True); time.sleep(3600)"],
         stdout=subprocess.PIPE,
     )
     try:

@@ -37,11 +37,9 @@ def _program(*arguments):
         process.communicate()
 
 
-def _wait_until(what, process, seconds=60.0):
-    end_s = time.monotonic() + seconds
+def _wait_until(what, process):
     while not what():
         assert process.poll() is None, process.communicate()
-        assert time.monotonic() < end_s
         time.sleep(0.02)
 
 
@@ -62,7 +60,7 @@ def test_a_running_capture_is_stopped_and_kept(acquire, served, tmp_path):
         for axis in ("psg", "psa", "arm"):
             assert f"{axis}: stop sent, at rest at " in out
         assert not _moving(simulation)
-        assert running.wait(20) == 130
+        assert running.wait() == 130
     partial = next((tmp_path / "captures").glob("*.partial"))
     with Capture(partial) as capture:
         assert capture.status == "aborted"
@@ -72,7 +70,7 @@ def test_a_running_capture_is_stopped_and_kept(acquire, served, tmp_path):
 def test_another_program_is_named_and_left_alone(acquire, served):
     _, rig = served
     port = load_rig(rig).axes["psg"].port
-    with _program("-c", f"import time; f = open('{port}', 'rb'); print('open', flush=True); time.sleep(60)") as other:
+    with _program("-c", f"import time; f = open('{port}', 'rb'); print('open', flush=True); time.sleep(3600)") as other:
         assert other.stdout.readline() == "open\n"
         code, out, _ = acquire("stop", "--rig", rig)
         assert code == 1
@@ -96,8 +94,9 @@ def test_a_move_that_nobody_waits_for_is_stopped_where_it_can_be(acquire, small_
         "mount": {"kind": "elliptec", "axes": 1, "speed_deg_s": 100, "homed": True},
         "shutter": {"kind": "sc10"},
     }
+    without_arm = {"park_deg": {}, "backlash_deg": {}, "homing": {}, "home_order": [], "forbidden": [], "solids": None}
     behind = small_rig(
-        "behind.yaml", {"axes": {"psg": zaber, "psa": elliptec | {"assume_homed": True}}, "park_deg": {}},
+        "behind.yaml", {"axes": {"psg": zaber, "psa": elliptec | {"assume_homed": True}}} | without_arm,
         clock_speed=1, ports=ports, axes={"psg": {"port": "rotators"}, "psa": {"port": "mount"}},
     )  # fmt: skip
     with serve(behind, tmp_path / "served.yaml", "red_sphere") as simulation:
@@ -152,6 +151,6 @@ def test_ctrl_c_stops_a_move(served):
         axis = simulation.emulators["rotators"].axes[0]
         _wait_until(lambda: axis.homed and axis.is_moving(), running)
         os.kill(running.pid, signal.SIGINT)
-        assert running.wait(10) == 130
+        assert running.wait() == 130
         assert not axis.is_moving()
         assert axis.position_deg() < FAR_DEG / 2

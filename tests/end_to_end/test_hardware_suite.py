@@ -20,6 +20,5 @@ def test_hardware_suite_passes_on_a_served_rig(small_rig, acquire, tmp_path):
             cwd=ROOT,
             capture_output=True,
             text=True,
-            timeout=100,
         )
     assert "4 passed" in run.stdout, run.stdout + run.stderr

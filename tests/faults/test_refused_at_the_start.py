@@ -21,7 +21,7 @@ def test_disc_too_small_is_refused_before_any_motion(spawn, quick_rig, tmp_path)
         resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
 
     child = spawn("--omega", 35, "--rig", rig, "--out", tmp_path / "out", preexec_fn=starve)
-    out, err = child.communicate(timeout=60)
+    out, err = child.communicate()
     assert child.returncode == 1, out + err
     needed = bytes_needed(44, 1, (64, 80))
     assert f"needs {needed:,} bytes" in err
@@ -35,12 +35,12 @@ def test_second_program_is_refused_with_the_name_of_the_first(spawn, partial_of,
         first = spawn("--omega", 35, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "first")
         partial_of(tmp_path / "first", first, states=2)
         second = spawn("--omega", 35, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "second")
-        _, err = second.communicate(timeout=60)
+        _, err = second.communicate()
         assert second.returncode == 1
         assert f"pid {first.pid}" in err
         assert not list((tmp_path / "second").glob("*"))
         # The first one has not noticed.
-        _, err = first.communicate(timeout=60)
+        _, err = first.communicate()
         assert first.returncode == 0, err
 
 
@@ -57,7 +57,7 @@ def test_a_rig_served_by_the_command_line_takes_a_capture(quick_rig, acquire, in
         assert intact(next((tmp_path / "out").glob("*.h5"))) == 44
     finally:
         server.terminate()
-        server.communicate(timeout=20)
+        server.communicate()
 
 
 def test_a_capture_that_is_being_written_cannot_be_resumed(spawn, partial_of, quick_rig, acquire, tmp_path):

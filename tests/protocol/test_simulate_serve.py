@@ -33,7 +33,7 @@ def test_first_line_is_the_port_and_sigterm_ends_it() -> None:
                 # A full turn takes 1 to 2 seconds.
                 assert 1.0 <= axis.move_time_s(360.0) <= 2.0
             process.send_signal(signal.SIGTERM)
-        assert {kind: process.wait(5) for kind, process in served.items()} == dict.fromkeys(KINDS, 0)
+        assert {kind: process.wait() for kind, process in served.items()} == dict.fromkeys(KINDS, 0)
 
 
 def test_options_reach_the_emulator() -> None:
@@ -48,7 +48,7 @@ def test_options_reach_the_emulator() -> None:
             assert axis.describe().model.startswith("CONEX-CC")
             assert not axis.is_homed()
         process.terminate()
-        assert process.wait(5) == 0
+        assert process.wait() == 0
 
 
 @pytest.mark.parametrize(
