@@ -109,7 +109,7 @@ def active(truth: RealBench, given: Iterable[str]) -> list[TrueFault]:
 
 def _cause(effect: Mapping[str, Any], faults: Sequence[TrueFault]) -> Cause:
     also = tuple(effect["indistinguishable_from"])
-    certainty = effect.get("certainty") or _word(bool(effect["confident"]), bool(also))
+    certainty = _certainty(effect)
     probability = effect.get("probability")
     capture = effect.get("capture")
     name = f"{effect['kind']}[{effect['element'] or ''}]"
@@ -123,10 +123,13 @@ def _cause(effect: Mapping[str, Any], faults: Sequence[TrueFault]) -> Cause:
     )
 
 
-def _word(confident: bool, has_set: bool) -> str:
-    if not confident:
+def _certainty(effect: Mapping[str, Any]) -> str:
+    """A word of `WORDS`: the answer of the result; of a result without one, that its `confident` stands for."""
+    if effect.get("answer"):
+        return str(effect["answer"]).replace(" ", "_")
+    if not effect["confident"]:
         return "unknown"
-    return "one_of" if has_set else "sure"
+    return "one_of" if effect["indistinguishable_from"] else "sure"
 
 
 def _is_true(text: str, capture: str | None, faults: Sequence[TrueFault]) -> bool:
@@ -153,8 +156,7 @@ def told_of(result: Result, truth: RealBench, given: Sequence[str]) -> tuple[Mat
         size = max((v for c, v in fault.matters.items() if c in (*given, VALIDATION)), default=0.0)
         told = "missed"
         for effect in result["effects"]:
-            certainty = effect.get("certainty") or _word(bool(effect["confident"]), False)
-            if certainty == "unknown":
+            if _certainty(effect) == "unknown":
                 continue
             if _names(f"{effect['kind']}[{effect['element'] or ''}]", effect.get("capture"), fault):
                 told = "named"

@@ -19,7 +19,7 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import PRIOR_WIDTH, minimize
 from processing.diagnosis.search.space import Space
-from processing.instrument.effects.base import OfOneCapture, ValuePerState
+from processing.instrument.effects.base import ValuePerState
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
 from processing.storage.capture import Capture
 from simulators.blind.bench_judge import GIVEN, active
@@ -82,6 +82,6 @@ def _applied(candidate: Candidate, values: Array, names: tuple[str, ...], wavele
         element=candidate.place or None,
         parameters=parameters,
         captures=names if candidate.capture is None else (names[candidate.capture],),
-        scope="capture" if isinstance(candidate.effect, OfOneCapture) else "instrument",
+        scope="instrument" if candidate.capture is None else "capture",
         wavelength_nm=wavelength_nm,
     )

@@ -64,11 +64,8 @@ def _diagnosed(captures: Sequence[Path], declared: InstrumentModel) -> tuple[dic
     except Exception as error:  # noqa: BLE001 - a crash is a wrong answer of this bench, not the end of the suite
         return {"verdict": f"crashed: {type(error).__name__}: {error}", "effects": []}, declared
     diagnosis = judged.diagnosis
-    if not diagnosis.effects and not diagnosis.calibrated:
-        corrected = declared
-    else:
-        corrected = extended(declared, diagnosis)
-    return json.loads(diagnosis.model_dump_json()), corrected
+    nothing = not diagnosis.applied() and not diagnosis.calibrated
+    return json.loads(diagnosis.model_dump_json()), declared if nothing else extended(declared, diagnosis)
 
 
 def _truth(away: Path, capture: str) -> Any:

@@ -12,7 +12,8 @@ import pytest
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
 from simulators.blind.bench_judge import Judgement, names_of, told_of
 from simulators.blind.bench_oracle import known_oracle
-from simulators.blind.bench_table import is_worse, reliability, table
+from simulators.blind.bench_run import judge_bench
+from simulators.blind.bench_table import is_worse, reliability, sure_and_wrong, table
 from simulators.blind.mueller_error import Reduced
 from simulators.blind.real_bench import GROUPS, INSTRUMENTS, STATES, RealBench, TrueFault, make_bench, read_truth
 from simulators.blind.suite import declared_bench, state_angles
@@ -121,6 +122,16 @@ def test_fit_of_the_truth_is_far_better_than_the_declared_instrument(bench, conf
     assert known_oracle(folder, truth, configs, "joint") == reached
 
 
+@pytest.mark.parametrize(("group", "seed", "given"), [("none", 1, "joint"), ("real", 5, "sphere"), ("real", 7, "air")])
+def test_answer_to_a_small_bench_harms_nothing(group, seed, given, configs, tmp_path):
+    judgement, result = judge_bench(tmp_path, make_bench(tmp_path, seed, configs, group, pixels=SMALL), configs, given)
+    assert not sure_and_wrong(judgement)
+    assert not is_worse(judgement.declared, judgement.corrected)
+    assert not any(is_worse(*pair) for pair in judgement.own.values())
+    if group == "none":
+        assert result["verdict"] == "consistent"
+
+
 def truth_of(*faults):
     return RealBench("real_0000", "real", 0, "rgb950.yaml", 662.0, faults)
 
@@ -144,7 +155,7 @@ def test_a_name_is_right_at_its_place_and_in_its_capture():
         "effects": [
             effect("rotation_slip", "psa@11", "air (air.h5)"),
             effect("rotation_slip", "psa@11", "flat (flat.h5)"),
-            effect("rotation_slip", "psg@11", "air (air.h5)", certainty="likely", probability=0.93),
+            effect("rotation_slip", "psg@11", "air (air.h5)", answer="likely", probability=0.93),
             effect("stray_light", also=("psg_extinction[psg_polarizer]",)),
             effect("source_drift", confident=False),
         ]
