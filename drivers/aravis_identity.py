@@ -35,5 +35,6 @@ def identify(
             bits=bits,
             shift=config.shift,
             polarized=fmt.polarized,
+            colour=fmt.colour,
             library=f"Aravis {aravis._version}",
         )

@@ -103,7 +103,8 @@ class StreamStatistics:
 class CameraIdentity:
     """Which camera answered, over which interface, and how its pixels are laid out.
 
-    `pixel_format_code` is the code as the camera sends it; `shift` is how many empty low bits were removed.
+    `pixel_format_code` is the code as the camera sends it; `shift` is how many empty low bits were removed; `colour` is
+    True for the raw mosaic of a colour filter.
     """
 
     kind: str
@@ -122,6 +123,7 @@ class CameraIdentity:
     bits: int
     shift: int
     polarized: bool
+    colour: bool
     library: str
 
 

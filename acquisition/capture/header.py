@@ -7,6 +7,7 @@ import json
 import platform
 import re
 
+from acquisition.capture.mosaic_phase import colours_of
 from acquisition.capture.plan import MeasurementPlan
 from acquisition.rig.config import RigConfig
 from acquisition.rig.rig import Rig
@@ -40,6 +41,8 @@ def capture_header(
         versions=versions(),
         seed=seed,
         folded_deg=dict(config.fold_deg),
+        camera_nodes=camera.node_map(),
+        colours=colours_of(instrument, camera),
     )
 
 

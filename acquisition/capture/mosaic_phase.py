@@ -30,6 +30,24 @@ def seen_by_camera(instrument: InstrumentModel, camera: Camera) -> InstrumentMod
     return instrument.model_copy(update={"mosaic": mosaic})
 
 
+def colours_of(instrument: InstrumentModel, camera: Camera) -> tuple[tuple[str, ...], ...] | None:
+    """Colour before each pixel of the camera's frames; None without a colour filter.
+
+    On a polarization sensor each colour covers a whole super-pixel.
+    """
+    who, settings = camera.describe(), camera.settings
+    if not who.colour:
+        return None
+    each = 1 if instrument.mosaic is None else 2
+    rows, columns = 2 * each, 2 * each
+    top, left = settings.offset_y or 0, settings.offset_x or 0
+    sensor = (("red", "green"), ("green", "blue"))
+    return tuple(
+        tuple(sensor[(top + r) % rows // each][(left + c) % columns // each] for c in range(columns))
+        for r in range(rows)
+    )
+
+
 def _unknown(settings: CameraSettings, bins_like_with_like: bool) -> str | None:
     if settings.offset_x is None or settings.offset_y is None:
         return "the camera does not tell where its region begins, so which analyzer a pixel has is not known"

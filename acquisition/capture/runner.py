@@ -52,6 +52,7 @@ class _Exposed:
     positions: dict[str, Position]
     retake: int
     exposure_s: float
+    temperature_c: float
 
 
 @dataclass
@@ -235,11 +236,13 @@ class CaptureRunner:
         positions = moved | still
         self._require_on_target(state, targets, positions)
         # Looked at after the exposure: it also tells of an interlock that was open before it.
+        temperature_c = camera.temperature_c()
+        temperature = float("nan") if temperature_c is None else temperature_c
         blocked = self.interlocks.open_now()
         if blocked is not None:
             self._discard(state, f"{blocked} in state {state}")
             return None
-        return _Exposed(state, exposure, {axis: positions[axis] for axis in targets}, retake, exposure_s)
+        return _Exposed(state, exposure, {axis: positions[axis] for axis in targets}, retake, exposure_s, temperature)
 
     def _collect(self, exposed: _Exposed) -> None:
         with self.ledger.time("transfer"):
@@ -269,6 +272,7 @@ class CaptureRunner:
             "saturated_fraction": report.saturated_fraction,
             "near_black_fraction": report.near_black_fraction,
             "monitor": report.monitor,
+            "camera_temperature_c": exposed.temperature_c,
         }
         with self.ledger.time("writing"):
             self.writer.put(StateRecord(exposed.state, frame.pixels, exposed.positions, columns))

@@ -1,4 +1,4 @@
-"""`process import`: data measured elsewhere become a capture."""
+"""`process import` and `process colours`: captures made of data measured elsewhere, or of another capture."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import typer
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
     app.command("import")(import_command)
+    app.command("colours")(colours_command)
 
 
 def import_command(
@@ -66,3 +67,14 @@ def import_command(
     with progress_bar("importing", "states") as tick:
         header = import_capture(request, tick)
     typer.echo(f"{request.out}: {header.title}, {header.wavelength_nm:g} nm, sample {header.sample.kind}")
+
+
+def colours_command(
+    capture: Annotated[Path, typer.Argument(help="Capture of a sensor with a colour filter.")],
+    out: Annotated[Path | None, typer.Option(help="Folder for the captures; default: that of the capture.")] = None,
+) -> None:
+    """Split a capture of a colour sensor into one for each colour: red, green_a, green_b, blue."""
+    from processing.storage.colour_split import split_colours
+
+    for path in split_colours(capture, out or capture.parent):
+        typer.echo(path)

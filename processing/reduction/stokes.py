@@ -107,6 +107,11 @@ def reduce_stokes(
     mosaic = capture.header.mosaic or model.mosaic
     if mosaic is None:
         raise CaptureError(f"{capture.path} is not a mosaic capture; it reduces to a Mueller image.")
+    if capture.header.colours is not None:
+        raise CaptureError(
+            f"{capture.path} is of a colour sensor: each colour is a mosaic of its own. "
+            "Split it with `process colours`."
+        )
     layout = MosaicLayout.of(mosaic, [c.name for c in model.channels])
     states = sample_states(capture)
     changes = capture_changes(capture, model, states)

@@ -137,6 +137,19 @@ class Capture:
         """A column of the state table (exposure_s, host_time_s, ...) for the states done."""
         return np.asarray(self._h5[f"entry/states/{name}"][...][self.done])
 
+    @property
+    def start_time(self) -> str:
+        """When the capture began, ISO 8601."""
+        return str(self._h5["entry/start_time"].asstr()[()])
+
+    @property
+    def camera_nodes(self) -> dict[str, str]:
+        """Every feature of the camera with its value when the capture began; empty where none were kept."""
+        if "entry/camera_nodes" not in self._h5:
+            return {}
+        nodes: dict[str, str] = json.loads(self._h5["entry/camera_nodes/data"][()])
+        return nodes
+
     def planned_column(self, name: str) -> NDArray[Any]:
         """A column of the state table for all planned states, done or not."""
         return np.asarray(self._h5[f"entry/states/{name}"][...])

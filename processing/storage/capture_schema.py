@@ -40,6 +40,7 @@ STATE_COLUMNS: dict[str, Any] = {
     "saturated_fraction": np.float64,
     "near_black_fraction": np.float64,
     "monitor": np.float64,
+    "camera_temperature_c": np.float64,
 }
 #: What a column holds before its state is taken, where it is not NaN or zero.
 EMPTY: dict[str, int] = {"repeats": 1, "crc32": -1}
@@ -96,6 +97,10 @@ class CaptureHeader(_Part):
     seed: int | None = None
     #: Axes whose targets were moved into their travel by whole multiples of so many degrees.
     folded_deg: dict[str, float] = {}
+    #: Every feature of the camera with its value when the capture began; in a note of its own, not in header_json.
+    camera_nodes: dict[str, str] = Field(default={}, exclude=True)
+    #: Colour before each pixel from the first of the frames on, for a sensor with a colour filter.
+    colours: tuple[tuple[str, ...], ...] | None = None
 
 
 def create_layout(
@@ -160,13 +165,14 @@ def create_layout(
         empty = np.nan if np.issubdtype(kind, np.floating) else EMPTY.get(name, 0)
         _column(states, name, n, kind, empty)
 
-    for name, text in (
-        ("plan", header.plan_yaml),
-        ("rig", header.rig_yaml),
-        ("instrument_model", header.instrument_yaml),
+    for name, kind, text in (
+        ("plan", "yaml", header.plan_yaml),
+        ("rig", "yaml", header.rig_yaml),
+        ("instrument_model", "yaml", header.instrument_yaml),
+        ("camera_nodes", "json", json.dumps(header.camera_nodes)),
     ):
         note = _group(entry, name, "NXnote")
-        note["type"] = "application/yaml"
+        note["type"] = f"application/{kind}"
         note["data"] = text
     data = _group(entry, "data", "NXdata")
     data.attrs["signal"] = "data"

@@ -56,6 +56,9 @@ class SimulatorConfig(_Part):
     flux_e_per_s: float = Field(gt=0, description="electrons a second where a . M . g is 1")
     dark_current_e_per_s: float = Field(default=DARK_CURRENT_E_PER_S, ge=0)
     effects: tuple[AnyBenchEffect, ...] = ()
+    camera: str = Field(
+        default="loopback", description="feature table of a maker's camera, simulators/camera/node_maps"
+    )
     camera_address: str = Field(default="127.0.0.1", description="loopback address that the camera occupies")
     camera_wait_s: float = Field(default=10.0, ge=0, description="wait for that address while another run has it")
     packet_loss: float = Field(default=0.0, ge=0, lt=1)

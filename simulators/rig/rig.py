@@ -106,6 +106,7 @@ class SimulatedRig:
             bits=config.detector.bits or 12,
             lost_ratio=config.packet_loss,
             address=config.camera_address,
+            description=config.camera,
             wait_s=config.camera_wait_s,
             clock=self.clock.base,
         )

@@ -37,6 +37,21 @@ def short_plan(tmp_path: Path) -> Callable[[str], Path]:
     return make
 
 
+def run_process(*arguments: object) -> None:
+    with pytest.raises(SystemExit) as end:
+        process([str(argument) for argument in arguments])
+    assert not end.value.code
+
+
+def assert_horizontal(path: Path) -> None:
+    """Reduce a capture of horizontal light and look at what comes out."""
+    out = path.with_suffix(".stokes.h5")
+    run_process("reduce", path, "--out", out)
+    s0, s1, s2 = StokesImage.load(out).values[:, 4:-4, 4:-4]
+    assert np.median(np.hypot(s1, s2) / s0) == pytest.approx(1.0, abs=0.02)
+    assert np.max(np.abs(np.rad2deg(np.arctan2(s2, s1)) / 2)) < 3.0
+
+
 @pytest.mark.parametrize(("offset_x", "offset_y"), [(0, 0), (1, 0), (0, 1), (1, 1)])
 def test_horizontal_light_reads_zero_degrees_wherever_the_region_begins(
     acquire: Acquire,
@@ -57,13 +72,7 @@ def test_horizontal_light_reads_zero_degrees_wherever_the_region_begins(
         assert capture.header.mosaic == tuple(map(tuple, rolled))
         assert capture.instrument is not None
         assert capture.instrument.mosaic == capture.header.mosaic
-    with pytest.raises(SystemExit) as end:
-        process(["reduce", str(path), "--out", str(tmp_path / "stokes.h5")])
-    assert not end.value.code
-    s0, s1, s2 = StokesImage.load(tmp_path / "stokes.h5").values[:, 4:-4, 4:-4]
-    assert np.median(np.hypot(s1, s2) / s0) == pytest.approx(1.0, abs=0.02)
-    aolp_deg = np.rad2deg(np.arctan2(s2, s1)) / 2
-    assert np.max(np.abs(aolp_deg)) < 3.0
+    assert_horizontal(path)
 
 
 @pytest.mark.parametrize(
@@ -160,3 +169,38 @@ def test_a_rotator_of_limited_travel_takes_the_same_states_half_a_turn_away(
         assert capture.header.folded_deg == {"psa": 180}
         np.testing.assert_allclose((targets["psa"] - 4.91 * targets["psg"] + 90) % 180, 90, atol=1e-6)
         assert np.all(np.abs(capture.angles_deg["psa"]) <= 95)
+
+
+def test_a_maker_s_polarization_camera_takes_a_capture_with_its_node_map(
+    acquire: Acquire, small_rig: Rig, short_plan: Callable[[str], Path], tmp_path: Path
+) -> None:
+    settings = {"pixel_format": "PolarizeMono12p", "width": 40, "height": 32, "offset_x": 4}
+    camera = CAMERA | {"settings": settings, "features": {"PtpEnable": True}}
+    rig = small_rig(top={"camera": camera}, camera="lucid_tri050s_p")
+    out = tmp_path / "captures"
+    code, _, err = acquire("--rig", rig, "--plan", short_plan("stokes"), *THROUGH, "--out", out)
+    assert code == 0, err
+    (path,) = out.glob("*.h5")
+    with Capture(path) as capture:
+        assert capture.camera_nodes["PtpEnable"] == "true"
+        assert capture.camera_nodes["PtpStatus"] == "Disabled"
+        assert capture.camera_nodes["DeviceModelName"] == "TRI050S-P"
+        assert capture.column("camera_temperature_c").tolist() == [38.5, 38.5]
+    assert_horizontal(path)
+
+
+def test_a_colour_polarization_camera_is_reduced_colour_by_colour(
+    acquire: Acquire, small_rig: Rig, short_plan: Callable[[str], Path], tmp_path: Path
+) -> None:
+    camera = CAMERA | {"settings": {"pixel_format": "BayerRG12p", "width": 64, "height": 56, "offset_x": 4}}
+    rig = small_rig(top={"camera": camera}, camera="lucid_tri050s_q")
+    out = tmp_path / "captures"
+    code, _, err = acquire("--rig", rig, "--plan", short_plan("stokes"), *THROUGH, "--out", out)
+    assert code == 0, err
+    (path,) = out.glob("*.h5")
+    with pytest.raises(SystemExit) as end:
+        process(["reduce", str(path)])
+    assert end.value.code
+    run_process("colours", path, "--out", tmp_path / "colours")
+    for part in ("red", "green_b"):
+        assert_horizontal(tmp_path / "colours" / f"{path.stem}.{part}.h5")

@@ -1,0 +1,104 @@
+"""A capture of a sensor with a colour filter, split into one capture for each colour.
+
+On a colour polarization sensor (Sony IMX250MYR) each colour of the Bayer pattern covers a whole super-pixel of four
+polarizers, so the pixels of one colour are a plain polarization mosaic of half the rows and columns. Nothing is
+interpolated between colours: light of one wavelength reaches the colours in very different strength.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from processing.errors import ProcessError
+from processing.instrument.model import InstrumentModel
+from processing.storage.capture import Capture
+from processing.storage.capture_schema import STATE_COLUMNS, create_layout, write_closing
+from processing.yaml_file import dump_yaml, parse_yaml
+
+Colours = tuple[tuple[str, ...], ...]
+
+
+def split_colours(path: Path, folder: Path) -> list[Path]:
+    """Write a capture for each colour, the two greens apart; returns their paths.
+
+    Raises
+    ------
+    ProcessError : the capture has no colour filter, the frames are too small, or a file exists already.
+    """
+    with Capture(path) as capture:
+        colours = capture.header.colours
+        if colours is None:
+            raise ProcessError(f"{path} has no colour filter; reduce it as it is.")
+        cell = len(colours) // 2
+        parts = _parts(colours, cell, capture.frame_shape)
+        out = {name: folder / f"{path.stem}.{name}.h5" for name in parts}
+        there = [str(file) for file in out.values() if file.exists()]
+        if there:
+            raise ProcessError(f"{', '.join(there)} exists. Give another --out.")
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, (rows, columns) in parts.items():
+            _write(capture, name, out[name], rows, columns)
+    return list(out.values())
+
+
+def _parts(colours: Colours, cell: int, shape: tuple[int, int]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Row and column indices of each part, from the first whole cell of the pattern on."""
+    period = 2 * cell
+    top = _start(["".join(row) for row in colours], cell)
+    left = _start(["".join(column) for column in zip(*colours, strict=True)], cell)
+    height, width = (shape[0] - top) // period, (shape[1] - left) // period
+    if min(height, width) < 2:
+        raise ProcessError(f"frames of {shape} hold less than 2 x 2 colour cells of {period} pixels.")
+    greens = iter(("green_a", "green_b"))
+    parts = {}
+    for r in (0, 1):
+        for c in (0, 1):
+            row, column = top + r * cell, left + c * cell
+            name = colours[row % period][column % period]
+            rows = (row + period * np.arange(height)[:, None] + np.arange(cell)).ravel()
+            columns = (column + period * np.arange(width)[:, None] + np.arange(cell)).ravel()
+            parts[next(greens) if name == "green" else name] = (rows, columns)
+    return parts
+
+
+def _start(lines: Sequence[str], cell: int) -> int:
+    """Lines to leave out until a cell begins: a frame may begin in the middle of one."""
+    return next((k for k in range(1, cell) if lines[k] != lines[k - 1]), 0)
+
+
+def _write(capture: Capture, name: str, out: Path, rows: np.ndarray, columns: np.ndarray) -> None:
+    header, done = capture.header, capture.done
+    mosaic = header.mosaic
+    if mosaic is not None:
+        mosaic = tuple(tuple(mosaic[r % len(mosaic)][c % len(mosaic[0])] for c in columns[:2]) for r in rows[:2])
+    text = header.instrument_yaml
+    if text:
+        model = parse_yaml(text, InstrumentModel, source=f"{capture.path}: instrument model")
+        text = dump_yaml(model.model_copy(update={"mosaic": mosaic}))
+    part = header.model_copy(
+        update={
+            "instrument_yaml": text,
+            "title": f"{header.title}, {name}",
+            "colours": None,
+            "mosaic": mosaic,
+            "versions": header.versions | {"umov": version("umov")},
+            "camera_nodes": capture.camera_nodes,
+        }
+    )
+    targets = {axis: angles[done] for axis, angles in capture.planned_targets_deg().items()}
+    role = tuple(capture.role)
+    with h5py.File(out, "w") as h5:
+        create_layout(h5, part, targets, role, (len(rows), len(columns)), capture.dtype, capture.start_time)
+        for state in range(len(done)):
+            h5["entry/instrument/detector/data"][state] = capture.frames(state)[:, rows][:, :, columns]
+        for axis, angles in capture.angles_deg.items():
+            h5[f"entry/instrument/{axis}/value"][...] = angles
+        for column in STATE_COLUMNS.keys() - {"done", "crc32", "segment"}:
+            h5[f"entry/states/{column}"][...] = capture.column(column)
+        h5["entry/states/done"][...] = 1
+        write_closing(h5, "complete", {"colour": name, "of": str(capture.path)})
