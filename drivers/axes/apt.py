@@ -1,9 +1,9 @@
-"""Thorlabs APT controllers over their binary protocol: K10CR1, and KDC101 with a PRM1-Z8 stage.
+"""Thorlabs APT controllers over their binary protocol: K10CR1, KDC101 with PRM1-Z8, KBD101 with DDR25 or DDR100.
 
-Facts: public drivers (pylablib, qmi, thorlabs-apt-protocol, PnPQ) and their issues. A plain serial port is enough
-on Linux, no vendor's driver. States are read, the messages at the end of a motion are not relied on: they go
-missing on real units (PnPQ#104). Counts per degree and the units of speed and acceleration are those of qmi and
-pylablib.
+Facts: public drivers (pylablib, qmi, thorlabs-apt-protocol, PnPQ) and their issues. A plain serial port is enough on
+Linux, no vendor's driver. States are read, the messages at the end of a motion are not relied on: they go missing on
+real units (PnPQ#104). Counts per degree and the units of speed and acceleration are those of qmi and pylablib.
+Unverified on hardware: everything of the KBD101, whose messages are taken to be those of the KDC101.
 """
 
 from __future__ import annotations
@@ -43,13 +43,22 @@ PRM1_Z8 = Scale(1919.6418578623391, 1919.6418578623391 * 65536 * _KDC_CLOCK, 191
 K10CR1 = Scale(409600 / 3, 7329109.0, 1502.0)
 
 
+def _brushless(counts_per_turn: int) -> Scale:
+    """Scale of a direct-drive stage: encoder counts, and the 102.4 us in which a brushless controller samples."""
+    per_deg, sample_s = counts_per_turn / 360, 102.4e-6
+    return Scale(per_deg, per_deg * 65536 * sample_s, per_deg * 65536 * sample_s**2)
+
+
+STAGES = {"K10CR1": K10CR1, "PRM1-Z8": PRM1_Z8, "DDR25": _brushless(1_440_000), "DDR100": _brushless(3_276_800)}
+
+
 class Config(AxisConfig):
     """An APT axis in a rig file. Every unit has its own USB port; `serial_number` makes sure it is the right one."""
 
     kind: Literal["apt"] = "apt"
     serial_number: int | None = None
-    stage: Literal["K10CR1", "PRM1-Z8"] | None = Field(
-        default=None, description="scale to use for a controller or a stage that is not known here"
+    stage: Literal["K10CR1", "PRM1-Z8", "DDR25", "DDR100"] | None = Field(
+        default=None, description="scale of the stage, where the controller does not tell it (KBD101) or is not known"
     )
     home_speed_deg_s: float | None = Field(
         default=None, gt=0, description="sets the homing speed, which a unit forgets at power-off"
@@ -146,7 +155,7 @@ class APTAxis(MotionAxis):
 
     def _find_scale(self, model: str, stage: int) -> Scale:
         if self.config.stage is not None:
-            return PRM1_Z8 if self.config.stage == "PRM1-Z8" else K10CR1
+            return STAGES[self.config.stage]
         if model.startswith("K10CR"):
             if model != "K10CR1":
                 self._unknown = f"model {model} is not known here, treated as K10CR1"
@@ -156,7 +165,7 @@ class APTAxis(MotionAxis):
         raise WrongDevice(
             f"axis {self.name}, find the counts per degree",
             f"controller {model} with stage id {stage} is not known",
-            "If it is compatible, set `stage: K10CR1` or `stage: PRM1-Z8` in the rig file",
+            f"Set `stage` in the rig file to one that counts alike: {', '.join(STAGES)}",
         )
 
     def describe(self) -> AxisIdentity:

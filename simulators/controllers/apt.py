@@ -1,9 +1,10 @@
-"""Thorlabs APT units with a rotation stage: K10CR1, and KDC101 with PRM1-Z8; binary, with unsolicited messages."""
+"""Thorlabs APT units with a rotation stage: K10CR1, KDC101, KBD101; binary, with unsolicited messages."""
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from typing import Literal
 
 from drivers.axes.apt import Config
 from simulators.clock import Clock
@@ -28,7 +29,8 @@ class APTModel:
         self.serial_number = serial_number
         self.per_deg, self.per_deg_s, self.per_deg_s2 = scale
         self.stage_id = stage_id
-        self.is_dc = name.startswith("KDC")
+        # Brushed and brushless servos send the same status.
+        self.is_dc = name.startswith(("KDC", "KBD"))
 
 
 def k10cr1() -> APTModel:
@@ -40,6 +42,12 @@ def kdc101() -> APTModel:
     """DC servo controller with a PRM1-Z8 stage."""
     per_deg, tick_s = 1919.6418578623391, 2048 / 6e6
     return APTModel("KDC101", 44, 27000001, (per_deg, per_deg * 65536 * tick_s, per_deg * 65536 * tick_s**2), 6)
+
+
+def kbd101() -> APTModel:
+    """Brushless servo controller with a DDR25 stage, which it does not name."""
+    per_deg, sample_s = 1_440_000 / 360, 102.4e-6
+    return APTModel("KBD101", 45, 28000001, (per_deg, per_deg * 65536 * sample_s, per_deg * 65536 * sample_s**2), 0)
 
 
 class APTEmulator(Emulator):
@@ -274,9 +282,15 @@ def make_kdc101(options: ServeOptions) -> APTEmulator:
     return _make(options, kdc101(), 12.0)
 
 
+def make_kbd101(options: ServeOptions) -> APTEmulator:
+    """A KBD101 with a DDR25, serial number starting with 28."""
+    return _make(options, kbd101(), 57.0)
+
+
 def axis_configs(emulator: APTEmulator, port: str) -> list[Config]:
     """Rig entry for the unit."""
-    return [Config(port=port, serial_number=emulator.model.serial_number)]
+    stage: Literal["DDR25"] | None = "DDR25" if emulator.model.name == "KBD101" else None
+    return [Config(port=port, serial_number=emulator.model.serial_number, stage=stage)]
 
 
-SERVES = {"apt-k10cr1": make_k10cr1, "apt-kdc101": make_kdc101}
+SERVES = {"apt-k10cr1": make_k10cr1, "apt-kdc101": make_kdc101, "apt-kbd101": make_kbd101}

@@ -39,7 +39,7 @@ from simulators.serial.serve_options import ServeOptions
 MOTION_KINDS = [kind for kind, make in served_kinds().items() if axis_configs(make(ServeOptions()), "none")]
 SHARED_LINES = [kind for kind in MOTION_KINDS if not kind.startswith("apt")]
 # These controllers do not tell limits of their own: only the rig file's hold.
-KEEPS_NO_LIMITS = {"elliptec", "apt-k10cr1", "apt-kdc101"}
+KEEPS_NO_LIMITS = {"elliptec", "apt-k10cr1", "apt-kdc101", "apt-kbd101"}
 WIDE = (-1000.0, 1000.0)
 FAST = 200.0
 

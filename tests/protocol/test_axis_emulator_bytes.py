@@ -243,6 +243,7 @@ QUESTIONS = {
     "esp301": b"VE?\r",
     "apt-k10cr1": bytes.fromhex("110401005001"),
     "apt-kdc101": bytes.fromhex("900401005001"),
+    "apt-kbd101": bytes.fromhex("900401005001"),
 }
 
 

@@ -75,7 +75,9 @@ def test_pylablib_elliptec() -> None:
             motor.close()
 
 
-@pytest.mark.parametrize(("kind", "scale"), [("apt-k10cr1", "K10CR1"), ("apt-kdc101", "stage")])
+@pytest.mark.parametrize(
+    ("kind", "scale"), [("apt-k10cr1", "K10CR1"), ("apt-kdc101", "stage"), ("apt-kbd101", "DDR25")]
+)
 def test_pylablib_kinesis(kind: str, scale: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from pylablib.devices import Thorlabs
     from pylablib.devices.Thorlabs import kinesis
@@ -95,7 +97,10 @@ def test_pylablib_kinesis(kind: str, scale: str, monkeypatch: pytest.MonkeyPatch
             motor.wait_move()
             assert motor.get_position() == pytest.approx(-20, abs=0.01)
             assert emulator.true_deg(0) == pytest.approx(-20, abs=0.01)
-            assert motor.get_full_info()["device_info"].serial_no // 1_000_000 == (55 if scale == "K10CR1" else 27)
+            assert (
+                motor.get_full_info()["device_info"].serial_no // 1_000_000
+                == {"K10CR1": 55, "stage": 27, "DDR25": 28}[scale]
+            )
         finally:
             motor.close()
 
