@@ -10,6 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 
 from processing.errors import ProcessError
@@ -21,7 +22,7 @@ from processing.reports.tables import table_section
 from processing.reports.template import Figure, Section, render
 from processing.storage.capture import Capture, CaptureError
 from processing.storage.product import Product, is_product
-from processing.storage.provenance import Step, input_text, step_text
+from processing.storage.provenance import read_steps, steps_text
 
 #: File types that a report takes in.
 PICTURES = (".png", ".svg")
@@ -45,7 +46,7 @@ def collect(sources: Sequence[Path]) -> list[Path]:
             inside = [p for p in source.rglob("*") if p.suffix in SUFFIXES and p.is_file()]
             twins = [p for p in inside if p.suffix in PICTURES and p.with_suffix(".h5").is_file()]
             kept = set(inside) - set(twins)
-            files += sorted(kept, key=lambda p: (p.suffix == ".h5", p.stat().st_mtime, p.name))
+            files += sorted(kept, key=lambda p: (p.suffix == ".h5", _date(p), p.name))
         elif source.is_file():
             if source.suffix not in SUFFIXES:
                 raise ProcessError(f"{source}: a report takes {', '.join(SUFFIXES)} files.")
@@ -56,6 +57,17 @@ def collect(sources: Sequence[Path]) -> list[Path]:
         places = ", ".join(str(s) for s in sources)
         raise ProcessError(f"nothing to report in {places}: no {', '.join(SUFFIXES)} files.")
     return list(dict.fromkeys(files))
+
+
+def _date(path: Path) -> str:
+    # As the file itself says (ISO 8601), so that copies keep their order.
+    try:
+        with h5py.File(path, "r") as h5:
+            steps = read_steps(h5.get("entry", h5))
+            started = h5.get("entry/start_time")
+            return steps[-1].date if steps else "" if started is None else str(started.asstr()[()])
+    except OSError:
+        return ""
 
 
 def write_report(
@@ -193,14 +205,9 @@ def _product(path: Path) -> Section:
             figures.append(Figure(png(drawn), "residual of the fit"))
         datasets = [("dataset", "unit", "what it is")]
         datasets += [(name, product.units(name), product.long_name(name)) for name in product.names]
-        provenance = "\n".join(line for step in product.steps for line in _provenance(step))
         warnings = list(product.facts.get("warnings", []))
-        notes = [("provenance, oldest first", provenance)]
+        notes = [("provenance, oldest first", steps_text(product.steps))]
         return Section(path.name, summary, figures, [("datasets", datasets)], warnings, notes)
-
-
-def _provenance(step: Step) -> list[str]:
-    return [step_text(step), *(f"    from {input_text(i)}" for i in step.inputs)]
 
 
 def _curve(path: Path) -> Section:

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.reflectance.table_axes import SHAPE
-from processing.reflectance.tables import ScatteringTable
+from processing.reflectance.tables import ScatteringTable, table_steps
 from processing.reports.figure_style import map_figure, png
 from processing.reports.template import Figure, Section
+from processing.storage.provenance import steps_text
 
 
 def table_section(path: Path) -> Section:
@@ -32,8 +33,9 @@ def table_section(path: Path) -> Section:
             f"{np.median(known):.3g}" if known.size else "not known: no bin has two samples",
         ),
     ]
+    notes = [("provenance, oldest first", steps_text(table_steps(path)))] if table_steps(path) else []
     if not table.bins.size:
-        return Section(path.name, summary)
+        return Section(path.name, summary, notes=notes)
     mean, count = _over_phi(table)
     drawn = map_figure(
         [
@@ -43,7 +45,8 @@ def table_section(path: Path) -> Section:
         f"{path.name}: rows $\\theta_h$, columns $\\theta_d$, bins",
         table.simulated,
     )
-    return Section(path.name, summary, [Figure(png(drawn), f"{name} over theta_h (up) and theta_d (right)")])
+    figure = Figure(png(drawn), f"{name} over theta_h (up) and theta_d (right)")
+    return Section(path.name, summary, [figure], notes=notes)
 
 
 def _over_phi(table: ScatteringTable) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

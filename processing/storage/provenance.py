@@ -7,6 +7,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,18 @@ import numpy as np
 MADE_OF = "made_of"
 
 
+@cache
+def program() -> str:
+    """Name and version of this program, and the first digits of the SHA-256 of its code.
+
+    A checkout changes while its version stays, and what its numbers are made with changes with it.
+    """
+    code = hashlib.sha256()
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+        code.update(path.read_bytes())
+    return f"umov {version('umov')}, code {code.hexdigest()[:12]}"
+
+
 @dataclass(frozen=True)
 class Step:
     """One step: what runs, with which options, on which files (`file_identity`), by which program, when (ISO 8601)."""
@@ -25,7 +38,7 @@ class Step:
     name: str
     arguments: dict[str, Any]
     inputs: tuple[dict[str, Any], ...] = ()
-    program: str = field(default_factory=lambda: f"umov {version('umov')}")
+    program: str = field(default_factory=lambda: program())
     date: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
 
     @property
@@ -97,10 +110,14 @@ def read_steps(entry: h5py.Group) -> tuple[Step, ...]:
     )
 
 
-def step_text(step: Step) -> str:
-    """One line for people: step and the arguments that were given."""
-    given = ", ".join(f"{k}={v}" for k, v in step.arguments.items() if v is not None)
-    return f"{step.date} {step.program}: {step.name}({given})"
+def steps_text(steps: Sequence[Step]) -> str:
+    """Lines for people: each step with the arguments that were given, and its inputs."""
+    lines = []
+    for step in steps:
+        given = ", ".join(f"{k}={v}" for k, v in step.arguments.items() if v is not None)
+        lines += [f"{step.date} {step.program}: {step.name}({given})"]
+        lines += [f"    from {input_text(identity)}" for identity in step.inputs]
+    return "\n".join(lines)
 
 
 def input_text(identity: dict[str, Any]) -> str:

@@ -1,5 +1,6 @@
 """`process report`: one HTML file that needs nothing else, and tells simulated from measured."""
 
+import os
 import re
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 from processing.commands.application import main
 from processing.instrument.model import InstrumentModel
 from processing.reduction.mueller import reduce_mueller
+from processing.reports.report import collect
 from processing.storage.capture import Capture
 from processing.storage.product import Step
 
@@ -60,6 +62,13 @@ def test_report_is_self_contained(campaign: Path, capsys: pytest.CaptureFixture[
     assert code == 2
     assert "exists" in err
     assert run(capsys, "report", campaign / "rmsd.csv", "--out", out, "--overwrite")[0] == 0
+
+
+def test_files_are_in_the_order_that_they_were_made_in_whatever_their_time_stamps(campaign: Path) -> None:
+    names = ["curve.svg", "rmsd.csv", "capture.h5", "capture.mueller.h5"]
+    assert [path.name for path in collect([campaign])] == names
+    os.utime(campaign / "capture.mueller.h5", (1e9, 1e9))
+    assert [path.name for path in collect([campaign])] == names
 
 
 def test_report_refuses_to_mix_and_to_be_empty(

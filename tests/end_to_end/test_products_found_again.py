@@ -142,7 +142,7 @@ def test_what_a_step_is_made_of(capture, other, tmp_path, monkeypatch):
     for step in changed:
         assert step.record().made_of not in seen
         seen.append(step.record().made_of)
-    monkeypatch.setattr(provenance, "version", lambda _: "another")
+    monkeypatch.setattr(provenance, "program", lambda: "another")
     assert plain.record().made_of not in seen
     monkeypatch.undo()
     product = plain.make()
