@@ -146,7 +146,11 @@ class Rig:
                 f"port {entry.port!r} is an emulator, but the rig file has no `simulator` section. "
                 "Give the device path."
             )
-        return entry.model_copy(update={"port": self.simulation.port(entry.port.removeprefix(SCHEME))})
+        changes = {"port": self.simulation.port(entry.port.removeprefix(SCHEME))}
+        # A filter wheel's shutter has a port of its own.
+        if getattr(entry, "shutter", None) is not None:
+            changes["shutter"] = self._at_port(entry.shutter)
+        return entry.model_copy(update=changes)
 
     # --- motion ------------------------------------------------------------------------------------------
 

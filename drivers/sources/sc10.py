@@ -1,8 +1,8 @@
 """Thorlabs SC10 beam shutter controller: shutter for dark states, interlock input for the door.
 
-Text protocol, 9600 8N1: a command ends in CR; the box echoes it, answers in lines that end in CR and then sends
-the prompt "> ". `ens` toggles the enable state, `ens?` reads it, `closed?` reads the blade, `interlock?` is 1 while
-the interlock circuit is open (command names as in the public InstrumentKit driver; not yet tried on the real box).
+Text protocol, 9600 8N1, as `drivers.prompt_line` has it. `ens` toggles the enable state, `ens?` reads it, `closed?`
+reads the blade, `interlock?` is 1 while the interlock circuit is open (command names as in the public InstrumentKit
+driver; not yet tried on the real box).
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from drivers.clock import Clock
-from drivers.errors import CommandRejected, DeviceError, ReplyError, ReplyTimeout, WrongDevice
+from drivers.errors import CommandRejected, DeviceError, WrongDevice
+from drivers.prompt_line import PromptLine, prompt_framer
 from drivers.serial_link import LineRegistry, SerialLink, Transcript
 from drivers.source import LightSource
 
 BAUDRATE = 9600
-PROMPT = b"> "
 
 
 class Config(BaseModel):
@@ -32,23 +32,14 @@ class Config(BaseModel):
     blade_s: float = Field(default=1.0, gt=0, description="longest time for the blade to open or close")
 
 
-def prompt_framer(buffer: bytearray) -> bytes | None:
-    """Take everything up to the prompt off the buffer."""
-    end = buffer.find(PROMPT)
-    if end < 0:
-        return None
-    frame = bytes(buffer[:end])
-    del buffer[: end + len(PROMPT)]
-    return frame
-
-
 class Shutter(LightSource):
     """SC10 in manual mode: light is on while the shutter is enabled."""
 
     def __init__(self, config: Config, link: SerialLink, lines: LineRegistry) -> None:
         self.config = config
         self._link, self._lines = link, lines
-        self._model = self._ask("id?")
+        self._line = PromptLine(link, f"shutter on {config.port}", config.reply_s)
+        self._model = self._line.ask("id?")
         if "SC10" not in self._model.upper():
             raise WrongDevice(
                 f"identify the shutter on {config.port}",
@@ -61,11 +52,11 @@ class Shutter(LightSource):
         asked = f"shutter on {self.config.port}, {'open' if on else 'close'}"
         if on and self.interlock_open():
             raise CommandRejected(asked, "its interlock is open", "Close the door or the interlock circuit")
-        if self._ask("mode?") != "1":
-            self._tell("mode=1")
+        if self._line.ask("mode?") != "1":
+            self._line.tell("mode=1")
         # `ens` toggles: it is sent only after a fresh reading and never repeated.
         if self._flag("ens?") != on:
-            self._tell("ens")
+            self._line.tell("ens")
         deadline_s = self._link.clock.now_s() + self.config.blade_s
         while self._flag("closed?") == on:
             if self._link.clock.now_s() > deadline_s:
@@ -90,44 +81,7 @@ class Shutter(LightSource):
         self._lines.release(self.config.port)
 
     def _flag(self, query: str) -> bool:
-        answer = self._ask(query)
-        if not answer.isdigit():
-            raise ReplyError(
-                f"shutter on {self.config.port}, {query}",
-                f"{answer!r} instead of a number",
-                "The line is disturbed: check cable and baud rate",
-            )
-        return answer != "0"
-
-    def _ask(self, query: str) -> str:
-        """One query; an unusable reply is asked for once more, after the line has been quiet."""
-        try:
-            return self._exchange(query)
-        except (ReplyError, ReplyTimeout):
-            self._link.purge()
-            return self._exchange(query)
-
-    def _tell(self, command: str) -> None:
-        """One command, sent once: whether it worked is read from the state afterwards."""
-        try:
-            self._exchange(command)
-        except (ReplyError, ReplyTimeout):
-            self._link.purge()
-
-    def _exchange(self, text: str) -> str:
-        asked = f"shutter on {self.config.port}, {text}"
-        with self._link.lock:
-            self._link.write(text.encode("ascii") + b"\r")
-            frame = self._link.read_frame(self._link.clock.now_s() + self.config.reply_s)
-        if frame is None:
-            raise ReplyTimeout(asked, f"no reply in {self.config.reply_s:g} s", "Check power, cable and baud rate")
-        lines = frame.decode("ascii", "replace").replace("\n", "").split("\r")
-        if lines[0] != text:
-            raise ReplyError(asked, f"the echo is {lines[0]!r}", "The line is disturbed: check cable and baud rate")
-        answer = " ".join(line for line in lines[1:] if line)
-        if "error" in answer.lower():
-            raise CommandRejected(asked, answer, "Check that it is an SC10 with current firmware")
-        return answer
+        return self._line.ask_number(query) != 0
 
 
 def open(config: Config, lines: LineRegistry) -> Shutter:
