@@ -59,7 +59,7 @@ def take(
     )
     header = capture_header(job.plan, job.rig, job.instrument, rig, job.seed)
     begin = begin_record(job, rig, 0)
-    writer = CaptureWriter.create(path, header, job.table, frame_shape(rig), now(), begin)
+    writer = CaptureWriter.create(path, header, job.table, frame_shape(rig), now(), begin, rig.clock)
     if not job.exposure_known:
         writer.set_exposure(np.full(len(job.table), np.nan))
     return _run(job, rig, writer, range(len(job.table)), stop, observers, None)
@@ -92,7 +92,7 @@ def resume(
             )
         require_same_devices(capture, rig)
         earlier = Earlier(len(capture.segments), light_so_far(capture))
-    writer = CaptureWriter(as_partial(partial))
+    writer = CaptureWriter(as_partial(partial), rig.clock)
     pending = [k for k in range(len(job.table)) if k not in done]
     return _run(job, rig, writer, pending, stop, observers, earlier)
 

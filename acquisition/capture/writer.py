@@ -10,7 +10,6 @@ import errno
 import os
 import shutil
 import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from acquisition.capture.closing import closing_of_killed
 from acquisition.capture.state_file import StateFile
 from acquisition.errors import AcquisitionError
+from drivers.clock import REAL, Clock
 from drivers.motion import Position
 from processing.instrument.states import StateTable
 from processing.storage.capture import Capture
@@ -78,10 +78,16 @@ class CaptureWriter:
     ----------
     on_failure : called from the writing thread with what `put` would raise.
     segment : number of the segment that the states written now belong to.
+
+    Parameters
+    ----------
+    path : of the partial file.
+    clock : what the patience with the disc is counted by.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, clock: Clock = REAL) -> None:
         self.path = path
+        self._clock = clock
         self.file = StateFile(path)
         self.segment = 0
         self.on_failure: Callable[[AcquisitionError], None] | None = None
@@ -102,6 +108,7 @@ class CaptureWriter:
         frame_shape: tuple[int, int],
         start_time: str,
         begin: Mapping[str, Any] | None = None,
+        clock: Clock = REAL,
     ) -> CaptureWriter:
         """Create `path` + ".partial" with everything allocated.
 
@@ -146,13 +153,13 @@ class CaptureWriter:
         except (OSError, RuntimeError) as error:
             new.unlink(missing_ok=True)
             raise _no_room(path.parent, needed, error) from error
-        return cls(partial)
+        return cls(partial, clock)
 
     def put(self, record: StateRecord) -> None:
         """Hand over a state, when the one before is on the disc. Raises AcquisitionError after PATIENCE_S."""
         self.settle()
         with self._change:
-            self._record, self._since_s = record, time.monotonic()
+            self._record, self._since_s = record, self._clock.now_s()
             self._change.notify_all()
 
     def set_exposure(self, exposure_s: NDArray[np.float64]) -> None:
@@ -173,7 +180,7 @@ class CaptureWriter:
     def waiting_s(self) -> float:
         """Seconds that the state in hand has been waiting for the disc."""
         with self._change:
-            return time.monotonic() - self._since_s if self._record is not None else 0.0
+            return self._clock.now_s() - self._since_s if self._record is not None else 0.0
 
     def seal(self, status: Status, closing: Mapping[str, Any], *, keep_partial: bool = False) -> Path:
         """Write what waits, the closing record and the status; give the file its final name.
@@ -212,7 +219,7 @@ class CaptureWriter:
         """Wait until every state handed over is on the disc. Raises AcquisitionError, after PATIENCE_S at most."""
         with self._change:
             while self._record is not None and self._error is None:
-                left_s = PATIENCE_S - (time.monotonic() - self._since_s)
+                left_s = PATIENCE_S - (self._clock.now_s() - self._since_s)
                 if left_s <= 0:
                     raise AcquisitionError(
                         f"{self.path}: the disc has not taken state {self._record.state} for {PATIENCE_S:g} s. States "

@@ -37,6 +37,7 @@ class LiveState(Observer):
         # Every light state thinned out, for the quick look of a rotation: a copy, so that whole frames are let go.
         self._thin: deque[Any] = deque(maxlen=64)
         self._view: dict[str, Any] = {"title": "", "activity": "starting", "done": 0, "pending": 0, "status": "running"}
+        # Real time, as everything that a person reads.
         self._start_s = time.monotonic()
 
     def campaign_progress(self, number: int, total: int, name: str) -> None:

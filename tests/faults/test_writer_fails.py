@@ -49,19 +49,16 @@ def test_any_exception_in_the_writer_ends_the_run_and_it_goes_on(run_with, intac
 def test_a_disc_that_takes_nothing_ends_the_run(run_with, intact, monkeypatch):
     monkeypatch.setattr(writer, "PATIENCE_S", 0.3)
     blocked = threading.Event()
-    _failing_at(monkeypatch, 5, lambda: blocked.wait(30))
-    start_s = time.monotonic()
+    _failing_at(monkeypatch, 5, blocked.wait)
     error, path = run_with(plan=SHORT)
     assert "the disc has not taken state 5" in str(error)
-    assert time.monotonic() - start_s < 30
     blocked.set()
     _let_go(path)
     assert intact(path) >= 5
 
 
-def _let_go(path, timeout_s=10.0):
-    end_s = time.monotonic() + timeout_s
-    while time.monotonic() < end_s:
+def _let_go(path):
+    while True:
         try:
             Capture(path).close()
             return
@@ -72,10 +69,8 @@ def _let_go(path, timeout_s=10.0):
 def test_a_failure_of_another_thread_reaches_the_main_thread_in_the_middle_of_a_wait():
     with StopRequest() as stop:
         threading.Timer(0.1, stop.fail, (AcquisitionError("told"),)).start()
-        start_s = time.monotonic()
         with pytest.raises(AcquisitionError, match="told"), stop.failing_here():
-            time.sleep(30)
-        assert time.monotonic() - start_s < 10
+            time.sleep(3600)
         # Outside, clean-up is under way: it is left alone.
         stop.fail(AcquisitionError("not heard"))
         assert not stop.requested

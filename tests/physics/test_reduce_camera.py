@@ -7,7 +7,7 @@ import pytest
 
 from processing.calibration.photon_transfer import bad_pixels, photon_transfer, read_camera, write_camera
 from processing.errors import NotDetermined, ProcessError
-from processing.reduction.counts_to_signal import Correction
+from processing.reduction.counts_to_signal import Correction, saturation
 from processing.storage.capture import Capture, CaptureError
 from processing.storage.product import Step
 
@@ -125,3 +125,23 @@ def test_dark_and_flat_of_another_capture(synthetic_capture) -> None:
         with pytest.raises(CaptureError, match="bad-pixel map"):
             Correction.of(s, bad=np.zeros((3, 3), bool))
         assert not bad_pixels(d).any()
+
+
+@pytest.mark.parametrize(
+    ("detector", "level"),
+    [
+        ({"bits": 12}, 4095.0),
+        # Full at 64 + 8000 / 2.5 counts, less four times the read noise of 5 / 2.5 counts that spreads them.
+        ({"bits": 12, "full_well_e": 8000.0, "gain_e_per_count": 2.5, "read_noise_e": 5.0}, 3256.0),
+        ({"bits": 12, "full_well_e": 8000.0, "gain_e_per_count": 2.5}, 3264.0),
+        ({"bits": 12, "full_well_e": 20_000.0, "gain_e_per_count": 2.5, "read_noise_e": 5.0}, 4095.0),
+        ({"bits": 12, "full_well_e": 8000.0}, 4095.0),
+        ({"full_well_e": 8000.0, "gain_e_per_count": 2.5}, None),
+    ],
+)
+def test_saturation_is_where_the_full_well_begins_to_spread(synthetic_capture, detector: dict, level) -> None:
+    pixels = np.array([[3255, 3256, 3264]], np.uint16)[None, None]
+    path = synthetic_capture(pixels, {"psg": np.zeros(1)}, detector={"black_level_counts": 64.0, **detector})
+    with Capture(path) as capture:
+        assert saturation(capture) == level
+        assert Correction.of(capture).saturation == level

@@ -76,6 +76,39 @@ def test_equals_weighted_least_squares_of_numpy(rgb950: InstrumentModel, synthet
         )
 
 
+@pytest.mark.parametrize("darks", [1, 4])
+def test_the_error_of_the_darks_is_common_to_all_states(rgb950: InstrumentModel, synthetic_capture, darks: int) -> None:
+    """Generalized least squares by hand: the mean dark has been taken off every intensity, and errs in all alike."""
+    rng = np.random.default_rng(7)
+    angles = {axis: np.concatenate([np.zeros(darks), column]) for axis, column in ANGLES.items()}
+    w = rgb950.rows(ANGLES)[:, 0]
+    electrons = rng.poisson((w @ (400 * pure(rng).ravel()) * GAIN)[:, None] * np.ones(6)) + rng.normal(0, READ, (40, 6))
+    light = np.rint(electrons / GAIN + BLACK).astype(np.uint16)
+    frames = np.concatenate([np.full((darks, 6), BLACK, np.uint16), light]).reshape(-1, 1, 2, 3)
+    role = ("dark",) * darks + ("sample",) * 40
+    path = synthetic_capture(frames, angles, role=role, detector=DETECTOR)
+    image = reduced(path, rgb950, Choice(weighted=True, covariance=True))
+    with Product(path.with_suffix(".m.h5")) as product:
+        chi_square = product.get("reduced_chi_square").ravel()
+        packed = product.get("mueller_covariance").reshape(136, -1)
+    counts = light - BLACK
+    floor = (READ / GAIN) ** 2 + 1 / 12
+    variance = np.maximum(w @ (np.linalg.pinv(w) @ counts), 0) / GAIN + floor
+    common = floor / darks
+    for p in range(6):
+        weight = 1 / variance[:, p]
+        own = np.linalg.inv(w.T @ (weight[:, None] * w))
+        gain = own @ (w.T * weight)
+        covariance = gain @ (np.diag(variance[:, p]) + common) @ gain.T
+        np.testing.assert_allclose(image.errors.reshape(16, -1)[:, p], np.sqrt(np.diag(covariance)), rtol=1e-4)
+        lower = covariance[PACKED_ROW, PACKED_COLUMN]
+        np.testing.assert_allclose(packed[:, p], lower, atol=1e-4 * np.max(covariance))
+        residual = counts[:, p] - w @ (gain @ counts[:, p])
+        left = np.eye(40) - w @ gain
+        expected = np.trace(left.T @ np.diag(weight) @ left @ (np.diag(variance[:, p]) + common))
+        assert chi_square[p] == pytest.approx(weight @ residual**2 / expected, rel=1e-3)
+
+
 @pytest.mark.parametrize("case", ["plain", "dark", "flat", "saturated"])
 def test_unit_variance_and_smaller_errors(case: str, rgb950: InstrumentModel, synthetic_capture) -> None:
     rng = np.random.default_rng(2)

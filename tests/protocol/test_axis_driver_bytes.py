@@ -148,6 +148,31 @@ def test_smc100_open_and_refusals() -> None:
             arm._do_check_fault()
 
 
+def smc100_after(*states: bytes) -> tuple[tuple[bytes, bytes], ...]:
+    """The exchanges of opening a CONEX, then one `TS` for each of these replies."""
+    values = (b"VA?", b"20"), (b"AC?", b"80"), (b"SL?", b"0"), (b"SR?", b"90")
+    constants = [(b"1%b\r\n" % name, b"1%b%b\r\n" % (name[:2], value)) for name, value in values]
+    return (
+        (b"1VE\r\n", b"1VE CONEX-CC 2.0.1\r\n"),
+        (b"1ID?\r\n", b"1IDPR50CC\r\n"),
+        *[pair for pair in constants for _ in range(2)],
+        *[(b"1TS\r\n", b"1TS%b\r\n" % state) for state in states],
+    )
+
+
+def test_smc100_asks_again_for_a_state_that_there_is_not() -> None:
+    # 0x29 is no state: a reply of the right form with one digit changed.
+    with scripted(*smc100_after(b"000029", b"000028")) as path, LineRegistry(clock=patient_clock()) as lines:
+        assert smc100.open("arm", smc100.Config(port=path), lines).is_moving()
+
+
+def test_smc100_does_not_guess_a_state_that_stays_unknown() -> None:
+    with scripted(*smc100_after(b"000029", b"000029")) as path, LineRegistry(clock=patient_clock()) as lines:
+        arm = smc100.open("arm", smc100.Config(port=path), lines)
+        with pytest.raises(ReplyError, match="unknown state 000029"):
+            arm.is_moving()
+
+
 def test_apt_bytes() -> None:
     info = bytes.fromhex("060054008150") + (27_000_001).to_bytes(4, "little") + b"KDC101\0\0" + bytes(64)
     info += (6).to_bytes(2, "little") + bytes(6)

@@ -1,0 +1,249 @@
+"""What the writer does to the file, in which order: a state is on the disc before it is marked done."""
+
+from __future__ import annotations
+
+import errno
+import os
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from acquisition.capture import writer as writer_module
+from acquisition.capture.state_file import StateFile
+from acquisition.capture.writer import (
+    CaptureWriter,
+    StateRecord,
+    as_partial,
+    bytes_needed,
+    check_space,
+    mark_not_taken,
+    seal_whole,
+)
+from acquisition.errors import AcquisitionError
+from drivers.motion import Position
+from processing.instrument.states import StateTable
+from processing.storage.capture import Capture
+from processing.storage.capture_schema import CaptureHeader
+from simulators.clock import ManualClock
+
+HEADER = CaptureHeader(title="three states", simulated=True, mode="drr", wavelength_nm=662)
+SHAPE = (4, 5)
+
+
+def table(states: int = 3) -> StateTable:
+    return StateTable(
+        angles_deg={"psg": np.arange(states) * 9.0},
+        exposure_s=np.full(states, 0.02),
+        role=("sample",) * states,
+        repeats=np.full(states, 2),
+    )
+
+
+def record(state: int) -> StateRecord:
+    pixels = np.full(SHAPE, 100 + state, np.uint16)
+    return StateRecord(state, pixels, {"psg": Position(9.0 * state, 1000 * state, True)}, {"exposure_s": 0.03})
+
+
+@pytest.fixture
+def create(tmp_path: Path):
+    opened = []
+
+    def make(name: str = "c.h5", **options: Any) -> CaptureWriter:
+        opened.append(CaptureWriter.create(tmp_path / name, HEADER, table(), SHAPE, "2026-01-01T00:00:00", **options))
+        return opened[-1]
+
+    yield make
+    for writer in opened:
+        writer.abandon()
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+    """System calls that concern the disc, in their order."""
+    seen: list[tuple[Any, ...]] = []
+
+    def watch(name: str, note: Any) -> None:
+        call = getattr(os, name)
+
+        def watched(*arguments: Any) -> Any:
+            seen.append((name, *note(*arguments)))
+            return call(*arguments)
+
+        monkeypatch.setattr(os, name, watched)
+
+    watch("pwrite", lambda file, data, offset: (offset, bytes(data)))
+    watch("fdatasync", lambda file: ())
+    watch("fsync", lambda file: (os.readlink(f"/proc/self/fd/{file}").rpartition("/")[2],))
+    watch("rename", lambda old, new: (Path(old).name, Path(new).name))
+    return seen
+
+
+def test_a_state_is_synced_before_it_is_marked_done_and_the_mark_after(create, calls):
+    writer = create()
+    with h5py.File(writer.path, locking=False) as h5:
+        mark = h5["entry/states/done"].id.get_offset()
+    calls.clear()
+    writer.put(record(1))
+    writer.settle()
+    names = [call[0] for call in calls]
+    assert names[-3:] == ["fdatasync", "pwrite", "fdatasync"]
+    assert "fdatasync" not in names[:-3]
+    assert calls[-2][1] == mark + calls[-2][2].__len__()
+    assert any(call[0] == "pwrite" and record(1).pixels.tobytes() in call[2] for call in calls[:-3])
+    # Nothing of the state is written after its mark.
+    assert int.from_bytes(calls[-2][2], "little") == 1
+
+
+def test_the_file_has_its_final_name_when_all_is_on_the_disc(create, calls, tmp_path):
+    writer = create()
+    assert ("fsync", "c.h5.new") in calls
+    assert calls.index(("fsync", "c.h5.new")) < calls.index(("rename", "c.h5.new", "c.h5.partial"))
+    assert calls[-1] == ("fsync", tmp_path.name)
+    calls.clear()
+    assert writer.seal("complete", {"end_time": "now"}) == tmp_path / "c.h5"
+    end = [call for call in calls if call[0] in ("fsync", "rename")]
+    assert end == [("fsync", "c.h5.partial"), ("rename", "c.h5.partial", "c.h5"), ("fsync", tmp_path.name)]
+    assert writer.path == tmp_path / "c.h5"
+
+
+def test_states_are_read_back_as_they_were_handed_over(create, tmp_path):
+    writer = create(begin={"event": "begin", "segment": 0})
+    writer.segment = 0
+    for state in (0, 2):
+        writer.put(record(state))
+    path = writer.seal("aborted", {"end_time": "now"}, keep_partial=True)
+    assert path == tmp_path / "c.h5.partial"
+    with Capture(path) as capture:
+        assert capture.status == "aborted"
+        assert capture.done.tolist() == [0, 2]
+        assert [int(capture.frames(k)[0][0, 0]) for k in range(2)] == [100, 102]
+        assert capture.angles_deg["psg"].tolist() == [0.0, 18.0]
+        assert capture.column("exposure_s").tolist() == [0.03, 0.03]
+        assert capture.column("repeats").tolist() == [2, 2]
+        assert capture.planned_column("exposure_s")[1] == 0.02
+
+
+def test_going_on_with_a_partial_file_fills_what_is_missing(create, tmp_path):
+    writer = create()
+    writer.put(record(0))
+    path = writer.seal("failed", {}, keep_partial=True)
+    assert seal_whole(path) is None
+    again = CaptureWriter(path)
+    for state in (1, 2):
+        again.put(record(state))
+    again.settle()
+    again.abandon()
+    assert seal_whole(path) == tmp_path / "c.h5"
+    with Capture(tmp_path / "c.h5") as capture:
+        assert capture.status == "complete"
+        assert capture.done.tolist() == [0, 1, 2]
+
+
+def test_an_exposure_found_later_and_states_that_are_forgotten(create):
+    writer = create()
+    writer.put(record(0))
+    writer.set_exposure(np.array([0.1, 0.2, 0.3]))
+    writer.forget()
+    path = writer.seal("failed", {}, keep_partial=True)
+    with Capture(path) as capture:
+        assert capture.done.tolist() == []
+        assert capture.planned_column("exposure_s").tolist() == [0.1, 0.2, 0.3]
+
+
+def test_states_to_be_taken_again_make_the_capture_partial(create):
+    writer = create()
+    for state in range(3):
+        writer.put(record(state))
+    final = writer.seal("complete", {})
+    path = mark_not_taken(final, [1])
+    assert path.name == "c.h5.partial"
+    assert not final.exists()
+    assert as_partial(path) == path
+    with Capture(path) as capture:
+        assert capture.status == "failed"
+        assert capture.done.tolist() == [0, 2]
+        assert np.isnan(capture.planned_column("exposure_s")[1])
+
+
+def test_nothing_is_overwritten(create, tmp_path):
+    (tmp_path / "c.h5").write_bytes(b"whole")
+    (tmp_path / "d.h5.partial").write_bytes(b"part")
+    for name, there in (("c.h5", "c.h5"), ("d.h5", "d.h5.partial")):
+        with pytest.raises(AcquisitionError, match=rf"{there} exists already; nothing was changed"):
+            create(name)
+    assert (tmp_path / "c.h5").read_bytes() == b"whole"
+    assert not list(tmp_path.glob("*.new"))
+
+
+def test_room_that_is_too_small_is_refused_with_both_numbers(monkeypatch, tmp_path):
+    needed = bytes_needed(3, 2, SHAPE)
+    assert needed == 3 * (2 * 4 * (5 * 2 + 4) + 512) + (3 << 19)
+    monkeypatch.setattr(writer_module.shutil, "disk_usage", lambda _: SimpleNamespace(free=needed))
+    check_space(tmp_path, needed)
+    with pytest.raises(AcquisitionError, match=rf"needs {needed + 1:,} bytes in .*, {needed:,} are free"):
+        check_space(tmp_path, needed + 1)
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES])
+def test_space_that_cannot_be_taken_leaves_nothing_behind(create, monkeypatch, tmp_path, number):
+    def refuse(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    message = "cannot be created" if number == errno.EACCES else "cannot get them"
+    with pytest.raises(AcquisitionError, match=message):
+        create()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_blocks_are_taken_before_the_first_state(create):
+    writer = create()
+    assert os.stat(writer.path).st_blocks * 512 >= os.stat(writer.path).st_size
+
+
+def test_an_error_of_the_disc_is_told_at_once_and_by_the_next_call(create, monkeypatch):
+    told: list[AcquisitionError] = []
+    heard = threading.Event()
+
+    def fail(*_: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    writer = create()
+    writer.on_failure = lambda error: (told.append(error), heard.set())
+    monkeypatch.setattr(StateFile, "write_state", fail)
+    writer.put(record(0))
+    heard.wait()
+    assert "could not be written ([Errno 5] Input/output error)" in str(told[0])
+    for call in (lambda: writer.put(record(1)), writer.settle, lambda: writer.seal("complete", {})):
+        with pytest.raises(AcquisitionError, match="States done before it are intact"):
+            call()
+
+
+def test_a_disc_that_takes_nothing_is_given_up_after_a_while_and_the_next_state_waits(create, monkeypatch):
+    class Passing(ManualClock):
+        """Time goes by when it is looked at."""
+
+        def now_s(self) -> float:
+            self.sleep_s(0.4)
+            return super().now_s()
+
+    going_on = threading.Event()
+    write = StateFile.write_state
+    monkeypatch.setattr(StateFile, "write_state", lambda *arguments: (going_on.wait(), write(*arguments)))
+    writer = create(clock=Passing())
+    assert writer.waiting_s() == 0.0
+    writer.put(record(0))
+    assert writer.waiting_s() > 0
+    with pytest.raises(AcquisitionError, match="the disc has not taken state 0 for 2 s"):
+        writer.put(record(1))
+    going_on.set()
+    writer._thread.join(0.0)
+    while writer.waiting_s():
+        pass
+    writer.put(record(1))
+    writer.settle()
