@@ -16,7 +16,7 @@ from scipy.optimize import minimize
 
 from processing.arrays import Array
 from processing.errors import ProcessError
-from processing.instrument.model import InstrumentModel, Retarder, condition_number, rank
+from processing.instrument.model import InstrumentModel, Retarder, rank
 from processing.instrument.states import Role, StateTable, rotating_retarders
 from processing.polarization import mueller
 
@@ -54,37 +54,49 @@ class Score:
     Attributes
     ----------
     intensities : rows of W.
-    rank : of W; below 16 the other numbers are infinite.
-    condition_number : of W.
-    equally_weighted_variance : trace (W^T W)^-1.
+    rank : of W.
+    wanted : rank that the instrument can have; below it the other numbers are infinite.
+    condition_number : of W, among what the instrument can determine.
+    equally_weighted_variance : trace (W^T W)^-1, of the same.
     bound : the least that any table with as many intensities can have.
-    element_stderr : (4, 4), standard error of m_ij / m00 for the stated noise, without the error of m00.
+    element_stderr : (4, 4), standard error of m_ij / m00 for the stated noise, without the error of m00; NaN for
+        elements that the instrument cannot determine.
     """
 
     intensities: int
     rank: int
+    wanted: int
     condition_number: float
     equally_weighted_variance: float
     bound: float
     element_stderr: Array
 
 
-def score(w: Array, noise: Noise) -> Score:
-    """Score a measurement matrix (..., 16), rows kron(a, g) as `InstrumentModel.rows` gives them."""
+def score(w: Array, noise: Noise, basis: Array | None = None, bound: float | None = None) -> Score:
+    """Score a measurement matrix (..., 16), rows kron(a, g) as `InstrumentModel.rows` gives them.
+
+    `basis` (16, rank) and `bound` are those of the instrument (`free_angles`); default: all 16 elements.
+    """
     w = np.asarray(w, dtype=float).reshape(-1, 16)
-    n, found = len(w), rank(w)
-    if found < 16:
-        return Score(n, found, np.inf, np.inf, 1600 / n, np.full((4, 4), np.inf))
-    inverse = np.linalg.pinv(w)
+    basis = np.eye(16) if basis is None else basis
+    n, found, wanted = len(w), rank(w), basis.shape[1]
+    bound = 1600 / n if bound is None else bound
+    if found < wanted:
+        return Score(n, found, wanted, np.inf, np.inf, bound, np.full((4, 4), np.inf))
+    inverse = basis @ np.linalg.pinv(w @ basis)
     # An ideal depolarizer of throughput m00 gives every state m00 w_n0.
     m00 = noise.electrons / w[:, 0].mean()
     variance = m00 * w[:, 0] + noise.read_noise_e**2
     stderr = np.sqrt((inverse**2) @ variance) / m00
-    return Score(n, 16, condition_number(w), equally_weighted_variance(w), 1600 / n, np.asarray(stderr.reshape(4, 4)))
+    # An element is determined where it lies in the span of the basis, and so are ratios to m00.
+    stderr[np.sum(basis**2, axis=1) < 1 - 1e-9] = np.nan
+    size = np.linalg.svd(w @ basis, compute_uv=False)
+    variance_sum = equally_weighted_variance(w @ basis)
+    return Score(n, found, wanted, float(size[0] / size[-1]), variance_sum, bound, stderr.reshape(4, 4))
 
 
 def equally_weighted_variance(w: Array) -> float:
-    """Trace of (W^T W)^-1; infinite where W has a rank below 16."""
+    """Trace of (W^T W)^-1; infinite where W lacks full rank."""
     values = np.linalg.eigvalsh(w.T @ w)
     return float(np.sum(1 / values)) if values[0] > 1e-10 * values[-1] else float("inf")
 

@@ -29,13 +29,21 @@ def design_command(
         Path | None, typer.Option(help="CSV of your own states: a column of degrees for each axis.")
     ] = None,
     optimize: Annotated[
-        str | None, typer.Option(help="What may change: retardances, ratio, or both with a comma.")
+        str | None, typer.Option(help="What may change: angles, retardances, ratio; several with a comma.")
     ] = None,
+    speed: Annotated[
+        list[str] | None,
+        typer.Option(help="AXIS=DEG_PER_S:DEG_PER_S2 of every axis: --optimize angles also saves motor time."),
+    ] = None,
+    weighted: Annotated[bool, typer.Option("--weighted", help="Optimize for --electrons and --read-noise.")] = False,
+    jitter: Annotated[float, typer.Option(min=0, help="Angles scatter by so many degrees: prefer what bears it.")] = 0,
     electrons: Annotated[
         float, typer.Option(help="Mean signal of a state, electrons, for the standard errors.")
     ] = 20_000,
     read_noise: Annotated[float, typer.Option(help="Read noise, electrons.")] = 3.0,
-    out: Annotated[Path | None, typer.Option(help="Write the table of the (last) design as CSV.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Write the table of the (last) design: CSV, or a plan (.yaml).")
+    ] = None,
     stokes: Annotated[bool, typer.Option("--stokes", help="Illumination of a linear Stokes capture instead.")] = False,
     geometry: Annotated[Path | None, typer.Option(help="--stokes: geometry file.")] = None,
     material: Annotated[Path | None, typer.Option(help="--stokes: material file, the dominant process.")] = None,
@@ -57,6 +65,7 @@ def design_command(
         return
     if instrument is None:
         raise ProcessError("give an instrument file, for instance configs/instruments/rgb950.yaml (or --stokes)")
+    from processing.calibration.free_angles import bound_of, determined
     from processing.calibration.state_design import Noise, score
     from processing.instrument.applied_effects import changes_at
     from processing.instrument.model import InstrumentModel
@@ -69,14 +78,21 @@ def design_command(
     model = model.at(nm) if nm else model
     noise = Noise(electrons, read_noise)
     counts = _counts(states)
-    if optimize is not None:
+    if optimize is not None and "angles" in optimize:
+        from processing.commands.design_angles import optimize_angles
+
+        chosen = optimize_angles(model, noise, counts, optimize, speed or (), weighted, jitter)
+    elif optimize is not None:
         chosen = _optimized(model, noise, counts, optimize, ratio)
     else:
         chosen = _given(model, counts, ratio, step, table)
         w = model.rows(chosen.angles_deg, changes_at(model, chosen.angles_deg))
-        _show(f"{model.name}, {nm:g} nm, {len(chosen)} states", score(w, noise), noise)
+        intensities = len(chosen) * len(model.channels)
+        found = score(w, noise, determined(model), bound_of(model, intensities))
+        _show(f"{model.name}, {nm:g} nm, {len(chosen)} states", found, noise)
+        _tell_robustness(model, chosen)
     if out is not None:
-        _write(chosen, out)
+        _write(chosen, out, nm)
         typer.echo(str(out))
 
 
@@ -95,11 +111,16 @@ def _counts(text: str) -> list[int]:
 def _given(
     model: InstrumentModel, counts: list[int], ratio: float, step: float | None, table: Path | None
 ) -> StateTable:
+    import numpy as np
+
     from processing.calibration.state_design import read_table, two_retarders
-    from processing.instrument.states import rotating_retarders
+    from processing.instrument.states import StateTable, rotating_retarders
 
     if table is not None:
         return read_table(table, model.axes)
+    if len(model.axes) == 1:
+        turn = step if step is not None else 360 / counts[0]
+        return StateTable.of_angles({model.axes[0]: turn * np.arange(counts[0], dtype=float)})
     generator, analyzer = two_retarders(model)
     axes = (str(generator.axis), str(analyzer.axis))
     return rotating_retarders(1.0, counts[0], step if step is not None else 360 / counts[0], ratio, axes=axes)
@@ -112,7 +133,7 @@ def _optimized(model: InstrumentModel, noise: Noise, counts: list[int], free: st
 
     names = {name.strip() for name in free.split(",")}
     if not names <= {"retardances", "ratio"}:
-        raise ProcessError(f"--optimize {free!r}: what may change is retardances, ratio, or retardances,ratio")
+        raise ProcessError(f"--optimize {free!r}: what may change is angles, retardances, ratio, or two of them")
     with progress_bar("optimizing", "ratios") as tick:
         designs = optimize(model, noise, counts, dict.fromkeys(names, True), ratio, tick)
     for d in designs:
@@ -127,14 +148,14 @@ def _optimized(model: InstrumentModel, noise: Noise, counts: list[int], free: st
 
 def _show(title: str, found: Score, noise: Noise) -> None:
     typer.echo(title)
-    typer.echo(f"  rank {found.rank} of 16, condition number {found.condition_number:.4g}")
+    typer.echo(f"  rank {found.rank} of {found.wanted}, condition number {found.condition_number:.4g}")
     typer.echo(
         f"  equally weighted variance {found.equally_weighted_variance:.4g}; the bound for {found.intensities} "
         f"intensities is {found.bound:.4g}"
     )
-    if found.rank < 16:
+    if found.rank < found.wanted:
         typer.echo(
-            "  these states do not determine a Mueller matrix: take another ratio, or steps that are less regular"
+            "  these states do not determine all that the instrument can: take another ratio, or less regular steps"
         )
         return
     typer.echo(
@@ -142,11 +163,25 @@ def _show(title: str, found: Score, noise: Noise) -> None:
         f"{noise.read_noise_e:g}:"
     )
     for row in found.element_stderr:
-        typer.echo("    " + "  ".join(f"{value:.5f}" for value in row))
+        typer.echo("    " + "  ".join(f"{value:.5f}" if value == value else "   -   " for value in row))
 
 
-def _write(table: StateTable, path: Path) -> None:
+def _tell_robustness(model: InstrumentModel, table: StateTable) -> None:
+    from processing.calibration.robustness import ERRORS, errors_of_table
+
+    typer.echo("  rms error of m_ij / m00 that an undeclared error of the bench makes (a sample with rms m_ij of 0.3):")
+    for name, value in errors_of_table(model, table.angles_deg).items():
+        typer.echo(f"    {ERRORS[name]}: {value:.5f}")
+
+
+def _write(table: StateTable, path: Path, wavelength_nm: float) -> None:
     names = list(table.angles_deg)
+    if path.suffix in (".yaml", ".yml"):
+        lines = ["kind: plan", f"wavelength_nm: {wavelength_nm:g}", "states:", "  kind: table", "  angles:"]
+        for name in names:
+            lines.append(f"    {name}: [{', '.join(f'{angle:.4f}' for angle in table.angles_deg[name])}]")
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        return
     lines = [",".join(names)]
     lines += [",".join(f"{table.angles_deg[name][k]:.6f}" for name in names) for k in range(len(table))]
     path.write_text("\n".join(lines) + "\n")

@@ -49,6 +49,13 @@ class StateTable:
     def __len__(self) -> int:
         return len(self.role)
 
+    @classmethod
+    def of_angles(cls, angles_deg: Mapping[str, NDArray[np.float64]], exposure_s: float = 1.0) -> StateTable:
+        """Sample states of one exposure at these angles, axis name to (N,)."""
+        n = len(next(iter(angles_deg.values())))
+        sample: Role = "sample"
+        return cls(angles_deg, np.full(n, float(exposure_s)), (sample,) * n, np.ones(n, dtype=np.int64))
+
 
 def rotating_retarders(
     exposure_s: float,

@@ -1,0 +1,71 @@
+"""`process design --optimize angles`: every angle free, and motor time as a second goal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import typer
+
+from processing.calibration.free_angles import FreeDesign, Goal, free_design
+from processing.calibration.motor_time import Point, Speed, front, move_seconds
+from processing.calibration.state_design import Noise
+from processing.commands.progress_bar import progress_bar
+from processing.errors import ProcessError
+from processing.instrument.model import InstrumentModel
+from processing.instrument.states import StateTable, rotating_retarders
+
+MAY_CHANGE = {"angles", "retardances"}
+
+
+def optimize_angles(
+    model: InstrumentModel,
+    noise: Noise,
+    counts: Sequence[int],
+    free: str,
+    speeds: Sequence[str],
+    weighted: bool,
+    jitter_deg: float,
+) -> StateTable:
+    """Optimize, print, and return the (last) best table. Raises ProcessError."""
+    names = {name.strip() for name in free.split(",")}
+    if not names <= MAY_CHANGE:
+        raise ProcessError(f"--optimize {free!r}: free angles go with retardances, not with a ratio")
+    model = model.model_copy(update={"effects": ()})
+    goal = Goal(noise if weighted else None, jitter_deg)
+    given = dict(Speed.parse(text) for text in speeds)
+    unknown = sorted(set(given) - set(model.axes))
+    if unknown:
+        raise ProcessError(f"--speed {unknown[0]}: the instrument turns {', '.join(model.axes)}")
+    for n in counts:
+        with progress_bar(f"{n} states", "starts") as tick:
+            if given:
+                points = front(model, n, given, goal, "retardances" in names, tick)
+            else:
+                points = [Point(free_design(model, n, goal, "retardances" in names, progress=tick), float("nan"))]
+        best = points[0].design
+        _show(model, n, best)
+        if given:
+            _show_front(model, n, points, given)
+    return StateTable.of_angles(best.angles_deg)
+
+
+def _show(model: InstrumentModel, states: int, best: FreeDesign) -> None:
+    plates = ", ".join(f"{name} {value:.1f}" for name, value in best.retardances_deg.items())
+    typer.echo(f"{states} states, free angles, rank {best.rank}, retardances {plates} degrees")
+    typer.echo(
+        f"  equally weighted variance {best.variance:.4f}; the bound for {states * len(model.channels)} intensities "
+        f"is {best.bound:.4f} ({best.variance / best.bound - 1:+.2%})"
+    )
+
+
+def _show_front(model: InstrumentModel, states: int, points: Sequence[Point], speeds: dict[str, Speed]) -> None:
+    typer.echo("  variance   motor time")
+    for point in points:
+        typer.echo(f"  {point.design.variance:8.3f}   {point.seconds:8.1f} s")
+    if len(model.axes) == 2:
+        import numpy as np
+
+        equal = rotating_retarders(1.0, states, 360 / states, axes=(model.axes[0], model.axes[1])).angles_deg
+        angles = np.stack([equal[axis] for axis in model.axes])
+        seconds = move_seconds(angles, [speeds[axis] for axis in model.axes])
+        typer.echo(f"  (equal steps, ratio 4.91: {seconds:.1f} s)")
