@@ -13,10 +13,11 @@ from typing import Literal
 from pydantic import Field
 
 from drivers.clock import Clock
-from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
+from drivers.errors import CommandRejected, ReplyError, WrongDevice
 from drivers.motion import AxisIdentity
 from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
 from drivers.session_reference import SessionReferenceAxis, SessionReferenceConfig
+from drivers.unmarked_replies import ask
 
 ERRORS = {6: "no such command", 7: "parameter out of range", 9: "axis out of range", 37: "axis number missing"}
 AXIS_ERRORS = {
@@ -90,22 +91,8 @@ class ESP301Line:
         ------
         ReplyTimeout, ReplyError
         """
-        seen: list[bytes] = []
-        for _ in range(2):
-            with self.link.lock:
-                self.link.purge(0.0)
-                self.send(command)
-                deadline_s = self.link.clock.now_s() + self.reply_s
-                while (frame := self.link.read_frame(deadline_s)) is not None:
-                    text = frame.decode("ascii", "replace").strip()
-                    if form.fullmatch(text):
-                        return text
-                    seen.append(frame)
-                self.link.purge()
-        asked = f"ESP301 {self.link.port}, {command}"
-        if seen:
-            raise ReplyError(asked, f"no valid reply, but {seen[:3]}", "Check cable and baud rate")
-        raise ReplyTimeout(asked, f"nothing within {self.reply_s} s", "Check power, cable, baud rate and RTS/CTS")
+        asked, check = f"ESP301 {self.link.port}, {command}", "Check power, cable, baud rate and RTS/CTS"
+        return ask(self.link, f"{command}\r".encode("ascii"), form, self.reply_s, asked, check)
 
     def take_errors(self, axis: int) -> list[int]:
         """Empty the controller's error memory and return what concerns an axis, oldest first.

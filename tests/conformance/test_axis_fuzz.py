@@ -31,11 +31,15 @@ pytestmark = pytest.mark.timeout(600 + 10 * ROUNDS)
 PIECES = {
     "zaber": [b"/1 1 move abs ", b"/1 home", b"/0 0 01 get pos:", b"/2 set maxspeed ", b"/1 move vel ", b"stop", b"\n"],
     "elliptec": [b"0ma", b"1mr0000", b"0ho0", b"0gp", b"0gs", b"1in", b"0sj", b"0fw", b"0st", b"\r\n"],
-    "smc100": [b"1PA", b"1OR", b"1TS", b"1RS", b"1MM0", b"1VA", b"1SL-", b"ST", b"1PW1", b"\r\n", b"?"],
+    "smc100": [b"\r\n1TS\r\n", b"1PA", b"1OR", b"1TS", b"1RS", b"1MM0", b"1VA", b"1SL-", b"ST", b"1PW1", b"\r\n", b"?"],
     "esp301": [b"1PA", b"1OR1", b"1MO", b"TB?", b"1DH", b"1SL", b";", b"\r", b"AB", b"2TP?"],
     "apt-k10cr1": [b"\x53\x04\x06\x00\xd0\x01", b"\x43\x04\x01\x00\x50\x01", b"\x11\x00\x00\x00\x50\x01", b"\x50\x01"],
 }
-PIECES["apt-kdc101"] = PIECES["apt-k10cr1"]
+# A whole question so often that it is heard behind any length that noise has announced.
+PIECES["apt-k10cr1"].append(b"\x11\x04\x01\x00\x50\x01" * 50)
+PIECES["apt-kdc101"] = PIECES["apt-kbd101"] = PIECES["apt-k10cr1"]
+PIECES["zaber-no-checksums"] = PIECES["zaber"]
+PIECES["gcs2"] = [b"MOV 1 ", b"FRF", b"SVO 1 1\n", b"POS?\n", b"HLT 2", b"VEL 1 ", b"\x05", b"\x18", b"ERR?\n", b"\n"]
 
 
 class NoisyWire:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.apt_frames import apt_framer
-from drivers.axes import apt, elliptec, esp301, smc100, zaber
+from drivers.axes import apt, elliptec, esp301, gcs2, smc100, zaber
 from drivers.errors import CommandRejected, NotHomedError, ReplyError
 from drivers.serial_link import LONGEST_FRAME, LineRegistry, line_framer
 from simulators.clock import Clock, patient_clock
@@ -226,6 +226,36 @@ def test_esp301_bytes() -> None:
         assert axis.read_position().counts == 30.0
         with pytest.raises(CommandRejected, match="213: motor not enabled"):
             axis._do_check_fault()
+
+
+def test_gcs2_bytes() -> None:
+    opening = [
+        (b"*IDN?\n", b"(c)2015 Physik Instrumente (PI) GmbH & Co. KG, C-863.11, 0115012345, 1.2.1.0\n"),
+        *[(b"VEL? 2\n", b"2=50.0\n")] * 2,
+        *[(b"ACC? 2\n", b"2=200.0\n")] * 2,
+        *[(b"TMN? 2\n", b"2=-1e7\n")] * 2,
+        *[(b"TMX? 2\n", b"2=180.0\n")] * 2,
+        # The answer for another axis is none for this one.
+        (b"POS? 2\n", b"1=7.0\n2=30.25\n"),
+        (b"POS? 2\n", b"2=30.25\n"),
+        *[(b"\x05", b"2\n")] * 2,
+        (b"HLT 2\n", b""),
+        (b"SVO? 2\n", b"2=0\n"),
+        (b"ERR?\n", b"0\n"),
+        (b"SVO 2 1\n", b""),
+        (b"ERR?\n", b"0\n"),
+        (b"ERR?\n", b"0\n"),
+        (b"MOV 2 12.500000\n", b""),
+        (b"ERR?\n", b"7\n"),
+    ]
+    with scripted(*opening) as path, LineRegistry(clock=patient_clock()) as lines:
+        axis = gcs2.open("psg", gcs2.Config(port=path, axis=2, serial_number="0115012345"), lines)
+        assert (axis.limits.min_deg, axis.limits.max_deg) == (None, 180.0)
+        assert axis.read_position().counts == 30.25
+        assert axis.is_moving()
+        axis.stop()
+        with pytest.raises(CommandRejected, match="error 7: position out of limits"):
+            axis._do_start_move(12.5)
 
 
 def test_readings_that_disagree_are_no_position() -> None:

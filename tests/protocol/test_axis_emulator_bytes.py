@@ -236,11 +236,29 @@ def test_esp301() -> None:
     assert -150 < box.true_deg(0) < 30
 
 
+def test_gcs2() -> None:
+    box, clock = emulator("gcs2")
+    assert talk(box, b"*IDN?\n") == b"(c)2015 Physik Instrumente (PI) GmbH & Co. KG, C-884.4DC, 0115012345, 1.2.1.0\n"
+    assert talk(box, b"SAI?\n") == b"1 \n2\n"
+    assert talk(box, b"POS? 1\n") == b"1=0.000000\n"
+    # Servo off, then not referenced: the move is dropped and the error stays until it is read.
+    assert talk(box, b"MOV 1 10\nERR?\nERR?\n") == b"5\n0\n"
+    assert talk(box, b"SVO 1 1\nFRF 1\nERR?\n\x05") == b"0\n1\n"
+    run_out(box, clock)
+    assert talk(box, b"\x05FRF?\n") == b"0\n1=1 \n2=0\n"
+    assert talk(box, b"MOV 1 -12.5\nERR?\n") == b"0\n"
+    run_out(box, clock)
+    assert talk(box, b"POS? 1\nONT? 1\n") == b"1=-12.500000\n1=1\n"
+    assert talk(box, b"MOV 1 90\nHLT 1\nERR?\n") == b"10\n"
+    assert talk(box, b"FLY 1\nERR?\nMOV 7 1\nERR?\nMOV 1\nERR?\n") == b"2\n15\n1\n"
+
+
 QUESTIONS = {
     "zaber": b"/1 1 07 get limit.max\n",
     "elliptec": b"1gp",
     "smc100": b"1TS\r\n",
     "esp301": b"VE?\r",
+    "gcs2": b"*IDN?\n",
     "apt-k10cr1": bytes.fromhex("110401005001"),
     "apt-kdc101": bytes.fromhex("900401005001"),
     "apt-kbd101": bytes.fromhex("900401005001"),

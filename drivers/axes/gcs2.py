@@ -1,0 +1,188 @@
+"""PI controllers with the General Command Set 2 (C-863, C-867, C-884, ...) and rotation stages.
+
+Facts: PI's own public PIPython (names, single-byte commands, form of the answers, error codes) and the GCS adapter of
+Micro-Manager, written at PI. A line ends with LF; an answer is ``1=12.5000``. Without an address in front, one
+controller answers on a line: a daisy chain is not supported. The axis's unit must be degrees, which is not asked.
+Unverified on hardware: everything; that `FRF` wants the servo on, and that limits of a stage without any are huge.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Literal
+
+from pydantic import Field
+
+from drivers.clock import Clock
+from drivers.errors import CommandRejected, NotHomedError, ReplyError, WrongDevice
+from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
+from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
+from drivers.unmarked_replies import ask
+
+ERRORS = {
+    1: "parameter syntax error",
+    2: "unknown command",
+    5: "not referenced, or servo off",
+    7: "position out of limits",
+    10: "stopped by command",
+    15: "invalid axis",
+    -1024: "motion error: the position error was too large and the servo was switched off",
+}
+NOT_REFERENCED, STOPPED = 5, 10
+MOVING = "\x05"
+# Limits as large as this are those of a stage that has none.
+NO_LIMIT_DEG = 1e6
+_HEX = re.compile(r"[0-9A-Fa-f]{1,8}")
+_CODE = re.compile(r"-?\d{1,5}")
+_IDENTITY = re.compile(r"[^,]+,[^,]+,[^,]+,[^,]+")
+
+
+class Config(AxisConfig):
+    """An axis of a PI controller in a rig file."""
+
+    kind: Literal["gcs2"] = "gcs2"
+    axis: int = Field(default=1, ge=1, le=16, description="axis identifier, as SAI? lists it")
+    serial_number: str | None = None
+    baudrate: int = 115_200
+
+
+class GCS2Line:
+    """The port of one controller, shared by its axes."""
+
+    def __init__(self, config: Config, transcript: Transcript | None, clock: Clock) -> None:
+        self.link = SerialLink(
+            config.port, config.baudrate, line_framer, transcript=transcript, clock=clock, held_by=config.held_by
+        )
+        self.reply_s = config.reply_s or 1.0
+
+    def close(self) -> None:
+        """Close the port."""
+        self.link.close()
+
+    def send(self, command: str) -> None:
+        """Write a command that answers nothing; takes no lock."""
+        self.link.write(_bytes(command))
+
+    def ask(self, command: str, form: re.Pattern[str]) -> str:
+        """Ask a question and return the answer of the given form; once more if none came.
+
+        Raises
+        ------
+        ReplyTimeout, ReplyError
+        """
+        asked = f"GCS2 {self.link.port}, {command!r}"
+        return ask(self.link, _bytes(command), form, self.reply_s, asked, "Check power, cable and baud rate")
+
+
+def _bytes(command: str) -> bytes:
+    # Single control bytes have no line end.
+    return f"{command}\n".encode("ascii") if command >= " " else command.encode("ascii")
+
+
+class GCS2Axis(MotionAxis):
+    """One axis of a controller."""
+
+    def __init__(self, name: str, config: Config, line: GCS2Line, lines: LineRegistry) -> None:
+        super().__init__(name, config)
+        self.config: Config = config
+        self._line, self._lines = line, lines
+        self._answer = re.compile(rf"{config.axis}=([+-]?\d+\.?\d*(?:[eE][+-]?\d+)?)")
+        maker, model, serial_number, firmware = (part.strip() for part in line.ask("*IDN?", _IDENTITY).split(","))
+        asked = f"axis {name} on {config.port} axis {config.axis}"
+        if "PHYSIK INSTRUMENTE" not in maker.upper():
+            raise WrongDevice(asked, f"{maker} {model} answers", "Correct `port` in the rig file")
+        if config.serial_number not in (None, serial_number):
+            raise WrongDevice(asked, f"{model} has serial number {serial_number}", "Correct it in the rig file")
+        self.speed_deg_s, self.acceleration_deg_s2 = self._constant("VEL?"), self._constant("ACC?")
+        if min(self.speed_deg_s, self.acceleration_deg_s2) <= 0:
+            raise ReplyError(f"{asked}, speed", f"{self.speed_deg_s}, {self.acceleration_deg_s2}", "Set VEL and ACC")
+        self._device_min_deg, self._device_max_deg = self._limit("TMN?"), self._limit("TMX?")
+        self._identity = AxisIdentity(
+            kind="gcs2",
+            model=model,
+            serial_number=serial_number,
+            firmware=firmware,
+            port=config.port,
+            address=str(config.axis),
+        )
+
+    def describe(self) -> AxisIdentity:
+        return self._identity
+
+    def _number(self, query: str) -> float:
+        return float(self._line.ask(f"{query} {self.config.axis}", self._answer).partition("=")[2])
+
+    def _constant(self, query: str) -> float:
+        return agreed(lambda: self._number(query))
+
+    def _limit(self, query: str) -> float | None:
+        value = self._constant(query)
+        return None if abs(value) >= NO_LIMIT_DEG else value
+
+    def _take_error(self) -> int:
+        """Read the last error, which clears it."""
+        return int(self._line.ask("ERR?", _CODE))
+
+    def _command(self, command: str) -> None:
+        """Send a command that answers nothing and look for the error that it may have left."""
+        with self._line.link.lock:
+            self._take_error()
+            self._line.send(command)
+            code = self._take_error()
+        if code in (0, STOPPED):
+            return
+        asked, words = f"axis {self.name}, {command}", f"error {code}: {ERRORS.get(code, 'see the manual')}"
+        if code == NOT_REFERENCED:
+            raise NotHomedError(asked, words, "Home the axis (acquire home)")
+        raise CommandRejected(asked, words, "Look at the state of the controller")
+
+    def _servo_on(self) -> None:
+        if not self._number("SVO?"):
+            self._command(f"SVO {self.config.axis} 1")
+
+    def _do_read_counts(self) -> float:
+        return self._number("POS?")
+
+    def _do_is_homed(self) -> bool:
+        # One garbled digit must not make a reference.
+        return self._number("FRF?") == 1 and self._number("FRF?") == 1
+
+    def _do_is_moving(self) -> bool:
+        # A hexadecimal number with a bit for each axis.
+        answers = [int(self._line.ask(MOVING, _HEX), 16) for _ in range(2)]
+        return any(answer >> (self.config.axis - 1) & 1 for answer in answers)
+
+    def _do_start_move(self, counts: float) -> None:
+        self._servo_on()
+        self._command(f"MOV {self.config.axis} {counts:.6f}")
+
+    def _do_start_home(self) -> None:
+        self._servo_on()
+        self._command(f"FRF {self.config.axis}")
+
+    def _do_stop(self) -> None:
+        # HLT stops this axis alone; the controller notes it as error 10.
+        self._line.send(f"HLT {self.config.axis}")
+
+    def _do_check_fault(self) -> None:
+        code = self._take_error()
+        if code not in (0, STOPPED):
+            raise CommandRejected(
+                f"axis {self.name}, state", f"error {code}: {ERRORS.get(code, 'see the manual')}", "Remove the cause"
+            )
+
+    def _do_warnings(self) -> list[str]:
+        return [] if self._number("SVO?") else ["servo off"]
+
+    def _do_close(self) -> None:
+        self._lines.release(self.config.port)
+
+
+def open(name: str, config: Config, lines: LineRegistry) -> GCS2Axis:
+    """Open one axis; reads its identity, limits and speed and moves nothing."""
+    line = lines.take(config.port, GCS2Line, lambda transcript: GCS2Line(config, transcript, lines.clock))
+    try:
+        return GCS2Axis(name, config, line, lines)
+    except BaseException:
+        lines.release(config.port)
+        raise
