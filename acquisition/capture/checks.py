@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from acquisition.capture.plan import ARM, AutoExposure, MeasurementPlan
 from acquisition.errors import PlanRefused
 from acquisition.rig.config import RigConfig
@@ -12,7 +14,8 @@ from acquisition.rig.rig import Rig
 from acquisition.rig.way import find_obstacle
 from drivers.errors import LimitError
 from processing.instrument.applied_effects import changes_at
-from processing.instrument.model import InstrumentModel, WavelengthError, condition_number, rank
+from processing.instrument.determined import determined_basis
+from processing.instrument.model import InstrumentModel, WavelengthError, rank
 from processing.instrument.states import StateTable
 
 
@@ -91,11 +94,15 @@ def check_table(table: StateTable, rig: RigConfig, instrument: InstrumentModel) 
             return [*checks, Check("instrument", False, found)]
         angles = {axis: table.angles_deg[axis][light] for axis in instrument.axes}
         w = instrument.rows(angles, changes_at(instrument, angles))
-        r = rank(w)
-        found = f"rank {r} of 16, condition number {condition_number(w):.2f}"
-        if r < 16:
-            found += ": these states do not determine a Mueller matrix. Change states, step_deg or ratio"
-        checks.append(Check("state table", r == 16, found))
+        basis = determined_basis(instrument)
+        r, wanted = rank(w), basis.shape[1]
+        size = np.linalg.svd(w.reshape(-1, 16) @ basis, compute_uv=False)
+        condition = size[0] / size[-1] if r == wanted else np.inf
+        found = f"rank {r} of {wanted}, condition number {condition:.2f}"
+        if r < wanted:
+            what = "a Mueller matrix" if wanted == 16 else "all that this instrument can"
+            found += f": these states do not determine {what}. Change states, step_deg or ratio"
+        checks.append(Check("state table", r == wanted, found))
     return checks
 
 

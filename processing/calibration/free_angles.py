@@ -17,6 +17,7 @@ from scipy.optimize import minimize
 from processing.arrays import Array
 from processing.calibration.state_design import Noise
 from processing.errors import ProcessError
+from processing.instrument.determined import DRAWN, determined_basis
 from processing.instrument.model import InstrumentModel, Retarder
 
 #: Step of the central difference of a row by an angle, radians: truncation and rounding are both near 1e-9 there.
@@ -25,8 +26,6 @@ STEP = 1e-4
 STARTS = 40
 #: A design this close to the bound is not improved further.
 AT_BOUND = 1.002
-#: States drawn to find out what an instrument can determine.
-DRAWN = 400
 
 
 @dataclass(frozen=True)
@@ -65,14 +64,6 @@ class FreeDesign:
     rank: int
 
 
-def determined(model: InstrumentModel) -> Array:
-    """Orthonormal basis (16, rank) of what states of this instrument can determine."""
-    random = np.random.default_rng(0)
-    w = model.rows({axis: random.uniform(0, 360, DRAWN) for axis in model.axes}).reshape(-1, 16)
-    _, size, vt = np.linalg.svd(w, full_matrices=False)
-    return np.asarray(vt[size > 1e-8 * size[0]].T)
-
-
 def bound_of(model: InstrumentModel, intensities: int) -> float:
     """Least trace of the inverse information of `intensities` rows.
 
@@ -96,7 +87,7 @@ class Cost:
     def __init__(self, model: InstrumentModel, states: int, goal: Goal, free: Sequence[str]) -> None:
         self.model, self.states, self.goal, self.free = model, states, goal, tuple(free)
         self.axes = tuple(model.axes)
-        self.basis = determined(model)
+        self.basis = determined_basis(model)
 
     def split(self, x: Array) -> tuple[Array, Array]:
         """Angles (axes, states) and free retardances, radians."""

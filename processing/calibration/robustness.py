@@ -7,7 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from processing.arrays import Array
-from processing.calibration.free_angles import determined, retardance_deg, turning_retarders, with_retardances
+from processing.calibration.free_angles import retardance_deg, turning_retarders, with_retardances
+from processing.instrument.determined import determined_basis
 from processing.instrument.model import InstrumentModel
 
 #: The errors that `diagnose` finds most often, at the size of a bench that was set up with care.
@@ -29,7 +30,7 @@ def errors_of_table(
 
     An error p of W makes M wrong by pinv(W) dW/dp M; several axes or plates add in squares.
     """
-    basis = determined(model)
+    basis = determined_basis(model)
     w = model.rows(angles_deg).reshape(-1, 16)
     inverse = basis @ np.linalg.pinv(w @ basis)
     prior = np.concatenate([[1.0], np.full(15, polarization)])

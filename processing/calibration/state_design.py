@@ -16,6 +16,7 @@ from scipy.optimize import minimize
 
 from processing.arrays import Array
 from processing.errors import ProcessError
+from processing.instrument.determined import determined_elements
 from processing.instrument.model import InstrumentModel, Retarder, rank
 from processing.instrument.states import Role, StateTable, rotating_retarders
 from processing.polarization import mueller
@@ -89,7 +90,7 @@ def score(w: Array, noise: Noise, basis: Array | None = None, bound: float | Non
     variance = m00 * w[:, 0] + noise.read_noise_e**2
     stderr = np.sqrt((inverse**2) @ variance) / m00
     # An element is determined where it lies in the span of the basis, and so are ratios to m00.
-    stderr[np.sum(basis**2, axis=1) < 1 - 1e-9] = np.nan
+    stderr[~determined_elements(basis)] = np.nan
     size = np.linalg.svd(w @ basis, compute_uv=False)
     variance_sum = equally_weighted_variance(w @ basis)
     return Score(n, found, wanted, float(size[0] / size[-1]), variance_sum, bound, stderr.reshape(4, 4))

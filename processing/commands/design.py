@@ -65,9 +65,10 @@ def design_command(
         return
     if instrument is None:
         raise ProcessError("give an instrument file, for instance configs/instruments/rgb950.yaml (or --stokes)")
-    from processing.calibration.free_angles import bound_of, determined
+    from processing.calibration.free_angles import bound_of
     from processing.calibration.state_design import Noise, score
     from processing.instrument.applied_effects import changes_at
+    from processing.instrument.determined import determined_basis
     from processing.instrument.model import InstrumentModel
 
     model = InstrumentModel.load(instrument)
@@ -88,7 +89,7 @@ def design_command(
         chosen = _given(model, counts, ratio, step, table)
         w = model.rows(chosen.angles_deg, changes_at(model, chosen.angles_deg))
         intensities = len(chosen) * len(model.channels)
-        found = score(w, noise, determined(model), bound_of(model, intensities))
+        found = score(w, noise, determined_basis(model), bound_of(model, intensities))
         _show(f"{model.name}, {nm:g} nm, {len(chosen)} states", found, noise)
         _tell_robustness(model, chosen)
     if out is not None:

@@ -18,7 +18,7 @@ from processing.polarization.decompositions.symmetric import symmetric
 from processing.polarization.propagation import Derived
 from processing.polarization.quantities import PAPER_PAIRS, State
 from processing.reduction.mueller import Progress
-from processing.storage.images import MuellerImage
+from processing.storage.images import MuellerImage, require_all_elements
 from processing.storage.product import LIT_ERRORS, Plane, Product, ProductWriter, Step
 
 #: Pixels of a block: gradients take 128 bytes a pixel and quantity.
@@ -109,7 +109,7 @@ def quantities_of_mueller(
         if plane.dtype is np.float32:
             planes[f"{name}_errors"] = Plane(plane.leading, plane.units, f"standard errors of {name}, first order")
     with Product(source) as product:
-        product.require("mueller")
+        require_all_elements(product)
         steps = (*product.steps, step)
         with ProductWriter(out, "quantities", product.header, product.shape, planes, steps, overwrite) as writer:
             for rows in product.row_blocks(BLOCK_PIXELS):

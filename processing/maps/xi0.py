@@ -17,7 +17,7 @@ from processing.reduction.mosaic.methods import REACH
 from processing.reduction.mueller import Progress
 from processing.reflectance.base import load_reflectance
 from processing.storage.capture_schema import CaptureHeader
-from processing.storage.images import MuellerImage, StokesImage
+from processing.storage.images import MuellerImage, StokesImage, require_all_elements
 from processing.storage.product import Plane, Product, ProductWriter, Step
 
 #: The largest eigenvalue has a meaning of its own where it stands this many standard errors above the next.
@@ -60,7 +60,7 @@ def xi0_of_mueller(source: Path, out: Path, step: Step, overwrite: bool, progres
     The standard error is first order: d xi0 = <dM, m0 - 4 xi0 e00> / (4 m00), m0 being the dominant process.
     """
     with Product(source) as product:
-        product.require("mueller")
+        require_all_elements(product)
         steps = (*product.steps, step)
         with ProductWriter(out, "xi0", product.header, product.shape, MUELLER_PLANES, steps, overwrite) as writer:
             for rows in product.row_blocks():

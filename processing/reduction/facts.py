@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.instrument.determined import determined_elements
 from processing.reduction.counts_to_signal import Correction
 from processing.reduction.noise import NoiseModel
 from processing.reduction.solvers.inversion import Inversion
@@ -44,7 +45,7 @@ def mueller_facts(
     # Medians from about 128 rows are plenty, and read little.
     some = slice(None, None, max(1, mask.shape[0] // 128))
     residual, elements = product.get("residual_rms", some), product.get("mueller", some)
-    signal = np.tensordot(inversion.w.mean(axis=0), elements.reshape(16, *residual.shape), axes=1)
+    signal = np.tensordot(inversion.w.mean(axis=0), np.nan_to_num(elements.reshape(16, *residual.shape)), axes=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = residual / signal
         errors, m00 = product.get("mueller_errors", some), elements[0, 0]
@@ -53,7 +54,7 @@ def mueller_facts(
     facts: dict[str, Any] = {
         "states": states,
         "intensities_per_pixel": inversion.w.shape[0],
-        "rank": 16,
+        "rank": inversion.rank,
         "condition_number": inversion.condition_number,
         "degrees_of_freedom": inversion.degrees_of_freedom,
         "black": correction.source,
@@ -84,6 +85,9 @@ def mueller_facts(
                 f"the residual is only {np.sqrt(ratio):.2g} of what the noise explains, so the standard errors are too "
                 "large: the gain or read noise is not this camera's, or a black level was not subtracted"
             )
+    if inversion.rank < len(inversion.basis):
+        seen = determined_elements(inversion.basis)
+        facts["determined"] = ", ".join(f"m{k // 4}{k % 4}" for k in np.flatnonzero(seen)) or "combinations only"
     return facts | {"warnings": warnings}
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from processing.errors import ProcessError
 from processing.instrument.changes import Changes
+from processing.instrument.determined import determined_basis, determined_elements
 from processing.instrument.model import InstrumentModel
 from processing.polarization.physical import nearest
 from processing.reduction.counts_to_signal import BlockReader, Correction
@@ -203,17 +204,22 @@ def reduce_mueller(
 
     Raises
     ------
-    NotDetermined : W has a rank below 16.
+    NotDetermined : W has a lower rank than states of this instrument can have.
     CaptureError : angles or frames are missing or not finite.
     """
     states = sample_states(capture)
     changes = capture_changes(capture, model, states)
     w = measurement_matrix(capture, model, states, changes)
-    inversion = Inversion.of(w.reshape(-1, 16), what=f"{capture.path}: ")
+    inversion = Inversion.of(w.reshape(-1, 16), f"{capture.path}: ", determined_basis(model))
     correction = correction or Correction.of(capture)
     reader = BlockReader(capture, states, correction, counts_correction(changes, model))
     choice = choice or Choice()
     noise = choice.noise or NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
+    if inversion.rank < ELEMENTS and (choice.weighted or (changes is not None and changes.field_retardance_rad)):
+        raise ProcessError(
+            f"{capture.path}: instrument {model.name!r} determines {inversion.rank} of 16 numbers; --weighted and "
+            "field_retardance need all of them. Leave them away."
+        )
     solver = choice.solver(MuellerSolver(inversion, reader, noise), field_of(capture, model, states, changes))
     planes = choice.planes(known_noise=noise is not None)
     with ProductWriter(out, "mueller", capture.header, capture.frame_shape, planes, steps, overwrite) as product:
@@ -256,6 +262,10 @@ def _block(solver: Solver, rows: slice, planes: Mapping[str, Plane]) -> dict[str
     found = solver.solve(frames)
     mask = found["pixel_mask"]
     lost = (mask & np.uint8(Mask.NOT_FINITE | Mask.BAD | Mask.NOT_DETERMINED)) != 0
+    unseen = ~determined_elements(solver.inversion.basis)
+    if unseen.any():
+        found["mueller"][unseen] = np.nan
+        found["mueller_errors"][unseen] = np.nan
     for name, values in found.items():
         if lost.any() and name != "pixel_mask":
             values[..., lost] = np.nan

@@ -11,7 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.storage.capture_schema import CaptureHeader
-from processing.storage.product import Product, Step
+from processing.storage.product import Product, ProductError, Step
+
+
+def require_all_elements(product: Product) -> None:
+    """Raise ProductError for the image of a partial polarimeter, which has no whole Mueller matrices."""
+    product.require("mueller")
+    if int(product.facts.get("rank", 16)) < 16:
+        raise ProductError(
+            f"{product.path} is of a partial polarimeter: it determines {product.facts.get('determined', 'less')}, and "
+            "this needs all 16 elements. What it holds is in the product of `process reduce` itself."
+        )
 
 
 @dataclass(frozen=True)
@@ -90,11 +100,11 @@ class MuellerImage:
         rows, columns = self.mask.shape
         n = self.w.shape[0]
         if np.isnan(self.noise_slope).any():
-            free = max(n - 16, 0)
+            free = max(n - int(self.facts.get("rank", 16)), 0)
             with np.errstate(divide="ignore", invalid="ignore"):
                 level = self.residual_rms.reshape(-1).astype(float) ** 2 * n / free if free else np.nan
             return np.broadcast_to(level, (n, rows * columns))
-        fitted = self.w @ self.values.reshape(16, -1)
+        fitted = self.w @ np.nan_to_num(self.values.reshape(16, -1))
         floor = self.noise_floor[:, None]
         return np.asarray(np.maximum(self.noise_slope[:, None] * fitted + floor, 0.5 * floor))
 

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from processing.calibration.free_angles import Cost, Goal, bound_of, determined, free_design
+from processing.calibration.free_angles import Cost, Goal, bound_of, free_design
 from processing.calibration.motor_time import Speed, front, move_seconds, ordered, periods_deg
 from processing.calibration.robustness import errors_of_table
 from processing.calibration.state_design import Noise, equally_weighted_variance, score
 from processing.commands.application import app
 from processing.errors import ProcessError
+from processing.instrument.determined import determined_basis
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
 from processing.yaml_file import parse_yaml
@@ -50,7 +51,7 @@ def test_the_labs_plates_allow_less_than_its_table_has(rgb950):
 
 
 def test_a_stokes_polarimeter_is_scored_by_what_it_determines(stokes):
-    basis = determined(stokes)
+    basis = determined_basis(stokes)
     assert basis.shape == (16, 4)
     found = free_design(stokes, 8)
     # The generator sends (1, 0, 0, 0), and a plate of 131.8 degrees covers the sphere evenly: 40 / 8.

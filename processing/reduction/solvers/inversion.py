@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from processing.computing.threads import for_ranges
 from processing.errors import NotDetermined
-from processing.instrument.model import condition_number, rank
+from processing.instrument.model import rank
 
 #: Pixels in a tile: 40 float32 rows of it stay in a core's second-level cache.
 TILE = 4096
@@ -30,34 +30,40 @@ class Inversion:
     ----------
     w : (N, K) measurement matrix, K = 16 for Mueller, 3 for linear Stokes.
     pinv : (K, N) pseudo-inverse.
-    null : (N - K, N) orthonormal rows that see only what W cannot explain: the residual, without forming the fit.
-    condition_number : largest over smallest singular value.
+    null : (N - R, N) orthonormal rows that see only what W cannot explain: the residual, without forming the fit.
+    condition_number : largest over smallest singular value, of what is determined.
+    basis : (K, R) what the instrument can determine; R = K unless it is a partial polarimeter.
     """
 
     w: NDArray[np.float64]
     pinv: NDArray[np.float64]
     null: NDArray[np.float64]
     condition_number: float
+    basis: NDArray[np.float64]
 
     @classmethod
-    def of(cls, w: NDArray[np.float64], what: str = "") -> Inversion:
-        """Invert a measurement matrix (N, 16).
+    def of(cls, w: NDArray[np.float64], what: str = "", basis: NDArray[np.float64] | None = None) -> Inversion:
+        """Invert a measurement matrix (N, 16); `basis` (16, R) is what the instrument can determine, default all.
 
         Raises
         ------
         NotDetermined
-            W has a rank below 16; the message names the rank and the elements of M that the states cannot see.
+            W has a rank below R; the message names the rank and the elements of M that the states cannot see.
         """
+        basis = np.eye(w.shape[1]) if basis is None else basis
+        seen = w @ basis
         found = rank(w)
-        if found < w.shape[1]:
-            raise NotDetermined(_missing(w, found, what))
-        u, _, _ = np.linalg.svd(w, full_matrices=True)
-        return cls(
-            w,
-            np.asarray(np.linalg.pinv(w), dtype=float),
-            np.array(u[:, w.shape[1] :].T, dtype=float),
-            condition_number(w),
-        )
+        if found < basis.shape[1]:
+            raise NotDetermined(_missing(w, found, basis.shape[1], what))
+        u, size, _ = np.linalg.svd(seen, full_matrices=True)
+        pinv = basis @ np.linalg.pinv(seen)
+        null = np.array(u[:, basis.shape[1] :].T, dtype=float)
+        return cls(w, np.asarray(pinv, dtype=float), null, float(size[0] / size[-1]), basis)
+
+    @property
+    def rank(self) -> int:
+        """Numbers that are determined."""
+        return int(self.basis.shape[1])
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -115,13 +121,12 @@ def mueller_planes(
     return out
 
 
-def _missing(w: NDArray[np.float64], found: int, what: str) -> str:
+def _missing(w: NDArray[np.float64], found: int, need: int, what: str) -> str:
     # An element of M is not determined if its unit vector leaves the row space of W.
     _, _, vt = np.linalg.svd(w, full_matrices=False)
     row_space = vt[:found]
     outside = 1.0 - np.sum(row_space**2, axis=0)
     lost = [f"m{k // 4}{k % 4}" for k in np.flatnonzero(outside > 1e-6)]
-    need = w.shape[1]
     return (
         f"{what}the measurement matrix W has rank {found}, and {need} are needed: {w.shape[0]} intensities a pixel "
         f"do not determine {', '.join(lost)} (each alone or in combination). Take states at more, or at less "

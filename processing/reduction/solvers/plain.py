@@ -24,7 +24,7 @@ LEAST = 0.5
 class MuellerSolver:
     """What is the same for all row blocks: the stacked matrix that one product with a tile needs.
 
-    Its rows: pseudo-inverse (16), residual (N - 16), and, with a noise model, squares of the pseudo-inverse (16) and
+    Its rows: pseudo-inverse (16), residual (N - rank), and, with a noise model, squares of the pseudo-inverse (16) and
     of the residual rows, summed (1): applied to the signal these give the variances that shot noise makes.
     """
 
@@ -35,7 +35,7 @@ class MuellerSolver:
         self.repeats = np.repeat(reader.repeats, channels)
         stack = [inversion.pinv, inversion.null, *([squares / self.repeats] if noise else [])]
         self.stack = np.concatenate(stack).astype(np.float32)
-        self.first_square = inversion.w.shape[0]
+        self.first_square = len(inversion.pinv) + len(inversion.null)
         black = reader.correction.black
         excess = np.repeat(black.excess(noise, reader.exposure_s), channels)
         #: Variance without light of each intensity (N,), counts^2.
@@ -70,7 +70,8 @@ class MuellerSolver:
         return out
 
     def _range(self, frames: NDArray[Any], start: int, stop: int, out: dict[str, NDArray[Any]]) -> None:
-        n, dof = self.first_square, self.inversion.degrees_of_freedom
+        n, dof = self.inversion.w.shape[0], self.inversion.degrees_of_freedom
+        square = self.first_square
         tile = np.empty((*frames.shape[:2], TILE), np.float32)
         product = np.empty((len(self.stack), TILE), np.float32)
         for a in range(start, stop, TILE):
@@ -79,13 +80,13 @@ class MuellerSolver:
             gain = self.reader.load(frames, a, b, part, out["pixel_mask"])
             np.matmul(self.stack, part.reshape(n, b - a), out=result)
             out["mueller"][:, a:b] = result[:16]
-            rss = np.einsum("np,np->p", result[16:n], result[16:n])
+            rss = np.einsum("np,np->p", result[16:square], result[16:square])
             out["residual_rms"][a:b] = np.sqrt(rss / n)
             if self.noise is None:
                 sigma = np.sqrt(rss / dof) if dof else np.full(b - a, np.nan, np.float32)
                 out["mueller_errors"][:, a:b] = self.unit_sigma[:, None] * sigma
                 continue
-            variance = self._variance(part, gain, result[n:], self.noise)
+            variance = self._variance(part, gain, result[square:], self.noise)
             np.sqrt(variance[:16], out=out["mueller_errors"][:, a:b])
             if dof:
                 out["reduced_chi_square"][a:b] = rss / variance[16]
@@ -104,7 +105,7 @@ class MuellerSolver:
             shot += constant.sum(axis=1, keepdims=True)
             return np.asarray(np.maximum(shot, LEAST * constant.sum(axis=1, keepdims=True), out=shot))
         # Divided by the flat, signal and noise scale together: shot variance with the gain, the rest with its square.
-        np.matmul(self.stack[self.first_square :], (signal * gain).reshape(self.first_square, -1), out=shot)
+        np.matmul(self.stack[self.first_square :], (signal * gain).reshape(self.inversion.w.shape[0], -1), out=shot)
         dark = constant.astype(np.float32) @ gain**2
         return np.asarray(np.maximum(noise.slope * shot + dark, LEAST * dark))
 
@@ -117,8 +118,9 @@ def solve_without_saturated(
     A pixel whose remaining states are too few is flagged Mask.NOT_DETERMINED.
     """
     level = solver.reader.correction.saturation
-    w = solver.inversion.w
-    n, dof = w.shape
+    basis = solver.inversion.basis
+    w = solver.inversion.w @ basis
+    n, rank = w.shape
     for part in np.array_split(pixels, -(-len(pixels) // REPAIR_BATCH)):
         raw = frames[:, :, part]
         signal = np.empty(raw.shape, np.float32)
@@ -127,12 +129,12 @@ def solve_without_saturated(
         normal = np.einsum("pn,ni,nj->pij", keep, w, w, optimize=True)
         eigenvalues = np.linalg.eigvalsh(normal)
         ill = eigenvalues[:, 0] < WORST_CONDITION**-2 * eigenvalues[:, -1]
-        normal[ill] = np.eye(dof)
-        solve = np.linalg.solve(normal, w.T * keep[:, None, :])
+        normal[ill] = np.eye(rank)
+        solve = basis @ np.linalg.solve(normal, w.T * keep[:, None, :])
         y = signal.reshape(n, -1).T.astype(float)
         m = np.einsum("pin,pn->pi", solve, y)
-        residual = (y - m @ w.T) * keep
-        free = np.maximum(keep.sum(axis=1) - dof, 0)
+        residual = (y - m @ solver.inversion.w.T) * keep
+        free = np.maximum(keep.sum(axis=1) - rank, 0)
         rss = np.sum(residual**2, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             if solver.noise is None:

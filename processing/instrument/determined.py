@@ -1,0 +1,32 @@
+"""What an instrument can determine of a Mueller matrix: all 16 elements, or fewer for a partial polarimeter."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from processing.arrays import Array, BoolArray
+from processing.instrument.model import InstrumentModel
+
+#: States drawn to find out: more than any rank, at angles without regularity.
+DRAWN = 400
+#: Relative size of a singular value that counts.
+LEAST = 1e-8
+
+
+def determined_basis(model: InstrumentModel) -> Array:
+    """Orthonormal basis (16, rank) of what states of this instrument can determine; `model` is at a wavelength.
+
+    Its span is that of all rows kron(a, g): 16 for two turning retarders, 4 for a Stokes polarimeter, 9 where only
+    linear polarization is sent and analyzed.
+    """
+    random = np.random.default_rng(0)
+    ideal = model.model_copy(update={"effects": ()})
+    w = ideal.rows({axis: random.uniform(0, 360, DRAWN) for axis in model.axes}).reshape(-1, 16)
+    _, size, vt = np.linalg.svd(w, full_matrices=False)
+    found = np.asarray(vt[size > LEAST * size[0]].T)
+    return np.eye(16) if found.shape[1] == 16 else found
+
+
+def determined_elements(basis: Array) -> BoolArray:
+    """(16,) True for elements of M that lie in the span of the basis: they are determined each by itself."""
+    return np.asarray(np.sum(basis**2, axis=1) > 1 - 1e-9)
