@@ -196,7 +196,7 @@ def test_another_campaign_in_the_same_folder_is_refused(acquire, small_rig, camp
     changed = campaign(plans="{stokes: stokes.yaml}", omega_deg="[45]")
     code, _, err = acquire("--campaign", changed, "--rig", rig, "--out", tmp_path)
     assert code == 2
-    assert "campaign.omega_deg[0]: " in err
+    assert "campaign.omega_deg" in err
 
 
 def test_exposure_is_found_for_each_geometry(acquire, small_rig, campaign, tmp_path):
