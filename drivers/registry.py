@@ -1,4 +1,4 @@
-"""Finds the kinds of axes: one module in `drivers/axes/` each, and plug-ins by the entry point `umov.axes`.
+"""Opens axes and light sources. A kind of axis is a module in `drivers/axes/`, or a plug-in (entry point `umov.axes`).
 
 A kind is a module with a `Config` model, whose field `kind` is the kind's name, and a function
 ``open(name, config, lines) -> MotionAxis``. The file's name is the kind.
@@ -11,10 +11,12 @@ import pkgutil
 from functools import cache
 from importlib.metadata import entry_points
 from types import ModuleType
+from typing import Any
 
 import drivers.axes
 from drivers.motion import AxisConfig, MotionAxis
 from drivers.serial_link import LineRegistry
+from drivers.source import LightSource
 
 
 @cache
@@ -52,3 +54,9 @@ def open_axis(name: str, config: AxisConfig, lines: LineRegistry) -> MotionAxis:
     kind: str = getattr(config, "kind")  # noqa: B009 - the base class has no kind, each Config has
     axis: MotionAxis = axis_kinds()[kind].open(name, config, lines)
     return axis
+
+
+def open_source(config: Any, lines: LineRegistry) -> LightSource:
+    """Open a light source of any kind; changes no light. Raises DeviceError."""
+    source: LightSource = importlib.import_module(f"drivers.sources.{config.kind}").open(config, lines)
+    return source

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from acquisition.capture.operator import Operator
 from acquisition.capture.writer import PARTIAL, bytes_needed, check_space, seal_whole
 from acquisition.errors import AcquisitionError, Differs, InterlockOpened, PlanRefused, Stopped
 from acquisition.rig.config import RigConfig
+from acquisition.rig.guarded import guarded
 from acquisition.rig.interlocks import LOOK_S
 from acquisition.rig.rig import Rig
 from acquisition.screen.observer import Observer
@@ -104,6 +106,7 @@ class CampaignRun:
         self.observers = observers
         self.home = home
         self._rig: Rig | None = None
+        self._guard = ExitStack()
 
     def run(self, jobs: Sequence[tuple[CampaignCapture, Job]]) -> bool:
         """True if every capture is complete at the end, False if a stop was asked for.
@@ -129,6 +132,10 @@ class CampaignRun:
             return True
         except KeyboardInterrupt:
             self.folder.log("campaign stopped at once")
+            raise
+        except (AcquisitionError, DeviceError) as error:
+            # The guard calls somebody.
+            self._guard.__exit__(type(error), error, error.__traceback__)
             raise
         finally:
             self._close_rig()
@@ -236,9 +243,11 @@ class CampaignRun:
             self._rig = rig
             # A device may have been changed between two tries.
             require_same_campaign(self.folder.folder, with_devices({}, rig))
+            self._guard.enter_context(guarded(self.config, self.folder.folder))
         return self._rig
 
     def _close_rig(self) -> None:
+        self._guard.close()
         rig, self._rig = self._rig, None
         failure = rig.close() if rig is not None else None
         if failure is not None:

@@ -25,8 +25,8 @@ from processing.storage.capture import Capture
 from processing.storage.segments import Identity
 from processing.yaml_file import parse_yaml
 
-#: Keys of a rig file that tell where something is, not what it is.
-PLACES = ("port", "device", "wire_log")
+#: Keys of a rig file that tell where something is or who hears of it, not what it is.
+PLACES = ("port", "device", "wire_log", "alert", "held_by")
 #: Properties of a device that stay.
 LASTING = (
     "kind", "vendor", "model", "serial_number", "firmware", "sensor_width", "sensor_height", "pixel_format", "bits",

@@ -33,7 +33,9 @@ PARTIAL = ".partial"
 NEW = ".new"
 THREAD = "capture writer"
 #: How long the disc may take for one state before the run is ended.
-PATIENCE_S = 2.0
+PATIENCE_S = 1.5
+#: How often it is looked at.
+LOOK_S = 0.2
 #: Layout, notes and journals besides the frames, and the columns of a state, generously.
 LAYOUT_BYTES = 3 << 19
 COLUMN_BYTES = 512
@@ -98,6 +100,7 @@ class CaptureWriter:
         self._ending = False
         self._thread = threading.Thread(target=self._work, name=THREAD, daemon=True)
         self._thread.start()
+        threading.Thread(target=self._watch, name=f"{THREAD}, watch", daemon=True).start()
 
     @classmethod
     def create(
@@ -177,11 +180,6 @@ class CaptureWriter:
         except OSError as error:
             raise self._failure(error) from error
 
-    def waiting_s(self) -> float:
-        """Seconds that the state in hand has been waiting for the disc."""
-        with self._change:
-            return self._clock.now_s() - self._since_s if self._record is not None else 0.0
-
     def seal(self, status: Status, closing: Mapping[str, Any], *, keep_partial: bool = False) -> Path:
         """Write what waits, the closing record and the status; give the file its final name.
 
@@ -219,15 +217,27 @@ class CaptureWriter:
         """Wait until every state handed over is on the disc. Raises AcquisitionError, after PATIENCE_S at most."""
         with self._change:
             while self._record is not None and self._error is None:
-                left_s = PATIENCE_S - (self._clock.now_s() - self._since_s)
-                if left_s <= 0:
-                    raise AcquisitionError(
-                        f"{self.path}: the disc has not taken state {self._record.state} for {PATIENCE_S:g} s. States "
-                        "done before it are intact; go on with --resume when the disc is well."
-                    )
-                self._change.wait(left_s)
+                if self._clock.now_s() - self._since_s > PATIENCE_S:
+                    raise self._blocked(self._record.state)
+                self._change.wait(LOOK_S)
             if self._error is not None:
                 raise self._failure(self._error) from self._error
+
+    def _watch(self) -> None:
+        """Tell of a disc that blocks although nobody hands over a state, as in a long exposure."""
+        with self._change:
+            while not self._ending and self._error is None:
+                self._change.wait(LOOK_S)
+                if self._record is not None and self._clock.now_s() - self._since_s > PATIENCE_S:
+                    if self.on_failure is not None:
+                        self.on_failure(self._blocked(self._record.state))
+                    return
+
+    def _blocked(self, state: int) -> AcquisitionError:
+        return AcquisitionError(
+            f"{self.path}: the disc has not taken state {state} for {PATIENCE_S:g} s. States done before it are "
+            "intact; go on with --resume when the disc is well."
+        )
 
     def _failure(self, error: BaseException) -> AcquisitionError:
         why = str(error) or type(error).__name__

@@ -22,6 +22,7 @@ from acquisition.capture.plan import MeasurementPlan
 from acquisition.capture.writer import PARTIAL, seal_whole
 from acquisition.commands.defaults import CONFIGS, DEFAULT_RIG, INTERRUPTED
 from acquisition.rig.config import RigConfig, load_rig
+from acquisition.rig.guarded import guarded
 from acquisition.rig.rig import Rig
 from acquisition.screen.observer import Observer
 from acquisition.screen.progress import ConsoleProgress
@@ -72,7 +73,7 @@ def run(options: Options, stop: StopRequest) -> int:
         if stop.requested:
             return INTERRUPTED
         take = session.resume if resuming else session.take
-        with live_page(options.live, job.rig, stop, console) as page:
+        with guarded(job.rig, path.parent), live_page(options.live, job.rig, stop, console) as page:
             result = take(job, rig, path, stop, [ConsoleProgress(console), *page], home=options.home)
     summarize(job, result)
     return INTERRUPTED if result.status == "aborted" else 0

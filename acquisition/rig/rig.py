@@ -15,7 +15,7 @@ from drivers.camera import Camera, CameraSettings
 from drivers.clock import REAL, Clock
 from drivers.errors import LimitError, MotionFailed
 from drivers.motion import Motion, MotionAxis, Position
-from drivers.registry import open_axis
+from drivers.registry import open_axis, open_source
 from drivers.serial_link import LineRegistry
 from drivers.source import LightSource
 from drivers.sources.manual import Ask, ManualSource
@@ -120,7 +120,7 @@ class Rig:
         if self.config.source is None:
             raise AcquisitionError(f"rig {self.config.name!r} has no source")
         entry = self._at_port(self.config.source)
-        source: LightSource = _driver("drivers.sources", entry.kind).open(entry, self._lines)
+        source = open_source(entry, self._lines)
         if isinstance(source, ManualSource):
             source.ask = self._ask
             if self.simulation is not None:

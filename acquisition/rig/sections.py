@@ -69,6 +69,9 @@ class RigSections(Part):
     settle_s: float = Field(default=0.02, ge=0, le=600, description="wait after the last axis is idle")
     exposure_s: Range = Field(default=(1e-5, 10.0), description="shortest and longest exposure")
     retakes: int = Field(default=3, ge=0, le=1000, description="tries again for a state whose frame is incomplete")
+    alert: tuple[str, ...] = Field(
+        default=(), description="command that is run, with a message as its last argument, when a run fails or dies"
+    )
     wire_log: Path | None = Field(default=None, description="folder for a transcript of every byte on serial lines")
     forbidden: tuple[ForbiddenPose, ...] = ()
     solids: Solids | None = Field(default=None, description="arm, sample holder, ... that must keep apart")

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -25,6 +25,8 @@ from simulators.rig.model import SCHEME
 
 #: Longest wait for a running `acquire` to seal its file and let go of the ports.
 LET_GO_S = 15.0
+#: Longest time for which a program that is gone still holds a port.
+DYING_S = 2.0
 #: Longest wait for rest after a stop; an Elliptec runs a started move to its end.
 REST_S = 5.0
 REST_UNSTOPPABLE_S = 30.0
@@ -32,17 +34,18 @@ REST_UNSTOPPABLE_S = 30.0
 Tell = Callable[[str], None]
 
 
-def stop_axes(config: RigConfig, tell: Tell) -> bool:
+def stop_axes(config: RigConfig, tell: Tell, let_go: Collection[int] = ()) -> bool:
     """Stop every axis, each line for itself so that a silent one holds up no other; True if all came to rest.
 
     Parameters
     ----------
     tell : prints a line, from several threads.
+    let_go : processes that are ending: their ports are waited for.
     """
     lines: dict[str, dict[str, AxisConfig]] = {}
     for name, entry in config.axes.items():
         lines.setdefault(os.path.realpath(entry.port), {})[name] = entry
-    told = _tell_running(list(lines), tell)
+    told = set(let_go) or _tell_running(list(lines), tell)
     with LineRegistry(clock=clock_of(config)) as registry, ThreadPoolExecutor(max(1, len(lines))) as threads:
         stopped = threads.map(lambda port: _stop_line(port, lines[port], registry, told, tell), lines)
         return all(list(stopped))
@@ -89,7 +92,7 @@ def _stop_line(port: str, entries: Mapping[str, AxisConfig], lines: LineRegistry
     busy: dict[str, AxisConfig] = {}
     for name, entry in entries.items():
         try:
-            axes.append(_stop_axis(name, entry, lines))
+            axes.append(_stop_let_go(name, entry, lines) if told else _stop_axis(name, entry, lines))
         except CommandRejected as error:
             tell(f"{name}: answers no question now ({error.came_back}); asked again until it does")
             busy[name] = entry
@@ -109,6 +112,18 @@ def _stop_axis(name: str, entry: AxisConfig, lines: LineRegistry) -> MotionAxis:
     axis = open_axis(name, entry, lines)
     axis.stop()
     return axis
+
+
+def _stop_let_go(name: str, entry: AxisConfig, lines: LineRegistry) -> MotionAxis:
+    """Stop an axis whose port a program has just let go of: one that dies holds it a moment longer than it is seen."""
+    end_s = time.monotonic() + DYING_S
+    while True:
+        try:
+            return _stop_axis(name, entry, lines)
+        except PortBusy:
+            if time.monotonic() > end_s:
+                raise
+            time.sleep(0.02)
 
 
 def _stop_when_free(name: str, entry: AxisConfig, lines: LineRegistry) -> MotionAxis:

@@ -1,0 +1,79 @@
+"""Promise 17: when `acquire` is killed or frozen, a process beside it shuts the light and stops the axes."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from simulators.rig.served_rig import serve
+
+#: Wide enough for a machine that does other things; `benchmarks/guard_time.py` measures how long it takes.
+SOON_S = 10.0
+
+
+@pytest.fixture
+def served(quick_rig, tmp_path):
+    """A rig whose emulators live in this process, so that they outlast the program that is killed."""
+    told = tmp_path / "told.txt"
+    hook = tmp_path / "hook.sh"
+    hook.write_text(f'#!/bin/sh\necho "$1" >> {told}\n')
+    hook.chmod(0o755)
+    rig = quick_rig("behind.yaml", clock_speed=4, top={"settle_s": 0.0, "alert": [str(hook)]})
+    with serve(rig, tmp_path / "served.yaml", "red_sphere") as simulation:
+        yield simulation, tmp_path / "served.yaml", told
+
+
+def _lit(simulation):
+    return simulation.light()
+
+
+def _moving(simulation):
+    return any(axis.is_moving() for emulator in simulation.emulators.values() for axis in emulator.axes)
+
+
+def _until(condition, timeout_s=SOON_S):
+    end_s = time.monotonic() + timeout_s
+    while not condition() and time.monotonic() < end_s:
+        time.sleep(0.01)
+    return condition()
+
+
+@pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGSTOP])
+def test_killed_or_frozen_the_light_is_shut_and_the_axes_stop(kind, spawn, partial_of, served, intact, tmp_path):
+    simulation, rig, told = served
+    child = spawn("--omega", 35, "--rig", rig, "--out", tmp_path / "out")
+    partial = partial_of(tmp_path / "out", child, states=5)
+    assert _until(lambda: _lit(simulation) and _moving(simulation))
+    child.send_signal(kind)
+    assert _until(lambda: not _lit(simulation) and not _moving(simulation))
+    journal = tmp_path / "out" / "guard.jsonl"
+    assert _until(lambda: "axes at rest" in journal.read_text())
+    events = [json.loads(line)["event"] for line in journal.read_text().splitlines()]
+    assert events[0] == "guard watches"
+    assert {"light shut", "axes at rest"} <= set(events)
+    assert _until(lambda: told.exists() and "guard" in told.read_text())
+    assert child.wait(SOON_S) == -signal.SIGKILL
+    # What was done is there, and the rig is free again.
+    assert intact(partial) >= 5
+    child = spawn("--resume", partial)
+    _, err = child.communicate(timeout=60)
+    assert child.returncode == 0, err
+    assert "guard rests" in journal.read_text()
+
+
+def test_a_guard_tells_of_a_failure_and_rests(tmp_path, served):
+    """Beats, a failure and the word to rest: nothing is shut and no port is opened."""
+    _, rig, told = served
+    guard = subprocess.Popen([sys.executable, "-m", "acquisition.rig.guard"], stdin=subprocess.PIPE, text=True)
+    log = tmp_path / "guard.jsonl"
+    first = {"rig": rig.read_text(), "pid": os.getpid(), "log": str(log)}
+    guard.communicate(json.dumps(first) + "\nbeat 1\nfailed a device broke\nrest\n", timeout=30)
+    assert guard.returncode == 0
+    assert _until(lambda: told.exists() and "a device broke" in told.read_text())
+    assert [json.loads(line)["event"] for line in log.read_text().splitlines()] == [
+        "guard watches", "alert", "guard rests",
+    ]  # fmt: skip
