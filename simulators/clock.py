@@ -5,23 +5,24 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 
 from drivers import clock as driver_clock
 
-#: The patient clock looks at real time this often, and counts no more than this between two looks.
+#: Who attends the patient clock looks at it this often; it runs no further than this past the last time that all did.
 BEAT_S = 0.005
 LONGEST_BEAT_S = 0.02
 
 
 class PatientClock:
-    """Real time without the gaps in which this process was kept from running.
+    """Real time without the gaps in which part of this process was kept from running.
 
-    Something has to look at it all the time (`beat`); where that comes late, only the first `LONGEST_BEAT_S` count. A
-    driver and the emulator that it talks to then lose the same time on a busy machine: what is in time on a quiet
-    one is in time there too, and a deadline that passes has really been missed.
+    Every thread that others wait for says all the time that it is there (`attend`). The clock goes on when all of them
+    have, by `LONGEST_BEAT_S` at most. A driver and the emulator that it talks to then lose the same time on a busy
+    machine: what is in time on a quiet one is in time there too, and a deadline that passes has really been missed.
 
     Parameters
     ----------
@@ -33,25 +34,46 @@ class PatientClock:
         self._real_s = real_s
         self._lock = threading.Lock()
         self._counted_s = 0.0
-        self._beat_s = real_s()
+        self._all_there_s = real_s()
+        # Whether each thread that attends has been there since then.
+        self._there: dict[object, bool] = {}
 
-    def beat(self) -> None:
-        """Look at real time."""
+    @contextmanager
+    def attend(self) -> Iterator[Callable[[], None]]:
+        """Give a function to call every `BEAT_S`; the clock waits for the thread that does until the block ends."""
+        key = object()
+
+        def here() -> None:
+            with self._lock:
+                self._there[key] = True
+                self._go_on()
+
         with self._lock:
-            real_s = self._real_s()
-            self._counted_s += min(real_s - self._beat_s, LONGEST_BEAT_S)
-            self._beat_s = real_s
+            self._there[key] = False
+        try:
+            yield here
+        finally:
+            with self._lock:
+                del self._there[key]
+                self._go_on()
 
     def now_s(self) -> float:
         """Seconds counted since the clock was made."""
         with self._lock:
-            return self._counted_s + min(self._real_s() - self._beat_s, LONGEST_BEAT_S)
+            return self._counted_s + min(self._real_s() - self._all_there_s, LONGEST_BEAT_S)
 
     def sleep_s(self, duration_s: float) -> None:
         """Wait until so many seconds were counted; not at all if `duration_s` is not positive."""
         end_s = self.now_s() + duration_s
         while (left_s := end_s - self.now_s()) > 0:
             time.sleep(left_s)
+
+    def _go_on(self) -> None:
+        if all(self._there.values()):
+            real_s = self._real_s()
+            self._counted_s += min(real_s - self._all_there_s, LONGEST_BEAT_S)
+            self._all_there_s = real_s
+            self._there = dict.fromkeys(self._there, False)
 
 
 @cache
@@ -60,9 +82,10 @@ def patient_clock() -> PatientClock:
     clock = PatientClock()
 
     def keep_going() -> None:
-        while True:
-            time.sleep(BEAT_S)
-            clock.beat()
+        with clock.attend() as here:
+            while True:
+                time.sleep(BEAT_S)
+                here()
 
     threading.Thread(target=keep_going, name="patient clock", daemon=True).start()
     return clock

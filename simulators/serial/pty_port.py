@@ -12,6 +12,8 @@ import tty
 from types import TracebackType
 from typing import Protocol, Self
 
+from simulators.clock import BEAT_S, patient_clock
+
 
 class SerialEmulator(Protocol):
     """What a port needs of an emulator."""
@@ -81,25 +83,29 @@ class PtyPort:
 
     def _serve(self) -> None:
         try:
-            pending = b""
-            while True:
-                pending = (pending + self.emulator.take_output())[-65536:]
-                wait_s = self.emulator.next_output_s()
-                readable, _, _ = select.select(
-                    [self._master, self._wake_read], [], [], 0.5 if wait_s is None else max(0.0, min(wait_s, 0.5))
-                )
-                if self._wake_read in readable:
-                    return
-                if self._master in readable:
-                    data = self._read()
-                    if data is None:
-                        # Nobody has the port open: what is not yet sent is lost, as on a cable without a host.
-                        # Real time: a program outside may open the port at any moment.
-                        pending = b""
-                        time.sleep(0.005)
-                    else:
-                        self.emulator.receive(data)
-                pending = self._send(pending + self.emulator.take_output())
+            with patient_clock().attend() as here:
+                pending = b""
+                while True:
+                    here()
+                    pending = (pending + self.emulator.take_output())[-65536:]
+                    wait_s = self.emulator.next_output_s()
+                    readable, _, _ = select.select(
+                        [self._master, self._wake_read],
+                        [],
+                        [],
+                        BEAT_S if wait_s is None else max(0.0, min(wait_s, BEAT_S)),
+                    )
+                    if self._wake_read in readable:
+                        return
+                    if self._master in readable:
+                        data = self._read()
+                        if data is None:
+                            # Nobody has the port open: what is not yet sent is lost, as on a cable without a host.
+                            pending = b""
+                            time.sleep(BEAT_S)
+                        else:
+                            self.emulator.receive(data)
+                    pending = self._send(pending + self.emulator.take_output())
         except BaseException as error:  # noqa: BLE001 - raised again by close()
             # Kept for close(), which raises it in the thread that owns the port.
             self._error = error

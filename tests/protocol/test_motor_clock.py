@@ -101,20 +101,31 @@ def test_clocks_run_fast_or_jump() -> None:
         Clock(0.0)
 
 
-def test_a_patient_clock_leaves_out_the_time_in_which_it_was_not_looked_at() -> None:
+def test_a_patient_clock_leaves_out_the_time_in_which_not_all_were_there() -> None:
     real_s = [100.0]
     clock = PatientClock(lambda: real_s[0])
-    for _ in range(100):
+    with clock.attend() as first, clock.attend() as second:
+        for _ in range(100):
+            real_s[0] += LONGEST_BEAT_S / 2
+            first()
+            second()
+        on_time_s = 50 * LONGEST_BEAT_S
+        assert clock.now_s() == pytest.approx(on_time_s)
+        # All are kept from running for ten seconds.
+        real_s[0] += 10.0
+        assert clock.now_s() == pytest.approx(on_time_s + LONGEST_BEAT_S)
+        first()
+        second()
         real_s[0] += LONGEST_BEAT_S / 2
-        clock.beat()
-    on_time_s = 50 * LONGEST_BEAT_S
-    assert clock.now_s() == pytest.approx(on_time_s)
-    # Kept from running for ten seconds.
-    real_s[0] += 10.0
-    assert clock.now_s() == pytest.approx(on_time_s + LONGEST_BEAT_S)
-    clock.beat()
+        assert clock.now_s() == pytest.approx(on_time_s + 1.5 * LONGEST_BEAT_S)
+        # One of them alone is.
+        for _ in range(100):
+            real_s[0] += LONGEST_BEAT_S / 2
+            first()
+        assert clock.now_s() == pytest.approx(on_time_s + 2 * LONGEST_BEAT_S)
+    # Who has left is not waited for.
     real_s[0] += LONGEST_BEAT_S / 2
-    assert clock.now_s() == pytest.approx(on_time_s + 1.5 * LONGEST_BEAT_S)
+    assert clock.now_s() == pytest.approx(on_time_s + 2.5 * LONGEST_BEAT_S)
 
 
 def test_the_patient_clock_of_this_process_goes_and_waits() -> None:
