@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
+from ruamel.yaml.composer import Composer
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.events import AliasEvent
 
+from processing.doors import MOST_DEPTH, one_line, read_text
 from processing.errors import ProcessError
 
 Model = TypeVar("Model", bound=BaseModel)
+
+#: Most bytes and most values of a file, aliases counted as often as they are used. The parser takes up to 0.2 ms a
+#: value, so that this is about two seconds; a table of 5000 states of two axes fits.
+MOST_BYTES = 256 << 10
+MOST_NODES = 10_500
+#: Lines of a message about a file with very many mistakes.
+MOST_LINES = 30
 
 
 class ConfigError(ProcessError):
@@ -29,31 +40,85 @@ def load_yaml(path: Path | str, model: type[Model]) -> Model:
         The file is missing, is not YAML, repeats a key, or does not fit the model.
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: is not UTF-8 text") from error
-    return parse_yaml(text, model, source=str(path))
+    return parse_yaml(read_text(path, ConfigError, MOST_BYTES), model, source=str(path))
+
+
+class _BoundedComposer(Composer):
+    """Builds the tree of a document, but none that is too deep, too large, or contains itself."""
+
+    def __init__(self, loader: Any = None) -> None:
+        super().__init__(loader=loader)
+        self._nodes = self._depth = 0
+        self._size_of: dict[str, int] = {}
+        self._open: set[str] = set()
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        event = self.parser.peek_event()
+        if isinstance(event, AliasEvent):
+            if event.anchor in self._open:
+                raise MarkedYAMLError(problem=f"*{event.anchor} contains itself", problem_mark=event.start_mark)
+            self._count(self._size_of.get(event.anchor, 0), event)
+            return super().compose_node(parent, index)
+        before, anchor = self._nodes, getattr(event, "anchor", None)
+        self._count(1, event)
+        self._depth += 1
+        if self._depth > MOST_DEPTH:
+            raise MarkedYAMLError(problem=f"nested deeper than {MOST_DEPTH} levels", problem_mark=event.start_mark)
+        if anchor is not None:
+            self._open.add(anchor)
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        if anchor is not None:
+            self._open.discard(anchor)
+            self._size_of[anchor] = self._nodes - before
+        return node
+
+    def _count(self, nodes: int, event: Any) -> None:
+        self._nodes += nodes
+        if self._nodes > MOST_NODES:
+            raise MarkedYAMLError(problem=f"more than {MOST_NODES} values", problem_mark=event.start_mark)
 
 
 def parse_yaml(text: str, model: type[Model], source: str = "text") -> Model:
     """Validate YAML text as `model`; `source` names it in errors. Raises ConfigError."""
+    tree = _tree(text, source)
+    endless = [
+        f"{source}:{_line(tree, where)}: {'.'.join(map(str, where))}: must be a finite number"
+        for where, value in _scalars(tree)
+        if isinstance(value, float) and not math.isfinite(value)
+    ]
     try:
-        tree = YAML(typ="rt").load(text)
-    except MarkedYAMLError as error:
-        line = error.problem_mark.line + 1 if error.problem_mark else "?"
-        raise ConfigError(f"{source}:{line}: {error.problem}") from error
-    except YAMLError as error:
-        raise ConfigError(f"{source}: {error}") from error
-    if not isinstance(tree, CommentedMap):
-        raise ConfigError(f"{source}: expected keys and values at the top level, found {type(tree).__name__}")
-    try:
-        return model.model_validate(_plain(tree))
+        value = model.model_validate(_plain(tree))
     except ValidationError as error:
         lines = [_describe(source, tree, entry) for entry in error.errors()]
-        raise ConfigError("\n".join(lines)) from error
+        told = {line.split(" ", 1)[0] for line in lines}
+        raise _refusal(source, lines + [line for line in endless if line.split(" ", 1)[0] not in told]) from error
+    if endless:
+        raise _refusal(source, endless)
+    return value
+
+
+def _refusal(source: str, lines: list[str]) -> ConfigError:
+    left = [f"{source}: and {len(lines) - MOST_LINES} more"] if len(lines) > MOST_LINES else []
+    return ConfigError("\n".join(lines[:MOST_LINES] + left))
+
+
+def _tree(text: str, source: str) -> CommentedMap:
+    if len(text) > MOST_BYTES:
+        raise ConfigError(f"{source}: {len(text):,} characters; at most {MOST_BYTES:,} are read")
+    yaml = YAML(typ="rt")
+    yaml.Composer = _BoundedComposer
+    try:
+        tree = yaml.load(text)
+    except MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else "?"
+        raise ConfigError(f"{source}:{line}: {one_line(error.problem)}") from error
+    except (YAMLError, ValueError, TypeError, AttributeError, KeyError, IndexError, AssertionError) as error:
+        # The parser's own errors on tags and dates that are none come as Python's.
+        raise ConfigError(f"{source}: is not YAML that can be read ({one_line(error)})") from error
+    if not isinstance(tree, CommentedMap):
+        raise ConfigError(f"{source}: expected keys and values at the top level, found {type(tree).__name__}")
+    return tree
 
 
 def dump_yaml(value: BaseModel) -> str:
@@ -84,7 +149,7 @@ def _plain(node: Any) -> Any:
 def _describe(source: str, tree: CommentedMap, entry: Any) -> str:
     location: Sequence[int | str] = entry["loc"]
     where = ".".join(str(part) for part in location)
-    return ": ".join(filter(None, (f"{source}:{_line(tree, location)}", where, message_of(entry))))
+    return ": ".join(filter(None, (f"{source}:{_line(tree, location)}", one_line(where), one_line(message_of(entry)))))
 
 
 def message_of(entry: Any) -> str:
@@ -97,9 +162,21 @@ def message_of(entry: Any) -> str:
 def _line(tree: Any, location: Sequence[int | str]) -> int:
     node, line = tree, tree.lc.line + 1
     for part in location:
-        if isinstance(node, CommentedMap) and part in node:
-            line, node = node.lc.key(part)[0] + 1, node[part]
-        elif isinstance(node, CommentedSeq) and isinstance(part, int) and part < len(node):
-            line, node = node.lc.item(part)[0] + 1, node[part]
+        if isinstance(node, (CommentedMap, CommentedSeq)) and _has(node, part):
+            # What came in by a merge has no line of its own: the one above it stays.
+            place = (node.lc.data or {}).get(part)
+            line, node = line if place is None else place[0] + 1, node[part]
         # Any other part is a tag that pydantic adds for unions: the line stays.
     return int(line)
+
+
+def _has(node: CommentedMap | CommentedSeq, part: int | str) -> bool:
+    return part in node if isinstance(node, CommentedMap) else isinstance(part, int) and part < len(node)
+
+
+def _scalars(node: Any, where: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
+    if isinstance(node, (dict, list)):
+        for part, item in node.items() if isinstance(node, dict) else enumerate(node):
+            yield from _scalars(item, (*where, part))
+    else:
+        yield where, node

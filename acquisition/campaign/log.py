@@ -18,8 +18,10 @@ from acquisition.campaign.identity import IDENTITY
 from acquisition.campaign.plan import Campaign, CampaignCapture
 from acquisition.capture.writer import sync
 from acquisition.errors import AcquisitionError
+from processing.doors import read_json, read_text
+from processing.errors import ProcessError
 from processing.storage.capture import Capture
-from processing.yaml_file import dump_yaml
+from processing.yaml_file import ConfigError, dump_yaml, load_yaml
 
 log = logging.getLogger(__name__)
 
@@ -45,17 +47,24 @@ class CampaignFolder:
             self._lock.acquire(timeout=0)
         except filelock.Timeout:
             raise AcquisitionError(f"another program runs the campaign in {folder}. End that one first.") from None
-        text = dump_yaml(campaign)
-        plan = folder / PLAN
-        if plan.exists() and plan.read_text(encoding="utf-8") != text:
+        try:
+            self._require_same(campaign)
+            self.index = read_index(folder)
+        except BaseException:
             self.close()
-            raise AcquisitionError(
-                f"{folder} holds another campaign: {plan} differs from the file given. "
-                "Give the same file, or another folder with --out."
-            )
+            raise
+
+    def _require_same(self, campaign: Campaign) -> None:
+        plan, text = self.folder / PLAN, dump_yaml(campaign)
         if not plan.exists():
             self._write_whole(plan, text)
-        self.index = read_index(folder)
+        elif read_text(plan, ConfigError) != text:
+            # What is no campaign any more says so itself.
+            load_yaml(plan, Campaign)
+            raise AcquisitionError(
+                f"{self.folder} holds another campaign: {plan} differs from the file given. "
+                "Give the same file, or another folder with --out."
+            )
 
     def begin_with(self, identity: Mapping[str, Any]) -> None:
         """Note what the campaign is taken with, once."""
@@ -112,11 +121,11 @@ def read_index(folder: Path) -> dict[str, dict[str, Any]]:
     if not path.exists():
         return {}
     try:
-        index = json.loads(path.read_text(encoding="utf-8"))
+        index = read_json(path)
         if isinstance(index, dict) and all(isinstance(entry, dict) for entry in index.values()):
             return index
-    except (OSError, ValueError, RecursionError) as error:
-        log.warning("%s cannot be read (%s)", path, error)
+    except ProcessError as error:
+        log.warning("%s", error)
     log.warning("%s is damaged: it is made anew from the captures", path)
     return {}
 

@@ -8,20 +8,20 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
-from acquisition.capture.plan import Auto, AutoExposure, MeasurementPlan, Seconds, exposure_kind
+from acquisition.capture.plan import Auto, AutoExposure, MeasurementPlan, Mode, Seconds, exposure_kind
 from processing.storage.capture_schema import Sample
 from processing.yaml_file import load_yaml
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 Angle = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class AngleSteps(_Part):
-    """Equal steps from `start` to `stop`, both included."""
+    """Equal steps from `start` to `stop`, both included; at most 3600."""
 
     start: Angle
     stop: Angle
@@ -36,6 +36,8 @@ class AngleSteps(_Part):
     def _ascending(self) -> Self:
         if self.stop < self.start:
             raise ValueError(f"stop {self.stop:g} lies before start {self.start:g}")
+        if self.stop - self.start > 3600 * self.step:
+            raise ValueError(f"step {self.step:g} makes more than 3600 angles")
         return self
 
 
@@ -64,10 +66,10 @@ class Campaign(_Part):
     kind: Literal["campaign"] = "campaign"
     name: str = Field(pattern=r"^[A-Za-z0-9_-]+$")
     rig: Path | None = None
-    plans: dict[str, Path]
+    plans: dict[Mode, Path] = Field(min_length=1)
     samples: tuple[Sample, ...] = Field(min_length=1)
     wavelengths_nm: tuple[Annotated[float, Field(gt=0)], ...] = Field(min_length=1)
-    omega_deg: AngleSteps | tuple[Angle, ...]
+    omega_deg: AngleSteps | Annotated[tuple[Angle, ...], Field(min_length=1)]
     exposure_s: (
         Annotated[Seconds | Annotated[dict[float, float], Tag("by wavelength")] | Auto, Discriminator(exposure_kind)]
         | None
@@ -76,6 +78,15 @@ class Campaign(_Part):
     retries: int = Field(default=0, ge=0, le=100)
     retry_wait_s: float = Field(default=5.0, ge=0)
     continue_after_interlock: bool = False
+
+    @model_validator(mode="after")
+    def _references_have_a_plan(self) -> Self:
+        for reference in self.references:
+            unknown = sorted(set(reference.modes) - set(self.plans))
+            if unknown or not reference.modes:
+                known = ", ".join(self.plans)
+                raise ValueError(f"a reference in mode {', '.join(unknown) or 'none'}; `plans` has {known}")
+        return self
 
     @classmethod
     def load(cls, path: Path | str) -> Campaign:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.doors import require_picture
 from processing.geometry.errors import GeometryError, OutlineNotFound
 from processing.geometry.pinhole import PinholeCamera
 
@@ -121,6 +122,7 @@ def calibrate(
 
 def read_grey(path: Path) -> NDArray[np.uint8]:
     """An image file as 8-bit grey. Raises GeometryError when it is none."""
+    require_picture(path, GeometryError)
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise GeometryError(f"{path}: cannot be read as an image")

@@ -13,8 +13,11 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from processing.arrays import Array
 from processing.computing.threads import for_ranges
+from processing.doors import one_line, require_file
 from processing.geometry.errors import GeometryError
 
+#: A million triangles as binary STL take 50 MB.
+MOST_MESH_BYTES = 256 << 20
 #: Rays that embree gets at a time.
 RAYS = 1 << 15
 
@@ -106,12 +109,16 @@ def _load(
     from embreex import rtcore_scene
     from embreex.mesh_construction import TriangleMesh
 
+    require_file(path, GeometryError, MOST_MESH_BYTES)
     try:
         mesh = trimesh.load_mesh(path)
-    except (ValueError, TypeError, IndexError, KeyError, NotImplementedError) as error:
-        raise GeometryError(f"{path} cannot be read as a mesh ({error}). STL, OBJ and PLY are.") from error
+    except Exception as error:
+        # Readers of a dozen formats raise whatever they like.
+        raise GeometryError(f"{path} cannot be read as a mesh ({one_line(error)}). STL, OBJ and PLY are.") from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise GeometryError(f"{path} holds no triangles. Export it as a triangle mesh.")
+    if not np.isfinite(mesh.vertices).all():
+        raise GeometryError(f"{path} has corners that are no finite numbers.")
     if not mesh.is_watertight and not allow_holes:
         raise GeometryError(
             f"{path} has holes ({len(mesh.faces)} triangles, not closed): rays would reach its inside. "

@@ -116,9 +116,16 @@ def load(path: Path | str, white_m00: float = 1.0, only_nm: float | None = None)
     ):
         if values.size != wanted.size or not np.allclose(np.rad2deg(values.reshape(-1)), wanted, atol=0.02):
             raise TableError(f"{path}: its {name} axis is not the 91 x 91 x 361 layout that the renderer's files have")
+    wavelengths, shape = fields["wvls"].reshape(-1), fields["M"].shape
+    if shape != (*SHAPE[::-1], wavelengths.size, 4, 4) or fields["M"].dtype.kind != "f":
+        raise TableError(f"{path}: M is {fields['M'].dtype} {shape}, not {(*SHAPE[::-1], wavelengths.size, 4, 4)}")
+    if fields["wvls"].dtype.kind not in "uif" or np.unique(np.rint(wavelengths)).size != wavelengths.size:
+        raise TableError(f"{path}: its wavelengths are not all different")
+    if not np.all((wavelengths > 0) & (wavelengths < 1e6)):
+        raise TableError(f"{path}: its wavelengths are no wavelengths in nm")
     angles, cos_i, _ = _grid()
     tables = {}
-    for k, wavelength in enumerate(fields["wvls"].reshape(-1)):
+    for k, wavelength in enumerate(wavelengths):
         if only_nm is not None and abs(only_nm - wavelength) > 0.5:
             continue
         m = np.moveaxis(fields["M"][..., k, :, :].reshape(*SHAPE[::-1], 16), -1, 0).transpose(0, 3, 2, 1)

@@ -19,6 +19,7 @@ from processing.computing.threads import for_ranges
 from processing.errors import ProcessError
 from processing.geometry.rusinkiewicz import Angles
 from processing.reflectance.table_axes import SHAPE, Layout, TableAxes
+from processing.storage.h5_door import damage_as, open_h5, require_dataset
 from processing.storage.provenance import Step, read_steps, sign, write_steps
 
 SCHEMA_VERSION = 1
@@ -170,24 +171,27 @@ class ScatteringTable:
     @classmethod
     def load(cls, path: Path | str) -> ScatteringTable:
         """Read a table. Raises TableError when the file is none, or its axes are not those of its layout."""
-        try:
-            with h5py.File(path, "r") as h5:
-                if "umov_table" not in h5.attrs:
-                    raise TableError(f"{path} is no scattering table. `process table` makes one.")
-                a = h5.attrs
-                table = cls(
-                    tuple(str(q) for q in a["quantities"]),
-                    float(a["wavelength_nm"]),
-                    a["layout"],
-                    bool(a["simulated"]),
-                    str(a["frames"]),
-                )
-                if not np.allclose(h5["theta_h_deg"][...], table.axes.theta_h_deg):
-                    raise TableError(f"{path}: its theta_h axis is not that of layout {a['layout']!r}")
-                table.bins, table.count = h5["bin"][...], h5["count"][...]
-                table._sum, table._square = h5["sum"][...], h5["sum_of_squares"][...]
-        except (OSError, KeyError) as error:
-            raise TableError(f"{path} cannot be read as a scattering table ({error})") from error
+        failing = damage_as(TableError, f"{path} cannot be read as a scattering table")
+        with failing, open_h5(Path(path), TableError) as h5:
+            if "umov_table" not in h5.attrs:
+                raise TableError(f"{path} is no scattering table. `process table` makes one.")
+            a = h5.attrs
+            table = cls(
+                tuple(str(q) for q in a["quantities"]),
+                float(a["wavelength_nm"]),
+                a["layout"],
+                bool(a["simulated"]),
+                str(a["frames"]),
+            )
+            if not np.allclose(h5["theta_h_deg"][...], table.axes.theta_h_deg):
+                raise TableError(f"{path}: its theta_h axis is not that of layout {a['layout']!r}")
+            bins = require_dataset(h5, "bin", (None,), "i")[...]
+            n, q = bins.size, len(table.quantities)
+            if n and not (bins.min() >= 0 and bins.max() < table._row.size and np.unique(bins).size == n):
+                raise ValueError("bins outside the axes, or given twice")
+            table.bins, table.count = bins, require_dataset(h5, "count", (n,), "i")[...]
+            table._sum = require_dataset(h5, "sum", (q, n), "f")[...]
+            table._square = require_dataset(h5, "sum_of_squares", (q, n), "f")[...]
         table._row[table.bins] = np.arange(table.bins.size, dtype=np.int32)
         return table
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.doors import require_file
 from processing.errors import ProcessError
 
 EPOCH = datetime(1904, 1, 1, tzinfo=UTC)
@@ -153,6 +154,7 @@ def write_mueller_file(path: Path, image: MuellerFile) -> None:
 
 
 def _words(path: Path) -> NDArray[np.uint32]:
+    require_file(path, AxoStepError)
     data = path.read_bytes()
     if len(data) % 4:
         raise AxoStepError(f"{path} has {len(data)} bytes, no whole number of 32-bit words; it is truncated")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -12,12 +12,14 @@ from typing import Any, Self
 import h5py
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
+from processing.doors import parse_json
 from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
+from processing.storage.capture_door import check_capture
 from processing.storage.capture_schema import SCHEMA_VERSION, CaptureHeader
 from processing.storage.checksums import NONE, row_crc32, state_crc32
+from processing.storage.h5_door import damage_as, open_h5, text_attribute
 from processing.storage.segments import Segment, decode_lines, segments_of
 from processing.yaml_file import parse_yaml
 
@@ -50,15 +52,11 @@ class Capture:
         self._verifying = verify
         self._h5 = _open(self.path)
         try:
-            self._read()
+            with damage_as(CaptureError, f"{self.path} is not a whole umov capture"):
+                self._read()
         except CaptureError:
             self._h5.close()
             raise
-        except (KeyError, OSError, ValidationError, ValueError) as error:
-            self._h5.close()
-            raise CaptureError(
-                f"{self.path} is not a whole umov capture ({error}). If it comes from elsewhere, use `process import`."
-            ) from error
 
     def _read(self) -> None:
         if "umov_schema" not in self._h5.attrs:
@@ -71,7 +69,8 @@ class Capture:
                 f"{self.path} has capture schema {version}; this program reads up to {SCHEMA_VERSION}. Update it."
             )
         entry = self._h5["entry"]
-        self.header = CaptureHeader.model_validate_json(entry.attrs["header_json"])
+        self.header = CaptureHeader.model_validate_json(text_attribute(entry, "header_json"))
+        check_capture(entry, self.header)
         self.simulated: bool = bool(entry.attrs["simulated"])
         status = entry.attrs["status"]
         self.status: str = status.decode() if isinstance(status, bytes) else str(status)
@@ -135,28 +134,32 @@ class Capture:
 
     def column(self, name: str) -> NDArray[Any]:
         """A column of the state table (exposure_s, host_time_s, ...) for the states done."""
-        return np.asarray(self._h5[f"entry/states/{name}"][...][self.done])
+        return self.planned_column(name)[self.done]
 
     @property
     def start_time(self) -> str:
         """When the capture began, ISO 8601."""
-        return str(self._h5["entry/start_time"].asstr()[()])
+        with self._damage():
+            return str(self._h5["entry/start_time"].asstr()[()])
 
     @property
     def camera_nodes(self) -> dict[str, str]:
         """Every feature of the camera with its value when the capture began; empty where none were kept."""
         if "entry/camera_nodes" not in self._h5:
             return {}
-        nodes: dict[str, str] = json.loads(self._h5["entry/camera_nodes/data"][()])
-        return nodes
+        with self._damage():
+            nodes = parse_json(self._h5["entry/camera_nodes/data"][()], f"{self.path}: camera nodes", CaptureError)
+            return dict(nodes)
 
     def planned_column(self, name: str) -> NDArray[Any]:
         """A column of the state table for all planned states, done or not."""
-        return np.asarray(self._h5[f"entry/states/{name}"][...])
+        with self._damage():
+            return np.asarray(self._h5[f"entry/states/{name}"][...])
 
     def planned_targets_deg(self) -> dict[str, NDArray[np.float64]]:
         """Target angles of each axis for all planned states, done or not."""
-        return {name: self._h5[f"entry/instrument/{name}/target_value"][...] for name in self.angles_deg}
+        with self._damage():
+            return {name: self._h5[f"entry/instrument/{name}/target_value"][...] for name in self.angles_deg}
 
     @property
     def frame_shape(self) -> tuple[int, int]:
@@ -174,7 +177,8 @@ class Capture:
 
     def frames(self, state: int, rows: slice = slice(None)) -> NDArray[Any]:
         """Counts (channels, rows, columns) of one state done, as stored."""
-        counts = np.asarray(self._frames[int(self.done[state]), :, rows, :])
+        with self._damage():
+            counts = np.asarray(self._frames[int(self.done[state]), :, rows, :])
         self._verify(state, rows, counts)
         return counts
 
@@ -191,9 +195,10 @@ class Capture:
 
     def read_block(self, states: NDArray[np.int64], rows: slice, out: NDArray[Any]) -> None:
         """Fill `out` (len(states), channels, rows, columns) with counts of states done, as stored."""
-        for k, state in enumerate(states):
-            self._frames.read_direct(out, np.s_[int(self.done[state]), :, rows, :], np.s_[k])
-            self._verify(int(state), rows, out[k])
+        with self._damage():
+            for k, state in enumerate(states):
+                self._frames.read_direct(out, np.s_[int(self.done[state]), :, rows, :], np.s_[k])
+                self._verify(int(state), rows, out[k])
 
     def row_blocks(self, pixels: int = 1 << 17) -> Iterator[slice]:
         """Row slices of about `pixels` pixels, an even number of rows each (mosaics stay whole)."""
@@ -215,14 +220,20 @@ class Capture:
         """The runs that took states of this capture, one after another; the light may jump between them."""
         if "segments" not in self._h5["entry"]:
             return segments_of([], self.done)
-        records, _ = decode_lines(self._h5["entry/segments/json"][...].tobytes())
-        return segments_of(records, self.column("segment"))
+        with self._damage():
+            records, _ = decode_lines(self._h5["entry/segments/json"][...].tobytes())
+            return segments_of(records, self.column("segment"))
 
     @cached_property
     def closing(self) -> dict[str, Any]:
         """Closing record: end time, time ledger, stream statistics, messages; empty if not sealed."""
-        raw = self._h5["entry/closing/json"][...].tobytes().rstrip(b"\0")
-        return json.loads(raw) if raw else {}
+        with self._damage():
+            raw = self._h5["entry/closing/json"][...].tobytes().rstrip(b"\0")
+            closing = parse_json(raw, f"{self.path}: closing record", CaptureError) if raw else {}
+            return dict(closing)
+
+    def _damage(self) -> AbstractContextManager[None]:
+        return damage_as(CaptureError, f"{self.path} is damaged")
 
     def close(self) -> None:
         """Close the file."""
@@ -238,10 +249,5 @@ class Capture:
 def _open(path: Path) -> h5py.File:
     if not path.exists():
         raise CaptureError(f"{path}: no such file. Check the path; `acquire` prints it at the end of a run.")
-    try:
-        return h5py.File(path, "r")
-    except OSError as error:
-        raise CaptureError(
-            f"{path} cannot be opened as HDF5 ({error}). It is truncated or not a capture; "
-            "nothing was changed. If a run was interrupted, its states are in the .partial file beside it."
-        ) from error
+    hint = "Nothing was changed. If a run was interrupted, its states are in the .partial file beside it."
+    return open_h5(path, CaptureError, hint)

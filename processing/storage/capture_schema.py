@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 #: 2 added segments and checksums; a file of version 1 is read, but not gone on with.
 SCHEMA_VERSION = 2
@@ -45,9 +45,12 @@ STATE_COLUMNS: dict[str, Any] = {
 #: What a column holds before its state is taken, where it is not NaN or zero.
 EMPTY: dict[str, int] = {"repeats": 1, "crc32": -1}
 
+#: What else stands in /entry/instrument, so that no axis can have the name.
+NOT_AXES = frozenset({"beam", "detector", "omega", "omega_deg", "name"})
+
 
 class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class Sample(_Part):
@@ -58,7 +61,13 @@ class Sample(_Part):
 
     kind: SampleKind = "unknown"
     name: str = ""
-    mueller: tuple[float, ...] | None = None
+    mueller: Annotated[tuple[float, ...], Field(min_length=16, max_length=16)] | None = None
+
+    @model_validator(mode="after")
+    def _matrix_goes_with_its_kind(self) -> Self:
+        if (self.kind == "mueller") != (self.mueller is not None):
+            raise ValueError("kind mueller and its 16 numbers under `mueller` go together")
+        return self
 
 
 class Detector(_Part):
@@ -72,7 +81,7 @@ class Detector(_Part):
     gain_e_per_count: float | None = Field(default=None, gt=0)
     read_noise_e: float | None = Field(default=None, ge=0)
     full_well_e: float | None = Field(default=None, gt=0)
-    bits: int | None = None
+    bits: int | None = Field(default=None, ge=1, le=32)
 
 
 class CaptureHeader(_Part):

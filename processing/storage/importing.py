@@ -17,15 +17,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.computing.threads import thread_count
+from processing.doors import one_line, read_text
 from processing.instrument.model import InstrumentModel
-from processing.storage.axostep import read_rmmd
 from processing.storage.capture_schema import CaptureHeader, Detector, Sample, create_layout, write_closing
+from processing.storage.frame_files import check_stack, open_stack, read_picture
+from processing.storage.h5_door import read_npy
 from processing.storage.state_csv import ImportFailed, StatesFile, read_states
 
 #: Called with (states done, states in all).
 Progress = Callable[[int, int], None]
 
 Frame = NDArray[Any]
+
+#: Most bytes of a file of 16 numbers.
+MOST_SAMPLE_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -104,6 +109,8 @@ def _write(
     data = h5["entry/instrument/detector/data"]
     count = 0
     for count, frame in enumerate(source.frames(), 1):
+        if frame.dtype.kind == "f" and not np.isfinite(frame).any():
+            raise ImportFailed(f"{states.path}:{states.line[count - 1]}: the frame of this state has no finite value")
         data[count - 1] = frame
         if progress:
             progress(count, len(states))
@@ -148,36 +155,10 @@ def _fluxes(states: StatesFile, names: tuple[str, ...]) -> FrameSource:
 
 
 def _stack(text: str, states: StatesFile, names: tuple[str, ...]) -> FrameSource:
-    file, _, inside = text.partition("::")
-    try:
-        if file.endswith(".rmmd"):
-            stack: Any = read_rmmd(Path(file)).states(len(states))
-        elif file.endswith(".npy"):
-            stack = np.load(file, mmap_mode="r")
-        else:
-            h5 = h5py.File(file, "r")
-            stack = h5[inside or _only_stack(h5, file)]
-    except (OSError, ValueError, KeyError) as error:
-        raise ImportFailed(
-            f"{text}: cannot be read as .npy or HDF5 ({error}). Write HDF5 as FILE::/path/to/dataset."
-        ) from error
-    shape = tuple(stack.shape)
-    expected = f"({len(states)}, rows, columns)" if len(names) == 1 else f"({len(states)}, {len(names)}, rows, columns)"
-    if shape[0] != len(states) or len(shape) not in (3, 4) or (shape[1] if len(shape) == 4 else 1) != len(names):
-        raise ImportFailed(f"{text}: shape {shape}; {states.path} and the instrument ask for {expected}.")
-    if stack.dtype.kind not in "uif":
-        raise ImportFailed(f"{text}: holds {stack.dtype}; frames are integers or floating numbers.")
-    per_state = (len(names), *shape[-2:])
+    stack = open_stack(text, len(states))
+    check_stack(text, stack, len(states), len(names))
+    per_state = (len(names), *stack.shape[-2:])
     return FrameSource(per_state, stack.dtype, lambda: (np.asarray(s).reshape(per_state) for s in stack), names)
-
-
-def _only_stack(h5: h5py.File, file: str) -> str:
-    found: list[str] = []
-    h5.visititems(lambda name, item: found.append(name) if isinstance(item, h5py.Dataset) and item.ndim >= 3 else None)
-    if len(found) != 1:
-        shown = ", ".join(found) or "none"
-        raise ImportFailed(f"{file}: datasets with three or four dimensions: {shown}. Say which: --stack {file}::/NAME")
-    return found[0]
 
 
 def _images(states: StatesFile, names: tuple[str, ...]) -> FrameSource:
@@ -192,11 +173,11 @@ def _images(states: StatesFile, names: tuple[str, ...]) -> FrameSource:
         line, file = absent[0]
         more = f" (and {len(absent) - 1} more)" if len(absent) > 1 else ""
         raise ImportFailed(f"{states.path}:{line}: column file: no such frame: {file}{more}")
-    first = _image(files[0])
+    first = read_picture(files[0])
 
     def load(item: tuple[int, Path]) -> Frame:
         line, file = item
-        image = _image(file)
+        image = read_picture(file)
         if image.shape != first.shape or image.dtype != first.dtype:
             raise ImportFailed(
                 f"{states.path}:{line}: {file.name} is {_kind(image)}, but the first frame is {_kind(first)}; "
@@ -217,21 +198,6 @@ def _images(states: StatesFile, names: tuple[str, ...]) -> FrameSource:
     return FrameSource((1, *first.shape), first.dtype, frames, names)
 
 
-def _image(file: Path) -> Frame:
-    import cv2
-
-    image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise ImportFailed(f"{file}: is not an image that can be read (PNG or TIFF)")
-    if image.ndim == 3:
-        grey = image[..., 0]
-        colours = image[..., :3]
-        if not np.array_equal(colours, np.broadcast_to(grey[..., None], colours.shape)):
-            raise ImportFailed(f"{file}: is a colour image; frames are raw grey values of one channel")
-        image = np.ascontiguousarray(grey)
-    return np.asarray(image)
-
-
 def _kind(image: Frame) -> str:
     return f"{image.shape[1]} x {image.shape[0]} {image.dtype}"
 
@@ -243,12 +209,12 @@ def read_sample(text: str) -> Sample:
     path = Path(text)
     try:
         if path.suffix == ".npy":
-            values = np.load(path)
+            values = read_npy(path, ImportFailed, MOST_SAMPLE_BYTES).astype(float)
         else:
-            values = np.array(path.read_text(encoding="utf-8").replace(",", " ").split(), dtype=float)
-    except (OSError, ValueError) as error:
+            values = np.array(read_text(path, ImportFailed, MOST_SAMPLE_BYTES).replace(",", " ").split(), dtype=float)
+    except (ImportFailed, ValueError) as error:
         raise ImportFailed(
-            f"--sample {text}: neither air, mirror, unknown nor a readable file of numbers ({error})"
+            f"--sample {text}: neither air, mirror, unknown nor a readable file of numbers ({one_line(error)})"
         ) from error
     if values.size != 16 or not np.all(np.isfinite(values)):
         raise ImportFailed(f"--sample {text}: a Mueller matrix has 16 finite numbers; found {values.size}")

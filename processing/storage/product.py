@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from processing.errors import ProcessError
 from processing.storage.capture_schema import CaptureHeader
+from processing.storage.h5_door import damage_as, open_h5, require_dataset, text_attribute
 from processing.storage.provenance import Step as Step
 from processing.storage.provenance import file_identity as file_identity
 from processing.storage.provenance import jsonable, read_steps, sign, write_steps
@@ -138,7 +139,8 @@ class ProductWriter:
 
     def get(self, name: str, rows: slice = slice(None)) -> NDArray[Any]:
         """What has been written so far: dataset (leading..., rows, columns)."""
-        return np.asarray(self._h5["entry/data"][name][..., rows, :])
+        with damage_as(ProductError, f"{self.path} is damaged"):
+            return np.asarray(self._h5["entry/data"][name][..., rows, :])
 
     def array(self, name: str, values: NDArray[Any], units: str, long_name: str) -> None:
         """Store something that is not per pixel (W, a curve) in /entry/reduction."""
@@ -183,29 +185,37 @@ class Product:
         self.path = Path(path)
         if not self.path.exists():
             raise ProductError(f"{self.path}: no such file. `process reduce` prints the name of what it writes.")
+        self._h5 = open_h5(self.path, ProductError)
         try:
-            self._h5 = h5py.File(self.path, "r")
-        except OSError as error:
-            raise ProductError(
-                f"{self.path} cannot be opened as HDF5 ({error}); it is truncated or no product."
-            ) from error
-        if "umov_product" not in self._h5.attrs:
+            with damage_as(ProductError, f"{self.path} is damaged, or not a whole product"):
+                self._read()
+        except ProductError:
             self._h5.close()
+            raise
+
+    def _read(self) -> None:
+        if "umov_product" not in self._h5.attrs:
             raise ProductError(
                 f"{self.path} is not a product of `process`. A capture goes through `process reduce` first."
             )
-        if int(self._h5.attrs["umov_product"]) > PRODUCT_VERSION:
-            found = int(self._h5.attrs["umov_product"])
-            self._h5.close()
-            raise ProductError(f"{self.path} has product version {found}; this program reads up to {PRODUCT_VERSION}.")
+        version = int(self._h5.attrs["umov_product"])
+        if version > PRODUCT_VERSION:
+            raise ProductError(
+                f"{self.path} has product version {version}; this program reads up to {PRODUCT_VERSION}."
+            )
         entry = self._h5["entry"]
-        self.kind = str(entry.attrs["kind"])
+        self.kind = text_attribute(entry, "kind")
         self.simulated = bool(entry.attrs["simulated"])
-        self.header = CaptureHeader.model_validate_json(entry.attrs["header_json"])
-        self.facts: dict[str, Any] = json.loads(entry.attrs["facts_json"])
+        self.header = CaptureHeader.model_validate_json(text_attribute(entry, "header_json"))
+        self.facts: dict[str, Any] = dict(json.loads(text_attribute(entry, "facts_json")))
         self.steps = read_steps(entry)
-        self.names: tuple[str, ...] = tuple(entry["data"])
-        self.shape: tuple[int, int] = tuple(entry["data"][entry["data"].attrs["signal"]].shape[-2:])
+        data = entry["data"]
+        self.names: tuple[str, ...] = tuple(data)
+        rows, columns = data[text_attribute(data, "signal")].shape[-2:]
+        self.shape: tuple[int, int] = (int(rows), int(columns))
+        for name in self.names:
+            leading = (None,) * (data[name].ndim - 2)
+            require_dataset(data, name, (*leading, *self.shape), "uif")
 
     def require(self, *kinds: str) -> None:
         """Raise ProductError unless the product is of one of the kinds."""
@@ -216,7 +226,8 @@ class Product:
         """Dataset (leading..., rows, columns)."""
         if name not in self.names:
             raise ProductError(f"{self.path} has no {name!r}; it has: {', '.join(self.names)}.")
-        return np.asarray(self._h5["entry/data"][name][..., rows, :])
+        with damage_as(ProductError, f"{self.path} is damaged"):
+            return np.asarray(self._h5["entry/data"][name][..., rows, :])
 
     def units(self, name: str) -> str:
         """Unit of a dataset."""
@@ -228,7 +239,8 @@ class Product:
 
     def array(self, name: str) -> NDArray[Any]:
         """An array of /entry/reduction that is not per pixel, such as the measurement matrix."""
-        return np.asarray(self._h5[f"entry/reduction/{name}"][...])
+        with damage_as(ProductError, f"{self.path} is damaged"):
+            return np.asarray(self._h5[f"entry/reduction/{name}"][...])
 
     def row_blocks(self, pixels: int = 1 << 17) -> Iterable[slice]:
         """Row slices of about `pixels` pixels."""

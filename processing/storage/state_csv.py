@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +12,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.doors import one_line, read_text
 from processing.errors import ProcessError
+from processing.storage.capture_schema import NOT_AXES
 
 ROLES = ("sample", "air", "dark", "flat")
 CHANNEL_PREFIX = "channel_"
+#: Columns that are no axes.
+KNOWN = ("state", "role", "file", "time_s", "exposure_s")
+#: What a column must look like, as a name in the capture file.
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_ .-]{0,63}")
+MOST_COLUMNS = 200
+MOST_STATES = 100_000
 
 
 class ImportFailed(ProcessError):
@@ -63,6 +72,7 @@ def read_states(path: Path, axes: Sequence[str]) -> StatesFile:
     """
     header, rows = _table(path)
     names = [_axis_name(h) for h in header]
+    _check_names(path, names)
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
         raise ImportFailed(f"{path}:1: column given twice: {', '.join(twice)}")
@@ -78,13 +88,12 @@ def read_states(path: Path, axes: Sequence[str]) -> StatesFile:
     lines = [lines[k] for k in order]
     columns = {name: [values[k] for k in order] for name, values in columns.items()}
     role = _roles(path, lines, columns)
-    special = {"state", "role", "file", "time_s", "exposure_s"}
     numbers = {n: _numbers(path, lines, n, columns[n], role) for n in names if n not in ("state", "role", "file")}
-    files = tuple(path.parent / text for text in columns["file"]) if "file" in columns else None
+    files = _files(path, lines, columns["file"]) if "file" in columns else None
     return StatesFile(
         path=path,
         line=tuple(lines),
-        angles_deg={n: v for n, v in numbers.items() if n not in special and not n.startswith(CHANNEL_PREFIX)},
+        angles_deg={n: v for n, v in numbers.items() if n not in KNOWN and not n.startswith(CHANNEL_PREFIX)},
         role=role,
         time_s=numbers.get("time_s"),
         exposure_s=numbers.get("exposure_s"),
@@ -95,20 +104,30 @@ def read_states(path: Path, axes: Sequence[str]) -> StatesFile:
 
 def _table(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            header = [h.strip() for h in next(reader, [])]
-            rows = [(reader.line_num, [c.strip() for c in row]) for row in reader if any(c.strip() for c in row)]
-    except OSError as error:
-        raise ImportFailed(f"{path}: cannot be read ({error.strerror})") from error
-    except (UnicodeDecodeError, csv.Error) as error:
+        reader = csv.reader(read_text(path, ImportFailed).splitlines(keepends=True))
+        header = [h.strip() for h in next(reader, [])]
+        rows = [(reader.line_num, [c.strip() for c in row]) for row in reader if any(c.strip() for c in row)]
+    except csv.Error as error:
         raise ImportFailed(f"{path}: is not a CSV text file ({error})") from error
     if not header or not rows:
         raise ImportFailed(f"{path}: needs a header line and one row per state; found {len(rows)} rows")
+    if len(header) > MOST_COLUMNS or len(rows) > MOST_STATES:
+        raise ImportFailed(
+            f"{path}: {len(header)} columns and {len(rows)} rows; at most {MOST_COLUMNS} and {MOST_STATES} are read"
+        )
     for line, row in rows:
         if len(row) != len(header):
             raise ImportFailed(f"{path}:{line}: {len(row)} columns, the header has {len(header)}")
     return header, rows
+
+
+def _check_names(path: Path, names: Sequence[str]) -> None:
+    for column, name in enumerate(names, 1):
+        if not NAME.fullmatch(name):
+            shown = repr(one_line(name, 40)) if name else "an empty name"
+            raise ImportFailed(f"{path}:1: column {column}: {shown}; a name is letters, digits and _ and begins so")
+        if name in NOT_AXES:
+            raise ImportFailed(f"{path}:1: column {column}: no axis can be called {name!r}; give it another name")
 
 
 def _axis_name(header: str) -> str:
@@ -118,13 +137,27 @@ def _axis_name(header: str) -> str:
 def _order(path: Path, lines: list[int], states: list[str]) -> list[int]:
     seen: dict[int, int] = {}
     for line, text in zip(lines, states, strict=True):
-        if not text.isdecimal():
+        if not text.isascii() or not text.isdecimal() or len(text) > 9:
             raise ImportFailed(f"{path}:{line}: column state: {text!r} is not a whole number")
         number = int(text)
         if number in seen:
             raise ImportFailed(f"{path}:{line}: state {number} is given already in line {seen[number]}")
         seen[number] = line
+    first, last = min(seen), max(seen)
+    if last - first + 1 != len(seen):
+        missing = next(number for number in range(first, last) if number not in seen)
+        raise ImportFailed(f"{path}: state {missing} is missing between {first} and {last}; number them without gaps")
     return sorted(range(len(states)), key=lambda k: int(states[k]))
+
+
+def _files(path: Path, lines: list[int], names: list[str]) -> tuple[Path, ...]:
+    line_of: dict[str, int] = {}
+    for line, name in zip(lines, names, strict=True):
+        if not name or "\0" in name:
+            raise ImportFailed(f"{path}:{line}: column file: {'no name' if not name else 'not a name of a file'}")
+        if line_of.setdefault(name, line) != line:
+            raise ImportFailed(f"{path}:{line}: column file: {one_line(name)} is given already in line {line_of[name]}")
+    return tuple(path.parent / name for name in names)
 
 
 def _roles(path: Path, lines: list[int], columns: dict[str, list[str]]) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.doors import require_file
 from processing.errors import ProcessError
 
 MAGIC = b"tensor_file\0"
@@ -28,6 +30,11 @@ TYPES: dict[int, Any] = {
     10: np.float32,
     11: np.float64,
 }
+
+
+#: A pBRDF has 5 fields of up to 6 dimensions.
+MOST_FIELDS = 64
+MOST_DIMENSIONS = 16
 
 
 class TensorFileError(ProcessError):
@@ -57,13 +64,15 @@ def create_tensor_file(path: Path, fields: Mapping[str, tuple[tuple[int, ...], A
 def read_tensor_file(path: Path) -> dict[str, NDArray[Any]]:
     """Fields of a tensor file as read-only memory maps. Raises TensorFileError."""
     try:
+        size = require_file(path, TensorFileError)
         with path.open("rb") as file:
-            size = path.stat().st_size
             if file.read(12) != MAGIC:
                 raise TensorFileError(f"{path} is no tensor file: its first bytes are not 'tensor_file'.")
             major, minor, count = struct.unpack("<BBI", file.read(6))
             if major != VERSION[0]:
                 raise TensorFileError(f"{path} has tensor file version {major}.{minor}; this program reads 1.x.")
+            if count > MOST_FIELDS:
+                raise TensorFileError(f"{path} promises {count} fields; at most {MOST_FIELDS} are read.")
             places = {}
             for _ in range(count):
                 (length,) = struct.unpack("<H", file.read(2))
@@ -76,6 +85,8 @@ def read_tensor_file(path: Path) -> dict[str, NDArray[Any]]:
             f"{path} cannot be read as a tensor file ({error}); it is truncated or damaged."
         ) from error
     for name, (shape, dtype, offset) in places.items():
-        if offset + int(np.prod(shape)) * dtype.itemsize > size:
+        if 0 in shape or len(shape) > MOST_DIMENSIONS:
+            raise TensorFileError(f"{path}: field {name!r} has the shape {shape[:MOST_DIMENSIONS]}; it holds nothing.")
+        if offset + math.prod(shape) * dtype.itemsize > size:
             raise TensorFileError(f"{path} is truncated: field {name!r} ends beyond its {size} bytes.")
     return {n: np.memmap(path, dtype=d, mode="r", offset=o, shape=s) for n, (s, d, o) in places.items()}

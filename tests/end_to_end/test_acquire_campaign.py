@@ -192,8 +192,9 @@ def test_one_bad_capture_refuses_the_campaign_before_any_motion(acquire, small_r
 
 def test_another_campaign_in_the_same_folder_is_refused(acquire, small_rig, campaign, tmp_path):
     rig = small_rig()
-    assert acquire("--campaign", campaign(plans="{stokes: stokes.yaml}"), "--rig", rig, "--out", tmp_path)[0] == 0
-    changed = campaign(plans="{stokes: stokes.yaml}", omega_deg="[45]")
+    lines = {"plans": "{stokes: stokes.yaml}", "references": "[]"}
+    assert acquire("--campaign", campaign(**lines), "--rig", rig, "--out", tmp_path)[0] == 0
+    changed = campaign(**lines, omega_deg="[45]")
     code, _, err = acquire("--campaign", changed, "--rig", rig, "--out", tmp_path)
     assert code == 2
     assert "campaign.omega_deg" in err

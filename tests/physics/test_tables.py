@@ -103,5 +103,5 @@ def test_what_does_not_belong_together_is_refused(tmp_path):
     with pytest.raises(TableError, match="cannot be merged"):
         table.merge(ScatteringTable(("xi0",), 451))
     (tmp_path / "no.h5").write_text("no")
-    with pytest.raises(TableError, match="cannot be read"):
+    with pytest.raises(TableError, match="cannot be opened as HDF5"):
         ScatteringTable.load(tmp_path / "no.h5")

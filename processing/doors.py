@@ -1,0 +1,117 @@
+"""What every file that people hand in has to pass before anything believes it.
+
+A file comes in through one door for its kind: text and JSON here, YAML in `processing.yaml_file`, HDF5, pictures and
+arrays in `processing.storage`. A door looks at size, depth, types and shapes before it takes memory for the content,
+and says in one line what is wrong.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import warnings
+from pathlib import Path
+from typing import Any, NoReturn
+
+from processing.errors import ProcessError
+
+#: Most bytes of a text file (states.csv of 100,000 states has about 6 MB).
+MOST_TEXT_BYTES = 16 << 20
+#: Most bytes of a JSON file: an index of 10,000 captures has about 5 MB.
+MOST_JSON_BYTES = 16 << 20
+#: Most pixels of a frame (8192 x 8192).
+MOST_PIXELS = 1 << 26
+#: Deepest nesting of lists and mappings; our own files have 8.
+MOST_DEPTH = 40
+
+
+def require_file(path: Path, error: type[ProcessError] = ProcessError, most_bytes: int | None = None) -> int:
+    """Size of a regular file in bytes; a pipe or a device would be read for ever.
+
+    Raises
+    ------
+    ProcessError
+        Of the class `error`: it is not there, no regular file, or larger than `most_bytes`.
+    """
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError) as why:
+        raise error(f"{one_line(path)}: cannot be read ({getattr(why, 'strerror', why)})") from why
+    if not stat.S_ISREG(found.st_mode):
+        raise error(f"{path}: is a folder" if stat.S_ISDIR(found.st_mode) else f"{path}: is no regular file")
+    if most_bytes is not None and found.st_size > most_bytes:
+        raise error(f"{path}: has {found.st_size:,} bytes; such a file has at most {most_bytes:,}")
+    return found.st_size
+
+
+def require_picture(path: Path, error: type[ProcessError] = ProcessError) -> None:
+    """Raise `error` for what is no picture or too large: a few kilobytes can promise a picture of terabytes."""
+    from PIL import Image
+
+    require_file(path, error)
+    try:
+        with warnings.catch_warnings():
+            # Its own warning of large pictures; ours is an error.
+            warnings.simplefilter("ignore")
+            with Image.open(path) as picture:
+                wide, high = picture.size
+    except Image.DecompressionBombError as why:
+        raise error(f"{path}: {one_line(why)}; at most {MOST_PIXELS:,} pixels are read") from why
+    except Exception as why:
+        # Readers of thirty formats raise whatever they like.
+        raise error(f"{path}: is not an image that can be read (PNG or TIFF)") from why
+    if wide * high > MOST_PIXELS:
+        raise error(f"{path}: {wide} x {high} pixels; at most {MOST_PIXELS:,} pixels are read")
+
+
+def read_text(path: Path, error: type[ProcessError] = ProcessError, most_bytes: int = MOST_TEXT_BYTES) -> str:
+    """Text of a UTF-8 file, with or without a byte order mark. Raises `error`."""
+    require_file(path, error, most_bytes)
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as why:
+        raise error(f"{path}: cannot be read ({why.strerror})") from why
+    except UnicodeDecodeError as why:
+        raise error(f"{path}: is not UTF-8 text") from why
+
+
+def parse_json(text: str | bytes, source: str, error: type[ProcessError] = ProcessError) -> Any:
+    """Value of JSON text, finite numbers only. Raises `error`; `source` names the text in it."""
+    try:
+        value = json.loads(text, parse_constant=_refuse_constant)
+        require_shallow(value)
+    except (ValueError, RecursionError) as why:
+        raise error(f"{source}: is not the JSON that it should be ({one_line(why)})") from why
+    return value
+
+
+def read_json(path: Path, error: type[ProcessError] = ProcessError) -> Any:
+    """Value of a JSON file. Raises `error`."""
+    return parse_json(read_text(path, error, MOST_JSON_BYTES), str(path), error)
+
+
+def require_shallow(value: Any) -> None:
+    """Raise ValueError for lists and mappings nested deeper than `MOST_DEPTH`."""
+    level = [value]
+    for _ in range(MOST_DEPTH + 1):
+        level = [item for node in level for item in _items(node)]
+        if not level:
+            return
+    raise ValueError(f"nested deeper than {MOST_DEPTH} levels")
+
+
+def one_line(text: object, most: int = 300) -> str:
+    """Text without line breaks and control characters, cut where it is long: fit for a message."""
+    words = " ".join("".join(c if c.isprintable() else " " for c in str(text)).split())
+    return words if len(words) <= most else words[: most - 3] + "..."
+
+
+def _items(node: Any) -> list[Any]:
+    if isinstance(node, dict):
+        return list(node.values())
+    return node if isinstance(node, list) else []
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not a finite number")

@@ -1,0 +1,78 @@
+"""The doors for frames from elsewhere: pictures, and stacks in one .npy or HDF5 file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.doors import MOST_PIXELS, one_line, require_file, require_picture
+from processing.storage.axostep import read_rmmd
+from processing.storage.h5_door import damage_as, open_h5, read_npy, require_dataset
+from processing.storage.state_csv import ImportFailed
+
+
+def read_picture(file: Path) -> NDArray[Any]:
+    """Raw grey values (rows, columns) of a PNG or TIFF file. Raises ImportFailed."""
+    import cv2
+
+    require_picture(file, ImportFailed)
+    # What is wrong is said in one line here, not in the library's own words.
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise ImportFailed(f"{file}: is damaged ({one_line(error)})") from error
+    if image is None:
+        raise ImportFailed(f"{file}: is not an image that can be read (PNG or TIFF)")
+    if image.ndim == 3:
+        grey = image[..., 0]
+        colours = image[..., :3]
+        if not np.array_equal(colours, np.broadcast_to(grey[..., None], colours.shape)):
+            raise ImportFailed(f"{file}: is a colour image; frames are raw grey values of one channel")
+        image = np.ascontiguousarray(grey)
+    return np.asarray(image)
+
+
+def open_stack(text: str, states: int) -> Any:
+    """Frames of all states as something with shape, type and slices. Raises ImportFailed.
+
+    Parameters
+    ----------
+    text : FILE.npy, FILE.rmmd, or HDF5 as FILE::/path/to/dataset.
+    """
+    name, _, inside = text.partition("::")
+    file = Path(name)
+    with damage_as(ImportFailed, f"{text}: cannot be read as .npy or HDF5 (write HDF5 as FILE::/path/to/dataset)"):
+        require_file(file, ImportFailed)
+        if name.endswith(".rmmd"):
+            return read_rmmd(file).states(states)
+        if name.endswith(".npy"):
+            return read_npy(file, ImportFailed)
+        h5 = open_h5(file, ImportFailed)
+        inside = inside or _only_stack(h5, name)
+        return require_dataset(h5, inside, (None,) * getattr(h5.get(inside), "ndim", 3), "uif")
+
+
+def check_stack(text: str, stack: Any, states: int, channels: int) -> None:
+    """Raise ImportFailed unless the stack has a frame for each state and channel, of a size that can be read."""
+    shape = tuple(stack.shape)
+    expected = f"({states}, rows, columns)" if channels == 1 else f"({states}, {channels}, rows, columns)"
+    if len(shape) not in (3, 4) or shape[0] != states or (shape[1] if len(shape) == 4 else 1) != channels:
+        raise ImportFailed(f"{text}: shape {shape}; the states file and the instrument ask for {expected}.")
+    if stack.dtype.kind not in "uif":
+        raise ImportFailed(f"{text}: holds {stack.dtype}; frames are integers or floating numbers.")
+    if not 0 < shape[-2] * shape[-1] <= MOST_PIXELS:
+        raise ImportFailed(f"{text}: frames of {shape[-2]} x {shape[-1]} pixels; 1 to {MOST_PIXELS:,} pixels are read")
+
+
+def _only_stack(h5: h5py.File, file: str) -> str:
+    found: list[str] = []
+    h5.visititems(lambda name, item: found.append(name) if isinstance(item, h5py.Dataset) and item.ndim >= 3 else None)
+    if len(found) != 1:
+        shown = ", ".join(found) or "none"
+        raise ImportFailed(f"{file}: datasets with three or four dimensions: {shown}. Say which: --stack {file}::/NAME")
+    return found[0]

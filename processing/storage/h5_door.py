@@ -1,0 +1,103 @@
+"""The door for HDF5 and .npy files: names, types and shapes are looked at before anything is read."""
+
+from __future__ import annotations
+
+import tokenize
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from processing.doors import one_line, require_file
+from processing.errors import ProcessError
+
+#: What h5py and numpy raise over a damaged file, or one with other things in it than its marks promise.
+DAMAGE = (
+    *(KeyError, OSError, ValueError, TypeError, RuntimeError, AttributeError),
+    *(IndexError, OverflowError, MemoryError),
+)
+#: Most states of a capture and most numbers of a table beside the frames.
+MOST_STATES = 100_000
+#: A compressed dataset larger than this many times its storage is none that a camera made (deflate ends at 1032).
+MOST_RATIO = 1100
+
+
+def open_h5(path: Path, error: type[ProcessError], hint: str = "") -> h5py.File:
+    """The file, open for reading. Raises `error` where it is not there or no HDF5; `hint` ends the message."""
+    require_file(path, error)
+    try:
+        return h5py.File(path, "r")
+    except DAMAGE as why:
+        text = f"{path} cannot be opened as HDF5 ({one_line(why)}). It is truncated or of another kind. {hint}"
+        raise error(text.strip()) from why
+
+
+@contextmanager
+def damage_as(error: type[ProcessError], what: str) -> Iterator[None]:
+    """Damage found while reading becomes `error`: one line that starts with `what`."""
+    try:
+        yield
+    except ProcessError:
+        raise
+    except DAMAGE as why:
+        raise error(f"{what} ({one_line(why)})") from why
+
+
+def require_dataset(parent: h5py.Group, name: str, shape: Sequence[int | None], kinds: str) -> h5py.Dataset:
+    """A dataset of a group, looked at but not read.
+
+    Parameters
+    ----------
+    shape : length of each dimension; None for any.
+    kinds : numpy's letters of the types allowed: u, i, f, S (fixed text), O (text).
+
+    Raises
+    ------
+    ValueError
+        It is not there, no dataset, or of another shape or type; or its values are not in the file.
+    """
+    dataset = parent.get(name)
+    if not isinstance(dataset, h5py.Dataset):
+        raise ValueError(f"there is no dataset {name}")
+    found = dataset.shape or ()
+    if len(found) != len(shape) or any(want not in (None, got) for want, got in zip(shape, found, strict=True)):
+        wanted = " x ".join("any" if want is None else str(want) for want in shape) or "one value"
+        raise ValueError(f"{name} has the shape {found}, not {wanted}")
+    if dataset.dtype.kind not in kinds:
+        raise ValueError(f"{name} holds {dataset.dtype}")
+    if dataset.dtype.kind != "O" and dataset.size:
+        _require_stored(dataset, name)
+    return dataset
+
+
+def _require_stored(dataset: h5py.Dataset, name: str) -> None:
+    # A shape is a few bytes in the file and may promise any amount of memory.
+    stored, size = dataset.id.get_storage_size(), int(np.prod(dataset.shape, dtype=object)) * dataset.dtype.itemsize
+    compact = dataset.id.get_create_plist().get_layout() == h5py.h5d.COMPACT
+    filtered = dataset.compression is not None
+    if size > stored * (MOST_RATIO if filtered else 1) and not compact:
+        raise ValueError(f"{name} should have {size:,} bytes and has {stored:,} in the file")
+
+
+def read_npy(path: Path, error: type[ProcessError], most_bytes: int | None = None) -> np.ndarray[Any, np.dtype[Any]]:
+    """An array of plain numbers in a .npy file, as a read-only memory map. Raises `error`."""
+    require_file(path, error, most_bytes)
+    try:
+        values = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (*DAMAGE, SyntaxError, EOFError, tokenize.TokenError) as why:
+        # The header is Python's text, and damaged text is a matter of its parser.
+        raise error(f"{path} cannot be read as .npy ({one_line(why)})") from why
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "uif":
+        raise error(f"{path} holds {getattr(values, 'dtype', 'an archive')}, not an array of numbers")
+    return values
+
+
+def text_attribute(node: Any, name: str) -> str:
+    """An attribute that is one text. Raises ValueError."""
+    value = node.attrs[name]
+    if not isinstance(value, str):
+        raise ValueError(f"the attribute {name} is no text")
+    return value

@@ -1,0 +1,386 @@
+"""Promise 20: a hostile or damaged file is refused: a line a mistake, no traceback, soon, in little memory."""
+
+import json
+import struct
+import subprocess
+import sys
+import time
+import zlib
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from processing.doors import MOST_PIXELS, ProcessError, parse_json, read_text, require_picture
+from processing.instrument.states import rotating_retarders
+from processing.reflectance.pbsdf import load as load_pbsdf
+from processing.storage.capture import Capture, CaptureError
+from processing.storage.tensor_file import create_tensor_file
+from processing.yaml_file import MOST_BYTES, ConfigError, load_yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+INSTRUMENT = ROOT / "configs" / "instruments" / "rgb950.yaml"
+
+
+@pytest.fixture
+def refused(tmp_path):
+    """Runs a command and asks that it refuses its input as promised; returns what it said."""
+
+    def run(main, *arguments):
+        start_s = time.process_time()
+        with pytest.raises(SystemExit) as end:
+            main([str(argument) for argument in arguments])
+        assert end.value.code == 2
+        assert time.process_time() - start_s < 5
+
+    return run
+
+
+@pytest.fixture
+def acquire_refuses(refused, capfd):
+    from acquisition.commands.application import main
+
+    def run(*arguments):
+        refused(main, *arguments)
+        said = capfd.readouterr().err
+        assert "Traceback" not in said
+        assert all(len(line) < 1000 for line in said.splitlines())
+        return said
+
+    return run
+
+
+@pytest.fixture
+def process_refuses(refused, capfd):
+    from processing.commands.application import main
+
+    def run(*arguments):
+        refused(main, *arguments)
+        said = capfd.readouterr().err
+        assert "Traceback" not in said
+        assert len(said.splitlines()) == 1, said
+        return said
+
+    return run
+
+
+# --- YAML -------------------------------------------------------------------------------------------------
+
+BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{chr(98 + k)}: &{chr(98 + k)} [{', '.join(['*' + chr(97 + k)] * 9)}]\n" for k in range(10)
+)
+YAML_FILES = {
+    "merges itself": ("a: &a {<<: *a, b: 1}\n", "contains itself"),
+    "holds itself": ("&a\na: *a\n", "contains itself"),
+    "anchor bomb": (BOMB, "values"),
+    "deep lists": ("a: " + "[" * 100_000, "nested deeper"),
+    "deep mappings": ("a: " + "{a: " * 50_000, "nested deeper"),
+    "many values": ("a: [" + "0, " * 60_000 + "0]\n", "values"),
+    "date that is none": ("title: 2001-99-99\n", "can be read"),
+    "number of 5000 digits": ("omega_deg: " + "9" * 5000 + "\n", "can be read"),
+    "control characters": ("title: \x07\n", "can be read"),
+    "list at the top": ("- a\n- b\n", "keys and values"),
+    "ordered map": ("!!omap [a: 1]\n", "a: unknown key"),
+    "two documents": ("a: 1\n---\na: 2\n", "document"),
+    "not a number": ("omega_deg: .nan\n", "finite"),
+    "infinite": ("exposure_s: 1e999\n", "finite"),
+    "infinite in a merge": ("states: {kind: table, angles: {<<: {psg: [.inf]}}}\n", "finite"),
+    "matrix of three": ("sample: {kind: mueller, mueller: [1, 2, 3]}\n", "mueller"),
+    "matrix not a number": ("sample: {kind: mueller, mueller: [" + "1, " * 15 + ".nan]}\n", "finite"),
+    "matrix missing": ("sample: {kind: mueller}\n", "mueller"),
+    "a thousand mistakes": ("".join(f"k{n}: 1\n" for n in range(1000)), "and 970 more"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", YAML_FILES)
+def test_yaml(acquire_refuses, tmp_path, name):
+    text, word = YAML_FILES[name]
+    plan = tmp_path / "plan.yaml"
+    plan.write_text(text)
+    said = acquire_refuses("--plan", plan, "--dry-run", "--out", tmp_path)
+    assert word in said, said
+    assert str(plan) in said
+
+
+def test_yaml_of_any_size_is_not_even_read(tmp_path):
+    from acquisition.capture.plan import MeasurementPlan
+
+    path = tmp_path / "plan.yaml"
+    with path.open("w") as file:
+        file.truncate(50 << 20)
+    with pytest.raises(ConfigError, match="at most"):
+        load_yaml(path, MeasurementPlan)
+    path.write_text("#\n" * (MOST_BYTES // 2 - 10))
+    start_s = time.process_time()
+    with pytest.raises(ConfigError, match="keys and values"):
+        load_yaml(path, MeasurementPlan)
+    assert time.process_time() - start_s < 5
+
+
+def test_what_is_no_file_is_not_waited_for(tmp_path):
+    import os
+
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/zero"), tmp_path):
+        with pytest.raises(ProcessError, match=r"regular file|folder"):
+            read_text(path)
+
+
+CAMPAIGNS = {
+    "no angles": ("omega_deg: []", "omega_deg"),
+    "a reference in an unknown mode": ("references: [{sample: {name: x}, omega_deg: 35, modes: [drrr]}]", "drrr"),
+    "a million angles": ("omega_deg: {start: 0, stop: 180, step: 1.0e-6}", "angles"),
+    "unknown mode of a plan": ("plans: {drrr: drr.yaml}", "drrr"),
+    "no plans": ("plans: {}", "plans"),
+}
+
+
+@pytest.mark.parametrize("name", CAMPAIGNS)
+def test_campaign_file(acquire_refuses, tmp_path, name):
+    line, word = CAMPAIGNS[name]
+    keys = {"name": "x", "plans": "{drr: drr.yaml}", "samples": "[{name: red_sphere}]", "wavelengths_nm": "[662]",
+            "omega_deg": "[35]"}  # fmt: skip
+    key, _, value = line.partition(": ")
+    path = tmp_path / "campaign.yaml"
+    path.write_text("".join(f"{k}: {v}\n" for k, v in (keys | {key: value}).items()))
+    assert word in acquire_refuses("--campaign", path, "--dry-run", "--out", tmp_path)
+
+
+INDEXES = ["{", "[]", '{"a": 1}', "\x00", "[" * 5000, '{"a": NaN}', '{"a": {"x": ' + "9" * 5000 + "}}", ""]
+
+
+@pytest.mark.parametrize("text", INDEXES, ids=range(len(INDEXES)))
+def test_damaged_books_of_a_campaign(tmp_path, caplog, text):
+    from acquisition.campaign.log import CampaignFolder
+    from acquisition.campaign.plan import Campaign
+
+    campaign = Campaign.load(ROOT / "configs" / "campaigns" / "red_sphere.yaml")
+    CampaignFolder(tmp_path, campaign).close()
+    (tmp_path / "index.json").write_text(text)
+    # It can be made anew from the captures, so a campaign goes on without it, and says so.
+    folder = CampaignFolder(tmp_path, campaign)
+    assert folder.index == {}
+    assert "index.json" in caplog.text
+    folder.close()
+    (tmp_path / "campaign.yaml").write_bytes(b"\xff\xfe kind: \x00")
+    with pytest.raises(ConfigError, match=r"campaign\.yaml"):
+        CampaignFolder(tmp_path, campaign)
+
+
+def test_json_is_finite_and_shallow():
+    assert parse_json('{"a": [1.5]}', "x") == {"a": [1.5]}
+    for text in ("[Infinity]", "[" * 50 + "]" * 50, "{'a': 1}", "9" * 5000):
+        with pytest.raises(ProcessError, match=r"^x: is not the JSON"):
+            parse_json(text, "x")
+
+
+# --- captures ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def capture(synthetic_capture):
+    table = rotating_retarders(0.01, 24, 15)
+    frames = np.random.default_rng(1).integers(64, 4000, (24, 1, 6, 8)).astype(np.uint16)
+    return synthetic_capture(frames, dict(table.angles_deg), instrument_yaml=INSTRUMENT.read_text())
+
+
+def _replace(h5, name, value):
+    del h5[name]
+    h5[name] = value
+
+
+def _header(h5, **changes):
+    header = json.loads(h5["entry"].attrs["header_json"])
+    header["detector"] |= changes
+    h5["entry"].attrs["header_json"] = json.dumps(header)
+
+
+def _huge(h5):
+    del h5["entry/instrument/detector/data"]
+    h5.create_dataset("entry/instrument/detector/data", (24, 1, 1 << 20, 1 << 20), "u2", chunks=(1, 1, 64, 64))
+
+
+CAPTURES = {
+    "no column": lambda h5: h5["entry/states"].pop("exposure_s"),
+    "short column": lambda h5: _replace(h5, "entry/states/frame_id", np.zeros(3, int)),
+    "column of text": lambda h5: _replace(h5, "entry/states/exposure_s", [b"x"] * 24),
+    "column that is a group": lambda h5: (h5["entry/states"].pop("done"), h5.create_group("entry/states/done")),
+    "done is a float": lambda h5: _replace(h5, "entry/states/done", np.full(24, 0.5)),
+    "done 7": lambda h5: h5["entry/states/done"].write_direct(np.full(24, 7, np.uint8)),
+    "bits 1e9": lambda h5: _header(h5, bits=10**9),
+    "bits 0": lambda h5: _header(h5, bits=0),
+    "black level no number": lambda h5: _header(h5, black_level_counts=float("nan")),
+    "unknown role": lambda h5: _replace(h5, "entry/states/role", [b"smaple"] * 24),
+    "short angles": lambda h5: _replace(h5, "entry/instrument/psg/value", np.zeros(2)),
+    "frames of two dimensions": lambda h5: _replace(h5, "entry/instrument/detector/data", np.zeros((24, 3), "u2")),
+    "frames of two channels": lambda h5: _replace(h5, "entry/instrument/detector/data", np.zeros((24, 2, 6, 8), "u2")),
+    "complex frames": lambda h5: _replace(h5, "entry/instrument/detector/data", np.zeros((24, 1, 6, 8), "c8")),
+    "frames of a terabyte": _huge,
+    "no header": lambda h5: h5["entry"].attrs.pop("header_json"),
+    "header of numbers": lambda h5: h5["entry"].attrs.create("header_json", 3),
+    "header in ruins": lambda h5: h5["entry"].attrs.modify("header_json", "{"),
+    "unknown status": lambda h5: h5["entry"].attrs.modify("status", "fine"),
+    "schema of text": lambda h5: h5.attrs.create("umov_schema", "x"),
+    "entry is data": lambda h5: _replace(h5, "entry", 3),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CAPTURES)
+def test_capture(capture, process_refuses, name):
+    with h5py.File(capture, "r+") as h5:
+        CAPTURES[name](h5)
+    with pytest.raises(CaptureError) as error:
+        Capture(capture)
+    assert len(str(error.value).splitlines()) == 1
+    assert str(capture) in process_refuses("reduce", capture)
+
+
+def test_a_capture_cut_short_or_of_other_bytes(capture):
+    data = capture.read_bytes()
+    for spoilt in (b"", data[:100], data[: len(data) // 2], b"\0" * 5000, b"kind: plan\n"):
+        capture.write_bytes(spoilt)
+        with pytest.raises(CaptureError):
+            Capture(capture)
+
+
+# --- what is imported -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def states(tmp_path):
+    """Writes states.csv, with 18 frames beside it."""
+    for k in range(18):
+        cv2.imwrite(str(tmp_path / f"f{k}.png"), np.full((4, 6), 100 + k, np.uint16))
+    rows = [["state", "psg_deg", "psa_deg", "file"], *([k, 20 * k, 98.2 * k, f"f{k}.png"] for k in range(18))]
+
+    def write(change=lambda rows: None, files=True):
+        change(rows)
+        path = tmp_path / "states.csv"
+        kept = rows if files else [row[:-1] for row in rows]
+        path.write_text("\n".join(",".join(map(str, row)) for row in kept) + "\n")
+        return path
+
+    return write
+
+
+def _column(name):
+    def add(rows):
+        for k, row in enumerate(rows):
+            row.insert(1, name if k == 0 else 0.0)
+
+    return add
+
+
+STATES = {
+    "axis called detector": (_column("detector"), "detector"),
+    "axis called beam": (_column("beam_deg"), "beam"),
+    "axis without a name": (_column(""), "empty name"),
+    "axis with a path": (_column("../x"), "letters"),
+    "axis twice": (_column("psg"), "given twice"),
+    "a row missing": (lambda rows: rows.pop(5), "state 4 is missing"),
+    "one file twice": (lambda rows: rows[7].__setitem__(3, "f2.png"), "f2.png is given already in line 4"),
+    "state of 400 digits": (lambda rows: rows[3].__setitem__(0, "9" * 400), "whole number"),
+    "state in other digits": (lambda rows: rows[3].__setitem__(0, "²"), "whole number"),
+    "no file": (lambda rows: rows[3].__setitem__(3, ""), "no name"),
+}
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_states_csv(states, process_refuses, name):
+    change, word = STATES[name]
+    arguments = ("--states", states(change), "--wavelength-nm", 662, "--instrument", INSTRUMENT)
+    assert word in process_refuses("import", *arguments)
+
+
+def _png(path, wide, high):
+    def chunk(kind, data):
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = struct.pack(">IIBBBBB", wide, high, 16, 0, 0, 0, 0)
+    body = chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(b"\0" * 100_000)) + chunk(b"IEND", b"")
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + body)
+
+
+def test_picture_that_promises_terabytes(states, tmp_path, process_refuses):
+    _png(tmp_path / "f0.png", 12_000, 12_000)
+    _png(tmp_path / "terabytes.png", 1_000_000, 1_000_000)
+    arguments = ("--states", states(), "--wavelength-nm", 662, "--instrument", INSTRUMENT)
+    assert f"at most {MOST_PIXELS:,} pixels" in process_refuses("import", *arguments)
+    with pytest.raises(ProcessError, match="pixels"):
+        require_picture(tmp_path / "terabytes.png")
+
+
+def test_picture_cut_short(states, tmp_path, process_refuses):
+    whole = tmp_path / "f3.png"
+    cv2.imwrite(str(whole), np.random.default_rng(1).integers(0, 4000, (4, 6)).astype(np.uint16))
+    whole.write_bytes(whole.read_bytes()[:-30])
+    arguments = ("--states", states(), "--wavelength-nm", 662, "--instrument", INSTRUMENT)
+    assert "f3.png" in process_refuses("import", *arguments)
+
+
+def _stack_h5(path):
+    with h5py.File(path, "w") as h5:
+        h5["group/frames"] = np.zeros((18, 4, 6), "u2")
+        h5["group/text"] = "x"
+        h5.create_dataset("huge", (18, 1 << 20, 1 << 20), "u2", chunks=(1, 64, 64))
+
+
+STACKS = {
+    "group": (_stack_h5, "::/group", "no dataset"),
+    "text": (_stack_h5, "::/group/text", "shape|holds"),
+    "nothing": (_stack_h5, "::/nothing", "no dataset"),
+    "terabytes": (_stack_h5, "::/huge", "bytes"),
+    "npy of a number": (lambda path: np.save(path, np.float64(3)), "", "shape"),
+    "npy of objects": (lambda path: np.save(path, np.array([{}], dtype=object), allow_pickle=True), "", "read|holds"),
+    "npy of complex": (lambda path: np.save(path, np.zeros((18, 4, 6), "c8")), "", "holds"),
+    "npy without pixels": (lambda path: np.save(path, np.zeros((18, 0, 6))), "", "pixels|read"),
+    "npy cut short": (lambda path: path.write_bytes(b"\x93NUMPY\x01\x00v\x00{'descr'z"), "", "read"),
+    "npy without a number": (lambda path: np.save(path, np.full((18, 4, 6), np.nan)), "", "no finite value"),
+    "empty": (lambda path: path.write_bytes(b""), "", "read"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", STACKS)
+def test_stack(states, tmp_path, process_refuses, name):
+    import re
+
+    make, inside, word = STACKS[name]
+    path = tmp_path / ("stack.h5" if inside else "stack.npy")
+    make(path)
+    arguments = ("--states", states(files=False), "--wavelength-nm", 662, "--instrument", INSTRUMENT)
+    said = process_refuses("import", *arguments, "--stack", f"{path}{inside}")
+    assert re.search(word, said), said
+
+
+def test_pbsdf_of_other_shapes(tmp_path):
+    shapes = {"theta_h": (1, 91), "theta_d": (1, 91), "phi_d": (1, 361), "wvls": (5,), "M": (3, 3, 3, 5, 4, 4)}
+    path = tmp_path / "x.pbsdf"
+    fields = create_tensor_file(path, {name: (shape, np.float32) for name, shape in shapes.items()})
+    fields["theta_h"][0] = np.deg2rad(90 * (np.arange(91) / 90) ** 2)
+    fields["theta_d"][0] = np.deg2rad(np.arange(91))
+    fields["phi_d"][0] = np.deg2rad(np.arange(-180, 181))
+    for field in fields.values():
+        field.flush()
+    with pytest.raises(ProcessError, match="M is float32"):
+        load_pbsdf(path)
+    # A shape whose product overflows 64 bits.
+    data = bytearray(path.read_bytes())
+    at = data.index(b"M") + 1 + 11
+    data[at : at + 48] = struct.pack("<6Q", *[1 << 40] * 6)
+    path.write_bytes(data)
+    with pytest.raises(ProcessError, match="truncated"):
+        load_pbsdf(path)
+
+
+# --- at random --------------------------------------------------------------------------------------------
+
+
+def test_random_damage_at_every_door():
+    """A fixed seed and few inputs here: about half a minute in all. An hour a door is `--seconds 3600`."""
+    found = subprocess.run(
+        [sys.executable, str(ROOT / "benchmarks" / "fuzz_doors.py"), "--inputs", "40", "--seed", "20"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert found.returncode == 0, found.stdout[-3000:] + found.stderr[-2000:]
