@@ -154,8 +154,12 @@ class SerialLink:
 
     def close(self) -> None:
         """Give the port back."""
+        # pyserial leaves a socket open whose other end has gone.
+        connection = getattr(self._serial, "_socket", None)
         with contextlib.suppress(OSError, serial.SerialException):
             self._serial.close()
+        if connection is not None:
+            connection.close()
         if self._transcript is not None:
             self._transcript.close()
 

@@ -44,9 +44,9 @@ def serve(
     """Serve an emulated controller until SIGTERM; the first line of output is the path of its port."""
     from simulators.clock import Clock
     from simulators.rig.controller_kinds import served_kinds
-    from simulators.serial.pty_port import PtyPort
     from simulators.serial.reply_faults import FaultSchedule, parse_fault
     from simulators.serial.serve_options import ServeOptions
+    from simulators.serial.tcp_port import port_for
 
     kinds = served_kinds()
     if kind not in kinds:
@@ -69,7 +69,7 @@ def serve(
         emulator = kinds[kind](options)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
-    with _signalled() as ended, PtyPort(emulator) as port:
+    with _signalled() as ended, port_for(emulator) as port:
         typer.echo(port.path)
         sys.stdout.flush()
         while not ended.wait(0.2) and port.is_serving():

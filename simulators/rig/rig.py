@@ -28,6 +28,7 @@ from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort
 from simulators.serial.reply_faults import FaultSchedule, parse_fault
 from simulators.serial.serve_options import ServeOptions
+from simulators.serial.tcp_port import TcpPort, port_for
 
 #: Exposure indices of one state: tries of it come this far apart.
 RETAKE_STRIDE = 1_000_000
@@ -49,7 +50,7 @@ class SimulatedRig:
         #: What the operator does with a source that has no cable: False while it is covered.
         self.uncovered: Callable[[], bool] = lambda: True
         self._with_camera = with_camera
-        self._ports: dict[str, PtyPort] = {}
+        self._ports: dict[str, PtyPort | TcpPort] = {}
         self._user_angle: dict[str, Callable[[float], float]] = {}
         self._next_index = 0
         self._lock = threading.Lock()
@@ -58,7 +59,7 @@ class SimulatedRig:
         """Start every emulator. Raises ConfigError for a kind or an axis that there is not."""
         for name, port in self.config.ports.items():
             self.emulators[name] = self._emulator(name)
-            self._ports[name] = PtyPort(self.emulators[name])
+            self._ports[name] = port_for(self.emulators[name])
             for text in port.faults:
                 self.emulators[name].faults.add(parse_fault(text))
         for name, axis in self.config.axes.items():

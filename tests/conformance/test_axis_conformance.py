@@ -35,8 +35,11 @@ from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort
 from simulators.serial.reply_faults import Fault, FaultSchedule
 from simulators.serial.serve_options import ServeOptions
+from simulators.serial.tcp_port import TcpPort, port_for
 
 MOTION_KINDS = [kind for kind, make in served_kinds().items() if axis_configs(make(ServeOptions()), "none")]
+# A controller on the network takes several programs at once.
+SERIAL_KINDS = [kind for kind in MOTION_KINDS if not hasattr(served_kinds()[kind](ServeOptions()), "connect")]
 SHARED_LINES = [kind for kind in MOTION_KINDS if not kind.startswith("apt")]
 # These controllers do not tell limits of their own: only the rig file's hold.
 KEEPS_NO_LIMITS = {"elliptec", "apt-k10cr1", "apt-kdc101", "apt-kbd101"}
@@ -49,7 +52,7 @@ class Bench:
     """An emulator behind a port, and the rig entries that open it."""
 
     emulator: Emulator
-    port: PtyPort
+    port: PtyPort | TcpPort
     lines: LineRegistry
     configs: list[AxisConfig]
 
@@ -67,7 +70,7 @@ def served(kind: str, homed: bool = True, speed: float = FAST, **options: object
     """Serve one kind; homed by default, so that a test need not wait for homing."""
     options = {"limits_deg": WIDE, "faults": FaultSchedule(seed=7)} | options
     emulator = served_kinds()[kind](ServeOptions(homed=homed, clock=Clock(speed, base=patient_clock()), **options))  # type: ignore[arg-type]
-    with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
+    with port_for(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
         yield Bench(emulator, port, lines, axis_configs(emulator, port.path, homed=homed))
 
 
@@ -311,6 +314,7 @@ def test_two_axes_on_one_line_move_at_once(kind: str) -> None:
         assert second.read_position().deg == pytest.approx(-150.0, abs=0.05)
 
 
+@pytest.mark.parametrize("kind", SERIAL_KINDS)
 def test_a_port_that_another_program_holds_is_refused_by_name(kind: str) -> None:
     with served(kind) as bench:
         holder = "import os, sys; f = os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY); print('open', flush=True); input()"
@@ -344,6 +348,8 @@ def test_another_device_than_the_rig_file_names_is_refused(kind: str) -> None:
     with served(kind) as bench:
         fields = type(bench.configs[0]).model_fields
         wrong = {"stage_id": "WRONG"} if "stage_id" in fields else {"serial_number": 99}
+        if "group" in fields:
+            wrong = {"group": "NotThere"}
         if "serial_number" in fields and "str" in str(fields["serial_number"].annotation):
             wrong = {"serial_number": "00000099"}
         with pytest.raises(WrongDevice, match="rig file"):

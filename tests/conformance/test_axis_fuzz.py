@@ -20,9 +20,13 @@ from simulators.rig.controller_kinds import axis_configs, served_kinds
 from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort
 from simulators.serial.serve_options import ServeOptions
+from simulators.serial.tcp_port import port_for
 
 ROUNDS = int(os.environ.get("UMOV_FUZZ_ROUNDS", "10"))
 KINDS = [kind for kind, make in served_kinds().items() if axis_configs(make(ServeOptions()), "none")]
+
+# TCP delivers what was sent.
+SERIAL_KINDS = [kind for kind in KINDS if not hasattr(served_kinds()[kind](ServeOptions()), "connect")]
 
 # The allowance of a single test, and for each round.
 pytestmark = pytest.mark.timeout(600 + 10 * ROUNDS)
@@ -38,6 +42,8 @@ PIECES = {
 # A whole question so often that it is heard behind any length that noise has announced.
 PIECES["apt-k10cr1"].append(b"\x11\x04\x01\x00\x50\x01" * 50)
 PIECES["apt-kdc101"] = PIECES["apt-kbd101"] = PIECES["apt-k10cr1"]
+PIECES["xps"] = [b"GroupStatusGet(Group1,int *)", b"GroupMoveAbsolute(Group1.Pos,", b"GroupKill(Group2)", b")", b"("]
+PIECES["xps"] += [b"GroupInitialize(Group1)", b"GroupHomeSearch(Group1)", b"GroupMoveAbort(Group1)", b"double *,"]
 PIECES["zaber-no-checksums"] = PIECES["zaber"]
 PIECES["gcs2"] = [b"MOV 1 ", b"FRF", b"SVO 1 1\n", b"POS?\n", b"HLT 2", b"VEL 1 ", b"\x05", b"\x18", b"ERR?\n", b"\n"]
 
@@ -80,7 +86,7 @@ def ask_within(allowed_s: float, call: Callable[[], object]) -> object | None:
         assert patient_clock().now_s() - start_s < allowed_s
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", SERIAL_KINDS)
 def test_noise_on_the_line_never_gives_a_wrong_position(kind: str) -> None:
     seed = 20 + KINDS.index(kind)
     clock = Clock(300.0, base=patient_clock())
@@ -115,25 +121,26 @@ def test_an_emulator_swallows_anything_and_still_answers(kind: str) -> None:
     seed = 40 + KINDS.index(kind)
     noise = random.Random(seed)
     emulator = served_kinds()[kind](ServeOptions(clock=Clock(50.0, base=patient_clock())))
+    line = emulator.connect() if hasattr(emulator, "connect") else emulator
     spoken = 0
     for _ in range(10 * ROUNDS):
         for _ in range(50):
             choice = noise.random()
             if choice < 0.4:
-                emulator.receive(noise.choice(PIECES[kind]))
+                line.receive(noise.choice(PIECES[kind]))
             elif choice < 0.7:
-                emulator.receive(str(noise.randrange(-99, 99_999)).encode())
+                line.receive(str(noise.randrange(-99, 99_999)).encode())
             else:
-                emulator.receive(noise.randbytes(noise.randrange(1, 30)))
-            spoken += len(emulator.take_output())
+                line.receive(noise.randbytes(noise.randrange(1, 30)))
+            spoken += len(line.take_output())
     assert spoken > 0
     # Whatever it was told, it is still there for a client that asks properly.
-    emulator.receive(b"\r\n" * 200)
+    line.receive(b"\r\n" * 200)
     for axis in emulator.axes:
         axis.stop()
     patient_clock().sleep_s(0.05)
-    emulator.take_output()
-    with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
+    line.take_output()
+    with port_for(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
         axis = open_axis("axis", axis_configs(emulator, port.path)[0], lines)
         position_deg = axis.read_position().deg
         assert math.isfinite(position_deg), f"seed {seed}"

@@ -12,14 +12,14 @@ from drivers.serial_link import LineRegistry
 from simulators.clock import Clock, patient_clock
 from simulators.rig.controller_kinds import axis_configs, served_kinds
 from simulators.serial.emulator import Emulator
-from simulators.serial.pty_port import PtyPort
 from simulators.serial.serve_options import ServeOptions
+from simulators.serial.tcp_port import port_for
 
 
 @contextmanager
 def opened(kind: str, model: str | None = None, **changes: object) -> Iterator[tuple[Emulator, MotionAxis]]:
     emulator = served_kinds()[kind](ServeOptions(homed=True, model=model, clock=Clock(100.0, base=patient_clock())))
-    with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
+    with port_for(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
         config = axis_configs(emulator, port.path, homed=True)[0].model_copy(update=changes)
         yield emulator, open_axis("axis", config, lines)
 

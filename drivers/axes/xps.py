@@ -1,0 +1,226 @@
+"""Newport XPS-C8, -Q8, -D with rotation stages in single-axis groups, over TCP (port 5001).
+
+Facts: Newport's own Python library, as newportxps and pyepics carry it (calls, ``code,values,EndOfAPI``), EPICS' and
+BLISS' drivers (status codes; a move or homing holds up its connection until it ends, so every axis has a second one
+for them). A group is homed after GroupInitialize and GroupHomeSearch; GroupKill ends a homing.
+Unverified on hardware: everything; that no Login is asked; the text behind an error code. The unit must be degrees,
+which is not asked. The position compare output is not used.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Literal
+
+from pydantic import Field
+
+from drivers.clock import Clock
+from drivers.errors import CommandRejected, NotHomedError, ReplyError, ReplyTimeout, WrongDevice
+from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
+from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed
+from drivers.unmarked_replies import ask
+
+END = b",EndOfAPI"
+READY = range(10, 19)
+DISABLED = range(20, 39)
+NOT_REFERENCED = 42
+HOMING = 43
+MOVING = range(43, 49)
+ERRORS = {-17: "parameter out of range", -19: "no such group", -22: "not allowed in this state", -27: "aborted"}
+NOT_ALLOWED, ABORTED = -22, -27
+# Limits as large as this are those of a stage that has none.
+NO_LIMIT_DEG = 1e6
+# GroupInitialize starts the motor's control loop; a refusal of a move comes at once.
+INITIALIZE_S = 20.0
+REFUSAL_S = 0.1
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_ERROR = r"-\d+,.*"
+
+
+class Config(AxisConfig):
+    """A single-axis group of an XPS in a rig file; `port` is ``socket://ADDRESS:5001``."""
+
+    kind: Literal["xps"] = "xps"
+    group: str = Field(pattern=r"^\w+$", description="name of the group")
+    positioner: str = Field(default="Pos", pattern=r"^\w+$", description="name of its positioner")
+
+
+def framer(buffer: bytearray) -> bytes | None:
+    """Take one answer off the buffer, without its end."""
+    end = buffer.find(END)
+    if end < 0:
+        return None
+    frame = bytes(buffer[:end])
+    del buffer[: end + len(END)]
+    return frame
+
+
+class XPSLine:
+    """The connection for questions, shared by the axes of one controller."""
+
+    def __init__(self, config: Config, transcript: Transcript | None, clock: Clock) -> None:
+        self.link = SerialLink(config.port, 9600, framer, transcript=transcript, clock=clock, held_by=config.held_by)
+        self.reply_s = config.reply_s or 1.0
+
+    def close(self) -> None:
+        """Close the connection."""
+        self.link.close()
+
+    def ask(self, call: str, form: str) -> str:
+        """Ask a question; returns the values of the answer, in the given form.
+
+        Raises
+        ------
+        CommandRejected, ReplyTimeout, ReplyError
+        """
+        asked = f"XPS {self.link.port}, {call}"
+        whole = re.compile(rf"0,{form}|{_ERROR}")
+        answer = ask(self.link, call.encode("ascii"), whole, self.reply_s, asked, "Check power, cable and address")
+        return _values(answer, asked)
+
+    def command(self, call: str, reply_s: float | None = None) -> None:
+        """Call a function without values, once; raises CommandRejected or ReplyTimeout."""
+        asked = f"XPS {self.link.port}, {call}"
+        with self.link.lock:
+            self.link.purge(0.0)
+            self.link.write(call.encode("ascii"))
+            frame = self.link.read_frame(self.link.clock.now_s() + (reply_s or self.reply_s))
+        if frame is None:
+            raise ReplyTimeout(asked, f"nothing within {reply_s or self.reply_s} s", "Check power, cable and address")
+        _values(frame.decode("ascii", "replace"), asked)
+
+
+def _values(answer: str, asked: str) -> str:
+    code, _, values = answer.partition(",")
+    if not re.fullmatch(r"-?\d+", code):
+        raise ReplyError(asked, f"no code in {answer!r}", "Is it an XPS, and the port 5001?")
+    if int(code) == 0:
+        return values
+    words = f"error {code}: {ERRORS.get(int(code), 'see the manual')}"
+    if int(code) == NOT_ALLOWED:
+        raise NotHomedError(asked, words, "Home the axis (acquire home)")
+    raise CommandRejected(asked, words, "Look at the state of the group in the controller's web page")
+
+
+class XPSAxis(MotionAxis):
+    """One group with one positioner."""
+
+    def __init__(self, name: str, config: Config, line: XPSLine, lines: LineRegistry, moving: SerialLink) -> None:
+        super().__init__(name, config)
+        self.config: Config = config
+        self._line, self._lines, self._moving = line, lines, moving
+        self._homing = False
+        positioner = f"{config.group}.{config.positioner}"
+        self._positioner = positioner
+        self._require_group(f"axis {name} on {config.port}")
+        firmware = agreed(lambda: line.ask("FirmwareVersionGet(char *)", r"[^,]+"))
+        if "XPS" not in firmware.upper():
+            raise WrongDevice(f"axis {name} on {config.port}", f"{firmware!r} answers", "Correct `port`")
+        speed = agreed(lambda: self._ask("PositionerSGammaParametersGet", 4))
+        self.speed_deg_s, self.acceleration_deg_s2 = speed[:2]
+        if min(speed[:2]) <= 0:
+            raise ReplyError(f"axis {name}, speed", f"{speed[:2]}", "Set the parameters of the stage")
+        limits = agreed(lambda: self._ask("PositionerUserTravelLimitsGet", 2))
+        self._device_min_deg, self._device_max_deg = (None if abs(end) >= NO_LIMIT_DEG else end for end in limits)
+        self._identity = AxisIdentity(
+            kind="xps",
+            model=firmware.partition(" ")[0],
+            serial_number="not told by the protocol",
+            firmware=firmware,
+            port=config.port,
+            address=positioner,
+        )
+
+    def _require_group(self, asked: str) -> None:
+        try:
+            self._status()
+        except CommandRejected as error:
+            raise WrongDevice(
+                f"{asked}, group {self.config.group}", error.came_back, "Correct `group` in the rig file"
+            ) from error
+
+    def describe(self) -> AxisIdentity:
+        return self._identity
+
+    def _ask(self, function: str, values: int) -> tuple[float, ...]:
+        wanted = ",".join(["double *"] * values)
+        answer = self._line.ask(f"{function}({self._positioner},{wanted})", ",".join([_NUMBER] * values))
+        return tuple(float(value) for value in answer.split(","))
+
+    def _status(self) -> int:
+        return int(self._line.ask(f"GroupStatusGet({self.config.group},int *)", r"\d{1,3}"))
+
+    def _do_read_counts(self) -> float:
+        return self._ask("GroupPositionCurrentGet", 1)[0]
+
+    def _do_is_homed(self) -> bool:
+        # One garbled digit must not make a reference.
+        return all(s in READY or s in DISABLED or (s in MOVING and s != HOMING) for s in self._twice())
+
+    def _do_is_moving(self) -> bool:
+        return any(status in MOVING for status in self._twice())
+
+    def _twice(self) -> tuple[int, int]:
+        return self._status(), self._status()
+
+    def _start(self, call: str) -> None:
+        """Start a motion on its own connection, whose answer comes at its end unless it is refused."""
+        link = self._moving
+        link.purge(0.0)
+        link.write(call.encode("ascii"))
+        frame = link.read_frame(link.clock.now_s() + REFUSAL_S)
+        if frame is not None:
+            _values(frame.decode("ascii", "replace"), f"axis {self.name}, {call}")
+
+    def _do_start_move(self, counts: float) -> None:
+        self._homing = False
+        if self._status() in DISABLED:
+            self._line.command(f"GroupMotionEnable({self.config.group})")
+        self._start(f"GroupMoveAbsolute({self._positioner},{counts:.6f})")
+
+    def _do_start_home(self) -> None:
+        """Initialize and home; a group that has a reference must be killed first, as the controller wants it."""
+        group = self.config.group
+        if self._status() in (*READY, *DISABLED):
+            self._line.command(f"GroupKill({group})")
+        if self._status() != NOT_REFERENCED:
+            self._line.command(f"GroupInitialize({group})", INITIALIZE_S)
+        self._homing = True
+        self._start(f"GroupHomeSearch({group})")
+
+    def _do_note_rest(self, counts: float) -> None:
+        self._homing = False
+
+    def _do_stop(self) -> None:
+        # A homing cannot be aborted, only killed; the answer is skipped by the next question, which it does not fit.
+        call = "GroupKill" if self._homing else "GroupMoveAbort"
+        self._line.link.write(f"{call}({self.config.group})".encode("ascii"))
+
+    def _do_check_fault(self) -> None:
+        while (frame := self._moving.read_frame(0.0)) is not None:
+            code = frame.decode("ascii", "replace").partition(",")[0]
+            if code not in ("0", str(ABORTED)):
+                words = ERRORS.get(int(code), "see the manual") if re.fullmatch(r"-\d+", code) else "garbled"
+                raise CommandRejected(f"axis {self.name}, motion", f"error {code}: {words}", "Remove the cause")
+
+    def _do_warnings(self) -> list[str]:
+        status = self._status()
+        return [f"motor off (status {status})"] if status in DISABLED else []
+
+    def _do_close(self) -> None:
+        self._moving.close()
+        self._lines.release(self.config.port)
+
+
+def open(name: str, config: Config, lines: LineRegistry) -> XPSAxis:
+    """Open one axis; reads identity, limits and speed and moves nothing."""
+    line = lines.take(config.port, XPSLine, lambda transcript: XPSLine(config, transcript, lines.clock))
+    moving: SerialLink | None = None
+    try:
+        moving = SerialLink(config.port, 9600, framer, clock=lines.clock)
+        return XPSAxis(name, config, line, lines, moving)
+    except BaseException:
+        if moving is not None:
+            moving.close()
+        lines.release(config.port)
+        raise

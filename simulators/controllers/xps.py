@@ -1,0 +1,206 @@
+"""Newport XPS with single-axis groups: functions over TCP, answered in order on each connection.
+
+A move or a homing holds up its own connection until it ends; other connections are answered meanwhile.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from drivers.axes.xps import Config
+from simulators.clock import Clock
+from simulators.serial.emulator import EmulatedAxis, Emulator
+from simulators.serial.reply_faults import FaultSchedule
+from simulators.serial.serve_options import ServeOptions
+
+WRONG_FORMAT, OUT_OF_RANGE, NO_GROUP, NOT_ALLOWED, UNKNOWN, ABORTED = -2, -17, -19, -22, -3, -27
+END = ",EndOfAPI"
+_CALL = re.compile(r"\s*(\w+)\((.*)\)")
+
+
+class Failed(Exception):
+    """The function fails; `code` is the first field of the answer."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(code)
+        self.code = code
+
+
+@dataclass
+class Group:
+    """A group with one positioner, `name`.Pos."""
+
+    name: str
+    axis: EmulatedAxis
+    initialized: bool = False
+    enabled: bool = True
+    came_by: int = 11
+    aborted: bool = False
+
+    def status(self) -> int:
+        """Status code of GroupStatusGet."""
+        if self.axis.is_moving():
+            return 43 if self.axis.homing else 44
+        if not self.initialized:
+            return 0
+        if not self.axis.homed:
+            return 42
+        return self.came_by if self.enabled else 20
+
+
+class XPSEmulator(Emulator):
+    """A controller; `true_deg(i)` belongs to the i-th group. `connect` begins a conversation on one connection."""
+
+    def __init__(self, groups: Sequence[Group], clock: Clock, faults: FaultSchedule | None = None) -> None:
+        super().__init__([group.axis for group in groups], clock, faults)
+        self.groups = {group.name: group for group in groups}
+
+    def connect(self) -> XPSConversation:
+        """Begin a conversation."""
+        return XPSConversation(self)
+
+    def _do_receive(self, data: bytes) -> None:
+        raise RuntimeError("an XPS is talked to over a connection")
+
+    def _do_make_foreign(self, reply: bytes) -> bytes:
+        return f"0,XPS-C8 Firmware V2.6.x{END}".encode()
+
+
+class XPSConversation(Emulator):
+    """One connection to a controller."""
+
+    def __init__(self, controller: XPSEmulator) -> None:
+        super().__init__(controller.axes, controller.clock, controller.faults)
+        # Connections share the axes.
+        self._lock = controller._lock
+        self._controller = controller
+        self._buffer = ""
+        self._waits_for: Group | None = None
+
+    def _do_receive(self, data: bytes) -> None:
+        self._buffer = (self._buffer + data.decode("latin-1"))[-4096:]
+        self._work()
+
+    def _work(self) -> None:
+        while self._waits_for is None and (end := self._buffer.find(")")) >= 0:
+            text, self._buffer = self._buffer[: end + 1], self._buffer[end + 1 :]
+            self._apply_faults()
+            try:
+                answer = self._run(text)
+            except Failed as failure:
+                self._reply(f"{failure.code},{text.strip()}{END}".encode("latin-1"))
+                continue
+            if answer is not None:
+                self._reply(f"0,{answer}{END}".encode("latin-1"))
+
+    def _run(self, text: str) -> str | None:
+        call = _CALL.fullmatch(text)
+        if call is None:
+            raise Failed(WRONG_FORMAT)
+        name, words = call[1], [word.strip() for word in call[2].split(",")]
+        if name == "FirmwareVersionGet":
+            return "XPS-C8 Firmware V2.6.x"
+        if name == "ErrorStringGet":
+            return f"Error {words[0]}"
+        functions: dict[str, Callable[[Group, list[str]], str | None]] = {
+            "GroupStatusGet": lambda group, _: str(group.status()),
+            "GroupPositionCurrentGet": lambda group, _: f"{group.axis.position_deg():.9g}",
+            "PositionerUserTravelLimitsGet": lambda group, _: _limits(group.axis),
+            "PositionerSGammaParametersGet": lambda group, _: (
+                f"{group.axis.speed_deg_s:.9g},{group.axis.acceleration_deg_s2:.9g},0.02,0.02"
+            ),
+            "GroupInitialize": self._initialize,
+            "GroupHomeSearch": self._home,
+            "GroupMoveAbsolute": self._move,
+            "GroupMoveAbort": self._abort,
+            "GroupKill": self._kill,
+            "GroupMotionEnable": lambda group, _: self._enable(group, True),
+            "GroupMotionDisable": lambda group, _: self._enable(group, False),
+        }
+        if name not in functions:
+            raise Failed(UNKNOWN)
+        group = self._controller.groups.get(words[0].partition(".")[0])
+        if group is None:
+            raise Failed(NO_GROUP)
+        return functions[name](group, words[1:])
+
+    def _initialize(self, group: Group, _: list[str]) -> str:
+        if group.status() != 0:
+            raise Failed(NOT_ALLOWED)
+        group.initialized = group.enabled = True
+        return ""
+
+    def _home(self, group: Group, _: list[str]) -> None:
+        if group.status() != 42:
+            raise Failed(NOT_ALLOWED)
+        group.axis.home()
+        group.came_by, group.aborted, self._waits_for = 11, False, group
+
+    def _move(self, group: Group, words: list[str]) -> None:
+        if not 10 <= group.status() <= 18:
+            raise Failed(NOT_ALLOWED)
+        try:
+            target_deg = float(words[0])
+        except (ValueError, IndexError):
+            raise Failed(WRONG_FORMAT) from None
+        if not group.axis.within(target_deg):
+            raise Failed(OUT_OF_RANGE)
+        group.axis.move_to(target_deg)
+        group.came_by, group.aborted, self._waits_for = 12, False, group
+
+    def _abort(self, group: Group, _: list[str]) -> str:
+        if group.status() != 44:
+            raise Failed(NOT_ALLOWED)
+        group.axis.stop()
+        group.aborted = True
+        return ""
+
+    def _kill(self, group: Group, _: list[str]) -> str:
+        group.aborted = group.axis.is_moving()
+        group.axis.lose_reference()
+        group.initialized = False
+        return ""
+
+    def _enable(self, group: Group, on: bool) -> str:
+        if group.status() not in ((20,) if on else range(10, 19)):
+            raise Failed(NOT_ALLOWED)
+        group.enabled, group.came_by = on, 10
+        return ""
+
+    def _do_advance(self) -> None:
+        group = self._waits_for
+        if group is not None and not group.axis.is_moving():
+            self._waits_for = None
+            self._reply(f"{ABORTED if group.aborted else 0},{END}".encode())
+            self._work()
+
+    def _do_next_event_s(self) -> float | None:
+        return None if self._waits_for is None else self._waits_for.axis.end_s()
+
+    def _do_make_foreign(self, reply: bytes) -> bytes:
+        return self._controller._do_make_foreign(reply)
+
+
+def _limits(axis: EmulatedAxis) -> str:
+    low = -1e7 if axis.min_deg is None else axis.min_deg
+    high = 1e7 if axis.max_deg is None else axis.max_deg
+    return f"{low:g},{high:g}"
+
+
+def make(options: ServeOptions) -> XPSEmulator:
+    """Two groups, Group1 and Group2, not initialized, with travel from -170 to 170 degrees."""
+    low, high = options.limits_deg or (-170.0, 170.0)
+    groups = [
+        Group(f"Group{k + 1}", options.axis(low, high, 12.0 * (k + 1)), options.homed) for k in range(options.axes or 2)
+    ]
+    return XPSEmulator(groups, options.clock, options.faults)
+
+
+def axis_configs(emulator: XPSEmulator, port: str) -> list[Config]:
+    """Rig entries for every group."""
+    return [Config(port=port, group=name) for name in emulator.groups]
+
+
+SERVES = {"xps": make}

@@ -1,0 +1,117 @@
+"""Runs an emulator behind a TCP port, for controllers on the network that take several connections at once."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import selectors
+import socket
+import threading
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+from simulators.serial.emulator import Emulator
+from simulators.serial.pty_port import PtyPort, SerialEmulator
+
+
+class NetworkEmulator(Protocol):
+    """What a TCP port needs of an emulator: a conversation of its own for each connection."""
+
+    def connect(self) -> SerialEmulator:
+        """Begin a conversation."""
+
+
+class TcpPort:
+    """A TCP port on 127.0.0.1 served by one emulator in a thread.
+
+    Attributes
+    ----------
+    path : str
+        ``socket://127.0.0.1:PORT``, for the client.
+    """
+
+    def __init__(self, emulator: NetworkEmulator) -> None:
+        self.emulator = emulator
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.path = f"socket://127.0.0.1:{self._listener.getsockname()[1]}"
+        self._wake_read, self._wake_write = os.pipe()
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._serve, name=f"emulator {self.path}", daemon=True)
+        self._thread.start()
+
+    def is_serving(self) -> bool:
+        """True until it is closed or the emulator fails."""
+        return self._thread.is_alive()
+
+    def close(self) -> None:
+        """Stop serving and close the port.
+
+        Raises
+        ------
+        RuntimeError
+            The emulator itself failed while it served.
+        """
+        if self._thread.is_alive():
+            os.write(self._wake_write, b"x")
+            self._thread.join()
+        self._listener.close()
+        for descriptor in (self._wake_read, self._wake_write):
+            if descriptor >= 0:
+                os.close(descriptor)
+        self._wake_read = self._wake_write = -1
+        error, self._error = self._error, None
+        if error is not None:
+            raise RuntimeError(f"the emulator on {self.path} failed") from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _serve(self) -> None:
+        talks: dict[socket.socket, SerialEmulator] = {}
+        try:
+            with selectors.DefaultSelector() as selector:
+                selector.register(self._listener, selectors.EVENT_READ)
+                selector.register(self._wake_read, selectors.EVENT_READ)
+                while True:
+                    waits = [wait for talk in talks.values() if (wait := talk.next_output_s()) is not None]
+                    events = selector.select(max(0.0, min([*waits, 0.5])))
+                    for key, _ in events:
+                        if key.fileobj == self._wake_read:
+                            return
+                        self._take(key.fileobj, talks, selector)
+                    for connection, talk in talks.items():
+                        # A client that has gone is noticed when it is read from.
+                        with contextlib.suppress(ConnectionError):
+                            connection.sendall(talk.take_output())
+        except BaseException as error:  # noqa: BLE001 - raised again by close()
+            self._error = error
+        finally:
+            for connection in talks:
+                connection.close()
+
+    def _take(self, ready: Any, talks: dict[socket.socket, SerialEmulator], selector: Any) -> None:
+        if ready is self._listener:
+            connection, _ = self._listener.accept()
+            talks[connection] = self.emulator.connect()
+            selector.register(connection, selectors.EVENT_READ)
+            return
+        try:
+            data = ready.recv(4096)
+        except ConnectionError:
+            data = b""
+        if data:
+            talks[ready].receive(data)
+        else:
+            selector.unregister(ready)
+            del talks[ready]
+            ready.close()
+
+
+def port_for(emulator: Emulator) -> PtyPort | TcpPort:
+    """A port of the kind that the controller has: TCP where it holds conversations, else a serial line."""
+    return TcpPort(emulator) if hasattr(emulator, "connect") else PtyPort(emulator)
