@@ -1,0 +1,37 @@
+"""One capture from Python: plan and rig in, path of the sealed capture out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from acquisition.capture import session
+from acquisition.capture.checks import refuse_failed
+from acquisition.capture.header import default_name
+from acquisition.capture.job import check_with_devices, prepare
+from acquisition.capture.plan import MeasurementPlan
+from acquisition.errors import AcquisitionError
+from acquisition.rig.config import RigConfig
+from acquisition.rig.rig import Rig
+from acquisition.stop_request import StopRequest
+
+
+def take_capture(plan: MeasurementPlan, rig: RigConfig, folder: Path | str, home: bool = False) -> Path:
+    """Check everything, take the capture, seal it; Ctrl-C ends it after the state that is being taken.
+
+    Parameters
+    ----------
+    folder : for the file, which is named as `acquire` names it.
+    home : home axes without a reference before the first move; nothing homes unless asked here or by the rig file.
+
+    Raises
+    ------
+    AcquisitionError, DeviceError : it was refused, failed or was stopped; the message names what is left to go on with.
+    """
+    job = prepare(plan, rig)
+    path = Path(folder) / default_name(plan)
+    with StopRequest() as stop, Rig(rig) as devices:
+        refuse_failed(check_with_devices(job, devices, path.parent))
+        result = session.take(job, devices, path, stop, home=home)
+    if result.status != "complete":
+        raise AcquisitionError(f"{result.path} was stopped ({result.status}); `acquire --resume` goes on with it.")
+    return result.path

@@ -1,0 +1,163 @@
+"""Captures and products as labelled arrays (xarray), with coordinates, units and standard errors; and back."""
+
+from __future__ import annotations
+
+import tempfile
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from processing.errors import ProcessError
+from processing.steps.reduction import Reduction
+from processing.storage.capture import Capture
+from processing.storage.capture_schema import CaptureHeader, create_layout, write_closing
+from processing.storage.product import Product, is_product
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+#: Leading shapes of planes that are matrices or vectors, and what their axes are called.
+LEADING = {(4, 4): ("row", "column"), (4,): ("element",), (3,): ("element",)}
+
+
+def open_dataset(path: Path | str) -> xr.Dataset:
+    """A capture or a product as an xarray Dataset, all of it in memory.
+
+    A capture has `counts` (state, channel, y, x) with coordinates `role`, `exposure_s`, `time` and one `AXIS_deg` for
+    each axis, as read back. A product has its planes, (row, column, y, x) for Mueller matrices; `NAME_errors` are
+    standard errors. Every variable has `units` and `long_name`; attributes hold title, wavelength, Omega, and whether
+    the data are simulated.
+    """
+    path = Path(path)
+    return _of_product(path) if is_product(path) else _of_capture(path)
+
+
+def reduce_to_dataset(capture: Path | str, instrument: Path | str | None = None, **options: Any) -> xr.Dataset:
+    """The Mueller or Stokes image of a capture as a Dataset; no file is left behind.
+
+    Parameters
+    ----------
+    instrument : file to use instead of the model in the capture.
+    options : of `processing.Reduction`, for instance `weighted=True`.
+
+    Raises
+    ------
+    ProcessError : what `process reduce` would say.
+    """
+    step = Reduction(Path(capture), Path(instrument) if instrument else None, **options)
+    with tempfile.TemporaryDirectory() as folder:
+        return open_dataset(step.make(Path(folder) / "reduced.h5"))
+
+
+def write_dataset(dataset: xr.Dataset, path: Path | str) -> Path:
+    """Write a Dataset as `open_dataset` gives it for a capture into a capture file; returns the path.
+
+    Needed are `counts` (state, channel, y, x), one `AXIS_deg` (state) for each axis that turned, and the attribute
+    `header` (JSON of a `CaptureHeader`) or `wavelength_nm` and `title`. Without `role` all states are of the sample.
+
+    Raises
+    ------
+    ProcessError : the file exists, or something needed is missing.
+    """
+    path = Path(path)
+    if path.exists():
+        raise ProcessError(f"{path} exists and is not replaced. Give another name.")
+    if "counts" not in dataset or dataset["counts"].dims != ("state", "channel", "y", "x"):
+        raise ProcessError("a capture needs a variable `counts` with the dimensions (state, channel, y, x)")
+    counts = dataset["counts"].to_numpy()
+    header = _header(dataset)
+    angles = {
+        str(name).removesuffix("_deg"): np.asarray(column, dtype=float)
+        for name, column in dataset.coords.items()
+        if str(name).endswith("_deg") and column.dims == ("state",)
+    }
+    n = len(counts)
+    role = tuple(dataset["role"].to_numpy().astype(str)) if "role" in dataset.coords else ("sample",) * n
+    import h5py
+
+    with h5py.File(path, "x") as h5:
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        create_layout(h5, header, angles, role, counts.shape[2:], counts.dtype, now)
+        h5["entry/instrument/detector/data"][...] = counts
+        for axis, values in angles.items():
+            h5[f"entry/instrument/{axis}/value"][...] = values
+        states = h5["entry/states"]
+        states["exposure_s"][...] = dataset["exposure_s"].to_numpy() if "exposure_s" in dataset.coords else np.nan
+        states["repeats"][...] = 1
+        states["done"][...] = 1
+        write_closing(h5, "complete", {"source": "written from labelled arrays"})
+    return path
+
+
+def _header(dataset: xr.Dataset) -> CaptureHeader:
+    if "header" in dataset.attrs:
+        return CaptureHeader.model_validate_json(dataset.attrs["header"])
+    missing = [name for name in ("title", "wavelength_nm") if name not in dataset.attrs]
+    if missing:
+        raise ProcessError(f"a capture needs the attribute {missing[0]!r}, or a whole `header`")
+    return CaptureHeader(
+        title=str(dataset.attrs["title"]),
+        wavelength_nm=float(dataset.attrs["wavelength_nm"]),
+        simulated=bool(dataset.attrs.get("simulated", False)),
+        mode="labelled",
+        channels=tuple(dataset["channel"].to_numpy().astype(str)) if "channel" in dataset.coords else ("camera",),
+    )
+
+
+def _attributes(header: CaptureHeader, simulated: bool) -> dict[str, Any]:
+    return {
+        "title": header.title,
+        "wavelength_nm": header.wavelength_nm,
+        "omega_deg": np.nan if header.omega_deg is None else header.omega_deg,
+        "simulated": int(simulated),
+        "header": header.model_dump_json(),
+    }
+
+
+def _of_capture(path: Path) -> xr.Dataset:
+    import xarray as xr
+
+    with Capture(path) as capture:
+        counts = np.stack([capture.frames(k) for k in range(len(capture.done))])
+        column = {name: capture.column(name) for name in ("exposure_s", "host_time_s")}
+        coords: dict[str, Any] = {
+            "state": ("state", capture.done, {"long_name": "number in the plan"}),
+            "channel": ("channel", list(capture.header.channels)),
+            "y": ("y", np.arange(counts.shape[2]), {"units": "pixel"}),
+            "x": ("x", np.arange(counts.shape[3]), {"units": "pixel"}),
+            "role": ("state", list(capture.role)),
+            "exposure_s": ("state", column["exposure_s"], {"units": "s"}),
+            "time": ("state", column["host_time_s"], {"units": "s", "long_name": "when the frame came, host clock"}),
+        }
+        for axis, values in capture.angles_deg.items():
+            coords[f"{axis}_deg"] = ("state", values, {"units": "degree", "long_name": f"{axis}, as read back"})
+        attributes = {"units": "count", "long_name": "counts as stored"}
+        variables = {"counts": (("state", "channel", "y", "x"), counts, attributes)}
+        return xr.Dataset(variables, coords, _attributes(capture.header, capture.simulated))
+
+
+def _of_product(path: Path) -> xr.Dataset:
+    import xarray as xr
+
+    with Product(path) as product:
+        variables: dict[str, Any] = {}
+        for name in product.names:
+            values = product.get(name)
+            leading = LEADING.get(values.shape[:-2]) or tuple(f"{name}_{k}" for k in range(values.ndim - 2))
+            attributes = {"units": product.units(name), "long_name": product.long_name(name)}
+            variables[name] = ((*leading, "y", "x"), values, attributes)
+        coords: dict[str, Any] = {
+            "y": ("y", np.arange(product.shape[0]), {"units": "pixel"}),
+            "x": ("x", np.arange(product.shape[1]), {"units": "pixel"}),
+        }
+        sizes = {
+            dim: size for dims, values, _ in variables.values() for dim, size in zip(dims, values.shape, strict=True)
+        }
+        coords |= {dim: (dim, np.arange(sizes[dim])) for dim in ("row", "column") if dim in sizes}
+        attributes = _attributes(product.header, product.simulated)
+        numbers = {
+            k: v for k, v in product.facts.items() if isinstance(v, int | float | str) and not isinstance(v, bool)
+        }
+        return xr.Dataset(variables, coords, attributes | {"kind": product.kind} | numbers)

@@ -1,0 +1,74 @@
+"""The public interface: every name is there, five lines to a Mueller image, xarray in and out."""
+
+import inspect
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import acquisition
+import processing
+from processing.errors import ProcessError
+
+
+@pytest.mark.parametrize("package", [processing, acquisition], ids=lambda p: p.__name__)
+def test_every_public_name_is_there_and_documented(package):
+    assert len(package.__all__) > 5
+    for name in package.__all__:
+        thing = getattr(package, name)
+        if inspect.isclass(thing) or inspect.isfunction(thing):
+            assert thing.__doc__, name
+    assert dir(package) == package.__all__
+    with pytest.raises(AttributeError, match="has no public name 'nonsense'"):
+        _ = package.nonsense
+
+
+def test_importing_a_package_loads_nothing_heavy():
+    code = "import sys, processing, acquisition; print({'numba', 'scipy', 'xarray', 'h5py'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+@pytest.fixture
+def capture(small_rig, tmp_path):
+    """Taken with the ten lines of the docstring."""
+    from acquisition import MeasurementPlan, load_rig, take_capture
+
+    plan = MeasurementPlan(omega_deg=35, wavelength_nm=662)
+    return take_capture(plan, load_rig(small_rig()), tmp_path / "captures")
+
+
+def test_from_capture_to_labelled_mueller_image_and_back(capture, tmp_path):
+    from processing import MuellerImage, Reduction, open_dataset, reduce_to_dataset, write_dataset
+
+    image = reduce_to_dataset(capture)
+    assert image.mueller.dims == ("row", "column", "y", "x")
+    assert image.mueller.units == image.mueller_errors.units == "count"
+    assert (image.attrs["kind"], image.attrs["simulated"]) == ("mueller", 1)
+    file = MuellerImage.load(Reduction(capture).make(tmp_path / "m.h5"))
+    np.testing.assert_array_equal(image.mueller.values, file.values)
+    raw = open_dataset(capture)
+    assert raw.counts.dims == ("state", "channel", "y", "x")
+    light = raw.where(raw.role == "sample", drop=True)
+    assert light.psa_deg.values % 360 == pytest.approx(4.91 * 9 * np.arange(40) % 360, abs=0.01)
+    copied = write_dataset(raw, tmp_path / "copy.h5")
+    again = reduce_to_dataset(copied)
+    np.testing.assert_array_equal(again.mueller.values, image.mueller.values)
+    with pytest.raises(ProcessError, match="exists and is not replaced"):
+        write_dataset(raw, copied)
+    with pytest.raises(ProcessError, match="dimensions"):
+        write_dataset(raw.drop_vars("counts"), tmp_path / "none.h5")
+
+
+def test_the_docstrings_run_as_they_stand(small_rig, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("acquisition.commands.defaults.DEFAULT_RIG", small_rig())
+    blocks = {}
+    for package in (acquisition, processing):
+        lines = (package.__doc__ or "").splitlines()
+        blocks[package.__name__] = "\n".join(line[4:] for line in lines if line.startswith("    ") or not line.strip())
+    exec(compile(blocks["acquisition"], "acquisition", "exec"), {})
+    taken = capsys.readouterr().out.strip()
+    exec(compile(blocks["processing"].replace("captures/NAME.h5", taken), "processing", "exec"), {})
+    assert "[[" in capsys.readouterr().out
