@@ -76,3 +76,8 @@ def test_a_citation_that_leads_outside_is_seen():
     ]
     assert cited_outside('docs/conventions.md, "No such heading"')
     assert not cited_outside('docs/conventions.md, "Frames"')
+
+
+def test_every_page_of_the_docs_is_in_the_site():
+    named = set(re.findall(r"[\w-]+\.md", (ROOT / "mkdocs.yml").read_text(encoding="utf-8")))
+    assert named == {page.name for page in (ROOT / "docs").glob("*.md")}
