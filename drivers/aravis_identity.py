@@ -28,6 +28,8 @@ def identify(
             interface=name,
             interface_mtu=mtu,
             packet_size=setup.packet_size(),
+            packet_delay=_packet_delay(features) if setup.is_gige else None,
+            resend=config.resend if setup.is_gige else None,
             sensor_width=int(features.number(genicam.SENSOR_WIDTH) or 0),
             sensor_height=int(features.number(genicam.SENSOR_HEIGHT) or 0),
             pixel_format=fmt.name,
@@ -38,3 +40,8 @@ def identify(
             colour=fmt.colour,
             library=f"Aravis {aravis._version}",
         )
+
+
+def _packet_delay(features: Features) -> int | None:
+    delay = features.number(genicam.PACKET_DELAY)
+    return None if delay is None else int(delay)

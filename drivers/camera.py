@@ -103,8 +103,9 @@ class StreamStatistics:
 class CameraIdentity:
     """Which camera answered, over which interface, and how its pixels are laid out.
 
-    `pixel_format_code` is the code as the camera sends it; `shift` is how many empty low bits were removed; `colour` is
-    True for the raw mosaic of a colour filter.
+    `packet_delay` is the pause between two packets in ticks of the camera's clock, `resend` whether lost packets are
+    asked for again; both None off Ethernet. `pixel_format_code` is the code as the camera sends it; `shift` is how many
+    empty low bits were removed; `colour` is True for the raw mosaic of a colour filter.
     """
 
     kind: str
@@ -116,6 +117,8 @@ class CameraIdentity:
     interface: str
     interface_mtu: int | None
     packet_size: int | None
+    packet_delay: int | None
+    resend: bool | None
     sensor_width: int
     sensor_height: int
     pixel_format: str

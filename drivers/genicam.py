@@ -20,6 +20,7 @@ BLACK_LEVEL = ("BlackLevel", "BlackLevelAbs", "BlackLevelRaw")
 TEMPERATURE_C = ("DeviceTemperature", "TemperatureAbs")
 SENSOR_WIDTH = ("SensorWidth", "WidthMax")
 SENSOR_HEIGHT = ("SensorHeight", "HeightMax")
+PACKET_DELAY = ("GevSCPD",)
 SERIAL_NUMBER = ("DeviceSerialNumber", "DeviceID")
 FIRMWARE = ("DeviceFirmwareVersion", "DeviceVersion")
 

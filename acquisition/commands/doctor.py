@@ -24,6 +24,8 @@ from processing.instrument.model import InstrumentModel
 #: Frames of the packet-loss test, and their exposure.
 FRAMES = 50
 EXPOSURE_S = 0.001
+#: Packet with its headers that gigabit links with jumbo frames carry, bytes.
+JUMBO_BYTES = 9000
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,7 @@ def _camera(camera: Camera, config: RigConfig, frames: int) -> str:
         f"{statistics.resent_packets} resent"
     )
     if lost:
-        raise AcquisitionError(found + ". Check cable, packet size and network load.")
+        raise AcquisitionError(found + ". " + _against_loss(who))
     if config.detector.bits is not None and camera.bits != config.detector.bits:
         raise AcquisitionError(
             f"{found}. The rig file says {config.detector.bits} bits under `detector`; correct that or `camera`"
@@ -151,7 +153,29 @@ def _camera(camera: Camera, config: RigConfig, frames: int) -> str:
     return found
 
 
+def _against_loss(who: CameraIdentity) -> str:
+    """What to change, with the numbers that are set now."""
+    if who.packet_size is None:
+        return "Check the cable, and that nothing else loads the USB controller."
+    advice = ["Check the cable"]
+    if who.interface_mtu is not None and who.packet_size < min(who.interface_mtu, JUMBO_BYTES):
+        largest = min(who.interface_mtu, JUMBO_BYTES)
+        advice.append(f"set packet_size to {largest}, which {who.interface} takes, if the switch does too")
+    elif who.interface_mtu is not None and who.interface_mtu < JUMBO_BYTES:
+        advice.append(f"raise the MTU of {who.interface} from {who.interface_mtu} to {JUMBO_BYTES}, then packet_size")
+    if not who.resend:
+        advice.append("set `resend: true`")
+    if who.packet_delay is not None:
+        pause = max(1000, 2 * who.packet_delay)
+        advice.append(f"raise the pause between packets, `features: {{GevSCPD: {pause}}}`, where links are shared")
+    return "; ".join(advice) + "."
+
+
 def _packets(who: CameraIdentity) -> str:
     if who.packet_size is None:
         return "not on Ethernet"
-    return f"at {who.address}, packets of {who.packet_size} bytes, {who.interface} takes up to {who.interface_mtu}"
+    pause = "not told" if who.packet_delay is None else f"{who.packet_delay} ticks"
+    return (
+        f"at {who.address}, packets of {who.packet_size} bytes, {who.interface} takes up to {who.interface_mtu}, "
+        f"pause between packets {pause} (GevSCPD), lost packets {'' if who.resend else 'not '}asked for again"
+    )

@@ -13,6 +13,7 @@ import time
 from typing import Any, NoReturn
 
 from drivers import genicam
+from drivers.aravis_frames import counts_of, other_layout
 from drivers.aravis_identity import identify
 from drivers.aravis_library import load_aravis, open_camera
 from drivers.aravis_setup import Config, Setup
@@ -20,7 +21,7 @@ from drivers.aravis_stream import Arrival, FrameStream
 from drivers.camera import Camera, CameraIdentity, CameraSettings, Frame, StreamStatistics
 from drivers.camera_clock import CameraClock
 from drivers.clock import REAL, Clock
-from drivers.errors import CameraError, FrameLost, UnknownPixelFormat
+from drivers.errors import CameraError, FrameLost
 from drivers.genicam import Features
 from drivers.pixel_formats import PixelFormat
 
@@ -309,22 +310,10 @@ class AravisCamera(Camera):
         raise self._frame_lost(f"frame {arrival.frame_id or 'without a number'} is not whole ({arrival.status})")
 
     def _make_frame(self, arrival: Arrival) -> Frame:
-        fmt = self._pixel_format()
-        announced = arrival.image_layout()
-        if announced != (fmt.code, *self._setup.size):
-            raise self._frame_lost(
-                f"frame {arrival.frame_id} says code 0x{announced[0]:08x}, {announced[1]} x {announced[2]} pixels,"
-                f" but 0x{fmt.code:08x}, {self._setup.size[0]} x {self._setup.size[1]} was set"
-            )
-        pixels = fmt.decode(arrival.memory, *self._setup.size, shift=self._config.shift)
-        # A wrong `bits` or `shift` in the rig file shows in the counts.
-        if found := fmt.misalignment(arrival.memory, pixels, self.bits, self._config.shift):
-            raise UnknownPixelFormat(
-                f"camera {self.name}, {fmt.name} with bits {self.bits} and shift {self._config.shift}",
-                found,
-                "Correct `bits` and `shift` in the rig file; the camera's manual says how it aligns its data",
-            )
-        pixels.flags.writeable = False
+        fmt, size = self._pixel_format(), self._setup.size
+        if wrong := other_layout(arrival, fmt, size):
+            raise self._frame_lost(wrong)
+        pixels = counts_of(arrival, fmt, size, self.bits, self._config.shift, f"camera {self.name}")
         host_time_s = arrival.first_packet_s if self._setup.hardware else self._sent_unix_s
         return Frame(pixels, arrival.frame_id, arrival.camera_time_ns, host_time_s)
 

@@ -25,6 +25,7 @@ SOFTWARE_TRIGGER = 0x30C
 # Reads 1 while a trigger would be heeded; the camera itself keeps it up to date.
 TRIGGER_ARMED = 0x4038
 GAIN_RAW, BLACK_LEVEL_RAW, FRAME_RATE_ENABLE, PTP_ENABLE, PTP_STATUS = 0x4040, 0x4044, 0x4048, 0x404C, 0x4050
+PACKET_DELAY = 0x4054
 # Texts of the GigE Vision bootstrap registers, 32 bytes each.
 VENDOR_NAME, MODEL_NAME = 0x48, 0x68
 
@@ -116,6 +117,7 @@ def description(table: NodeMap, width: int, height: int) -> str:
         *_acquisition(table),
         *_light(table),
         *_clock(table),
+        _integer("GevSCPD", PACKET_DELAY, 0, 1_000_000),
         _formula("PayloadSize", "W * H * ((F &gt;&gt; 16) &amp; 0xFF) / 8", W="Width", H="Height", F="PixelFormat"),
     ]
     names = re.findall(r'<\w+ Name="(\w+)" NameSpace="Standard">', "".join(features))

@@ -61,7 +61,7 @@ def test_horizontal_light_reads_zero_degrees_wherever_the_region_begins(
     offset_x: int,
     offset_y: int,
 ) -> None:
-    region = {"width": 40, "height": 24, "offset_x": offset_x, "offset_y": offset_y}
+    region = {"width": 40, "height": 24, "offset_x": offset_x, "offset_y": offset_y, "pixel_format": "PolarizeMono12p"}
     rig = small_rig(top={"camera": CAMERA | {"settings": region}})
     out = tmp_path / "captures"
     code, _, err = acquire("--rig", rig, "--plan", short_plan("stokes"), *THROUGH, "--out", out)

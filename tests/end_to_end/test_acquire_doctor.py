@@ -117,3 +117,15 @@ def test_a_source_switched_by_hand_needs_no_port(acquire, small_rig):
     code, out, err = acquire("doctor", "--frames", 1, "--rig", rig)
     assert code == 0, out + err
     assert "switched by the operator" in _line(out, "source")
+
+
+def test_lost_packets_are_told_with_what_to_change(acquire, small_rig):
+    camera = {"kind": "aravis", "bits": 12, "packet_size": 1500, "resend": False, "features": {"GevSCPD": 700}}
+    rig = small_rig(top={"camera": camera}, packet_loss=0.02, rows=300, columns=400)
+    code, out, _ = acquire("doctor", "--frames", 3, "--rig", rig)
+    line = _line(out, "camera")
+    assert code == 1
+    assert "pause between packets 700 ticks (GevSCPD), lost packets not asked for again" in line
+    assert "set packet_size to 9000, which lo takes" in line
+    assert "set `resend: true`" in line
+    assert "GevSCPD: 1400" in line
