@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from ruamel.yaml import YAML
 
 from processing.storage.capture import Capture
 from simulators.clock import Clock
 from simulators.rig.controller_kinds import served_kinds
+from simulators.rig.rig import SimulatedRig
 from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort
 from simulators.serial.serve_options import ServeOptions
@@ -75,3 +79,35 @@ def test_a_filter_wheel_chooses_the_wavelength_and_makes_the_darks(
     )
     assert code != 0
     assert "its filters are 451, 662 nm" in " ".join(err.split())
+
+
+def test_a_whole_capture_on_a_camera_that_nobody_here_wrote(
+    acquire: Acquire, small_rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = "arv-fake-gv-camera-0.8"
+    if shutil.which(program) is None:
+        pytest.skip(f"{program} is not installed (Debian: aravis-tools); ./lab test installs it")
+    # The other devices are ours; this camera stands at the address of our own.
+    monkeypatch.setattr(SimulatedRig, "_start_camera", lambda self: None)
+    settings = {"pixel_format": "Mono8", "width": 128, "height": 96}
+    camera = {"kind": "aravis", "packet_size": 9000, "answers_early": True, "settings": settings}
+    rig = small_rig(top={"camera": camera})
+    tree = YAML().load(rig)
+    tree["detector"]["bits"] = 8
+    with rig.open("w") as file:
+        YAML().dump(tree, file)
+    plan = tmp_path / "plan.yaml"
+    # Its picture does not change with the light: darks would be as bright as the rest, and end the capture.
+    plan.write_text("kind: plan\ndarks: 0\nexposure_s: 0.05\nstates: {kind: rotating_retarders, states: 20}\n")
+    with subprocess.Popen([program, "-i", "127.0.0.1"]) as process:
+        try:
+            out = tmp_path / "captures"
+            code, _, err = acquire("--rig", rig, "--plan", plan, "--out", out)
+        finally:
+            process.kill()
+    assert code == 0, err
+    with Capture(next(out.glob("*.h5"))) as capture:
+        assert capture.status == "complete"
+        assert capture.done.size == 20
+        assert sorted(set(capture.column("frame_id"))) == list(capture.column("frame_id"))
+        assert capture.closing["stream"]["stale_discarded"] == 0
