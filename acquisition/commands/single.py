@@ -159,12 +159,12 @@ def live_page(wanted: bool, rig: RigConfig, stop: StopRequest, console: Console)
     if not wanted:
         yield []
         return
-    from acquisition.screen.live_view import LiveServer, LiveState
+    from acquisition.screen.live_view import LiveView
 
-    state = LiveState(rig.simulated, rig.detector.black_level_counts, (1 << (rig.detector.bits or 16)) - 1)
-    with LiveServer(state, stop) as server:
-        console.print(f"live view: {server.url}", soft_wrap=True, highlight=False, markup=False)
-        yield [state]
+    full_scale = (1 << (rig.detector.bits or 16)) - 1
+    with LiveView(rig.simulated, rig.detector.black_level_counts, full_scale, stop) as view:
+        console.print(f"live view: {view.url}", soft_wrap=True, highlight=False, markup=False)
+        yield [view]
 
 
 def say_simulated(console: Console, rig: RigConfig) -> None:

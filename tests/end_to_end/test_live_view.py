@@ -15,10 +15,10 @@ import urllib.error
 import urllib.request
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from processing.storage.capture import Capture
-from simulators.clock import patient_clock
 
 STATES = 300
 
@@ -178,45 +178,113 @@ def test_page_shows_the_capture_and_its_button_stops_it(running, browser):
         assert 6 <= len(capture.done) < STATES
 
 
-def test_actions_need_the_token_and_a_local_host(running):
+def test_everything_needs_the_token_and_a_local_host(running):
     child, url, _ = running
     for path, host, method in (
         ("/stop", None, "POST"),
         ("/stop?token=wrong", None, "POST"),
         ("/stop?TOKEN", "evil.example", "POST"),
-        ("/state", "evil.example", "GET"),
+        ("/state?TOKEN", "evil.example", "GET"),
+        *((path, None, "GET") for path in ("/", "/state", "/frame.png", "/quick.png", "/frame.png?token=")),
     ):
         with pytest.raises(urllib.error.HTTPError) as refused:
             _get(url, path, host, method)
-        assert refused.value.code == 403
+        assert refused.value.code == 403, path
         refused.value.close()
-    assert json.loads(_get(url, "/state")[1])["simulated"] is True
+    assert json.loads(_get(url, "/state?TOKEN")[1])["simulated"] is True
     assert child.poll() is None
 
 
-def test_a_browser_that_stops_reading_does_not_slow_the_capture(small_rig, acquire, tmp_path, monkeypatch):
-    from acquisition.screen.live_view import LiveServer
+class Told:
+    """A view that is told of frames without a run."""
 
-    stuck = []
-    enter = LiveServer.__enter__
+    def __init__(self):
+        from acquisition.screen.live_view import LiveView
+        from acquisition.stop_request import StopRequest
 
-    def with_stuck_browsers(self):
-        enter(self)
-        for _ in range(5):
-            # Asks for much and never reads.
-            link = socket.create_connection(("127.0.0.1", self._server.server_address[1]))
+        self.stop = StopRequest()
+        self.view = LiveView(True, 64.0, 4095, self.stop)
+
+    def state(self, number, rows=64, value=1000):
+        from acquisition.screen.observer import StateReport
+        from drivers.motion import Position
+
+        pixels = np.full((rows, 80), value + number, np.uint16)
+        positions = {"psg": Position(9.0 * number, number)}
+        self.view.state_done(StateReport(number, "sample", positions, 0.01, 0.0, 0.0, 1e5, pixels))
+
+    def wait_for(self, condition):
+        while True:
+            with contextlib.suppress(urllib.error.URLError, ConnectionError):
+                state = json.loads(_get(self.view.url, "/state?TOKEN")[1])
+                if condition(state):
+                    return state
+            time.sleep(0.02)
+
+
+def test_many_browsers_that_do_not_read_are_refused_and_keep_nobody_out():
+    """Two hundred of them, half of which never finish asking: the run tells on at once, one browser gets through."""
+    told, stuck = Told(), []
+    with told.view as view:
+        view.run_started("many", None, 5, None)
+        address = view.url.split("//")[1].split("/")[0].split(":")
+        for k in range(200):
+            link = socket.socket()
             link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)
-            link.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" * 200)
+            link.setblocking(False)
+            link.connect_ex((address[0], int(address[1])))
+            with contextlib.suppress(OSError):
+                link.send(b"GET / HTTP/1.1\r\n" if k % 2 else b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" * 20)
             stuck.append(link)
-        return self
-
-    monkeypatch.setattr(LiveServer, "__enter__", with_stuck_browsers)
-    start_s = patient_clock().now_s()
-    code, _, err = acquire("--omega", 35, "--rig", small_rig(), "--out", tmp_path / "a", "--live")
-    assert code == 0, err
-    assert len(stuck) == 5
-    # Not a measure of speed: a measuring thread that waited for them would hang for their ten seconds each.
-    assert patient_clock().now_s() - start_s < 40
-    for link in stuck:
-        with contextlib.suppress(OSError):
+        for number in range(5):
+            start_s = time.thread_time()
+            told.state(number)
+            # What the measuring thread itself does for the page, whatever the browsers do.
+            assert time.thread_time() - start_s < 0.05
+        found = told.wait_for(lambda state: state["done"] == 5)
+        assert found["title"] == "many"
+        for link in stuck:
             link.close()
+
+
+def test_a_picture_is_drawn_once_and_from_the_last_frame(tmp_path):
+    from acquisition.screen import live_process
+
+    drawn = []
+    shown = live_process.Shown(64.0, 4095, True)
+    view = {"title": "x", "done": 1, "role": "sample", "mosaic": None}
+    shown.update(view, np.full((64, 80), 1000, np.uint16))
+    whole = shown._once
+
+    def once(name, draw):
+        return whole(name, lambda: drawn.append(name) or draw())
+
+    shown._once = once
+    first = [shown.picture("frame.png") for _ in range(5)]
+    assert len(set(first)) == 1
+    shown.update(view | {"done": 2}, np.full((64, 80), 3000, np.uint16))
+    assert shown.picture("frame.png") != first[0]
+    assert drawn == ["frame.png", "frame.png"]
+    assert shown.picture("quick.png")[:4] == b"\x89PNG"
+
+
+def test_the_run_goes_on_when_the_process_of_the_page_is_killed():
+    told = Told()
+    with told.view as view:
+        view.run_started("killed", None, 5, None)
+        told.wait_for(lambda state: state.get("title") == "killed")
+        view._process.kill()
+        view._process.wait()
+        for number in range(20):
+            told.state(number)
+    assert not told.stop.requested
+
+
+def test_the_stop_button_reaches_the_run():
+    told = Told()
+    with told.view as view:
+        view.run_started("stopping", None, 5, None)
+        told.wait_for(lambda state: state.get("title") == "stopping")
+        assert _get(view.url, "/stop?TOKEN", method="POST") == (200, b"stopping")
+        while not told.stop.requested:
+            time.sleep(0.01)
