@@ -1,7 +1,9 @@
-"""Opens axes and light sources. A kind of axis is a module in `drivers/axes/`, or a plug-in (entry point `umov.axes`).
+"""Finds and opens devices by kind: a module in `drivers/axes`, `cameras` or `sources`, or a plug-in of that group.
 
-A kind is a module with a `Config` model, whose field `kind` is the kind's name, and a function
-``open(name, config, lines) -> MotionAxis``. The file's name is the kind.
+A kind is a module with a `Config` model, whose field `kind` is the kind's name, and a function `open`:
+``open(name, config, lines) -> MotionAxis``, ``open(name, config, clock) -> Camera`` or
+``open(config, lines) -> LightSource``. The file's name is the kind. An outside package announces such a module by the
+entry point `umov.axes`, `umov.cameras` or `umov.sources`, under the kind's name.
 """
 
 from __future__ import annotations
@@ -11,26 +13,41 @@ import pkgutil
 from functools import cache
 from importlib.metadata import entry_points
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
-import drivers.axes
+from drivers.camera import Camera
+from drivers.clock import Clock
 from drivers.motion import AxisConfig, MotionAxis
 from drivers.serial_link import LineRegistry
 from drivers.source import LightSource
 
+Family = Literal["axes", "cameras", "sources"]
+
 
 @cache
-def axis_kinds() -> dict[str, ModuleType]:
-    """Return every kind of axis with its module, in alphabetical order; a plug-in cannot replace one of ours."""
+def device_kinds(family: Family) -> dict[str, ModuleType]:
+    """Return every kind of a family with its module, in alphabetical order.
+
+    Raises
+    ------
+    ValueError
+        A plug-in offers a kind that exists already, or a module that is none.
+    """
+    folder = importlib.import_module(f"drivers.{family}")
     found = {
-        entry.name: importlib.import_module(f"drivers.axes.{entry.name}")
-        for entry in pkgutil.iter_modules(drivers.axes.__path__)
+        entry.name: importlib.import_module(f"drivers.{family}.{entry.name}")
+        for entry in pkgutil.iter_modules(folder.__path__)
         if not entry.name.startswith("_")
     }
-    for plugin in entry_points(group="umov.axes"):
+    for plugin in entry_points(group=f"umov.{family}"):
         if plugin.name in found:
-            raise ValueError(f"plug-in {plugin.value} offers axis kind {plugin.name!r}, which exists already")
-        found[plugin.name] = plugin.load()
+            raise ValueError(
+                f"plug-in {plugin.value} offers the kind {plugin.name!r} of {family}, which exists already"
+            )
+        module = plugin.load()
+        if not (hasattr(module, "Config") and hasattr(module, "open")):
+            raise ValueError(f"plug-in {plugin.value} for {family} needs a `Config` and a function `open`")
+        found[plugin.name] = module
     return dict(sorted(found.items()))
 
 
@@ -52,11 +69,17 @@ def open_axis(name: str, config: AxisConfig, lines: LineRegistry) -> MotionAxis:
         As the port and the device have it.
     """
     kind: str = getattr(config, "kind")  # noqa: B009 - the base class has no kind, each Config has
-    axis: MotionAxis = axis_kinds()[kind].open(name, config, lines)
+    axis: MotionAxis = device_kinds("axes")[kind].open(name, config, lines)
     return axis
+
+
+def open_camera(name: str, config: Any, clock: Clock) -> Camera:
+    """Open a camera of any kind; takes no frame. Raises DeviceError."""
+    camera: Camera = device_kinds("cameras")[config.kind].open(name, config, clock)
+    return camera
 
 
 def open_source(config: Any, lines: LineRegistry) -> LightSource:
     """Open a light source of any kind; changes no light. Raises DeviceError."""
-    source: LightSource = importlib.import_module(f"drivers.sources.{config.kind}").open(config, lines)
+    source: LightSource = device_kinds("sources")[config.kind].open(config, lines)
     return source

@@ -15,7 +15,7 @@ from drivers.camera import Camera, CameraSettings
 from drivers.clock import REAL, Clock
 from drivers.errors import LimitError, MotionFailed
 from drivers.motion import Motion, MotionAxis, Position
-from drivers.registry import open_axis, open_source
+from drivers.registry import open_axis, open_camera, open_source
 from drivers.serial_link import LineRegistry
 from drivers.source import LightSource
 from drivers.sources.manual import Ask, ManualSource
@@ -133,7 +133,7 @@ class Rig:
         entry = self.config.camera
         if self.simulation is not None:
             entry = entry.model_copy(update={"device": self.simulation.camera_device()})
-        camera: Camera = _driver("drivers.cameras", entry.kind).open("camera", entry, self.clock)
+        camera = open_camera("camera", entry, self.clock)
         self.camera = camera
         return camera
 
@@ -325,9 +325,3 @@ class Rig:
         if self.simulation is not None:
             steps.append(("end the emulators", self.simulation.stop))
         return run_all(steps)
-
-
-def _driver(package: str, kind: str) -> Any:
-    import importlib
-
-    return importlib.import_module(f"{package}.{kind}")

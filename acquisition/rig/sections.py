@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
 from functools import reduce
 from operator import or_
 from pathlib import Path
@@ -14,19 +12,14 @@ from pydantic import Field
 from acquisition.rig.parts import ForbiddenPose, HomingPath, InterlockConfig, ModeConfig, Part, Range
 from acquisition.rig.solids import Solids
 from drivers.motion import AxisConfig
+from drivers.registry import Family, device_kinds
 from processing.storage.capture_schema import Detector
 from simulators.rig.model import SimulatorConfig
 
 
-def kinds(package: str) -> list[str]:
-    """Names of the driver modules in a folder, for instance of "drivers.axes": each is a kind in YAML."""
-    folder = importlib.import_module(package)
-    return sorted(m.name for m in pkgutil.iter_modules(folder.__path__) if not m.name.startswith("_"))
-
-
-def _entry(package: str) -> Any:
-    # Adding a controller is one new file: its Config class joins the union by being in the folder.
-    classes = [importlib.import_module(f"{package}.{kind}").Config for kind in kinds(package)]
+def _entry(family: Family) -> Any:
+    # Adding a controller is one new file: its Config class joins the union by being in the folder, or a plug-in.
+    classes = [module.Config for module in device_kinds(family).values()]
     return Annotated[reduce(or_, classes), Field(discriminator="kind")] if len(classes) > 1 else classes[0]
 
 
@@ -35,9 +28,9 @@ if TYPE_CHECKING:
     CameraEntry = Any
     SourceEntry = Any
 else:
-    AxisEntry = _entry("drivers.axes")
-    CameraEntry = _entry("drivers.cameras")
-    SourceEntry = _entry("drivers.sources")
+    AxisEntry = _entry("axes")
+    CameraEntry = _entry("cameras")
+    SourceEntry = _entry("sources")
 
 
 class RigSections(Part):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from collections.abc import Callable
+from importlib.metadata import entry_points
 
 import simulators.controllers
 from drivers.motion import AxisConfig
@@ -31,9 +32,11 @@ def axis_configs(emulator: Emulator, port: str, *, homed: bool = False) -> list[
 
 
 def served_kinds() -> dict[str, Callable[[ServeOptions], Emulator]]:
-    """Find what can be served: the `SERVES` table of every module in `simulators/controllers/` that has one."""
+    """Find what can be served: the `SERVES` table of every module in `simulators/controllers/`, and of plug-ins."""
     kinds: dict[str, Callable[[ServeOptions], Emulator]] = {}
     for entry in pkgutil.iter_modules(simulators.controllers.__path__):
         module = importlib.import_module(f"simulators.controllers.{entry.name}")
         kinds.update(getattr(module, "SERVES", {}))
+    for plugin in entry_points(group="umov.emulators"):
+        kinds.update(plugin.load().SERVES)
     return dict(sorted(kinds.items()))

@@ -27,7 +27,7 @@ from drivers.errors import (
     WrongDevice,
 )
 from drivers.motion import AxisConfig, MotionAxis
-from drivers.registry import axis_kinds, open_axis
+from drivers.registry import device_kinds, open_axis
 from drivers.serial_link import LineRegistry
 from simulators.clock import Clock, patient_clock
 from simulators.rig.controller_kinds import axis_configs, served_kinds
@@ -84,7 +84,7 @@ def test_every_kind_of_axis_has_an_emulator() -> None:
     for kind in MOTION_KINDS:
         configs = axis_configs(served_kinds()[kind](ServeOptions()), "none")
         covered |= {config.kind for config in configs}  # type: ignore[attr-defined]
-    assert covered == set(axis_kinds())
+    assert covered == set(device_kinds("axes"))
 
 
 def test_opening_moves_nothing_and_tells_that_it_is_not_homed(kind: str) -> None:

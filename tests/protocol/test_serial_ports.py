@@ -13,7 +13,7 @@ import serial
 
 from drivers.axes import smc100, zaber
 from drivers.errors import PermissionRefused, PortBusy, PortNotFound
-from drivers.registry import axis_kinds, open_axis
+from drivers.registry import device_kinds, open_axis
 from drivers.serial_link import LineRegistry, SerialLink, line_framer
 from simulators.clock import Clock, patient_clock
 from simulators.rig.controller_kinds import axis_configs, served_kinds
@@ -147,8 +147,8 @@ def test_a_failing_emulator_is_not_silent() -> None:
 
 
 def test_kinds_are_found_by_folder() -> None:
-    assert {"zaber", "elliptec", "smc100", "apt", "esp301"} <= set(axis_kinds())
-    for kind, module in axis_kinds().items():
+    assert {"zaber", "elliptec", "smc100", "apt", "esp301"} <= set(device_kinds("axes"))
+    for kind, module in device_kinds("axes").items():
         assert module.Config.model_fields["kind"].default == kind
         assert module.__doc__
 
