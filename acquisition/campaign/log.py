@@ -16,7 +16,7 @@ import numpy as np
 
 from acquisition.campaign.identity import IDENTITY
 from acquisition.campaign.plan import Campaign, CampaignCapture
-from acquisition.capture.writer import sync
+from acquisition.capture.synced import make_folder, sync
 from acquisition.errors import AcquisitionError
 from processing.doors import read_json, read_text
 from processing.errors import ProcessError
@@ -41,7 +41,7 @@ class CampaignFolder:
 
     def __init__(self, folder: Path, campaign: Campaign) -> None:
         self.folder = folder
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         self._lock = filelock.FileLock(folder / ".lock")
         try:
             self._lock.acquire(timeout=0)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from acquisition.capture.closing import closing_of_killed
 from acquisition.capture.state_file import StateFile
+from acquisition.capture.synced import make_folder, sync
 from acquisition.errors import AcquisitionError
 from drivers.clock import REAL, Clock
 from drivers.motion import Position
@@ -131,7 +132,7 @@ class CaptureWriter:
         if path.exists() or partial.exists():
             raise AcquisitionError(f"{path if path.exists() else partial} exists already; nothing was changed")
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(path.parent)
             check_space(path.parent, needed)
             _try_room(new, needed)
         except OSError as error:
@@ -352,12 +353,3 @@ def _reserve(path: Path) -> None:
     with path.open("r+b") as file:
         size = file.seek(0, os.SEEK_END)
         os.posix_fallocate(file.fileno(), 0, size)
-
-
-def sync(path: Path) -> None:
-    """Return when a file, or the names in a folder, are on the disc."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

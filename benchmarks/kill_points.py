@@ -1,0 +1,314 @@
+"""Kills `acquire` before each of its calls that change the disc, and cuts the power at each of them.
+
+    python benchmarks/kill_points.py kill [EVERY [FIRST]]     each (or every n-th) call of a small campaign
+    python benchmarks/kill_points.py power [CUTS]             states of the disc after a power cut, replayed
+    python benchmarks/kill_points.py image [CUTS]             the same on copies of a block device (root, ext4)
+    python benchmarks/kill_points.py night [CAPTURES [CALLS]] a night, killed at random again and again
+
+After each kill the same command goes on. At its end every capture must be complete and equal to that of an undisturbed
+run in all but times and segments, and `acquire verify` must find nothing. Exit code 1 if anything is lost.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+from ruamel.yaml import YAML
+
+import acquisition.commands.campaign
+import acquisition.screen.quicklook  # noqa: F401
+from acquisition.commands.application import main as acquire
+from acquisition.commands.custody import verify
+from processing.storage.capture import Capture, CaptureError
+from simulators.disc.power_cut import Disc, read_record
+from simulators.disc.watched import RECORD, DiscCalls, build, restart_watched
+
+ROOT = Path(__file__).resolve().parents[1]
+WORK = Path(tempfile.gettempdir()) / f"umov_kill_points_{os.getuid()}"
+#: What differs between two runs of one plan.
+TIMES = ("host_time_s", "camera_time_ns", "frame_id", "start_time", "closing/json", "segments/json", "segment", "crc32")
+
+
+def write_files(folder: Path, captures: int, states: int = 3) -> list[str]:
+    """Rig, plan and campaign of small captures; returns the options of `acquire`."""
+    yaml, source = YAML(), ROOT / "configs" / "rigs" / "simulated.yaml"
+    rig = yaml.load(source)
+    rig["settle_s"] = 0.0
+    rig["simulator"].update({"rows": 16, "columns": 20, "clock_speed": 200, "camera_wait_s": 60})
+    for mode in rig["modes"].values():
+        mode["instrument"] = str((source.parent / mode["instrument"]).resolve())
+    samples = rig["simulator"]["samples"]
+    samples.update({key: str((source.parent / path).resolve()) for key, path in samples.items()})
+    with (folder / "rig.yaml").open("w") as file:
+        yaml.dump(rig, file)
+    (folder / "plan.yaml").write_text(
+        "kind: plan\nmode: stokes\nwavelength_nm: 662\nomega_deg: 35\nsample: {name: red_sphere}\n"
+        f"states: {{kind: fixed, states: {states}}}\nexposure_s: 0.001\ndarks: 1\n"
+    )
+    angles = ", ".join(f"{20 + 100 * k / max(captures, 1):.3f}" for k in range(captures))
+    (folder / "campaign.yaml").write_text(
+        f"kind: campaign\nname: night\nplans: {{stokes: {folder / 'plan.yaml'}}}\nsamples: [{{name: red_sphere}}]\n"
+        f"wavelengths_nm: [662]\nomega_deg: [{angles}]\n"
+    )
+    return ["--campaign", str(folder / "campaign.yaml"), "--rig", str(folder / "rig.yaml"), "--yes"]
+
+
+def run(options: list[str], out: Path, before: Callable[[DiscCalls], None] = lambda calls: None) -> tuple[int, int]:
+    """`acquire` in a child; returns what `waitpid` says and, if it came to its end, the number of its calls."""
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        with open(os.devnull, "w") as nothing:
+            os.dup2(nothing.fileno(), 1)
+            os.dup2(nothing.fileno(), 2)
+        calls, code = DiscCalls(), 70
+        before(calls)
+        try:
+            acquire([*options, "--out", str(out)])
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 0
+        finally:
+            os.write(writer, str(calls.made()).encode())
+            os._exit(code)
+    os.close(writer)
+    status = os.waitpid(child, 0)[1]
+    with os.fdopen(reader) as pipe:
+        made = pipe.read()
+    return status, int(made or 0)
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """Everything in the captures of a campaign but times."""
+    found: dict[str, bytes] = {}
+    for path in sorted((folder / "night").glob("*.h5")):
+        with h5py.File(path) as h5:
+
+            def visit(name: str, node: h5py.Group | h5py.Dataset, path: Path = path) -> None:
+                if isinstance(node, h5py.Dataset) and not name.endswith(TIMES):
+                    value = np.asarray(node[()])
+                    found[f"{path.name}/{name}"] = str(value).encode() if value.dtype == object else value.tobytes()
+
+            h5.visititems(visit)
+    return found
+
+
+def check(out: Path, whole: dict[str, bytes]) -> str:
+    """What is wrong with a campaign that came to its end, or nothing."""
+    wrong = [f"{f.what}: {f.found}" for f in verify(out / "night") if f.well is not True]
+    there = content(out)
+    differing = sorted(name for name in {*whole, *there} if whole.get(name) != there.get(name))
+    if differing:
+        wrong.append(f"differs from an undisturbed run in {differing[:5]}")
+    return "; ".join(wrong)
+
+
+def kill(options: list[str], every: int, first: int) -> int:
+    """Kill before every n-th call, go on, compare."""
+    captures = WORK / "captures"
+    status, total = run(options, captures / "whole", lambda calls: calls.arm(0))
+    assert status == 0, status
+    whole = content(captures / "whole")
+    lost = points = 0
+    begin_s = time.monotonic()
+    for number in range(first, total + 1, every):
+        out = captures / f"run{number}"
+        status, _ = run(options, out, lambda calls, number=number: calls.arm(number))
+        killed = os.WIFSIGNALED(status)
+        status, _ = run(options, out)
+        wrong = check(out, whole) if status == 0 else f"going on ended with {status}"
+        points += killed
+        if wrong:
+            lost += 1
+            print(f"call {number}: {wrong}", flush=True)
+        shutil.rmtree(out)
+    print(f"{points} kill points of {total} calls, {lost} with something lost, {time.monotonic() - begin_s:.0f} s")
+    return lost
+
+
+def night(options: list[str], captures: int, calls: int, seed: int = 1) -> int:
+    """A campaign that is killed at random again and again until it is complete."""
+    out, chance = WORK / "captures" / "night", random.Random(seed)
+    begin_s, kills = time.monotonic(), 0
+    while True:
+        number = chance.randint(1, 2 * calls)
+        status, _ = run(options, out, lambda armed, number=number: armed.arm(number))
+        if not os.WIFSIGNALED(status):
+            break
+        kills += 1
+    wrong = [f"{f.what}: {f.found}" for f in verify(out / "night") if f.well is not True]
+    complete = len(list((out / "night").glob("*.h5")))
+    states = _states(out / "night")
+    print(
+        f"{kills} kills, exit code {os.waitstatus_to_exitcode(status)}, {complete} of {captures} captures complete, "
+        f"{states} states intact, {len(wrong)} findings, {time.monotonic() - begin_s:.0f} s"
+    )
+    print("\n".join(wrong[:10]))
+    return len(wrong) + (complete != captures)
+
+
+def _states(folder: Path) -> int:
+    states = 0
+    for path in folder.glob("*.h5*"):
+        if path.suffix in (".h5", ".partial"):
+            with Capture(path) as capture:
+                assert not capture.damaged_states()
+                states += len(capture.done)
+    return states
+
+
+class _Reported:
+    """Says in the record when a state is reported as done."""
+
+    def __init__(self, calls: DiscCalls) -> None:
+        from acquisition.screen.progress import ConsoleProgress
+
+        told = ConsoleProgress.state_done
+
+        def state_done(progress: ConsoleProgress, report: object) -> None:
+            told(progress, report)  # type: ignore[arg-type]
+            calls.note("state")
+
+        ConsoleProgress.state_done = state_done  # type: ignore[method-assign,assignment]
+
+
+def power(options: list[str], cuts: int, seed: int = 1) -> int:
+    """Replay the record of a run to chosen calls, cut the power there, and look what is left."""
+    out, record = WORK / "captures" / "whole", WORK / "record"
+
+    def begin(calls: DiscCalls) -> None:
+        os.environ[RECORD] = str(record)
+        _Reported(calls)
+        calls.arm(0)
+
+    status, _ = run(options, out, begin)
+    assert status == 0, status
+    calls = list(read_record(record))
+    chance = random.Random(seed)
+    chosen = sorted(chance.choices(range(1, len(calls) + 1), k=cuts)) if cuts else list(range(1, len(calls) + 1))
+    disc, done, reported, lost, worst, opened = Disc(), 0, 0, 0, 0, 0
+    for end in chosen:
+        for call in calls[done:end]:
+            disc.apply(call)
+            reported += call.what == "note"
+        done = end
+        for kept in (None, random.Random(chance.random())):
+            target = WORK / "cut"
+            shutil.rmtree(target, ignore_errors=True)
+            for path, raw in disc.after_power_cut(kept).items():
+                file = target / Path(path).relative_to(out)
+                file.parent.mkdir(parents=True, exist_ok=True)
+                file.write_bytes(raw)
+            there, unreadable = _left(target / "night")
+            opened += 1
+            worst = max(worst, reported - there)
+            if reported - there > 1 or unreadable:
+                lost += 1
+                print(f"cut at call {end}: {reported} states reported, {there} there; {unreadable}", flush=True)
+    print(f"{opened} power cuts at {len(calls)} calls: at most {worst} reported states lost, {lost} beyond the bound")
+    return lost
+
+
+def _left(folder: Path) -> tuple[int, str]:
+    """States that are there and intact, and what cannot be read."""
+    states, unreadable = 0, ""
+    for path in sorted(folder.glob("*")) if folder.exists() else ():
+        if not path.name.endswith((".h5", ".partial")):
+            continue
+        try:
+            with Capture(path) as capture:
+                states += len(capture.done)
+                damaged = capture.damaged_states()
+                unreadable += f"{path.name}: states {damaged} damaged " if damaged else ""
+        except CaptureError as error:
+            unreadable += f"{error} "
+    return states, unreadable
+
+
+def image(options: list[str], cuts: int, seed: int = 1) -> int:
+    """Stop at chosen calls, copy the block device as it is then, and look what the copy holds."""
+    device, mount = WORK / "device.img", WORK / "captures"
+    status, total = run(options, mount / "whole", lambda calls: calls.arm(0))
+    assert status == 0, status
+    chance, lost, worst = random.Random(seed), 0, 0
+    for number in sorted(chance.sample(range(1, total + 1), min(cuts, total))):
+        _fresh_device(device, mount)
+        log = WORK / "reported"
+        log.unlink(missing_ok=True)
+        child = os.fork()
+        if child == 0:
+            os.environ[RECORD] = str(log)
+            with open(os.devnull, "w") as nothing:
+                os.dup2(nothing.fileno(), 1)
+                os.dup2(nothing.fileno(), 2)
+            calls = DiscCalls()
+            _Reported(calls)
+            calls.arm(number, signal.SIGSTOP)
+            try:
+                acquire([*options, "--out", str(mount / "run")])
+            except SystemExit:
+                pass
+            finally:
+                os._exit(0)
+        os.waitpid(child, os.WUNTRACED)
+        shutil.copy(device, WORK / "copy.img")
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        subprocess.run(["umount", mount], check=True)
+        copy = WORK / "copy"
+        copy.mkdir(exist_ok=True)
+        subprocess.run(["mount", "-o", "loop", WORK / "copy.img", copy], check=True)
+        try:
+            there, unreadable = _left(copy / "run" / "night")
+        finally:
+            subprocess.run(["umount", copy], check=True)
+        reported = sum(call.what == "note" for call in read_record(log)) if log.exists() else 0
+        worst = max(worst, reported - there)
+        if reported - there > 1 or unreadable:
+            lost += 1
+            print(f"cut at call {number}: {reported} reported, {there} there; {unreadable}", flush=True)
+    print(f"{cuts} copies of the block device: at most {worst} reported states lost, {lost} beyond the bound")
+    return lost
+
+
+def _fresh_device(device: Path, mount: Path) -> None:
+    shutil.rmtree(mount, ignore_errors=True)
+    mount.mkdir(parents=True)
+    device.unlink(missing_ok=True)
+    with device.open("wb") as file:
+        file.truncate(48 << 20)
+    subprocess.run(["mkfs.ext4", "-q", device], check=True)
+    subprocess.run(["mount", "-o", "loop", device, mount], check=True)
+
+
+def main() -> None:
+    """Run one of the four."""
+    which, numbers = sys.argv[1], [int(text) for text in sys.argv[2:]]
+    if "LD_PRELOAD" not in os.environ:
+        shutil.rmtree(WORK, ignore_errors=True)
+        (WORK / "captures").mkdir(parents=True)
+        restart_watched(build(WORK), WORK / "captures")
+    captures = (numbers or [300])[0] if which == "night" else 1
+    options = write_files(WORK, captures)
+    every, first = [*numbers, *(1, 1)[len(numbers) :]][:2] if which == "kill" else (1, 1)
+    work: dict[str, Callable[[], int]] = {
+        "kill": lambda: kill(options, every, first),
+        "power": lambda: power(options, (numbers or [0])[0]),
+        "image": lambda: image(options, (numbers or [200])[0]),
+        "night": lambda: night(options, captures, numbers[1] if len(numbers) > 1 else 45),
+    }
+    sys.exit(1 if work[which]() else 0)
+
+
+if __name__ == "__main__":
+    main()

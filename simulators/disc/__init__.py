@@ -1,0 +1,1 @@
+"""A disc that is watched: every call that changes it is counted, written down, and may be the last one."""
