@@ -72,11 +72,14 @@ class RecordedRig:
     picture: Callable[[int], np.ndarray] = lambda number: np.full((4, 5), 500 + number, np.uint16)
     during_exposure: Callable[[int], None] = lambda number: None
     door_open: bool = False
+    temperature_c: float | None = 31.5
 
     def __post_init__(self) -> None:
         self.axes = {name: RecordedAxis(self, name) for name in ("psg", "psa")}
         self.config = SimpleNamespace(settle_s=0.25, retakes=2, interlocks=())
-        self.camera = SimpleNamespace(full_scale=FULL_SCALE, trigger=self._trigger)
+        self.camera = SimpleNamespace(
+            full_scale=FULL_SCALE, trigger=self._trigger, temperature_c=lambda: self.temperature_c
+        )
         self.source: Any = SimpleNamespace(
             set_light=lambda on: self.note("light", on), interlock_open=lambda: self.door_open
         )

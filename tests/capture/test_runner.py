@@ -144,10 +144,18 @@ def test_what_is_noted_of_a_state(rig, runner_of):
         "saturated_fraction": 0.1,
         "near_black_fraction": 0.05,
         "monitor": pytest.approx(monitor),
+        "camera_temperature_c": 31.5,
     }
     assert record.pixels is pixels
     assert (report.state, report.role, report.exposure_s) == (0, "sample", EXPOSURE_S)
     assert (report.saturated_fraction, report.near_black_fraction) == (0.1, 0.05)
+
+
+def test_a_camera_without_a_thermometer_leaves_a_gap(rig, runner_of):
+    rig.temperature_c = None
+    runner = runner_of(psg=(3.0,))
+    runner.run([0])
+    assert np.isnan(runner.writer.records[0].columns["camera_temperature_c"])
 
 
 def test_the_exposure_that_the_camera_set_is_the_one_that_counts(rig, runner_of):
