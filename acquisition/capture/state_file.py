@@ -178,6 +178,13 @@ class StateFile:
         self._write(self._closing.offset, box)
         self.sync()
 
+    def is_at(self, path: Path) -> bool:
+        """Whether the open file is the one of that name: False once it was deleted or moved."""
+        try:
+            return os.path.samestat(os.fstat(self._file), os.stat(path))
+        except OSError:
+            return False
+
     def sync(self) -> None:
         """Return when all that was written is on the disc."""
         os.fdatasync(self._file)

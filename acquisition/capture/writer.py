@@ -26,7 +26,7 @@ from acquisition.errors import AcquisitionError
 from drivers.clock import REAL, Clock
 from drivers.motion import Position
 from processing.instrument.states import StateTable
-from processing.storage.capture import Capture
+from processing.storage.capture import Capture, CaptureError
 from processing.storage.capture_schema import CaptureHeader, Status, create_layout, json_bytes, write_status
 from processing.storage.segments import encode_line
 
@@ -151,10 +151,11 @@ class CaptureWriter:
                     line = np.frombuffer(encode_line(json_bytes(begin)), np.uint8)
                     h5["entry/segments/json"][: line.size] = line
             _reserve(new)
+            _require_layout(new, table)
             sync(new)
             os.rename(new, partial)
             sync(partial.parent)
-        except (OSError, RuntimeError) as error:
+        except (OSError, RuntimeError, KeyError, ValueError) as error:
             new.unlink(missing_ok=True)
             raise _no_room(path.parent, needed, error) from error
         return cls(partial, clock)
@@ -162,9 +163,18 @@ class CaptureWriter:
     def put(self, record: StateRecord) -> None:
         """Hand over a state, when the one before is on the disc. Raises AcquisitionError after PATIENCE_S."""
         self.settle()
+        self._require_there()
         with self._change:
             self._record, self._since_s = record, self._clock.now_s()
             self._change.notify_all()
+
+    def _require_there(self) -> None:
+        """Raise AcquisitionError if the file is not in its folder any more: what is written then is lost with it."""
+        if not self.file.is_at(self.path):
+            raise AcquisitionError(
+                f"{self.path} was deleted or moved while it was written. Put it back where it was, then go on with "
+                "--resume; if it is gone, begin a new capture."
+            )
 
     def set_exposure(self, exposure_s: NDArray[np.float64]) -> None:
         """Write the exposure of every state; NaN while it is not known."""
@@ -199,6 +209,7 @@ class CaptureWriter:
         """
         try:
             self.settle()
+            self._require_there()
             self.file.write_closing(closing)
         except OSError as error:
             raise self._failure(error) from error
@@ -339,6 +350,21 @@ def _try_room(path: Path, needed: int) -> None:
     """Take the space and give it back: a write that fails inside HDF5 would bring the interpreter down."""
     with path.open("wb") as file:
         os.posix_fallocate(file.fileno(), 0, needed)
+
+
+def _require_layout(path: Path, table: StateTable) -> None:
+    """Read a new file back: a disc that lost a write of it says so now, not when the states are there.
+
+    Raises OSError.
+    """
+    try:
+        with Capture(path) as capture:
+            found = capture.planned_targets_deg() | {"exposure_s": capture.planned_column("exposure_s")}
+    except CaptureError as error:
+        raise OSError(f"the new file does not read back: {error}") from error
+    for name, values in {**table.angles_deg, "exposure_s": table.exposure_s}.items():
+        if not np.array_equal(found.get(name, ()), values):
+            raise OSError(f"the new file does not read back: {name} is not as it was written")
 
 
 def _no_room(folder: Path, needed: int, error: Exception) -> AcquisitionError:

@@ -18,6 +18,7 @@ from acquisition.rig.rig import Rig
 from drivers.camera import Camera, CameraIdentity, CameraSettings
 from drivers.errors import DeviceError, FrameLost
 from drivers.motion import MotionAxis
+from drivers.sources.manual import ManualSource
 from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
 
@@ -118,6 +119,8 @@ def _source(rig: Rig) -> str:
     state = "light on" if source.is_on() else "light off"
     who = source.describe()
     name = ", ".join(f"{key.replace('_', ' ')} {who[key]}" for key in who if key != "model")
+    if source.is_on() and not isinstance(source, ManualSource):
+        raise AcquisitionError(f"{who['model']}, {name}: LIGHT LEFT ON. Every run ends with the light off: shut it")
     if source.interlock_open():
         raise AcquisitionError(f"{who['model']}, {name}: {state}, INTERLOCK OPEN. Close the door")
     return f"{who['model']}, {name}: {state}, interlock closed"

@@ -185,7 +185,11 @@ def summarize(job: Job, result: Result) -> None:
     """Draw the quick look and print one screen."""
     from acquisition.screen.quicklook import draw
 
-    figure = draw(result.path)
+    try:
+        figure = str(draw(result.path))
+    except OSError as error:
+        # The capture is whole: a picture less is no reason to call it failed.
+        figure = f"not drawn ({error.strerror or error}); the capture is whole"
     plan, ledger = job.plan, result.ledger
     darks = sum(role == "dark" for role in job.table.role)
     parts = [f"{name.removesuffix('_s')} {ledger[name]:.1f}" for name in ledger if name.endswith("_s")]
@@ -198,7 +202,7 @@ def summarize(job: Job, result: Result) -> None:
         ("seconds", ", ".join(parts)),
         *(("overhead", text) for text in _overhead(ledger)),
         *(("note", message) for message in result.messages[-5:]),
-        ("figure", str(figure)),
+        ("figure", figure),
         ("capture", str(result.path)),
         ("next", next_command(job, result)),
     ]

@@ -45,6 +45,9 @@ class Config(AxisConfig):
     serial_number: str | None = None
     baudrate: int = 115_200
 
+    def place(self) -> str:
+        return f"axis {self.axis}"
+
 
 class GCS2Line:
     """The port of one controller, shared by its axes."""

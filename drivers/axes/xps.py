@@ -44,6 +44,9 @@ class Config(AxisConfig):
     group: str = Field(pattern=r"^\w+$", description="name of the group")
     positioner: str = Field(default="Pos", pattern=r"^\w+$", description="name of its positioner")
 
+    def place(self) -> str:
+        return f"positioner {self.group}.{self.positioner}"
+
 
 def framer(buffer: bytearray) -> bytes | None:
     """Take one answer off the buffer, without its end."""

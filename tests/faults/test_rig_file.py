@@ -226,3 +226,18 @@ def test_the_rig_stored_in_a_capture_is_read_again(configs):
 
     config = load_rig(configs / "rigs" / "simulated.yaml")
     assert parse_yaml(dump_yaml(config), RigConfig) == config
+
+
+def test_every_kind_tells_the_axes_of_one_line_apart():
+    """Two axes that an emulator has on one line are no mistake."""
+    from simulators.rig.controller_kinds import axis_configs, served_kinds
+    from simulators.serial.serve_options import ServeOptions
+
+    for kind, make in served_kinds().items():
+        try:
+            entries = axis_configs(make(ServeOptions(axes=2)), "socket://x:1")
+        except ValueError:
+            # One axis a line.
+            continue
+        places = [(entry.port, entry.place()) for entry in entries]
+        assert len(set(places)) == len(places), kind

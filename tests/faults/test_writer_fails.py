@@ -123,3 +123,64 @@ def _open_and_read(path):
 def _read_all(capture):
     for state in range(len(capture.done)):
         capture.frames(state, slice(0, 2))
+
+
+def test_a_folder_deleted_in_mid_run_is_noticed_with_the_next_state(run_with, tmp_path):
+    seen = []
+
+    def delete(rig, state, retake):
+        seen.append(state)
+        if state == 5:
+            for path in tmp_path.glob("capture*/run.h5.partial"):
+                path.rename(tmp_path / "moved.h5")
+
+    with pytest.raises(StopIteration):
+        # Nothing of that name is left, which the fixture looks for.
+        run_with(delete, plan=SHORT)
+    assert max(seen) <= 7
+    with Capture(tmp_path / "moved.h5") as capture:
+        assert 4 <= len(capture.done) <= 6
+
+
+def test_a_layout_that_a_disc_has_lost_is_no_capture(run_with, monkeypatch, tmp_path):
+    """Zeros where the targets should be: an arm that was sent to 35 would be recorded as sent to 0."""
+    reserve = writer._reserve
+
+    def lose(path):
+        reserve(path)
+        with h5py.File(path, "r+") as h5:
+            h5["entry/instrument/arm/target_value"][...] = 0
+
+    monkeypatch.setattr(writer, "_reserve", lose)
+    moved = []
+    with pytest.raises(StopIteration):
+        run_with(lambda *_: moved.append(1), plan=SHORT)
+    assert not moved
+    assert not list(tmp_path.glob("capture*/run.h5*"))
+
+
+def test_a_full_disc_at_the_quick_look_fails_no_complete_capture(acquire, quick_rig, tmp_path, monkeypatch):
+    from acquisition.screen import quicklook
+
+    def full(path):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(quicklook, "draw", full)
+    code, out, err = acquire("--omega", 35, "--mode", "stokes", "--rig", quick_rig(), "--out", tmp_path)
+    assert code == 0, err
+    assert "not drawn (No space left on device)" in out
+    with Capture(next(tmp_path.glob("*.h5"))) as capture:
+        assert capture.status == "complete"
+
+
+def test_doctor_says_that_a_light_was_left_on(small_rig):
+    from acquisition.commands.doctor import _source
+    from acquisition.rig.config import load_rig
+    from acquisition.rig.rig import Rig
+
+    with Rig(load_rig(small_rig()), with_camera=False) as rig:
+        assert "light off" in _source(rig)
+        rig.source.set_light(True)
+        rig.source.close()
+        with pytest.raises(AcquisitionError, match="LIGHT LEFT ON"):
+            _source(rig)
