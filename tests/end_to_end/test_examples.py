@@ -1,0 +1,50 @@
+"""Every example and notebook runs as it stands."""
+
+import json
+import runpy
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+
+
+def test_all_of_the_gallery_is_here():
+    assert {f.stem for f in EXAMPLES.glob("*.py")} == set(SAID)
+    assert {f.stem for f in EXAMPLES.glob("*.ipynb")} == {"capture_to_xi0", "close_the_loop"}
+
+
+#: Words that each script must have printed when it is done.
+SAID = {
+    "take_a_capture": "median reduced chi square",
+    "from_simulated_bench": "median xi0",
+    "close_the_loop": "corrected: rms of",
+    "design_states": "free angles:     71.4",
+    "algebra": "and its process is the retarder: True",
+}
+
+
+@pytest.mark.parametrize("name", SAID)
+def test_script(name, tmp_path, monkeypatch, capsys, small_rig):
+    monkeypatch.setattr("sys.argv", [name, str(tmp_path)])
+    monkeypatch.chdir(tmp_path)
+    # The rig of the examples has 360 000 pixels at a tenth of real time.
+    monkeypatch.setattr("acquisition.commands.defaults.DEFAULT_RIG", small_rig())
+    runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+    said = capsys.readouterr().out
+    assert SAID[name] in said
+    if name == "close_the_loop":
+        before, after = (float(line.split()[-1]) for line in said.splitlines()[-2:])
+        assert after < 0.7 * before
+
+
+@pytest.mark.parametrize("name", ["capture_to_xi0", "close_the_loop"])
+def test_notebook(name, capsys, monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    cells = json.loads((EXAMPLES / f"{name}.ipynb").read_text())["cells"]
+    scope: dict[str, object] = {}
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            assert cell["outputs"] == [], "notebooks are kept without outputs"
+            exec(compile("".join(cell["source"]), f"{name}.ipynb", "exec"), scope)
+    assert capsys.readouterr().out
