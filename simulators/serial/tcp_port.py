@@ -10,6 +10,7 @@ import threading
 from types import TracebackType
 from typing import Any, Protocol, Self
 
+from simulators.clock import BEAT_S, patient_clock
 from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort, SerialEmulator
 
@@ -74,12 +75,13 @@ class TcpPort:
     def _serve(self) -> None:
         talks: dict[socket.socket, SerialEmulator] = {}
         try:
-            with selectors.DefaultSelector() as selector:
+            with patient_clock().attend() as here, selectors.DefaultSelector() as selector:
                 selector.register(self._listener, selectors.EVENT_READ)
                 selector.register(self._wake_read, selectors.EVENT_READ)
                 while True:
+                    here()
                     waits = [wait for talk in talks.values() if (wait := talk.next_output_s()) is not None]
-                    events = selector.select(max(0.0, min([*waits, 0.5])))
+                    events = selector.select(max(0.0, min([*waits, BEAT_S])))
                     for key, _ in events:
                         if key.fileobj == self._wake_read:
                             return
