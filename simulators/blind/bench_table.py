@@ -12,8 +12,8 @@ from simulators.blind.bench_judge import Cause, Judgement
 
 #: Errors of M / m00 below this are the rounding of counts, not the instrument.
 FLOOR = 2e-5
-#: An error of M counts as reached up to this many times that of the fit with the true set.
-REACHED = 1.2
+#: An error of M counts as reached up to this many times that of the fit with the true set; the second is told as well.
+REACHED, NEARLY = 1.2, 2.0
 #: A fault matters from so many standard errors of M on.
 MATTERS = 1.0
 #: Edges of the bins of probability in the reliability table.
@@ -85,14 +85,15 @@ def _matrix_lines(judgements: Sequence[Judgement]) -> list[str]:
         if np.isfinite(values).any():
             low, middle, high = np.nanpercentile(values, [10, 50, 90])
             lines.append(f"error of M/m00, {name}: median {middle:.5f} ({low:.5f} to {high:.5f})")
-    reached = [j.corrected <= REACHED * j.oracle + FLOOR for j in known]
+    reached, nearly = ([j.corrected <= times * j.oracle + FLOOR for j in known] for times in (REACHED, NEARLY))
     own = [any(is_worse(*pair) for pair in j.own.values()) for j in judgements]
     patches, pixels = (
         100 * np.nanmean([getattr(j, f"coverage_{n}") for j in judgements]) for n in ("patches", "pixels")
     )
     return [
         *lines,
-        f"at most {REACHED} times the fit with the true set: {_share(reached)} (goal 90 %)",
+        f"at most {REACHED} times the fit with the true set: {_share(reached)} (goal 90 %); "
+        f"{NEARLY:g} times: {_share(nearly)}",
         f"M worse than uncorrected: {sum(is_worse(j.declared, j.corrected) for j in judgements)} (goal 0); "
         f"of the captures themselves: {sum(own)}",
         f"within 95 % intervals: {patches:.1f} % of means of patches, {pixels:.1f} % of pixels (goal 93 to 97 %)",
@@ -112,6 +113,9 @@ def _name_lines(judgements: Sequence[Judgement]) -> list[str]:
     wired = [any(w.right for w in j.wiring) for j in judgements if "wiring" in j.group]
     if wired:
         lines.append(f"mistake of wiring told: {_share(wired)}")
+    if any(j.group == "detector" for j in judgements):
+        noise = _share([j.noise == "not_as_declared" for j in judgements])
+        lines.append(f"noise told as not declared: {noise}; left out: {_share([bool(j.left_out) for j in judgements])}")
     lines += [
         f"told with {100 * b.low:.0f} to {100 * b.high:.0f} %: {b.count}, on average {100 * b.told:.1f} %, "
         f"true {100 * b.true:.1f} %"
