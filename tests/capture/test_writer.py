@@ -16,6 +16,7 @@ import pytest
 from acquisition.capture import writer as writer_module
 from acquisition.capture.state_file import StateFile
 from acquisition.capture.writer import (
+    PATIENCE_S,
     CaptureWriter,
     StateRecord,
     as_partial,
@@ -237,7 +238,7 @@ def test_a_disc_that_takes_nothing_is_given_up_after_a_while_and_the_next_state_
     monkeypatch.setattr(StateFile, "write_state", lambda *arguments: (going_on.wait(), write(*arguments)))
     writer = create(clock=Passing())
     writer.put(record(0))
-    with pytest.raises(AcquisitionError, match="the disc has not taken state 0 for 2 s"):
+    with pytest.raises(AcquisitionError, match=f"the disc has not taken state 0 for {PATIENCE_S:g} s"):
         writer.put(record(1))
     going_on.set()
     writer.abandon()
