@@ -66,6 +66,17 @@ class Config(BaseModel):
     trigger_latency_s: float = Field(default=0.002, ge=0, description="added to the exposure before the bench moves")
 
 
+def structure_of(settings: CameraSettings) -> tuple[object, ...]:
+    """The part of the settings that can only be changed while the acquisition is stopped."""
+    return (
+        settings.pixel_format,
+        (settings.width, settings.height, settings.offset_x, settings.offset_y),
+        (settings.binning, settings.decimation, settings.reverse_x, settings.reverse_y),
+        settings.packet_size,
+        settings.trigger,
+    )
+
+
 class Setup:
     """What is set on one camera.
 

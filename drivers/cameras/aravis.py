@@ -16,7 +16,7 @@ from drivers import genicam
 from drivers.aravis_frames import counts_of, other_layout
 from drivers.aravis_identity import identify
 from drivers.aravis_library import load_aravis, open_camera
-from drivers.aravis_setup import Config, Setup
+from drivers.aravis_setup import Config, Setup, structure_of
 from drivers.aravis_stream import Arrival, FrameStream
 from drivers.camera import Camera, CameraIdentity, CameraSettings, Frame, StreamStatistics
 from drivers.camera_clock import CameraClock
@@ -122,13 +122,7 @@ class AravisCamera(Camera):
     def _do_configure(self, settings: CameraSettings) -> CameraSettings:
         self._discard_outstanding()
         settings = self._config.settings.model_copy(update=settings.model_dump(exclude_none=True))
-        structure = (
-            settings.pixel_format,
-            (settings.width, settings.height, settings.offset_x, settings.offset_y),
-            (settings.binning, settings.decimation, settings.reverse_x, settings.reverse_y),
-            settings.packet_size,
-            settings.trigger,
-        )
+        structure = structure_of(settings)
         if self._stream is None or structure != self._asked_structure:
             self._stop()
             self._asked_structure = None

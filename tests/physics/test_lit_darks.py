@@ -1,0 +1,73 @@
+"""Darks that are not dark are found, and dark ones are left in peace whatever the sample looks like."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from processing.reduction.counts_to_signal import Correction
+from processing.reduction.lit_darks import LitDarks, lit_darks
+from processing.storage.capture import Capture
+from processing.storage.capture_schema import Detector
+
+BLACK = 64.0
+SHAPE = (64, 80)
+POSES = [(9.0 * k,) for k in range(12)]
+
+
+def frame(light: float, seed: int, rng_scale: float = 2.0) -> np.ndarray:
+    """A bright disc on a dark ground, with noise."""
+    r, c = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    disc = np.hypot(r - 32, c - 40) < 18
+    return BLACK + light * disc + np.random.default_rng(seed).normal(0, rng_scale, SHAPE)
+
+
+def verdict(dark: float, lights: list[float], *, mosaic: bool = False, black: float = BLACK) -> str | None:
+    look = LitDarks(black, mosaic=mosaic, lights=len(lights))
+    look.dark(0.01, POSES[0], frame(dark, 99))
+    for k, light in enumerate(lights):
+        wrong = look.light(0.01, POSES[k], frame(light, k))
+        if wrong is not None:
+            return wrong
+    return None
+
+
+@pytest.mark.parametrize("drift", [0.97, 1.0, 1.03])
+def test_lit_darks_are_found_in_a_mosaic_at_the_first_light_state(drift: float) -> None:
+    wrong = verdict(900.0, [900.0 * drift], mosaic=True)
+    assert wrong is not None
+    assert "as bright as a light state in the same pose" in wrong
+
+
+def test_lit_darks_are_found_in_a_rotation_whose_states_differ() -> None:
+    assert verdict(500.0, [500.0, 900.0, 100.0, 30.0, 700.0, 250.0, 900.0, 20.0]) is not None
+
+
+@pytest.mark.parametrize(
+    "lights",
+    [
+        [0.0, 900.0, 400.0, 100.0, 700.0, 20.0, 300.0, 800.0],  # crossed polarizers in the first pose
+        [5.0, 40.0, 12.0, 30.0, 8.0, 25.0, 36.0, 18.0],  # a dim sample
+        [900.0] * 8,
+    ],
+)
+@pytest.mark.parametrize("wrong_black", [0.0, -10.0, 1.0])
+def test_dark_darks_pass(lights: list[float], wrong_black: float) -> None:
+    assert verdict(0.0, lights, black=BLACK + wrong_black) is None
+
+
+def test_darks_of_another_exposure_say_nothing() -> None:
+    look = LitDarks(BLACK, mosaic=True, lights=1)
+    look.dark(0.01, POSES[0], frame(900.0, 1))
+    assert look.light(0.02, POSES[0], frame(900.0, 2)) is None
+
+
+def test_the_reduction_warns(synthetic_capture) -> None:
+    counts = np.stack([frame(800.0, k) for k in range(5)]).astype(np.uint16)[:, None]
+    header = {"detector": Detector(black_level_counts=BLACK), "mosaic": (("90", "45"), ("135", "0"))}
+    roles = ("dark", "dark", "sample", "sample", "sample")
+    path = synthetic_capture(counts, {"psg": np.zeros(5)}, role=roles, channels=("mosaic",), **header)
+    with Capture(path) as capture:
+        assert lit_darks(capture) is not None
+        (warning,) = [text for text in Correction.of(capture).warnings if "as bright as" in text]
+        assert "light shut off" in warning
