@@ -12,6 +12,7 @@ from scipy import ndimage
 from processing.errors import ProcessError
 from processing.geometry.viewing import ViewingGeometry
 from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
+from processing.polarization.eigenvalue_noise import TRIPLE, EigenvalueNoise, corrected
 from processing.polarization.xi0 import Xi0Estimate, estimate
 from processing.reduction.mosaic.methods import REACH
 from processing.reduction.mueller import Progress
@@ -20,30 +21,39 @@ from processing.storage.capture_schema import CaptureHeader
 from processing.storage.images import MuellerImage, StokesImage, require_all_elements
 from processing.storage.product import Plane, Product, ProductWriter, Step
 
-#: The largest eigenvalue has a meaning of its own where it stands this many standard errors above the next.
-DISTINCT = 3.0
-#: A pixel holds light where m00 is this many standard errors.
-LIT = 10.0
-#: Limits of the validity mask of the two-coefficient estimate (docs/conventions.md, "xi0 without singularity").
+#: Limits of the validity mask (docs/quantities.md, "xi0 and its interval"): on the noise, not on the outcome.
 MAX_CONDITION = 100.0
 MAX_STDERR = 0.1
+#: Half the 95 % interval of a normal distribution, in standard deviations.
+NORMAL_95 = 1.959964
 
 _XI0 = Plane((), "", "largest coherency eigenvalue over their sum; 1 = no depolarization, 1/4 = ideal depolarizer")
-_XI0_ERRORS = Plane((), "", "standard errors of xi0, first order; noise of the intensities only")
-_VALID = Plane((), "", "1 = xi0 is determined", np.uint8)
+_XI0_ERRORS = Plane((), "", "standard errors of xi0: half the 68 % interval; noise of the intensities only")
+_INTERVALS = {
+    f"xi0_{level}": Plane((2,), "", f"lower and upper bound of the {level} % interval of xi0, not clipped at 1/4 or 1")
+    for level in (68, 95)
+}
+_VALID = Plane(
+    (), "", "1 = the noise is small enough for xi0 to say something; does not depend on xi0 itself", np.uint8
+)
 MUELLER_PLANES = {
     "xi0": _XI0,
     "xi0_errors": _XI0_ERRORS,
-    "xi0_bias": Plane(
-        (), "", "upward bias of xi0 by noise, second order, for noise alike in all elements; not subtracted"
+    **_INTERVALS,
+    "xi0_shift": Plane((), "", "what noise alone added to the largest eigenvalue; xi0 is without it"),
+    "eigenvalues": Plane((4,), "", "coherency eigenvalues over their sum, descending, with their noise"),
+    "eigenvalue_spread": Plane(
+        (),
+        "",
+        "root of the sum of squares of xi1, xi2, xi3 minus their mean, the noise taken off; 0 if it explains all",
     ),
-    "eigenvalues": Plane((4,), "", "coherency eigenvalues over their sum, descending; negative ones are noise"),
-    "eigenvalue_spread": Plane((), "", "largest deviation of xi1, xi2, xi3 from their mean: 0 if triply degenerate"),
+    "eigenvalue_spread_noise": Plane((), "", "the same of a triply degenerate matrix, by noise alone"),
     "valid": _VALID,
 }
 STOKES_PLANES = {
     "xi0": _XI0,
     "xi0_errors": _XI0_ERRORS,
+    **_INTERVALS,
     "m00": Plane((), "count", "throughput for unpolarized light"),
     "m00_errors": Plane((), "count", "standard errors of m00"),
     "condition": Plane((), "", "condition number of the two-coefficient fit"),
@@ -57,7 +67,7 @@ STOKES_PLANES = {
 def xi0_of_mueller(source: Path, out: Path, step: Step, overwrite: bool, progress: Progress | None) -> dict[str, Any]:
     """Write the eigenvalue image of a Mueller product; returns its facts.
 
-    The standard error is first order: d xi0 = <dM, m0 - 4 xi0 e00> / (4 m00), m0 being the dominant process.
+    xi0 is the largest eigenvalue without what noise adds to it, see `processing.polarization.eigenvalue_noise`.
     """
     with Product(source) as product:
         require_all_elements(product)
@@ -65,35 +75,55 @@ def xi0_of_mueller(source: Path, out: Path, step: Step, overwrite: bool, progres
         with ProductWriter(out, "xi0", product.header, product.shape, MUELLER_PLANES, steps, overwrite) as writer:
             for rows in product.row_blocks():
                 if rows.stop > writer.rows_done:
-                    writer.write(rows, **_eigenvalue_block(MuellerImage.of(product, rows)))
+                    writer.write(rows, **eigenvalue_block(MuellerImage.of(product, rows)))
                 if progress:
                     progress(rows.stop, product.shape[0])
             valid = writer.get("valid") > 0
             facts = _facts(writer.get("xi0"), writer.get("xi0_errors"), valid, "coherency eigenvalues")
-            facts["median_xi0_bias"] = _median(writer.get("xi0_bias")[valid])
-            facts["median_eigenvalue_spread"] = _median(writer.get("eigenvalue_spread")[valid])
+            for name in ("xi0_shift", "eigenvalue_spread", "eigenvalue_spread_noise"):
+                facts[f"median_{name}"] = _median(writer.get(name)[valid])
             writer.seal(facts)
     return facts
 
 
-def _eigenvalue_block(image: MuellerImage) -> dict[str, NDArray[Any]]:
-    m = image.matrices
-    eigenvalues = coherency_eigenvalues(m)
-    xi0, m0 = xi0_and_dominant(m)
-    gradient = np.asarray(m0, dtype=np.float32).reshape(*m0.shape[:2], 16).copy()
-    gradient[..., 0] -= 4 * xi0
+def eigenvalue_block(image: MuellerImage) -> dict[str, NDArray[Any]]:
+    """Planes `MUELLER_PLANES` of an image, or of some rows of it."""
+    eigenvalues = coherency_eigenvalues(image.matrices)
+    noise = eigenvalue_noise(image)
+    found = corrected(eigenvalues.astype(float), noise)
+    known = np.isfinite(found.xi0)
+    # Without standard errors nothing can be taken off.
+    xi0 = np.where(known, found.xi0, eigenvalues[..., 0])
+    valid = known & (image.values[0, 0] > 0) & (noise.coupling <= MAX_STDERR)
+    return {
+        "xi0": xi0,
+        "xi0_errors": (found.interval_68[1] - found.interval_68[0]) / 2,
+        "xi0_68": found.interval_68,
+        "xi0_95": found.interval_95,
+        "xi0_shift": found.shift,
+        "eigenvalues": np.moveaxis(eigenvalues, -1, 0),
+        "eigenvalue_spread": found.spread,
+        "eigenvalue_spread_noise": np.sqrt(noise.others),
+        "valid": valid.astype(np.uint8),
+    }
+
+
+def eigenvalue_noise(image: MuellerImage) -> EigenvalueNoise:
+    """Noise of the coherency matrix about the dominant process of each pixel, from the image's own covariance.
+
+    To first order d xi0 = <dM, m0 - 4 xi0 e00> / (4 m00), m0 being the dominant process.
+    """
+    xi0, m0 = xi0_and_dominant(image.matrices)
+    process = np.asarray(m0, dtype=np.float32).reshape(*m0.shape[:2], 16)
+    m00 = image.values[0, 0].astype(float)
     with np.errstate(divide="ignore", invalid="ignore"):
-        gradient /= 4 * image.values[0, 0][..., None]
-        errors = np.sqrt(image.variance_of(gradient))
-        distinct = eigenvalues[..., 0] - eigenvalues[..., 1] > DISTINCT * np.nan_to_num(errors)
-        # A largest eigenvalue is pushed up by the noise that couples it to the others (second-order perturbation).
-        bias = errors**2 * np.sum(1 / (eigenvalues[..., :1] - eigenvalues[..., 1:]), axis=-1)
-    small = eigenvalues[..., 1:]
-    spread = np.max(np.abs(small - small.mean(axis=-1, keepdims=True)), axis=-1)
-    planes = {"xi0": xi0, "xi0_errors": errors, "xi0_bias": bias, "eigenvalues": np.moveaxis(eigenvalues, -1, 0)}
-    lit = image.values[0, 0] > LIT * image.errors[0, 0]
-    valid = np.isfinite(xi0) & distinct & lit & (errors <= MAX_STDERR)
-    return planes | {"eigenvalue_spread": spread, "valid": valid.astype(np.uint8)}
+        diagonal = image.variance_of(process) / (4 * m00) ** 2
+        row = image.product_of(TRIPLE, process) / m00**2
+        total = np.square(image.errors).sum(axis=(0, 1)) / (4 * m00**2)
+        gradient = process.copy()
+        gradient[..., 0] -= 4 * xi0
+        along = np.sqrt(image.variance_of(gradient)) / (4 * m00)
+    return EigenvalueNoise.of(total, row, diagonal, along)
 
 
 def xi0_of_stokes(
@@ -118,6 +148,8 @@ def xi0_of_stokes(
     planes: dict[str, NDArray[Any]] = {
         "xi0": found.xi0,
         "xi0_errors": found.xi0_stderr,
+        "xi0_68": found.xi0 + np.multiply.outer([-1.0, 1.0], found.xi0_stderr),
+        "xi0_95": found.xi0 + np.multiply.outer([-NORMAL_95, NORMAL_95], found.xi0_stderr),
         "m00": found.m00,
         "m00_errors": found.m00_stderr,
         "condition": found.condition,
@@ -174,7 +206,10 @@ def estimate_from_stokes(image: StokesImage, m0: NDArray[np.float64]) -> Xi0Esti
         u, v = 0.75 * (total - alpha_0) / total**2, -0.75 * alpha_0 / total**2
         xi0_errors = np.sqrt(u * u * spread[0, 0] + 2 * u * v * spread[0, 1] + v * v * spread[1, 1])
         m00_errors = np.sqrt(spread[0, 0] + 2 * spread[0, 1] + spread[1, 1])
-    valid = np.isfinite(plain.xi0) & (total > 0) & (plain.condition <= MAX_CONDITION) & (xi0_errors <= MAX_STDERR)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # The error that xi0 would have at 1/4: a limit on its own error would select by outcome.
+        noise = 0.75 * np.sqrt(spread[0, 0]) / total
+    valid = np.isfinite(plain.xi0) & (total > 0) & (plain.condition <= MAX_CONDITION) & (noise <= MAX_STDERR)
     unphysical = valid & ((plain.xi0 < 0.25 - xi0_errors) | (plain.xi0 > 1 + xi0_errors))
     weight = np.sqrt(spread[0, 0])
     return Xi0Estimate(

@@ -95,7 +95,8 @@ class MuellerImage:
             residual_rms=pick(self.residual_rms),
         )
 
-    def intensity_variance(self) -> NDArray[np.float64]:
+    @cached_property
+    def intensity_variance(self) -> NDArray[np.float32]:
         """Variance (N, pixels) of every intensity, from the fitted intensities and the noise of the reduction."""
         rows, columns = self.mask.shape
         n = self.w.shape[0]
@@ -103,10 +104,12 @@ class MuellerImage:
             free = max(n - int(self.facts.get("rank", 16)), 0)
             with np.errstate(divide="ignore", invalid="ignore"):
                 level = self.residual_rms.reshape(-1).astype(float) ** 2 * n / free if free else np.nan
-            return np.broadcast_to(level, (n, rows * columns))
-        fitted = self.w @ np.nan_to_num(self.values.reshape(16, -1))
-        floor = self.noise_floor[:, None]
-        return np.asarray(np.maximum(self.noise_slope[:, None] * fitted + floor, 0.5 * floor))
+            return np.asarray(np.broadcast_to(level, (n, rows * columns)), dtype=np.float32)
+        shot = (self.noise_slope[:, None] * self.w).astype(np.float32)
+        variance = shot @ np.nan_to_num(self.values.reshape(16, -1))
+        floor = self.noise_floor[:, None].astype(np.float32)
+        variance += floor
+        return np.asarray(np.maximum(variance, 0.5 * floor, out=variance))
 
     def covariance(self) -> NDArray[np.float64]:
         """Covariance (rows, columns, 16, 16) of the elements, counts^2, row-major order m00, m01, ... m33.
@@ -118,8 +121,7 @@ class MuellerImage:
 
     @cached_property
     def _covariance(self) -> NDArray[np.float64]:
-        inverse = self._inverse()
-        variance = self.intensity_variance()
+        inverse, variance = self._inverse, self.intensity_variance
         if self.facts["weighted"]:
             normal = np.einsum("np,ni,nj->pij", 1 / variance, self.w, self.w, optimize=True)
             full = np.linalg.inv(normal)
@@ -138,12 +140,33 @@ class MuellerImage:
         if self.facts["weighted"]:
             full = self._covariance.reshape(-1, 16, 16)
             return np.asarray(np.einsum("pi,pi->p", (full @ g[:, :, None])[..., 0], g).reshape(self.mask.shape))
-        inverse, variance = self._inverse(), self.intensity_variance()
-        found = np.einsum("pn,np->p", np.square(g @ inverse), variance)
-        # Flats, dark frames and left-out states change all errors of a pixel much alike.
-        told = np.square(self.errors.reshape(16, -1)).sum(axis=0) / (np.square(inverse) @ variance).sum(axis=0)
-        return np.asarray((found * told).reshape(self.mask.shape))
+        seen = self._inverse.T.astype(np.float32) @ g.T.astype(np.float32)
+        found = np.einsum("np,np,np->p", seen, seen, self.intensity_variance)
+        return np.asarray((found * self._told).reshape(self.mask.shape))
 
+    def product_of(self, form: NDArray[np.float64], gradient: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Sum over elements a, b, k of covariance[a, b] form[a, b, k] gradient[k]: (rows, columns).
+
+        Parameters
+        ----------
+        form : (16, 16, 16), symmetric in a and b.
+        gradient : (rows, columns, 16).
+        """
+        g = np.asarray(gradient).reshape(-1, 16)
+        if self.facts["weighted"]:
+            full = self._covariance.reshape(-1, 256) @ form.reshape(256, 16)
+            return np.asarray(np.einsum("pk,pk->p", full, g).reshape(self.mask.shape))
+        each = np.einsum("an,bn,abk->nk", self._inverse, self._inverse, form, optimize=True)
+        found = np.einsum("np,np->p", each.astype(np.float32) @ g.T.astype(np.float32), self.intensity_variance)
+        return np.asarray((found * self._told).reshape(self.mask.shape))
+
+    @cached_property
+    def _told(self) -> NDArray[np.float64]:
+        # Flats, dark frames and left-out states change all errors of a pixel much alike.
+        plain = np.square(self._inverse).sum(axis=0).astype(np.float32) @ self.intensity_variance
+        return np.asarray(np.square(self.errors.reshape(16, -1)).sum(axis=0) / plain)
+
+    @cached_property
     def _inverse(self) -> NDArray[np.float64]:
         return np.asarray(np.linalg.pinv(self.w))
 

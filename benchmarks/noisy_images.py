@@ -1,0 +1,76 @@
+"""Mueller images of one matrix, taken many times with Poisson and read noise: for `error_bars.py` and the tests.
+
+The noise is drawn here, not by the project's detector model, and the capture is the RGB950's with 40 states.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from processing.instrument.model import InstrumentModel
+from processing.instrument.states import rotating_retarders
+from processing.polarization import mueller, triply_degenerate
+from processing.storage.capture_schema import CaptureHeader
+from processing.storage.images import MuellerImage
+
+READ_NOISE_E = 2.3
+CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+LIGHT_LEVELS = (20.0, 200.0, 20_000.0)
+
+
+def rgb950(wavelength_nm: float = 662) -> np.ndarray:
+    """W (40, 16) of the RGB950's own state table."""
+    model = InstrumentModel.load(CONFIGS / "instruments/rgb950.yaml").at(wavelength_nm)
+    return np.asarray(model.rows(rotating_retarders(1.0).angles_deg).reshape(-1, 16))
+
+
+def five_samples() -> dict[str, np.ndarray]:
+    """Matrices (4, 4) with m00 = 1 of five kinds."""
+    element = mueller.retarder(0.4, 1.2) @ mueller.diattenuator(0.9, 1.0, 0.25) @ mueller.rotation(0.25)
+    pure = element / element[0, 0]
+    mirror = mueller.diattenuator(0.0, 1.0, 0.6) @ mueller.IDEAL_MIRROR
+    mirror = mirror / mirror[0, 0]
+    inverting = np.diag([1.0, 0.3, 0.25, -0.35])
+    inverting[0, 1], inverting[1, 0], inverting[2, 3] = 0.2, 0.15, 0.05
+    return {
+        "non-depolarizing": pure,
+        "diagonal depolarizer": np.diag([1.0, 0.6, 0.5, 0.35]),
+        "triply degenerate": triply_degenerate.mueller_matrix(pure, 0.55),
+        "mirror-like": triply_degenerate.mueller_matrix(mirror, 0.95),
+        "det < 0": inverting,
+    }
+
+
+def noisy_image(matrices: np.ndarray, electrons: float, seed: int, w: np.ndarray | None = None) -> MuellerImage:
+    """Image (1, pixels) reduced from a capture of each matrix (pixels, 4, 4) with m00 = 1.
+
+    Parameters
+    ----------
+    electrons : mean over the states of what an ideal depolarizer with m00 = 1 gives; one electron is one count.
+    """
+    w = rgb950() if w is None else w
+    rng = np.random.default_rng(seed)
+    scale = electrons / w[:, 0].mean()
+    expected = scale * matrices.reshape(-1, 16) @ w.T
+    counts = rng.poisson(np.maximum(expected, 0)) + rng.normal(0, READ_NOISE_E, expected.shape)
+    inverse = np.linalg.pinv(w)
+    m = inverse @ counts.T
+    floor = np.full(len(w), READ_NOISE_E**2)
+    variance = np.maximum(w @ m + floor[:, None], 0.5 * floor[:, None])
+    shape = (1, len(expected))
+    residual = counts.T - w @ m
+    return MuellerImage(
+        values=m.reshape(4, 4, *shape).astype(np.float32),
+        errors=np.sqrt(inverse**2 @ variance).reshape(4, 4, *shape).astype(np.float32),
+        mask=np.zeros(shape, np.uint8),
+        residual_rms=np.sqrt(np.mean(residual**2, axis=0)).reshape(shape).astype(np.float32),
+        w=w,
+        noise_slope=np.ones(len(w)),
+        noise_floor=floor,
+        header=CaptureHeader(title="noise", simulated=True, mode="mueller", wavelength_nm=662),
+        steps=(),
+        simulated=True,
+        facts={"weighted": False},
+    )

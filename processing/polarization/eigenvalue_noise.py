@@ -1,0 +1,172 @@
+"""What noise does to coherency eigenvalues, and how to take it off: xi0 without bias, with intervals that cover.
+
+Eigenvalues of a noisy matrix repel each other, so the largest is pushed up, most where it hardly stands out: there the
+delta method fails. For a triply degenerate matrix with noise alike in all directions the height of xi0 over the mean of
+the other three, in units of the noise s of one element of the coherency matrix, depends on one number only, the true
+height theta. Its quantiles, by Monte Carlo (`benchmarks/eigenvalue_quantiles.py`), are inverted: the estimate is
+median-unbiased and the intervals are Neyman's. Far above the noise this is the delta method with its second-order term.
+
+Noise that is not alike in all directions enters through two variances: along the dominant process (width), and between
+it and the others (shift). Where the small eigenvalues differ by more than noise, the shift is that of their own gaps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from processing.arrays import Array
+from processing.polarization.mueller import coherency
+
+#: Probabilities of the quantiles: two-sided 95 and 68 % about the median.
+LEVELS = np.array([0.025, 0.15865525, 0.5, 0.84134475, 0.975])
+_DEVIATES = np.array([-1.959964, -1.0, 0.0, 1.0, 1.959964])
+#: True heights of the table, in units of the noise.
+THETA = np.concatenate([np.arange(0, 8, 0.5), np.arange(8, 20.1, 2)])
+#: Spread and shift of the observed height beyond the table: sqrt(1 + 1/3), and 4 / theta.
+_SPREAD, _SHIFT = np.sqrt(4 / 3), 4.0
+_QUANTILES = np.array([
+    [2.076, 2.646, 3.334, 4.107, 4.914],  # 0
+    [2.089, 2.657, 3.351, 4.132, 4.965],  # 0.5
+    [2.128, 2.711, 3.420, 4.222, 5.061],  # 1
+    [2.191, 2.806, 3.545, 4.379, 5.260],  # 1.5
+    [2.305, 2.947, 3.729, 4.610, 5.531],  # 2
+    [2.436, 3.123, 3.967, 4.902, 5.850],  # 2.5
+    [2.626, 3.369, 4.264, 5.241, 6.230],  # 3
+    [2.834, 3.647, 4.595, 5.621, 6.638],  # 3.5
+    [3.096, 3.975, 4.966, 6.007, 7.036],  # 4
+    [3.424, 4.348, 5.368, 6.429, 7.474],  # 4.5
+    [3.780, 4.740, 5.788, 6.862, 7.907],  # 5
+    [4.157, 5.147, 6.220, 7.305, 8.378],  # 5.5
+    [4.561, 5.577, 6.658, 7.756, 8.818],  # 6
+    [4.998, 6.009, 7.111, 8.215, 9.292],  # 6.5
+    [5.428, 6.466, 7.568, 8.671, 9.749],  # 7
+    [5.865, 6.913, 8.030, 9.147, 10.228],  # 7.5
+    [6.323, 7.377, 8.492, 9.623, 10.699],  # 8
+    [8.185, 9.271, 10.396, 11.531, 12.625],  # 10
+    [10.107, 11.196, 12.334, 13.475, 14.564],  # 12
+    [12.061, 13.142, 14.286, 15.428, 16.529],  # 14
+    [14.008, 15.108, 16.249, 17.393, 18.500],  # 16
+    [15.970, 17.070, 18.226, 19.372, 20.482],  # 18
+    [17.946, 19.054, 20.201, 21.342, 22.457],  # 20
+])  # fmt: skip
+
+#: Grid of the inverted table: observed height, and width over that of noise alike in all directions.
+_X = np.arange(-20.0, 25.0, 0.1)
+_WIDTH = np.arange(0.2, 2.01, 0.1)
+
+
+def _inverted() -> NDArray[np.float64]:
+    """True height (levels, widths, observed) of which the observed one is the quantile of each level."""
+    # Below 0 the table is continued as an odd function: an estimate may fall below the ideal depolarizer, and must
+    # where its mean is to be right.
+    heights = np.concatenate([-THETA[:0:-1], THETA])
+    observed = np.concatenate([2 * _QUANTILES[0] - _QUANTILES[:0:-1], _QUANTILES])
+    median = observed[:, 2]
+    return np.array(
+        [[np.interp(_X, median + width * (column - median), heights) for width in _WIDTH] for column in observed.T]
+    )
+
+
+_INVERTED = _inverted()
+
+_UNITS = coherency(np.eye(16).reshape(16, 4, 4)) / 2
+#: Re tr(T_a T_b T_k) of the Hermitian matrices T of single Mueller elements.
+TRIPLE: NDArray[np.float64] = np.einsum("aij,bjl,kli->abk", _UNITS, _UNITS, _UNITS, optimize=True).real
+
+
+@dataclass(frozen=True)
+class EigenvalueNoise:
+    """Noise of the coherency matrix H / (2 m00) of each pixel; arrays of the shape of an image.
+
+    Attributes
+    ----------
+    along : standard error of xi0 to first order.
+    coupling : root mean square of the elements of H between the dominant process and another.
+    others : sum of squares that noise alone puts into the deviations of xi1, xi2, xi3 from their mean.
+    """
+
+    along: Array
+    coupling: Array
+    others: Array
+
+    @classmethod
+    def of(cls, total: Array, row: Array, diagonal: Array, along: Array) -> EigenvalueNoise:
+        """From second moments of the noise E of H / (2 m00) about the dominant process v.
+
+        Parameters
+        ----------
+        total : E tr(E^2).
+        row : v^H E[E^2] v.
+        diagonal : variance of v^H E v.
+        along : standard error of xi0; differs from sqrt(diagonal) by the noise of m00.
+        """
+        with np.errstate(invalid="ignore"):
+            coupling = np.sqrt(np.maximum(row - diagonal, 0) / 3)
+            # In the 3 x 3 block of the others 9 numbers are noise; 1 is their mean.
+            others = np.maximum(total - 2 * row + diagonal, 0) * (8 / 9)
+        return cls(along, coupling, others)
+
+
+@dataclass(frozen=True)
+class CorrectedXi0:
+    """xi0 of each pixel with the noise taken off.
+
+    Attributes
+    ----------
+    xi0 : median-unbiased; may lie below 1/4 or above 1, which is noise, and is not clipped.
+    interval_68, interval_95 : (2, ...), lower and upper bound.
+    shift : what was taken off the observed eigenvalue.
+    spread : root of the sum of squares of xi1, xi2, xi3 minus their mean, without noise; 0 where noise explains it.
+    """
+
+    xi0: Array
+    interval_68: Array
+    interval_95: Array
+    shift: Array
+    spread: Array
+
+
+def corrected(eigenvalues: Array, noise: EigenvalueNoise) -> CorrectedXi0:
+    """Take the noise off observed eigenvalues (..., 4), descending, of sum 1."""
+    xi = np.asarray(eigenvalues, dtype=float)
+    height = (4 * xi[..., 0] - 1) / 3
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # The table's own noise has a first-order width of sqrt(3)/2 in xi0.
+        width = noise.along / (np.sqrt(0.75) * noise.coupling)
+        bounds = _heights(height / noise.coupling, width) * noise.coupling
+        spread, extra = _small_eigenvalues(xi, bounds[2], noise)
+    values = 0.25 + 0.75 * bounds - extra
+    shift = xi[..., 0] - values[2]
+    # The lower bound is the height of which the observation is a high quantile.
+    return CorrectedXi0(values[2], values[[3, 1]], values[[4, 0]], shift, spread)
+
+
+def _heights(observed: Array, width: Array) -> Array:
+    """True heights (5, ...) whose quantile of each of `LEVELS` is the observed one."""
+    known = np.isfinite(observed) & np.isfinite(width)
+    at = np.stack([np.where(known, width - _WIDTH[0], 0) / 0.1, np.where(known, observed - _X[0], 0) / 0.1])
+    found = np.empty((len(LEVELS), *observed.shape))
+    for k, deviate in enumerate(_DEVIATES):
+        far = observed - _SPREAD * width * deviate
+        beyond = (far + np.sqrt(np.maximum(far**2 - 4 * _SHIFT, 0))) / 2
+        near = map_coordinates(_INVERTED[k], at, order=1, mode="nearest")
+        found[k] = np.where(beyond > THETA[-1] - 4, beyond, near)
+    return np.where(known, found, np.nan)
+
+
+def _small_eigenvalues(xi: Array, height: Array, noise: EigenvalueNoise) -> tuple[Array, Array]:
+    """Spread of the small eigenvalues without noise, and what it adds to the shift of xi0."""
+    deviation = xi[..., 1:] - xi[..., 1:].mean(axis=-1, keepdims=True)
+    observed = np.sum(deviation**2, axis=-1)
+    left = np.maximum(observed - noise.others, 0)
+    real = deviation * np.sqrt(left / np.where(observed > 0, observed, 1))[..., None]
+    # Eigenvalues closer than the noise repel no more strongly than at that distance.
+    least = 2 * noise.coupling[..., None]
+    gaps = np.maximum(height[..., None] - real, least)
+    even = np.maximum(height, least[..., 0])
+    extra = noise.coupling**2 * (np.sum(1 / gaps, axis=-1) - 3 / even)
+    return np.sqrt(left), extra
