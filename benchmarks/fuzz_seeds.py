@@ -26,7 +26,7 @@ from processing.reduction.mueller import choose_model, reduce_mueller
 from processing.reflectance.base import load_reflectance
 from processing.reflectance.pbsdf import load as load_pbsdf
 from processing.reflectance.tables import ScatteringTable
-from processing.storage.axostep import RawFrames, read_mueller_file, read_rmmd, write_rmmd
+from processing.storage.axostep import read_mueller_file, read_rmmd
 from processing.storage.capture import Capture
 from processing.storage.capture_schema import CaptureHeader, create_layout, write_closing
 from processing.storage.importing import ImportRequest, import_capture, read_sample
@@ -279,13 +279,18 @@ def _picture(path: Path) -> str | None:
         states.write_text(text)
 
 
+def _write_rmmd(path: Path, frames: np.ndarray) -> None:
+    header = np.array([0, *frames.shape, 0], dtype=">i4")
+    path.write_bytes(header.tobytes() + np.ascontiguousarray(frames[:, ::-1], dtype=">i4").tobytes())
+
+
 def _stack_files(folder: Path) -> Sequence[Path]:
     _import_files(folder)
     frames = np.random.default_rng(3).integers(0, 4000, (18, 8, 10)).astype(np.uint16)
     np.save(folder / "stack.npy", frames)
     with h5py.File(folder / "stack.h5", "w") as h5:
         h5["group/frames"] = frames
-    write_rmmd(folder / "stack.rmmd", RawFrames(frames.astype(np.int32)))
+    _write_rmmd(folder / "stack.rmmd", frames)
     states = (folder / "states.csv").read_text().splitlines()
     (folder / "stack.csv").write_text("\n".join(line.rsplit(",", 1)[0] for line in states) + "\n")
     return [folder / name for name in ("stack.npy", "stack.h5", "stack.rmmd")]
@@ -323,7 +328,7 @@ def _tensor(path: Path) -> str | None:
 
 
 def _axostep_files(folder: Path) -> Sequence[Path]:
-    write_rmmd(folder / "a.rmmd", RawFrames(np.ones((4, 5, 6), dtype=np.int32)))
+    _write_rmmd(folder / "a.rmmd", np.ones((4, 5, 6)))
     words = struct.pack(">4f", 3, 2, 4, 4) + struct.pack(">96f", *range(96)) + struct.pack(">f", 0)
     (folder / "a.cmmi").write_bytes(words)
     return [folder / "a.rmmd", folder / "a.cmmi"]

@@ -352,6 +352,9 @@ class Camera(ABC):
     def temperature_c(self) -> float | None:
         """Temperature of the camera in degrees Celsius; None where it has no sensor."""
 
+    def forget_clock(self) -> None:  # noqa: B027 - a camera that compares no clocks has nothing to forget
+        """The host's clock was set: what was learnt from it about the times of frames holds no more."""
+
     def close(self) -> None:
         """Stop and release the camera. Closing twice is harmless."""
         if not self._closed:

@@ -37,6 +37,10 @@ class CameraClock:
         """Start again, after the stream was interrupted."""
         self._ahead_s = None
 
+    def forget_all(self) -> None:
+        """Begin anew after the host's clock was set: nothing that was compared before holds any more."""
+        self._first, self._ahead_s, self._trusted = None, None, True
+
     def came_s(self, camera_time_ns: int, first_packet_s: float, exposure_s: float) -> float:
         """Unix time at which the first packet would have been seen by a host that is never late.
 

@@ -35,8 +35,9 @@ def serve(
     fault: Annotated[
         list[str] | None,
         typer.Option(
-            help="silent, stuck, slow, garbled, late, foreign or not_homed; repeatable. garbled@12x1 spoils one reply "
-            "from the 12th command on, slow@3.5s:0.2 slows to a fifth after 3.5 s, late:0.4 delays by 0.4 s"
+            help="silent, stuck, slow, garbled, late, foreign, not_homed, slip or jammed; repeatable. garbled@12x1 "
+            "spoils one reply from the 12th command on, slow@3.5s:0.2 slows to a fifth after 3.5 s, late:0.4 delays "
+            "by 0.4 s"
         ),
     ] = None,
     seed: Annotated[int, typer.Option(help="of the garbled bytes")] = 0,

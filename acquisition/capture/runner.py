@@ -16,7 +16,9 @@ import numpy as np
 
 from acquisition.capture.auto_exposure import find_exposure
 from acquisition.capture.plan import AutoExposure
+from acquisition.capture.repeated_state import RepeatedState
 from acquisition.capture.time_ledger import TimeLedger
+from acquisition.capture.wall_clock import WallClock
 from acquisition.capture.writer import CaptureWriter, StateRecord
 from acquisition.errors import RunFailed
 from acquisition.rig.interlocks import Interlocks
@@ -53,6 +55,7 @@ class _Exposed:
     retake: int
     exposure_s: float
     temperature_c: float
+    clock_ahead_s: float
 
 
 @dataclass
@@ -113,6 +116,8 @@ class CaptureRunner:
         self._saturation_limit = saturation_limit
         lights = sum(role != "dark" for role in table.role)
         self._lit_darks = LitDarks(detector.black_level_counts, mosaic=mosaic, lights=lights)
+        self._repeated = RepeatedState(detector.black_level_counts)
+        self._wall_clock = WallClock()
 
     def run(self, pending: Iterable[int]) -> bool:
         """Take these states; True if all are done, False if a stop was asked for.
@@ -217,6 +222,7 @@ class CaptureRunner:
             settings = self.rig.set_exposure(asked_s, int(self.table.repeats[state]))
         # Cameras set exposures in steps; what counts is the exposure that was.
         exposure_s = settings.exposure_s or asked_s
+        self._clock_jumped()
         start_s = self.rig.clock.now_s()
         with self.ledger.time("exposure"):
             try:
@@ -233,6 +239,10 @@ class CaptureRunner:
         readout_s = max(0.0, self.rig.clock.now_s() - start_s - light_s)
         self.ledger.readout_s += readout_s
         self.ledger.unavoidable_s += light_s + readout_s
+        if self._clock_jumped():
+            self.warn(f"state {state} is taken again")
+            self._pending.appendleft(state)
+            return None
         positions = moved | still
         self._require_on_target(state, targets, positions)
         # Looked at after the exposure: it also tells of an interlock that was open before it.
@@ -242,7 +252,8 @@ class CaptureRunner:
         if blocked is not None:
             self._discard(state, f"{blocked} in state {state}")
             return None
-        return _Exposed(state, exposure, {axis: positions[axis] for axis in targets}, retake, exposure_s, temperature)
+        where = {axis: positions[axis] for axis in targets}
+        return _Exposed(state, exposure, where, retake, exposure_s, temperature, self._wall_clock.ahead_s)
 
     def _collect(self, exposed: _Exposed) -> None:
         with self.ledger.time("transfer"):
@@ -262,10 +273,10 @@ class CaptureRunner:
         if blocked is not None:
             self._discard(exposed.state, blocked)
             return
-        self._check_darks(report)
+        self._check_light(report)
         columns = {
             "exposure_s": exposed.exposure_s,
-            "host_time_s": frame.host_time_s,
+            "host_time_s": frame.host_time_s - exposed.clock_ahead_s,
             "camera_time_ns": frame.camera_time_ns,
             "frame_id": frame.frame_id,
             "retakes": exposed.retake,
@@ -296,12 +307,24 @@ class CaptureRunner:
 
     # --- what can be wrong with it -----------------------------------------------------------------------
 
-    def _check_darks(self, report: StateReport) -> None:
+    def _clock_jumped(self) -> bool:
+        """Tell of a clock that was set or a machine that slept since the last look."""
+        what = self._wall_clock.look()
+        if what is None:
+            return False
+        self.warn(f"{what}; times in the capture go on evenly")
+        self.rig.require_camera().forget_clock()
+        return True
+
+    def _check_light(self, report: StateReport) -> None:
         exposure_s = float(self.table.exposure_s[report.state])
         pose = tuple(float(column[report.state]) for column in self.table.angles_deg.values())
         if report.role == "dark":
             self._lit_darks.dark(exposure_s, pose, report.pixels)
             return
+        changed = self._repeated.look(report.state, exposure_s, pose, report.pixels)
+        if changed is not None:
+            self.warn(changed)
         wrong = self._lit_darks.light(exposure_s, pose, report.pixels)
         if wrong is not None:
             raise RunFailed(

@@ -108,6 +108,10 @@ class AravisCamera(Camera):
         self._require_open()
         return self._features.number(genicam.TEMPERATURE_C)
 
+    def forget_clock(self) -> None:
+        """The host's clock was set: compare it with the camera's anew."""
+        self._camera_clock.forget_all()
+
     def node_map(self) -> dict[str, str]:
         """Every GenICam feature that can be read now, with its value; takes about a millisecond a feature."""
         self._require_open()

@@ -26,6 +26,8 @@ class SC10Emulator(Emulator):
         self._mode = 1
         self._enabled = False
         self._changed_s = -1e9
+        # Where a blade that sticks stays.
+        self._held: bool | None = None
         self._buffer = bytearray()
 
     def is_open(self) -> bool:
@@ -46,8 +48,16 @@ class SC10Emulator(Emulator):
                 self._changed_s = self.clock.now_s()
 
     def _blade_open(self) -> bool:
+        if self._held is not None:
+            return self._held
         arrived = self.clock.now_s() >= self._changed_s + self.blade_s
         return self._enabled if arrived else not self._enabled
+
+    def _stick(self, sticks: bool) -> None:
+        if not sticks:
+            self._held = None
+        elif self._held is None:
+            self._held = self._blade_open()
 
     def _do_receive(self, data: bytes) -> None:
         self._buffer += data
@@ -55,6 +65,7 @@ class SC10Emulator(Emulator):
             command = bytes(self._buffer[:end]).strip(b"\n")
             del self._buffer[: end + 1]
             self._apply_faults()
+            self._stick(bool(self.faults.active.keys() & {"stuck", "jammed"}))
             answer = self._answer(command.decode("ascii", "replace"))
             self._reply(command + b"\r" + (answer.encode() + b"\r" if answer else b"") + PROMPT)
 
@@ -65,7 +76,8 @@ class SC10Emulator(Emulator):
             case "ens?":
                 return str(int(self._enabled))
             case "closed?":
-                return str(int(not self._blade_open()))
+                blade_open = self._enabled if "jammed" in self.faults.active else self._blade_open()
+                return str(int(not blade_open))
             case "interlock?":
                 return str(int(self.interlock_tripped))
             case "mode?":

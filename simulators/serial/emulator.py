@@ -51,6 +51,7 @@ class EmulatedAxis:
         self._homed = homed
         self.homing = False
         self.true_angle = true_angle
+        self.slip_deg = 0.0
         self.stuck = False
         self.speed_factor = 1.0
         # Reported angle = mechanical angle - origin.
@@ -65,7 +66,8 @@ class EmulatedAxis:
     def true_deg(self) -> float:
         """True angle of the optic now, which no reply on the wire tells."""
         mechanical_deg = self._motion.position(self.clock.now_s())
-        return mechanical_deg if self.true_angle is None else self.true_angle(mechanical_deg)
+        on_shaft_deg = mechanical_deg if self.true_angle is None else self.true_angle(mechanical_deg)
+        return on_shaft_deg + self.slip_deg
 
     @property
     def homed(self) -> bool:
@@ -226,6 +228,8 @@ class Emulator(ABC):
             axis.speed_factor = active["slow"].size() if "slow" in active else 1.0
             if "not_homed" in active:
                 axis.lose_reference()
+            if "slip" in active:
+                axis.slip_deg += active["slip"].size()
 
     def _reply(self, data: bytes) -> None:
         """Queue a reply, as far as the active faults let it through."""

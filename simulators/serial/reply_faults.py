@@ -8,10 +8,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-FaultKind = Literal["silent", "stuck", "slow", "garbled", "late", "foreign", "not_homed"]
+FaultKind = Literal["silent", "stuck", "slow", "garbled", "late", "foreign", "not_homed", "slip", "jammed"]
 
-# What `amount` means, and its default: speed factor, delay in real seconds.
-DEFAULT_AMOUNT = {"slow": 0.1, "late": 0.5}
+# Default of `amount`: speed factor, delay in real seconds, degrees.
+DEFAULT_AMOUNT = {"slow": 0.1, "late": 0.5, "slip": 2.0}
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +24,8 @@ class Fault:
         ``silent`` no reply; ``stuck`` the axes stand still while they report a motion; ``slow`` axes at `amount`
         times their speed; ``garbled`` one byte of the reply changed; ``late`` the reply comes `amount` real
         seconds late; ``foreign`` a reply of another device or request comes instead; ``not_homed`` the axes lose
-        their reference, once.
+        their reference, once; ``slip`` the optics turn by `amount` degrees against their encoders, once; ``jammed``
+        a shutter's blade stays where it is and its sensor agrees with what was asked (``stuck``: with the blade).
     from_command : int
         First command affected; the emulator counts commands from 1.
     from_s : float
@@ -107,7 +108,7 @@ class FaultSchedule:
             if self.commands < fault.from_command or now_s < fault.from_s:
                 continue
             self.active[fault.kind] = fault
-            if fault.kind == "not_homed":
+            if fault.kind in ("not_homed", "slip"):
                 self._waiting.remove(fault)
             elif fault.commands is not None:
                 left = self._left.get(id(fault), fault.commands) - 1
