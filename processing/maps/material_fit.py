@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
 from processing.errors import ProcessError
 from processing.geometry.frames import ScatteringGeometry
 from processing.geometry.viewing import ViewingGeometry
-from processing.polarization.cloude import xi0_and_dominant
-from processing.reflectance.material_fit import MaterialFit, fit_intensities, fit_mueller
-from processing.storage.images import StokesImage
+from processing.reflectance.material_fit import MaterialFit, fit_values
+from processing.storage.images import MuellerImage, StokesImage, require_all_elements
 from processing.storage.product import Product
 
 #: At most so many pixels of each image go into a fit.
@@ -23,7 +23,7 @@ BORDER_PX = 4
 
 
 def fit_products(sources: Sequence[Path], geometry_file: Path) -> tuple[MaterialFit, float, bool]:
-    """Fit Mueller products (least squares) or Stokes products (linear correlation): fit, wavelength, simulated.
+    """Fit Mueller or Stokes products by linear correlation in units of their noise: fit, wavelength, simulated.
 
     Raises
     ------
@@ -49,37 +49,57 @@ def fit_products(sources: Sequence[Path], geometry_file: Path) -> tuple[Material
 
 
 def _fit_mueller(sources: Sequence[Path], view: ViewingGeometry) -> MaterialFit:
-    parts, matrices = [], []
+    parts, matrices, covariances = [], [], []
     for source in sources:
         with Product(source) as product:
+            require_all_elements(product)
             points, index = _sample(view, product)
-            parts.append(points)
-            matrices.append(product.get("mueller").reshape(16, -1)[:, index].T.reshape(-1, 4, 4).astype(float))
-    m = np.concatenate(matrices)
-    xi0, m0 = xi0_and_dominant(m)
-    return fit_mueller(_joined(parts), m0, xi0, m[:, 0, 0], max_pixels=len(m))
+            image = MuellerImage.of(product).at(index)
+        parts.append(points)
+        matrices.append(image.values.reshape(16, -1).astype(float))
+        covariances.append(covariance_by_light(image))
+    return _fit(parts, matrices, np.eye(16), covariances)
+
+
+def covariance_by_light(image: MuellerImage) -> NDArray[np.float64]:
+    """Covariance (pixels, 16, 16) as if the sample did not polarize: so that it follows no element's noise."""
+    light = np.maximum(image.values[0, 0].reshape(-1).astype(float), 0.0)
+    if np.isnan(image.noise_slope).any():
+        variance = np.ones((len(image.w), light.size))
+    else:
+        # A floor of nothing, in the dark, would be an infinite weight.
+        floor = np.maximum(image.noise_floor, 1e-3 * image.noise_slope**2)
+        variance = np.outer(image.noise_slope * image.w[:, 0], light) + floor[:, None]
+    inverse = np.linalg.pinv(image.w)
+    return np.asarray(np.einsum("np,in,jn->pij", variance, inverse, inverse, optimize=True))
 
 
 def _fit_stokes(sources: Sequence[Path], view: ViewingGeometry) -> MaterialFit:
-    parts, signals, variances = [], [], []
-    w = None
+    parts, signals, covariances = [], [], []
+    w = analyzers = None
     for source in sources:
         with Product(source) as product:
             points, index = _sample(view, product)
         image = StokesImage.load(source)
         if w is not None and not np.allclose(w, image.w):
             raise ProcessError(f"{source} was taken with another generator state than the first product.")
-        w = image.w
+        w, analyzers = image.w, image.analyzers
         parts.append(points)
-        stokes = image.values.reshape(3, -1)[:, index].astype(float)
-        covariance = image.covariance.reshape(-1, 3, 3)[index].astype(float)
-        signals.append(image.analyzers @ stokes)
-        variances.append(np.einsum("cs,nst,ct->cn", image.analyzers, covariance, image.analyzers, optimize=True))
-    if w is None:
+        signals.append(image.values.reshape(3, -1)[:, index].astype(float))
+        covariances.append(image.covariance.reshape(-1, 3, 3)[index].astype(float))
+    if w is None or analyzers is None:
         raise ProcessError("no product was given; there is nothing to fit.")
-    joined = _joined(parts)
-    variance = np.concatenate(variances, axis=1)
-    return fit_intensities(joined, np.concatenate(signals, axis=1), w, variance, max_pixels=variance.shape[1])
+    return _fit(parts, signals, np.linalg.pinv(analyzers) @ w, covariances)
+
+
+def _fit(
+    parts: Sequence[ScatteringGeometry],
+    values: Sequence[NDArray[np.float64]],
+    rows: NDArray[np.float64],
+    covariances: Sequence[NDArray[np.float64]],
+) -> MaterialFit:
+    covariance = np.concatenate(covariances)
+    return fit_values(_joined(parts), np.concatenate(values, axis=1), rows, covariance, max_pixels=len(covariance))
 
 
 def _sample(view: ViewingGeometry, product: Product) -> tuple[ScatteringGeometry, np.ndarray]:

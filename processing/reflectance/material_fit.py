@@ -1,9 +1,9 @@
-"""Material constants n + i k, a, b of the polarized diffuse model, from Mueller images or from intensities.
+"""Material constants n + i k, a, b of the polarized diffuse model from Mueller elements, Stokes vectors, intensities.
 
-Mueller images: least squares on the dominant process m0, each pixel weighed with alpha_0 = M00 (4 xi0 - 1)/3, which
-makes the noise of all pixels alike. Intensities: at each pixel P = alpha_0 W m0 + alpha_ID W mID, so the right
-constants make the measured and the modelled intensities most linearly related (paper, conclusion); the two
-coefficients of each pixel are projected out, with alpha_0 >= 0: a negative correlation is no agreement.
+At each pixel P = alpha_0 W m0 + alpha_ID W mID, so the right constants make the measured and the modelled values most
+linearly related (paper, conclusion); the two coefficients of each pixel are projected out, with alpha_0 >= 0: a
+negative correlation is no agreement. In units of the noise, where it is alike in all directions, what it adds to the
+sum of squares does not depend on the constants: the fit has no noise bias. A fit to dominant processes has.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class MaterialFit:
     covariance : (4, 4); NaN for a constant at its bound. From the scatter of whole pixels, whose elements are
         correlated; it holds noise and misfit, not errors of the geometry.
     identified : which constants the data fix at all; an unidentified one may be anything.
-    correlation : mean linear correlation between data and model; NaN for Mueller images.
+    correlation : mean linear correlation between data and model.
     residual : root mean square of the residual over that of the data's polarized part.
     """
 
@@ -78,31 +78,34 @@ class MaterialFit:
         return polarized_diffuse.Model(name=name, source="process fit-material", constants=constants)
 
 
-def fit_mueller(
-    geometry: ScatteringGeometry, dominant: ArrayLike, xi0: ArrayLike, m00: ArrayLike, max_pixels: int = 5000
+def fit_values(
+    geometry: ScatteringGeometry,
+    values: ArrayLike,
+    rows: ArrayLike,
+    covariance: ArrayLike,
+    max_pixels: int = 5000,
 ) -> MaterialFit:
-    """Constants from dominant processes (N, 4, 4) with xi0 and M00 (N,), by least squares.
+    """Constants from values that are linear in M, with correlated noise: Mueller elements or Stokes vectors.
 
     Parameters
     ----------
+    values : (K, N), of each pixel.
+    rows : (K, 16), from the Mueller matrix to the values.
+    covariance : (N, K, K) of the values. Where it is made from the noisy values themselves, the weights follow the
+        noise; the level of the light alone is enough.
     max_pixels : use at most so many, evenly spread.
 
     Raises
     ------
     NotDetermined : fewer than 10 pixels are finite.
     """
-    m0, xi, t = np.asarray(dominant, dtype=float), np.asarray(xi0, dtype=float), np.asarray(m00, dtype=float)
-    keep = _some(np.isfinite(m0).all(axis=(-2, -1)) & np.isfinite(xi) & np.isfinite(t), max_pixels)
-    model = _Forward(geometry[keep])
-    weight = t[keep] * (4 * xi[keep] - 1) / 3
-    data = weight[:, None] * m0[keep].reshape(-1, 16)[:, 1:]
-
-    def residual(p: Array) -> Array:
-        return np.asarray(data - weight[:, None] * model.mueller(p).reshape(-1, 16)[:, 1:])
-
-    found, jacobian = _search(residual)
-    left = residual(found)
-    return _result(found, jacobian, left, float(np.sqrt(np.sum(left**2) / np.sum(data**2))), np.nan)
+    x, c = np.asarray(values, dtype=float), np.asarray(covariance, dtype=float)
+    keep = _some(np.isfinite(x).all(axis=0) & np.isfinite(c).all(axis=(1, 2)), max_pixels)
+    # The ridge is for values without noise.
+    ridge = 1e-9 * np.trace(c[keep], axis1=1, axis2=2)[:, None, None] * np.eye(len(x))
+    whiten = np.linalg.inv(np.linalg.cholesky(c[keep] + ridge))
+    data = np.einsum("nij,jn->ni", whiten, x[:, keep])
+    return _fit(geometry[keep], data, whiten @ np.asarray(rows, dtype=float))
 
 
 def fit_intensities(
@@ -126,19 +129,24 @@ def fit_intensities(
     p = np.asarray(intensities, dtype=float)
     rows = np.asarray(w, dtype=float).reshape(-1, 16)
     keep = _some(np.isfinite(p).all(axis=0), max_pixels)
-    model, p = _Forward(geometry[keep]), p[:, keep].T
+    p = p[:, keep].T
     if variance is None:
         off = p - p.mean(axis=1, keepdims=True)
         scale = np.broadcast_to(1 / np.maximum(np.linalg.norm(off, axis=1, keepdims=True), 1e-12), p.shape)
     else:
         scale = 1 / np.sqrt(np.asarray(variance, dtype=float)[:, keep].T)
-    data, flat = p * scale, rows[:, 0] * scale
+    return _fit(geometry[keep], p * scale, rows * scale[:, :, None])
+
+
+def _fit(geometry: ScatteringGeometry, data: Array, rows: Array) -> MaterialFit:
+    """Fit data (N, K) in units of the noise; rows (N, K, 16) lead from the Mueller matrix to them."""
+    model = _Forward(geometry)
     # What the ideal depolarizer explains is projected out of the data and of the model.
-    flat = flat / np.linalg.norm(flat, axis=1, keepdims=True)
+    flat = rows[:, :, 0] / np.linalg.norm(rows[:, :, 0], axis=1, keepdims=True)
     data = data - flat * np.sum(flat * data, axis=1, keepdims=True)
 
     def parts(q: Array) -> tuple[Array, Array]:
-        modelled = model.mueller(q).reshape(-1, 16) @ rows.T * scale
+        modelled = np.einsum("nki,ni->nk", rows, model.mueller(q).reshape(-1, 16))
         modelled = modelled - flat * np.sum(flat * modelled, axis=1, keepdims=True)
         return modelled, np.sum(modelled * data, axis=1, keepdims=True)
 

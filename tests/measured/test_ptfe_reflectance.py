@@ -14,7 +14,7 @@ from processing.geometry.frames import ScatteringGeometry, change_frames
 from processing.polarization import mueller
 from processing.polarization.cloude import xi0_and_dominant
 from processing.reflectance import first_surface
-from processing.reflectance.material_fit import fit_intensities, fit_mueller
+from processing.reflectance.material_fit import fit_intensities
 
 pytestmark = pytest.mark.measured
 
@@ -98,15 +98,3 @@ def test_how_much_of_the_polarized_light_the_model_takes(rows, wavelength_um):
     assert fit.constants[0] == pytest.approx(1.01, abs=1e-3)
     assert not fit.identified["n"]
     assert not fit.identified["b"]
-
-
-@pytest.mark.parametrize("wavelength_um", WAVELENGTHS_UM)
-def test_least_squares_on_the_dominant_process(rows, wavelength_um):
-    data = load(rows, wavelength_um)
-    xi0, m0 = xi0_and_dominant(data.m)
-    fit = fit_mueller(data.geometry, m0, xi0, np.ones(len(m0)), max_pixels=len(m0))
-    model = fit.model("PTFE", 1000 * wavelength_um).mueller_jones(data.geometry, 1000 * wavelength_um)
-    # |<J, J'>|^2 of the two processes: 1 if equal, 1/4 by chance.
-    overlap = np.einsum("nij,nij->n", model, m0) / 4
-    assert 0.70 < overlap.mean() < 0.88
-    assert 0.45 < fit.residual < 0.65

@@ -2,13 +2,15 @@
 
 import numpy as np
 import pytest
+from noisy_images import noisy_image
 
 from processing.errors import NotDetermined
 from processing.geometry.frames import ScatteringGeometry
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
+from processing.maps.material_fit import covariance_by_light
 from processing.polarization.cloude import xi0_and_dominant
-from processing.reflectance.material_fit import NAMES, fit_intensities, fit_mueller
+from processing.reflectance.material_fit import NAMES, MaterialFit, fit_intensities, fit_values
 from simulators.bench.scene import Scene
 
 TRUE = np.array([1.3, 0.08, 0.17, 2.0])
@@ -39,10 +41,13 @@ def stokes(generator: np.ndarray) -> np.ndarray:
     return (analyzers[:, :, None] * generator).reshape(4, 16)
 
 
+def fit_matrices(geometry: ScatteringGeometry, m: np.ndarray) -> MaterialFit:
+    return fit_values(geometry, m.reshape(-1, 16).T, np.eye(16), np.tile(np.eye(16), (len(m), 1, 1)))
+
+
 def test_exact_data_give_the_constants(sphere, w40):
     geometry, m = sphere
-    xi0, m0 = xi0_and_dominant(m)
-    fit = fit_mueller(geometry, m0, xi0, m[:, 0, 0])
+    fit = fit_matrices(geometry, m)
     np.testing.assert_allclose(fit.constants, TRUE, rtol=1e-4)
     for w in (stokes(VERTICAL), w40):
         p = w @ m.reshape(-1, 16).T
@@ -59,23 +64,45 @@ def noisy(m: np.ndarray, w: np.ndarray, seed: int, electrons: float) -> tuple[np
     return p + np.random.default_rng(seed).normal(size=p.shape) * np.sqrt(variance), variance
 
 
-@pytest.mark.parametrize("way", ["mueller", "stokes"])
-def test_standard_errors_cover_the_truth(sphere, w40, way):
+@pytest.mark.parametrize("electrons", [200, 2000, 20_000])
+@pytest.mark.parametrize("angles", [1, 4])
+def test_a_mueller_image_gives_constants_without_noise_bias(sphere, angles, electrons):
+    geometry, m = sphere
+    chosen = np.s_[:380] if angles == 1 else np.s_[::3]
+    geometry, m = geometry[chosen], m[chosen] / m[chosen, 0, 0].mean()
+    pulls = []
+    for seed in range(5):
+        image = noisy_image(m, electrons, seed)
+        values, covariance = image.values.reshape(16, -1), covariance_by_light(image)
+        fit = fit_values(geometry, values, np.eye(16), covariance)
+        pulls.append((fit.constants - TRUE) / fit.stderr)
+    # Of 5 draws of 4 correlated values.
+    assert np.abs(np.nanmean(pulls, axis=0)).max() < 1.5
+    assert 0.5 < np.sqrt(np.nanmean(np.square(pulls))) < 1.6
+
+
+def test_standard_errors_of_a_stokes_fit_cover_the_truth(sphere):
     geometry, m = sphere
     pulls = []
     for seed in range(12):
-        if way == "mueller":
-            p, _ = noisy(m, w40, seed, 20_000)
-            measured = (np.linalg.pinv(w40) @ p).T.reshape(-1, 4, 4)
-            xi0, m0 = xi0_and_dominant(measured)
-            fit = fit_mueller(geometry, m0, xi0, measured[:, 0, 0])
-        else:
-            p, variance = noisy(m, stokes(VERTICAL), seed, 200_000)
-            fit = fit_intensities(geometry, p, stokes(VERTICAL), variance)
+        p, variance = noisy(m, stokes(VERTICAL), seed, 200_000)
+        fit = fit_intensities(geometry, p, stokes(VERTICAL), variance)
         pulls.append((fit.constants - TRUE) / fit.stderr)
     # 12 draws of 4 correlated values: the spread of a unit variance estimate is about 0.2.
     assert np.nanstd(pulls) == pytest.approx(1, abs=0.5)
     assert np.abs(np.nanmean(pulls, axis=0)).max() < 1.2
+
+
+def test_correlated_values_fit_like_the_intensities_that_they_come_from(sphere):
+    geometry, m = sphere
+    w = stokes(VERTICAL)
+    p, variance = noisy(m, w, 0, 200_000)
+    mix = np.random.default_rng(0).normal(size=(4, 4))
+    covariance = np.einsum("ik,kn,jk->nij", mix, variance, mix)
+    mixed = fit_values(geometry, mix @ p, mix @ w, covariance)
+    plain = fit_intensities(geometry, p, w, variance)
+    np.testing.assert_allclose(mixed.constants, plain.constants, rtol=1e-4)
+    np.testing.assert_allclose(mixed.stderr, plain.stderr, rtol=1e-2)
 
 
 def test_what_the_data_do_not_fix_is_said(sphere):
@@ -86,7 +113,7 @@ def test_what_the_data_do_not_fix_is_said(sphere):
     fit = fit_intensities(geometry[near], p, stokes(VERTICAL), variance)
     assert not fit.identified["b"]
     with pytest.raises(NotDetermined, match="10"):
-        fit_mueller(geometry, np.full((len(m), 4, 4), np.nan), np.ones(len(m)), np.ones(len(m)))
+        fit_matrices(geometry, np.full((len(m), 4, 4), np.nan))
 
 
 def test_a_turned_geometry_lowers_the_correlation(sphere):
@@ -102,8 +129,8 @@ def test_a_turned_geometry_lowers_the_correlation(sphere):
 
 def test_the_fitted_model_is_a_material(sphere):
     geometry, m = sphere
-    xi0, m0 = xi0_and_dominant(m)
-    fit = fit_mueller(geometry, m0, xi0, m[:, 0, 0])
+    m0 = xi0_and_dominant(m)[1]
+    fit = fit_matrices(geometry, m)
     model = fit.model("mine", 662)
     np.testing.assert_allclose(model.mueller_jones(geometry, 662), m0, atol=1e-4)
     assert tuple(fit.identified) == NAMES
