@@ -51,7 +51,9 @@ def write_instrument(path: Path, model: InstrumentModel, diagnosis: Diagnosis) -
     ------
     WriteError : the file exists, or there is nothing to write.
     """
-    if not diagnosis.effects and not diagnosis.calibrated:
+    if diagnosis.correction is not None and diagnosis.correction.refused is not None:
+        raise WriteError(f"{path} was not written: {diagnosis.correction.refused}.")
+    if not diagnosis.applied() and not diagnosis.calibrated:
         raise WriteError(f"nothing was found that could go into {path}; it was not written.")
     text = dump_yaml(extended(model, diagnosis))
     try:

@@ -121,6 +121,7 @@ class AppliedEffect(_Part):
     scope: Literal["instrument", "capture"] = "instrument"
     wavelength_nm: float | None = None
     indistinguishable_from: tuple[str, ...] = ()
+    probability: float | None = None
 
 
 class EffectParameter(_Part):

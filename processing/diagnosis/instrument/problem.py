@@ -356,7 +356,7 @@ def _exactly_undone(candidate: Candidate, pointwise: bool) -> bool:
 def _exact(space: Space, values: Array, *, pointwise: bool = False) -> dict[Candidate, Array]:
     """Values of what can be undone exactly; of the `pointwise` corrections alone."""
     active = zip(space.candidates, space.slices, strict=True)
-    return {c: values[p] for c, p in active if _exactly_undone(c, pointwise)}
+    return {c: values[p] for c, p in active if _exactly_undone(c, pointwise) and values[p].any()}
 
 
 def _undone(data: CaptureData, undone: Mapping[Candidate, Array]) -> tuple[Array, Array]:

@@ -65,6 +65,7 @@ def add_block(block: Block, a: Array, c: Array, da: Array, dc: Array | None, mom
     d -= q @ (q.T @ d)
     flat = d.reshape(k, -1)
     out.gradient[f] += flat @ r.reshape(-1) - pull
+    out.stretch[f] += pull
     out.curvature[f] += flat @ flat.T
 
 

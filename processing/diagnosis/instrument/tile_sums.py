@@ -60,8 +60,9 @@ def add_tiles(
     np.add.at(out.count, tiles.fold, free @ moments.left[use] * tiles.pixels)
     if len(da):
         folds = [tiles.fold == f for f in range(len(out.excess))]
-        gradient, curvature = all_tiles.slopes(da, dc[:, used], folds)
+        gradient, stretch, curvature = all_tiles.slopes(da, dc[:, used], folds)
         out.gradient += gradient
+        out.stretch += stretch
         out.curvature += curvature
 
 
@@ -101,15 +102,21 @@ class _Tiled:
         """B (T, L, F L) of coefficients c (F, L)."""
         return np.asarray((c.T[:, :, None] * self._takes).reshape(*self.outside.shape[:2], -1))
 
-    def slopes(self, da: Array, dc: Array, folds: Sequence[NDArray[np.bool_]]) -> tuple[Array, Array]:
-        """Half gradient (folds, K) and curvature (folds, K, K) of the excess, from dr = -P dA A+ y + P dB z."""
+    def slopes(self, da: Array, dc: Array, folds: Sequence[NDArray[np.bool_]]) -> tuple[Array, Array, Array]:
+        """Half gradient (folds, K) of the excess and of its noise, and curvature (folds, K, K) of the excess.
+
+        From dr = -P dA A+ y + P dB z.
+        """
         da = self.outside @ da
         noise = self._mean @ self._b.transpose(0, 2, 1)
         slope = np.einsum("ktli,tli->kt", da, (noise - self.ry) @ self._back)
+        pull = -np.einsum("ktli,tli->kt", da, noise @ self._back)
         counted = {int(j): self._onto(dc[j]) for j in np.flatnonzero(np.any(dc, axis=(1, 2)))}
         for j, db in counted.items():
             slope[j] += np.sum(db * (self._rz - self._mean), axis=(1, 2))
+            pull[j] += np.sum(db * self._mean, axis=(1, 2))
         gradient = np.stack([slope[:, mine].sum(axis=1) for mine in folds])
+        stretch = np.stack([pull[:, mine].sum(axis=1) for mine in folds])
         ds = da @ (self._back.transpose(0, 2, 1) @ self._yy @ self._back)
         curvature = np.stack([_flat(ds[:, mine]) @ _flat(da[:, mine]).T for mine in folds])
         for j, db in counted.items():
@@ -120,7 +127,7 @@ class _Tiled:
                 curvature[f, :, j] -= across[:, mine].sum(axis=1)
                 for i, other in counted.items():
                     curvature[f, i, j] += np.sum(es[mine] * other[mine])
-        return gradient, curvature
+        return gradient, stretch, curvature
 
 
 def _flat(x: Array) -> Array:

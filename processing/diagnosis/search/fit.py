@@ -148,12 +148,18 @@ class HeldOut:
         return float(np.sqrt(self.square / self.count))
 
 
-def held_out(problem: Problem, space: Space, full: Fit) -> HeldOut:
+def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = None) -> HeldOut:
     """Predict every fold from a fit to the other folds.
 
     Values that belong to one state alone cannot come from other states: where states are held out they are fitted to
-    the state itself, and each takes away a degree of freedom (and counts one more, as fitted noise would gain).
+    the state itself, and each takes away a degree of freedom (and counts one more, as fitted noise would gain). Where
+    the data have a single part nothing is held out, and each fitted value takes a degree of freedom away.
+
+    `weak` (K,) is the curvature of the prior; default: `prior`.
     """
+    weak = prior(space) if weak is None else weak
+    if problem.folds == 1:
+        return _in_sample(space, full, weak)
     by_state = problem.holds_out_states
     local = np.zeros(space.size, dtype=bool)
     for candidate, part in zip(space.candidates, space.slices, strict=True):
@@ -164,7 +170,7 @@ def held_out(problem: Problem, space: Space, full: Fit) -> HeldOut:
         if problem.far_from_linear:
             values = minimize(problem, space, full.values, others, steps=6).values
         else:
-            values = _one_step(full, space, others)
+            values = _one_step(full, space, others, weak)
         if local.any():
             start = np.where(local, full.values, values)
             fit = minimize(problem, space, start, [fold], free=local, steps=3)
@@ -178,11 +184,19 @@ def held_out(problem: Problem, space: Space, full: Fit) -> HeldOut:
     return HeldOut(*(float(t) for t in total))
 
 
-def _one_step(full: Fit, space: Space, folds: Sequence[int]) -> Array:
+def _in_sample(space: Space, full: Fit, weak: Array) -> HeldOut:
+    h = full.sums.curvature.sum(axis=0)
+    fitted = float(np.trace(np.linalg.solve(h + np.diag(weak), h))) if space.size else 0.0
+    freedom = float(full.sums.freedom.sum())
+    share = max(1 - fitted / max(freedom, 1e-300), 0.2)
+    square, count = float(full.sums.square.sum()), float(full.sums.count.sum())
+    return HeldOut(float(full.sums.excess.sum()), max(share * freedom, 1e-300), square, max(share * count, 1e-300))
+
+
+def _one_step(full: Fit, space: Space, folds: Sequence[int], weak: Array) -> Array:
     """Minimum for some of the folds, one Gauss-Newton step from the minimum for all: they are close."""
     if not space.size:
         return full.values
-    weak = prior(space)
     g = full.sums.gradient[folds].sum(axis=0) + weak * full.values
     h = full.sums.curvature[folds].sum(axis=0) + np.diag(weak)
     lower, upper = space.joined("lower"), space.joined("upper")

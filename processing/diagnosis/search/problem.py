@@ -49,3 +49,7 @@ class Problem(Protocol):
     def adopt_noise(self, space: Space, values: Array) -> bool:
         """Take the noise from the light that these values tell, for all that follows; False if that is as before."""
         ...
+
+    def noise_information(self, space: Space, values: Array) -> Array:
+        """Part (K, K) of the curvature that is noise of image derivatives and tells nothing about the values."""
+        ...

@@ -26,7 +26,8 @@ class Error(_Part):
 class FoundEffect(_Part):
     """One effect with its values, the chi-square it explains on held-out data, and what else it could be.
 
-    `confident` is False for a correction that explains less than what is left over: its name may be wrong.
+    `probability` is that of this cause or one of those that it cannot be told from; `answer` says it in a word (sure,
+    likely, one of, unknown). `confident` is False where the name may be wrong.
     """
 
     kind: str
@@ -38,6 +39,8 @@ class FoundEffect(_Part):
     capture: str | None = None
     removal_chance: float
     confident: bool
+    probability: float | None = None
+    answer: str | None = None
 
 
 class Ranked(_Part):
@@ -65,6 +68,30 @@ class Unexplained(_Part):
     description: tuple[str, ...]
     tried: tuple[str, ...]
     empirical: Empirical | None
+
+
+class Check(_Part):
+    """One figure of the guard: it must not get worse by a correction."""
+
+    name: str
+    before: float
+    after: float
+    holds: bool
+
+
+class Correction(_Part):
+    """What would be written: means of the posterior, apart from names, and whether it may be used.
+
+    Attributes
+    ----------
+    effects : as an instrument file stores them, with their standard errors.
+    checks : figures before and after; one that gets worse refuses the correction.
+    refused : why nothing is written; None if the correction holds.
+    """
+
+    effects: tuple[AppliedEffect, ...]
+    checks: tuple[Check, ...] = ()
+    refused: str | None = None
 
 
 class CaptureReport(_Part):
@@ -101,20 +128,10 @@ class Diagnosis(_Part):
     instrument: str
     wavelength_nm: float
     simulated: bool
+    correction: Correction | None = None
 
     def applied(self) -> tuple[AppliedEffect, ...]:
-        """The effects as an instrument file stores them."""
-        names = tuple(c.name for c in self.captures)
-        return tuple(
-            AppliedEffect(
-                kind=e.kind,
-                element=e.element,
-                parameters=e.parameters,
-                evidence=e.evidence,
-                captures=names if e.capture is None else (e.capture,),
-                scope=e.scope,
-                wavelength_nm=self.wavelength_nm,
-                indistinguishable_from=e.indistinguishable_from,
-            )
-            for e in self.effects
-        )
+        """The effects as an instrument file stores them; none where the correction does not hold."""
+        if self.correction is None or self.correction.refused is not None:
+            return ()
+        return self.correction.effects

@@ -21,6 +21,7 @@ class Sums:
     excess : (F,) sum of squares in units of the noise, minus what noise is expected to give (`freedom`, (F,)).
     square : (F,) sum of squares relative to the mean signal; count : (F,) the degrees of freedom behind it.
     gradient, curvature : (F, K), (F, K, K), half of the derivatives of the excess.
+    stretch : (F, K) half of the derivatives of `freedom`: a bend of the response stretches noise and structure alike.
     """
 
     excess: Array
@@ -29,13 +30,14 @@ class Sums:
     count: Array
     gradient: Array
     curvature: Array
+    stretch: Array
 
     @classmethod
     def empty(cls, folds: int, parameters: int) -> Sums:
         """All zero."""
         f, k = folds, parameters
         zero = np.zeros(f)
-        return cls(zero, zero.copy(), zero.copy(), zero.copy(), np.zeros((f, k)), np.zeros((f, k, k)))
+        return cls(zero, zero.copy(), zero.copy(), zero.copy(), np.zeros((f, k)), np.zeros((f, k, k)), np.zeros((f, k)))
 
 
 @dataclass

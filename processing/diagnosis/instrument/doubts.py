@@ -1,0 +1,127 @@
+"""Why a name is doubted although the evidence for its pattern is large."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from processing.arrays import Array
+from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.unevenness import unevenness
+from processing.diagnosis.instrument.whole_bench import Solution
+from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.causes import Cause
+from processing.diagnosis.search.posterior import Posterior
+from processing.instrument.effects.base import FieldEffect, GeneralEffect, PointwiseEffect, SourceEffect, ValuePerState
+
+#: Share of the scatter of values that belong to one state each which a single wave may hold, if they are to be random.
+ONE_WAVE = 0.85
+#: Standard deviations, and share of what it explains, by which the size of an effect of the source may differ over the
+#: image.
+UNEVEN, UNEVEN_SHARE = 6.0, 0.01
+#: Share of the directions of the data that values for each state, with all others, may have.
+TESTABLE = 0.75
+#: With structure left something is there that is not in the list, and causes that are may be parts of it: one alone has
+#: to explain this many times what is left, the second strongest four times as much, the third nine times, ...
+TIMES = 50.0
+#: Log odds that a name needs where nothing but what is left tells the noise: part of it may be structure. What can
+#: describe any pattern (a bend of the response, a value for each state) has to explain `TIMES` what is left.
+UNKNOWN_NOISE = 25.0
+#: Part of the range of a parameter that is its bound.
+BOUND = 1e-3
+
+
+def doubts(
+    problem: InstrumentProblem, found: Posterior, solved: Solution, causes: Sequence[Cause], left: float
+) -> dict[Cause, str]:
+    """Reasons by cause; a cause without one may be called by its name. `left` is the chi-square of structure."""
+    out: dict[Cause, str] = {}
+    uneven = 0.0
+    for cause in causes:
+        first = cause.candidates[0]
+        if _at_bound(cause):
+            out[cause] = "a value stands at its bound: the data ask for something else"
+        elif isinstance(first.effect, ValuePerState) and not testable(problem, solved, cause, causes):
+            out[cause] = "as many values as the data have"
+        elif isinstance(first.effect, ValuePerState) and _waves(found, cause):
+            out[cause] = "its values follow one wave over the states, as a beat or a fringe does, not a random source"
+        elif isinstance(first.effect, SourceEffect) and any(
+            _uneven(problem, solved, c, cause) for c in cause.candidates
+        ):
+            out[cause] = "it differs from part to part of the image, which a source does not"
+            uneven = max(uneven, cause.log_odds)
+    for rank, cause in enumerate(causes, 1):
+        if problem.noise_known:
+            weak = 2 * cause.log_odds * found.samples.best.unit < TIMES * rank**2 * left
+        else:
+            general = isinstance(cause.candidates[0].effect, GeneralEffect | PointwiseEffect)
+            rest = found.sets.noise.directions if general else 0.0
+            weak = cause.log_odds < max(UNKNOWN_NOISE, TIMES * rest / 2)
+        if cause not in out and weak:
+            out[cause] = "it may be a part of what is left unexplained"
+        # What is uneven is another cause, and smaller effects beside it may be parts of it.
+        if cause not in out and cause.log_odds < uneven:
+            out[cause] = "it may be a part of what is uneven over the image"
+    return out
+
+
+def testable(problem: InstrumentProblem, solved: Solution, cause: Cause, causes: Sequence[Cause]) -> bool:
+    """Values for each state are fewer than the directions in which the data could show something else."""
+    values = sum(c.size for other in causes for c in other.candidates if isinstance(c.effect, ValuePerState))
+    values += sum(1 for other in causes if other is not cause)
+    directions = 0.0
+    for free, power in problem.powers():
+        seen = max(solved.before.excess, 0.0) * power / power.sum()
+        directions += free * max(1.0, float(np.sum(seen / (1 + seen)))) if problem.noise_known else free
+    return bool(values < TESTABLE * directions)
+
+
+def _at_bound(cause: Cause) -> bool:
+    for candidate, values in zip(cause.candidates, cause.values, strict=True):
+        width = candidate.upper - candidate.lower
+        if np.any(np.minimum(values - candidate.lower, candidate.upper - values) < BOUND * width):
+            return True
+    return False
+
+
+def _waves(found: Posterior, cause: Cause) -> bool:
+    typical = found.space.joined("typical")
+    part = dict(zip(found.space.candidates, found.space.slices, strict=True))
+    shares = []
+    for candidate, values in zip(cause.candidates, cause.values, strict=True):
+        p = part[candidate]
+        curvature = found.sets.form.curvature[p, p] / np.outer(typical[p], typical[p]) / found.samples.best.unit
+        shares.append(_one_wave(values, curvature))
+    return max(shares) > ONE_WAVE
+
+
+def _one_wave(values: Array, information: Array) -> float:
+    """Largest share of what values (N,) explain that one sine over the states would explain as well.
+
+    `information` (N, N) is the curvature of the chi-square: patterns that the unknown sample takes up do not count.
+    """
+    n = values.size
+    k = np.arange(n)
+    power, vector = np.linalg.eigh(information)
+    root = (vector * np.sqrt(np.maximum(power, 0.0))).T
+    seen = root @ values
+    total = float(seen @ seen)
+    # N values fitted to noise alone explain N.
+    if total <= 2 * n:
+        return 0.0
+    best = 0.0
+    for rate in np.linspace(0.5 / n, 0.5, 8 * n):
+        wave = np.stack([np.cos(2 * np.pi * rate * k), np.sin(2 * np.pi * rate * k)], axis=1)
+        u, size, _ = np.linalg.svd(root @ wave, full_matrices=False)
+        along = u[:, size > 1e-6 * size[0]].T @ seen
+        best = max(best, float(along @ along))
+    return best / (total - n)
+
+
+def _uneven(problem: InstrumentProblem, solved: Solution, candidate: Candidate, cause: Cause) -> bool:
+    """A source that changes does so by the same share in the whole image; what differs from part to part is none."""
+    if candidate not in solved.space.candidates or any(isinstance(c.effect, FieldEffect) for c in solved.effects):
+        return False
+    excess, terms = unevenness(problem, candidate, solved.space, solved.fit.values)
+    return bool(excess > max(UNEVEN * np.sqrt(2 * terms), UNEVEN_SHARE * 2 * cause.log_odds))

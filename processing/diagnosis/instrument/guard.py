@@ -1,0 +1,72 @@
+"""Nothing is written that makes a measurement worse: figures before and after a correction."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.whole_bench import Solution
+from processing.diagnosis.search.fit import Fit
+from processing.diagnosis.search.result import Check
+from processing.diagnosis.search.space import Space
+
+#: Growth of the residual that is still put down to chance.
+WORSE = 1.002
+#: Growth of the condition number of W that a correction may cause: beyond it the states would be other ones.
+WORSE_CONDITION = 1.5
+#: Singular values below this, relative to the largest, are none.
+RANK = 1e-6
+
+
+def checks(problem: InstrumentProblem, solved: Solution) -> tuple[Check, ...]:
+    """Held-out residual, rank and condition of W, before and after."""
+    stretch = _stretch(problem, solved)
+    before, after = 100 * solved.before.rms, 100 * solved.after.rms / stretch
+    out = [
+        Check(
+            name="rms on held-out data, percent of the mean signal",
+            before=before,
+            after=after,
+            holds=bool(after <= WORSE * before),
+        )
+    ]
+    for k, data in enumerate(problem.captures):
+        (rank, condition), (new_rank, new_condition) = (
+            _of_rows(problem, k, space, fit)
+            for space, fit in ((solved.base, solved.before_fit), (solved.space, solved.fit))
+        )
+        where = f"of the measurement matrix of {data.name}"
+        out.append(Check(name=f"rank {where}", before=rank, after=new_rank, holds=new_rank >= rank))
+        out.append(
+            Check(
+                name=f"condition {where}",
+                before=condition,
+                after=new_condition,
+                holds=bool(new_condition <= WORSE_CONDITION * condition),
+            )
+        )
+    return tuple(out)
+
+
+def refusal(found: tuple[Check, ...]) -> str | None:
+    """Why a correction is not written, in words; None if every figure holds."""
+    worse = [f"{c.name}: {c.before:.4g} to {c.after:.4g}" for c in found if not c.holds]
+    return "it would make worse: " + "; ".join(worse) if worse else None
+
+
+def _stretch(problem: InstrumentProblem, solved: Solution) -> float:
+    """By how much a bend of the response stretches noise, and residual, relative to the signal."""
+    if not problem.noise_known:
+        return 1.0
+    before = problem.near(solved.base, solved.before_fit.values)[0]
+    after = problem.near(solved.space, solved.fit.values)[0]
+    old, new = (float(np.mean([m.noise_floor**2 for m in p.moments])) for p in (before, after))
+    return float(np.sqrt(new / old)) if old > 0 else 1.0
+
+
+def _of_rows(problem: InstrumentProblem, k: int, space: Space, fit: Fit) -> tuple[int, float]:
+    changes = problem.changes(k, space, fit.values)
+    w = problem.model.rows(problem.captures[k].conditions.angles_deg, changes).reshape(-1, 16)
+    size = np.linalg.svd(w, compute_uv=False)
+    size = size[size > RANK * size[0]]
+    return size.size, float(size[0] / size[-1])

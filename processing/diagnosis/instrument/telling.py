@@ -1,0 +1,238 @@
+"""What an answer consists of: causes, correction, captures, what cannot be seen, as they are stored."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from processing.arrays import Array
+from processing.diagnosis.instrument.closure import closure
+from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.structure import Residual
+from processing.diagnosis.instrument.whole_bench import Solution
+from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.causes import Cause
+from processing.diagnosis.search.fit import HeldOut
+from processing.diagnosis.search.posterior import Posterior
+from processing.diagnosis.search.result import CaptureReport, Check, Correction, Error, FoundEffect, Ranked
+from processing.diagnosis.search.rules import DECISIVE, NOMINAL_TAU
+from processing.diagnosis.search.space import Space
+from processing.instrument.effects.base import (
+    CountsEffect,
+    FieldEffect,
+    ImageShift,
+    OfOneCapture,
+    Switch,
+    ValuePerState,
+)
+from processing.instrument.model import AppliedEffect, EffectParameter
+
+#: An information about a parameter below this, in chi-square for its typical size, is none.
+SEEN = 4.0
+#: Relative error of the noise: information that is less than this share of it may be noise.
+NOISE_ERROR = 0.05
+
+
+def error(problem: InstrumentProblem, out: HeldOut) -> Error:
+    held = "; ".join(dict.fromkeys(m.held_out for m in problem.moments))
+    return Error(rms_percent=100 * out.rms, chi2_reduced=out.chi2_reduced, held_out=held)
+
+
+def floor(problem: InstrumentProblem) -> float | None:
+    """Rms noise over the mean signal, percent; of the corrected counts, since a bend stretches both."""
+    if not problem.noise_known:
+        return None
+    return 100 * float(np.sqrt(np.mean([m.noise_floor**2 for m in problem.moments])))
+
+
+def _parameters(candidate: Candidate, values: Array, stderr: Array) -> dict[str, EffectParameter]:
+    if isinstance(candidate.effect, Switch):
+        return {"left_out": EffectParameter(value=1.0, unit="1", note="pixels with a clipped state are left out")}
+    if isinstance(candidate.effect, ValuePerState):
+        unit = candidate.parameters[0].unit
+        return {"states": EffectParameter(value=tuple(values.tolist()), stderr=tuple(stderr.tolist()), unit=unit)}
+    return {
+        p.name: EffectParameter(value=float(v), stderr=float(s), unit=p.unit)
+        for p, v, s in zip(candidate.parameters, values, stderr, strict=True)
+    }
+
+
+def told_effects(problem: InstrumentProblem, cause: Cause, confident: bool) -> list[FoundEffect]:
+    """A cause as it is told; one for each capture in which it shows."""
+    told = []
+    strength = [
+        float(np.max(np.abs(v) / np.sqrt(np.diag(s)), initial=0.0))
+        for v, s in zip(cause.values, cause.covariance, strict=True)
+    ]
+    for candidate, values, covariance, size in zip(
+        cause.candidates, cause.values, cause.covariance, strength, strict=True
+    ):
+        if len(strength) > 1 and size < 3 and size < max(strength):
+            continue
+        told.append(
+            FoundEffect(
+                kind=candidate.kind,
+                element=candidate.place or None,
+                parameters=_parameters(candidate, values, np.sqrt(np.diag(covariance))),
+                evidence=2 * cause.log_odds,
+                indistinguishable_from=tuple(dict.fromkeys(c.short for c in cause.alternatives)),
+                scope=_scope(candidate),
+                capture=None if candidate.capture is None else problem.captures[candidate.capture].name,
+                removal_chance=1 - cause.probability,
+                confident=confident,
+                probability=cause.probability,
+                answer=cause.answer,
+            )
+        )
+    return told
+
+
+def told_switches(problem: InstrumentProblem, solved: Solution) -> list[FoundEffect]:
+    """Pixels that are left out because what they say is another thing than the others say."""
+    told = []
+    for candidate, part in zip(solved.space.candidates, solved.space.slices, strict=True):
+        if not isinstance(candidate.effect, Switch):
+            continue
+        values = solved.fit.values.copy()
+        values[part] = 0.0
+        with_all = problem.sums(solved.space, values, derivatives=False).excess.sum()
+        gain = float(with_all - solved.fit.excess)
+        if gain > DECISIVE:
+            told.append(
+                FoundEffect(
+                    kind=candidate.kind,
+                    element=candidate.place or None,
+                    parameters=_parameters(candidate, values[part], values[part]),
+                    evidence=gain,
+                    indistinguishable_from=(),
+                    scope=_scope(candidate),
+                    capture=None if candidate.capture is None else problem.captures[candidate.capture].name,
+                    removal_chance=0.0,
+                    confident=True,
+                    probability=1.0,
+                    answer="sure",
+                )
+            )
+    return told
+
+
+def correction(
+    problem: InstrumentProblem,
+    found: Posterior,
+    solved: Solution,
+    any_cause: bool,
+    guard: tuple[Check, ...],
+    refused: str | None,
+) -> Correction:
+    """What an instrument file would hold: means, with the spread over the sets."""
+    names = tuple(c.name for c in problem.captures)
+    part = dict(zip(found.space.candidates, found.space.slices, strict=True))
+    spread = np.sqrt(np.maximum(np.diag(found.covariance), 0.0))
+    chance = {found.space.candidates[m]: p for g, p in enumerate(found.samples.probability) for m in found.members[g]}
+    effects = []
+    for candidate, where in zip(solved.space.candidates, solved.space.slices, strict=True):
+        if candidate in solved.base.candidates or not any_cause:
+            continue
+        effects.append(
+            AppliedEffect(
+                kind=candidate.kind,
+                element=candidate.place or None,
+                parameters=_parameters(candidate, solved.fit.values[where], spread[part[candidate]]),
+                probability=float(chance[candidate]),
+                captures=names if candidate.capture is None else (names[candidate.capture],),
+                scope=_scope(candidate),
+                wavelength_nm=problem.captures[0].wavelength_nm,
+            )
+        )
+    return Correction(effects=tuple(effects), checks=guard, refused=refused)
+
+
+def _scope(candidate: Candidate) -> Literal["instrument", "capture"]:
+    return "capture" if isinstance(candidate.effect, OfOneCapture) else "instrument"
+
+
+def calibrated(problem: InstrumentProblem, found: Posterior, solved: Solution) -> dict[str, EffectParameter]:
+    out = {}
+    part = dict(zip(found.space.candidates, found.space.slices, strict=True))
+    for candidate, where in zip(solved.base.candidates, solved.base.slices, strict=True):
+        element, _, field = candidate.place.rpartition(".")
+        start = float(next(getattr(e, field) for e in problem.model.elements() if e.name == element))
+        index = part[candidate].start
+        out[candidate.place] = EffectParameter(
+            value=start + float(solved.fit.values[where.start]),
+            stderr=float(np.sqrt(found.covariance[index, index])),
+            unit=candidate.parameters[0].unit,
+        )
+    return out
+
+
+def ranking(found: Posterior, before: HeldOut) -> tuple[Ranked, ...]:
+    """Groups by what each would explain alone."""
+    form, groups = found.sets.form, found.sets.groups
+    total = max(before.excess + before.freedom, 1e-300)
+    alone = []
+    for k in np.flatnonzero(found.sets.free):
+        g, h = form.gradient[groups[k].index], form.curvature[np.ix_(groups[k].index, groups[k].index)]
+        alone.append((float(g @ np.linalg.solve(h + np.eye(g.size), g)), int(k)))
+    return tuple(
+        Ranked(
+            candidate=found.label(k).label,
+            evidence=round(gain, 1),
+            rms_percent=100 * before.rms * float(np.sqrt(max(1 - gain / total, 0.0))),
+        )
+        for gain, k in sorted(alone, reverse=True)[:10]
+    )
+
+
+def unobservable(problem: InstrumentProblem, found: Posterior) -> list[Candidate]:
+    """Candidates about which the captures say nothing, the nominal values being free."""
+    h = found.sets.form.curvature
+    always = np.concatenate([np.zeros(0, dtype=np.int64)] + [g.index for g in found.sets.groups if g.fixed_tau])
+    told = np.diag(h).copy()
+    if always.size:
+        prior = np.eye(always.size) / NOMINAL_TAU**2
+        told -= np.einsum("ij,ij->j", h[always], np.linalg.solve(h[np.ix_(always, always)] + prior, h[always]))
+    out = []
+    for candidate, part in zip(found.space.candidates, found.space.slices, strict=True):
+        if (
+            candidate.state_chosen
+            or isinstance(candidate.effect, Switch)
+            or set(range(part.start, part.stop)) & set(always)
+        ):
+            continue
+        least = np.full(candidate.size, SEEN)
+        if isinstance(candidate.effect, ImageShift):
+            # Noise alone has slopes too, from one pixel to the next, which a shift would change.
+            one = Space((candidate,))
+            noise = np.diag(problem.noise_information(one, np.zeros(one.size))) * candidate.typical**2
+            least = np.maximum(least, NOISE_ERROR * noise)
+        if np.all(told[part] < least):
+            out.append(candidate)
+    return out
+
+
+def missing(unseen: list[Candidate]) -> list[Candidate]:
+    """Of what is unobservable, what another sample could show."""
+    return [c for c in unseen if not isinstance(c.effect, CountsEffect | FieldEffect)]
+
+
+def capture_report(
+    problem: InstrumentProblem, k: int, solved: Solution, before: Residual, after: Residual
+) -> CaptureReport:
+    data = problem.captures[k]
+    sample = "unknown" if data.sample is None else "known up to a throughput for each pixel"
+    return CaptureReport(
+        name=data.name,
+        sample=sample,
+        simulated=data.simulated,
+        noise=data.noise_source,
+        binned=data.binned,
+        clipped_fraction=float(np.mean(data.clipped)),
+        dark_fraction=data.dark_fraction,
+        cut_off=data.cut_off,
+        tests_before=before.tests,
+        tests_after=after.tests,
+        closure_before_percent=closure(problem, k, solved.base, solved.before_fit.values),
+        closure_after_percent=closure(problem, k, solved.space, solved.fit.values),
+    )

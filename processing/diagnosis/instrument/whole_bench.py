@@ -1,0 +1,219 @@
+"""The posterior of all effects of an instrument at once, and the solution that a correction is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from processing.arrays import Array
+from processing.diagnosis.instrument.moments import MARGIN
+from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.fit import Fit, HeldOut, held_out, minimize, prior, score
+from processing.diagnosis.search.posterior import Posterior, Say, posterior
+from processing.diagnosis.search.rules import DECISIVE, TAKES_PART
+from processing.diagnosis.search.space import Space
+from processing.instrument.effects.base import FieldEffect, ImageShift, SourceEffect, Switch, ValuePerState
+
+#: Relative rms residual above which nominal values, and what else has far starts, are searched for from many starts.
+FAR_OFF = 0.05
+STARTS = 24
+#: Groups of single values that may take part where every tile of the image has a matrix of its own.
+BESIDE_FIELD = 90
+
+
+@dataclass
+class Solution:
+    """Before and after, on data that the fit did not see.
+
+    Attributes
+    ----------
+    base : what is always fitted; space : that, and the effects of the correction (the mean of the posterior).
+    before_fit, fit : at these; before, after : predictions of what was held out.
+    weak : (K,) curvature of the prior of the values of `space`.
+    """
+
+    base: Space
+    before_fit: Fit
+    before: HeldOut
+    space: Space
+    fit: Fit
+    after: HeldOut
+    weak: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def effects(self) -> tuple[Candidate, ...]:
+        """Effects of the correction."""
+        return self.space.candidates[len(self.base.candidates) :]
+
+
+def predicts(problem: InstrumentProblem) -> InstrumentProblem:
+    """The problem that is asked for held-out data: all of it where the parts have nothing left over."""
+    sums = problem.sums(Space(()), np.zeros(0), derivatives=False)
+    return problem if sums.freedom.min() > 0.5 and sums.count.min() > 0.5 else problem.undivided()
+
+
+class WholeBench:
+    """All effects of one problem.
+
+    Attributes
+    ----------
+    whole : the problem with one set of unknowns for all states; `posterior` is found on it.
+    """
+
+    def __init__(self, problem: InstrumentProblem, say: Say) -> None:
+        self.problem, self.say = problem, say
+        self.whole = problem.undivided() if problem.holds_out_states else problem
+        self.base = Space(problem.nominal())
+        self.pool = problem.pool()
+        self._start = self._first()
+
+    def run(self) -> Posterior:
+        """The posterior; again with the noise that its light tells, and with what varies over the image."""
+        plain = [c for c in self.pool if self._offered(c)]
+        fixed = [*self.base.candidates, *self._clipped()]
+        found = self._posterior([*fixed, *plain], fixed)
+        fields = [c for c in self.pool if isinstance(c.effect, FieldEffect)]
+        if fields and not self.whole.holds_out_states:
+            found = self._with_fields(found, fixed, fields)
+        solved = applied(found, self.base)
+        if self.whole.noise_known and self.whole.adopt_noise(*solved):
+            self.say("the same with the noise that this light has")
+            if self.whole is not self.problem:
+                self.problem.adopt_noise(*solved)
+            found = self._posterior(list(found.space.candidates), fixed, found)
+        return found
+
+    def _offered(self, candidate: Candidate) -> bool:
+        effect = candidate.effect
+        if isinstance(effect, FieldEffect | Switch):
+            return False
+        captures = self.whole.captures
+        mine = captures if candidate.capture is None else [captures[candidate.capture]]
+        if isinstance(effect, ImageShift):
+            return all(min(c.signal.shape[2:]) > 2 * MARGIN + 2 for c in mine)
+        if isinstance(effect, ValuePerState) and not self.whole.noise_known:
+            # A value for each intensity would be noise by another name.
+            return len(self.whole.model.channels) > 1
+        return True
+
+    def _posterior(
+        self, candidates: Sequence[Candidate], fixed: Sequence[Candidate], old: Posterior | None = None
+    ) -> Posterior:
+        space = Space(tuple(candidates))
+        start = dict(self._start)
+        if old is not None:
+            start |= {c: old.values[p] for c, p in zip(old.space.candidates, old.space.slices, strict=True)}
+        x = np.concatenate([np.zeros(0), *(start.get(c, np.zeros(c.size)) for c in space.candidates)])
+        return posterior(self.whole, space, fixed, x, self.say)
+
+    def _first(self) -> dict[Candidate, Array]:
+        """Values to begin with: zero, or the best of many starts where that is far off."""
+        space = self.base
+        fit = minimize(self.whole, space, np.zeros(space.size))
+        if _rms(fit) < FAR_OFF:
+            return _by_candidate(space, fit.values)
+        self.say("far off: searching from many starts")
+        if not space.size:
+            return self._far(fit)
+        # Nominal values are not found beside a source or channels that are as far off.
+        free = [
+            c
+            for c in self.pool
+            if c.kind == "channel_gain" or (isinstance(c.effect, SourceEffect) and isinstance(c.effect, ValuePerState))
+        ]
+        wide = Space((*space.candidates, *free))
+        random, best = np.random.default_rng(0), fit.excess
+        values = np.concatenate([fit.values, np.zeros(wide.size - space.size)])
+        width = np.concatenate(
+            [np.full(c.size, 45.0 if "azimuth" in c.place else 10.0) for c in space.candidates]
+            + [np.zeros(c.size) for c in free]
+        )
+        for k in range(STARTS + 1):
+            tried = minimize(self.whole, wide, random.uniform(-2, 2, wide.size) * width if k else values, expansions=0)
+            if tried.excess < best:
+                values, best = tried.values, tried.excess
+        return _by_candidate(wide, values)
+
+    def _far(self, fit: Fit) -> dict[Candidate, Array]:
+        best, out = 0.5 * fit.excess, {}
+        for candidate in self.pool:
+            for start in candidate.starts:
+                tried = minimize(self.whole, Space((candidate,)), start)
+                if tried.excess < best:
+                    best, out = tried.excess, {candidate: tried.values}
+        return out
+
+    def _clipped(self) -> list[Candidate]:
+        """The switch that leaves clipped pixels out, if they say something else than the others."""
+        for candidate in self.pool:
+            if isinstance(candidate.effect, Switch) and any(c.clipped.any() for c in self.whole.captures):
+                self._start[candidate] = np.ones(1)
+                return [candidate]
+        return []
+
+    def _with_fields(self, found: Posterior, fixed: Sequence[Candidate], fields: Sequence[Candidate]) -> Posterior:
+        """The posterior with values that vary over the image, if they promise something beside all others."""
+        space, values = applied(found, self.base)
+        unit = found.samples.best.unit
+        gains = {}
+        for candidate in fields:
+            both = Space((*space.candidates, candidate))
+            sums = self.whole.sums(both, np.append(values, np.zeros(candidate.size)))
+            gains[candidate] = score(sums, space.size, both.slices[-1], prior(both))[0] / unit
+        best = max(gains, key=lambda c: gains[c])
+        if gains[best] < DECISIVE:
+            return found
+        odds = found.sets.conditional(found.samples.best).log_odds
+        kept: list[Candidate] = [*fixed]
+        size = 0
+        for k in np.argsort(-odds):
+            mine = [found.space.candidates[m] for m in found.members[k]]
+            if mine[0] in fixed or size + sum(c.size for c in mine) > BESIDE_FIELD:
+                continue
+            kept += mine
+            size += sum(c.size for c in mine)
+        self.say(f"with {', '.join(c.label for c in fields)}")
+        return self._posterior([*kept, *fields], fixed)
+
+
+def applied(found: Posterior, base: Space) -> tuple[Space, Array]:
+    """Space and values of the correction: the mean of the posterior, of what is likely enough to take part."""
+    keep = set(base.candidates)
+    for g, probability in enumerate(found.samples.probability):
+        if probability > TAKES_PART:
+            keep |= {found.space.candidates[m] for m in found.members[g]}
+    order = [*base.candidates, *(c for c in found.space.candidates if c in keep and c not in base.candidates)]
+    part = dict(zip(found.space.candidates, found.space.slices, strict=True))
+    values = [found.values[part[c]] for c in order]
+    return Space(tuple(order)), np.concatenate([np.zeros(0), *values])
+
+
+def solution(bench: WholeBench, found: Posterior) -> Solution:
+    """The correction of a posterior, and how well it predicts what it did not see."""
+    asked = predicts(bench.problem)
+    base_fit = minimize(asked, bench.base, _values_of(bench, bench.base))
+    before = held_out(asked, bench.base, base_fit)
+    space, values = applied(found, bench.base)
+    asked.relinearize(space, values)
+    sums = asked.sums(space, values)
+    fit = Fit(values, sums, float(sums.excess.sum()))
+    typical = space.joined("typical")
+    part = dict(zip(found.space.candidates, found.space.slices, strict=True))
+    spread = np.concatenate([np.zeros(0), *(np.diag(found.covariance)[part[c]] for c in space.candidates)])
+    weak = found.samples.best.unit / np.maximum(np.sqrt(spread + values**2), 1e-3 * typical) ** 2
+    return Solution(bench.base, base_fit, before, space, fit, held_out(asked, space, fit, weak), weak)
+
+
+def _values_of(bench: WholeBench, space: Space) -> Array:
+    return np.concatenate([np.zeros(0), *(bench._start.get(c, np.zeros(c.size)) for c in space.candidates)])
+
+
+def _by_candidate(space: Space, values: Array) -> dict[Candidate, Array]:
+    return {c: values[p] for c, p in zip(space.candidates, space.slices, strict=True)}
+
+
+def _rms(fit: Fit) -> float:
+    return float(np.sqrt(fit.sums.square.sum() / max(fit.sums.count.sum(), 1.0)))

@@ -1,0 +1,89 @@
+"""Names: which group is a cause, how probable, and what could stand in its place.
+
+A correction is what improves predictions, a name is a cause. Groups whose signatures, seen through everything else,
+point the same way are one class: that one of them is there can be certain while which one is not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from processing.arrays import Array
+from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.posterior import Posterior
+from processing.diagnosis.search.rules import ALIKE, ALTERNATIVE, LIKELY, SURE
+
+Answer = Literal["sure", "likely", "one of", "unknown"]
+
+
+@dataclass(frozen=True, eq=False)
+class Cause:
+    """A group that is probably there.
+
+    Attributes
+    ----------
+    candidates : the group's, one for each capture where it differs from capture to capture.
+    values, covariance : of each candidate, if this one of the class is there.
+    probability : that one of the class is there; `alternatives` stand for the others.
+    log_odds : of being there, given everything else.
+    """
+
+    candidates: tuple[Candidate, ...]
+    values: tuple[Array, ...]
+    covariance: tuple[Array, ...]
+    probability: float
+    log_odds: float
+    alternatives: tuple[Candidate, ...]
+
+    @property
+    def answer(self) -> Answer:
+        """How it is told."""
+        if self.probability < LIKELY:
+            return "unknown"
+        if self.alternatives:
+            return "one of"
+        return "sure" if self.probability >= SURE else "likely"
+
+
+def causes(found: Posterior, left: float) -> tuple[Cause, ...]:
+    """Causes of the most likely set, the most certain first.
+
+    `left` is the chi-square of what no cause explains: less than that does not tell two of them apart.
+    """
+    sets, samples = found.sets, found.samples
+    state = samples.best
+    fit = sets.fitted(state)
+    typical = found.space.joined("typical")
+    out = []
+    for k in map(int, np.flatnonzero((state.tau > 0) & sets.free)):
+        odds = sets.conditional(sets.without(state, k)).log_odds
+        least = odds[k] - max(ALTERNATIVE, ALIKE * odds[k], 0.5 * left / state.unit)
+        others = [
+            int(j)
+            for j in np.argsort(-odds)
+            if sets.free[j] and state.tau[j] == 0 and odds[j] > max(least, 0.0) and not _same_family(found, int(j), k)
+        ]
+        candidates = tuple(found.space.candidates[m] for m in found.members[k])
+        values, errors = [], []
+        for m in found.members[k]:
+            part = found.space.slices[m]
+            at = np.flatnonzero((fit.active >= part.start) & (fit.active < part.stop))
+            values.append(fit.mean[at] * typical[part])
+            errors.append(fit.covariance[np.ix_(at, at)] * np.outer(typical[part], typical[part]))
+        members = [k, *others, *_alternatives_of_family(found, k)]
+        names = tuple(found.space.candidates[found.members[j][0]] for j in others)
+        probability = samples.any_of(members)
+        out.append(Cause(candidates, tuple(values), tuple(errors), probability, float(odds[k]), names))
+    return tuple(sorted(out, key=lambda c: -c.log_odds))
+
+
+def _same_family(found: Posterior, j: int, k: int) -> bool:
+    """Both are the same effect from one state on, or another."""
+    return found.label(j).family == found.label(k).family
+
+
+def _alternatives_of_family(found: Posterior, k: int) -> list[int]:
+    return [j for j in range(len(found.members)) if j != k and _same_family(found, j, k)]

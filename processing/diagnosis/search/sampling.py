@@ -1,0 +1,96 @@
+"""Visit sets of groups and average over them, each weighted by its probability.
+
+Weighted tempered Gibbs sampling (Zanella and Roberts, J. R. Stat. Soc. B 81, 489, 2019): a group whose present state is
+unlikely given the others is the more likely to be asked next, so that of two groups that explain the same now one is
+there and now the other. The chain only finds the sets: what they weigh is known, so each counts once, by its evidence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.arrays import Array
+from processing.diagnosis.search.rules import TAU
+from processing.diagnosis.search.sets import Conditional, Sets, State
+
+#: Weight of a set below which it changes no mean.
+LEAST_WEIGHT = 1e-6
+#: How often a group is asked at least, relative to one that is there half of the time.
+LEAST_INTEREST = 0.04
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Weighted average over the sets that were visited.
+
+    Attributes
+    ----------
+    probability : (G,) of each group to be there; mean (K,), covariance (K, K) of the parameters in typical sizes.
+    sets : (S, G) which groups were there; weight : (S,), sum 1.
+    best : the most likely set.
+    """
+
+    probability: Array
+    mean: Array
+    covariance: Array
+    sets: NDArray[np.bool_]
+    weight: Array
+    best: State
+
+    def any_of(self, members: Sequence[int]) -> float:
+        """Probability that at least one of some groups is there."""
+        return float(self.weight @ self.sets[:, list(members)].any(axis=1))
+
+
+class _Average:
+    """Every set that was visited counts once, by how likely it is."""
+
+    def __init__(self, sets: Sets) -> None:
+        self._sets = sets
+        self._seen: dict[bytes, tuple[float, Conditional, State, Array]] = {}
+
+    def add(self, c: Conditional, state: State, chance: Array) -> None:
+        key = (state.tau > 0).tobytes()
+        if key not in self._seen or c.score > self._seen[key][0]:
+            self._seen[key] = (c.score, c, state.copy(), chance)
+
+    def samples(self) -> Samples:
+        seen = sorted(self._seen.values(), key=lambda v: -v[0])
+        weight = np.exp(np.array([v[0] for v in seen]) - seen[0][0])
+        weight /= weight.sum()
+        probability = np.zeros(len(self._sets.groups))
+        size = self._sets.size
+        mean, second = np.zeros(size), np.zeros((size, size))
+        for w, (_, c, _, chance) in zip(weight, seen, strict=True):
+            if w < LEAST_WEIGHT:
+                break
+            probability += w * chance
+            mean[c.active] += w * c.mean
+            second[np.ix_(c.active, c.active)] += w * (c.covariance + np.outer(c.mean, c.mean))
+        there = np.array([v[2].tau > 0 for v in seen])
+        return Samples(probability, mean, second - np.outer(mean, mean), there, weight, seen[0][2])
+
+
+def sample(sets: Sets, state: State, visits: int, seed: int = 0) -> Samples:
+    """Average over sets, from a likely one on; the unit of chi-square stays that of the first."""
+    random = np.random.default_rng(seed)
+    state, average = state.copy(), _Average(sets)
+    interest = np.full(len(sets.groups), LEAST_INTEREST / 2)
+    for _ in range(visits):
+        c = sets.conditional(state)
+        present = state.tau > 0
+        chance = np.where(sets.free, 1 / (1 + np.exp(-np.clip(c.log_odds, -50, 50))), 1.0)
+        average.add(c, state, chance)
+        now = np.where(present, chance, 1 - chance)
+        rate = np.where(sets.free, interest / np.maximum(now, 1e-12), 0.0)
+        if not rate.any():
+            break
+        interest = np.maximum(interest, np.minimum(chance, 0.5) * sets.free)
+        k = int(random.choice(rate.size, p=rate / rate.sum()))
+        there = random.random() < 0.5
+        state.tau[k] = TAU[int(random.choice(TAU.size, p=c.tau_weights[k]))] if there else 0.0
+    return average.samples()

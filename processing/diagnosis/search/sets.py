@@ -1,0 +1,217 @@
+"""Which groups of parameters are there: evidence for sets of groups in one linearized problem.
+
+The chi-square is a quadratic form in the parameters x (in units of their typical sizes). A group of parameters is
+either absent (zero) or normal about zero with one variance tau^2, tau on a grid ("spike and slab", Mitchell and
+Beauchamp, J. Am. Stat. Assoc. 83, 1023, 1988): values of one group share it, so forty values of a source that hardly
+flickers come out as small as they are. The evidence of a set is then known in closed form (Tipping and Faul, AISTATS
+2003, for one parameter).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.special import betaln
+
+from processing.arrays import Array
+from processing.diagnosis.search.rules import FEW_CAUSES, TAU, TAU_WEIGHT
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """Chi-square about zero: excess + 2 gradient . x + x . curvature . x, of x (K,) in typical sizes."""
+
+    excess: float
+    gradient: Array
+    curvature: Array
+
+
+@dataclass(frozen=True)
+class Group:
+    """Parameters that are there together and have one variance.
+
+    Attributes
+    ----------
+    index : positions in x.
+    share : it is one of so many alternatives of which one may be there (states at which an axis slips).
+    fixed_tau : it is always there, with this standard deviation; None: it may be absent.
+    """
+
+    index: NDArray[np.int64]
+    share: float = 1.0
+    fixed_tau: float | None = None
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What the unit of chi-square is: noise, and structure that no set explains.
+
+    Structure that is left is the same in all pixels: a noise of a few directions. It widens every error, so that a
+    million pixels do not shout it down.
+
+    Attributes
+    ----------
+    known : the noise is known, so the unit is at least one; else all that is left is noise.
+    directions : independent directions over which structure spreads; of unknown noise, the degrees of freedom.
+    slack : excess up to which nothing but noise is left.
+    floor : least unit.
+    """
+
+    known: bool
+    directions: float
+    slack: float = 0.0
+    floor: float = 1.0
+
+    def unit(self, left: float) -> float:
+        """Most likely unit where the excess `left` is left, what the prior takes included."""
+        if self.known:
+            return max(1.0 + max(left - self.slack, 0.0) / self.directions, self.floor)
+        return max(left / self.directions, self.floor)
+
+    def log_likelihood(self, left: float) -> float:
+        """Log of the likelihood with the most likely unit."""
+        unit, spread, within = self.unit(left), left, 0.0
+        if self.known:
+            # Within the noise differences count in full.
+            spread, within = self.directions + max(left - self.slack, 0.0), min(left - self.slack, 0.0)
+        return -0.5 * (self.directions * float(np.log(unit)) + spread / unit + within)
+
+
+@dataclass
+class State:
+    """One set: tau of each group (0: absent), and the unit of chi-square."""
+
+    tau: Array
+    unit: float = 1.0
+
+    def copy(self) -> State:
+        """The same, to be changed."""
+        return State(self.tau.copy(), self.unit)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Posterior of the parameters of one set: which `active` (A,), mean (A,), covariance (A, A), and how likely.
+
+    `left` is the excess that is left (what the prior takes included), `score` the log probability of the set.
+    """
+
+    active: NDArray[np.int64]
+    mean: Array
+    covariance: Array
+    left: float
+    score: float
+
+
+@dataclass(frozen=True)
+class Conditional(Fitted):
+    """The same, with what it says of every group given the others: log odds (G,), and weights (G, T) of each tau."""
+
+    log_odds: Array
+    tau_weights: Array
+
+
+class Sets:
+    """Sets of groups in one quadratic problem."""
+
+    def __init__(self, form: Quadratic, groups: Sequence[Group], noise: Noise) -> None:
+        self.form, self.groups, self.noise = form, tuple(groups), noise
+        self.free = np.array([g.fixed_tau is None for g in groups])
+        self.share = np.array([g.share for g in groups])
+        self.size = form.gradient.size
+        # The alternatives of one group count once.
+        self.count = float(np.sum(1 / self.share[self.free]))
+        sizes = np.array([g.index.size for g in groups])
+        self._alike = [np.flatnonzero((sizes == n) & self.free) for n in np.unique(sizes)]
+
+    def empty(self) -> State:
+        """The set of what is always there."""
+        return self.settled(State(np.array([g.fixed_tau or 0.0 for g in self.groups])))
+
+    def settled(self, state: State) -> State:
+        """The state with the unit that goes with what it leaves."""
+        for _ in range(4):
+            state.unit = self.noise.unit(self.fitted(state).left)
+        return state
+
+    def without(self, state: State, k: int) -> State:
+        """The state without group k, the unit as it is."""
+        out = state.copy()
+        out.tau[k] = 0.0
+        return out
+
+    def _log_prior(self, tau: Array) -> float:
+        """Log probability of a set: how likely a group is is learnt from how many there are (beta-binomial)."""
+        there = self.free & (tau > 0)
+        k, n = float(there.sum()), self.count
+        taus = TAU_WEIGHT[np.argmin(np.abs(TAU[:, None] - tau[there]), axis=0)]
+        count = betaln(1 + k, max(n - k, 0.0) + FEW_CAUSES * n) - betaln(1, (1 + FEW_CAUSES) * n)
+        return float(count - np.log(self.share[there]).sum() + np.log(taus).sum())
+
+    def fitted(self, state: State) -> Fitted:
+        """Posterior of the parameters that are there."""
+        return self._solved(state)[0]
+
+    def _solved(self, state: State) -> tuple[Fitted, Array, Array]:
+        u, tau = state.unit, state.tau
+        on = np.flatnonzero(tau > 0)
+        active = np.concatenate([np.zeros(0, dtype=np.int64), *(self.groups[i].index for i in on)])
+        prior = np.concatenate([np.zeros(0), *(np.full(self.groups[i].index.size, tau[i] ** -2.0) for i in on)])
+        lower = np.linalg.cholesky(self.form.curvature[np.ix_(active, active)] / u + np.diag(prior))
+        inverse = solve_triangular(lower, np.eye(active.size), lower=True) if active.size else lower
+        right = inverse @ self.form.gradient[active] / u
+        left = self.form.excess - u * float(right @ right)
+        # What the width of the prior costs: log det (I + T H / u).
+        width = 2 * float(np.log(np.diag(lower)).sum()) - float(np.log(prior).sum())
+        score = self.noise.log_likelihood(left) - 0.5 * width + self._log_prior(tau)
+        return Fitted(active, -inverse.T @ right, inverse.T @ inverse, left, score), inverse, right
+
+    def conditional(self, state: State) -> Conditional:
+        """Posterior of the parameters that are there, and odds of every group given the others."""
+        fit, inverse, right = self._solved(state)
+        log_odds = np.full(len(self.groups), np.inf)
+        weights = np.zeros((len(self.groups), TAU.size))
+        for members, s, q in self._cavities(state, fit, inverse, right):
+            value, vector = np.linalg.eigh((s + s.transpose(0, 2, 1)) / 2)
+            value = np.maximum(value, 0.0)[:, None]
+            along = (vector.transpose(0, 2, 1) @ q[:, :, None])[:, None, :, 0] ** 2
+            t2 = (TAU**2)[:, None]
+            gain = 0.5 * np.sum(t2 * along / (1 + t2 * value) - np.log1p(t2 * value), axis=2) + np.log(TAU_WEIGHT)
+            top = gain.max(axis=1, keepdims=True)
+            weights[members] = np.exp(gain - top)
+            total = weights[members].sum(axis=1, keepdims=True)
+            weights[members] /= total
+            log_odds[members] = (top + np.log(total))[:, 0]
+        there = (state.tau > 0) & self.free
+        others = there.sum() - there
+        rest = np.maximum((1 + FEW_CAUSES) * self.count - others - 1, 0.1)
+        log_odds = np.where(self.free, log_odds + np.log((1 + others) / rest / self.share), np.inf)
+        return Conditional(fit.active, fit.mean, fit.covariance, fit.left, fit.score, log_odds, weights)
+
+    def _cavities(
+        self, state: State, fit: Fitted, inverse: Array, right: Array
+    ) -> Iterator[tuple[NDArray[np.int64], Array, Array]]:
+        """Groups of one size, with curvature (G, n, n) and gradient (G, n) about zero given all other groups."""
+        u, h = state.unit, self.form.curvature
+        cross = inverse @ h[fit.active] / u
+        gradient = self.form.gradient / u - cross.T @ right
+        where = np.full(self.size, -1)
+        where[fit.active] = np.arange(fit.active.size)
+        for members in self._alike:
+            if not members.size:
+                continue
+            index = np.stack([self.groups[i].index for i in members])
+            part = cross[:, index].transpose(1, 2, 0)
+            s = h[index[:, :, None], index[:, None, :]] / u - part @ part.transpose(0, 2, 1)
+            q = gradient[index]
+            for k in np.flatnonzero(state.tau[members] > 0):
+                at = where[index[k]]
+                # The posterior of a group that is there is its prior times what the others leave it.
+                own = np.linalg.inv(fit.covariance[np.ix_(at, at)])
+                s[k] = own - np.eye(at.size) * state.tau[members[k]] ** -2.0
+                q[k] = -own @ fit.mean[at]
+            yield members, s, q
