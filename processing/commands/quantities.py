@@ -14,7 +14,7 @@ from processing.commands.reduce import reduced_source
 from processing.commands.summary import summary
 
 if TYPE_CHECKING:
-    from processing.polarization.quantities import State
+    from processing.polarization.quantities import NamedStokes
 
 
 def register(app: typer.Typer) -> None:
@@ -48,12 +48,12 @@ def quantities_command(
     draw(product, figure, no_figure)
 
 
-def _pair(text: str) -> tuple[str, tuple[State, State]]:
+def _pair(text: str) -> tuple[str, tuple[NamedStokes, NamedStokes]]:
     from processing.errors import ProcessError
     from processing.polarization.quantities import STATES
 
     names = [part.strip() for part in text.split(",")]
     if len(names) != 2 or not set(names) <= set(STATES):
         raise ProcessError(f"--pair {text!r}: give GENERATOR,ANALYZER, each one of: {', '.join(STATES)}")
-    generator, analyzer = (cast("State", name) for name in names)
+    generator, analyzer = (cast("NamedStokes", name) for name in names)
     return f"{generator}_to_{analyzer}", (generator, analyzer)

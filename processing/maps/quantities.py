@@ -16,7 +16,7 @@ from processing.polarization.decompositions.differential import differential
 from processing.polarization.decompositions.lu_chipman import lu_chipman
 from processing.polarization.decompositions.symmetric import symmetric
 from processing.polarization.propagation import Derived
-from processing.polarization.quantities import PAPER_PAIRS, State
+from processing.polarization.quantities import PAPER_PAIRS, NamedStokes
 from processing.reduction.mueller import Progress
 from processing.storage.images import MuellerImage, require_all_elements
 from processing.storage.product import LIT_ERRORS, Plane, Product, ProductWriter, Step
@@ -84,7 +84,7 @@ def quantities_of_mueller(
     out: Path,
     step: Step,
     extra: Sequence[str] = (),
-    pairs: Mapping[str, tuple[State, State]] = PAPER_PAIRS,
+    pairs: Mapping[str, tuple[NamedStokes, NamedStokes]] = PAPER_PAIRS,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -122,7 +122,7 @@ def quantities_of_mueller(
     return facts
 
 
-def _planes(extra: Sequence[str], pairs: Mapping[str, tuple[State, State]]) -> dict[str, Plane]:
+def _planes(extra: Sequence[str], pairs: Mapping[str, tuple[NamedStokes, NamedStokes]]) -> dict[str, Plane]:
     found = dict(_MAPS)
     for name, (generator, analyzer) in pairs.items():
         found[name] = Plane((), "", f"light from a {generator} generator through a {analyzer} analyzer, over m00")
@@ -139,7 +139,7 @@ def _planes(extra: Sequence[str], pairs: Mapping[str, tuple[State, State]]) -> d
 
 
 def _block(
-    image: MuellerImage, extra: Sequence[str], pairs: Mapping[str, tuple[State, State]]
+    image: MuellerImage, extra: Sequence[str], pairs: Mapping[str, tuple[NamedStokes, NamedStokes]]
 ) -> dict[str, NDArray[Any]]:
     m = image.matrices.astype(float)
     # Where there is no light an eigenvalue solver only works on noise, slowly.

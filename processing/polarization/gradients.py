@@ -17,7 +17,7 @@ from processing.polarization.decompositions.differential import differential, di
 from processing.polarization.decompositions.lu_chipman import depolarization_power, lu_chipman
 from processing.polarization.decompositions.symmetric import G, symmetric
 from processing.polarization.propagation import Derived, numeric_gradient
-from processing.polarization.quantities import State
+from processing.polarization.quantities import NamedStokes
 
 
 def coherency(m: RealArray) -> dict[str, Derived]:
@@ -171,7 +171,7 @@ def differential_quantities(m: RealArray) -> dict[str, Derived]:
     }
 
 
-def pairs(m: RealArray, states: Mapping[str, tuple[State, State]]) -> dict[str, Derived]:
+def pairs(m: RealArray, states: Mapping[str, tuple[NamedStokes, NamedStokes]]) -> dict[str, Derived]:
     """Light between generator and analyzer over m00, for named pairs; linear in M apart from m00."""
     m = np.asarray(m, dtype=float)
     m00 = m[..., 0, 0]

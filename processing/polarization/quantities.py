@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from processing.arrays import RealArray
 
-State = Literal["horizontal", "vertical", "45", "135", "right", "left", "unpolarized"]
+NamedStokes = Literal["horizontal", "vertical", "45", "135", "right", "left", "unpolarized"]
 
 #: Stokes vectors of named states, unit intensity.
 STATES: dict[str, NDArray[np.float64]] = {
@@ -27,7 +27,7 @@ STATES: dict[str, NDArray[np.float64]] = {
 }
 
 #: The pairs of the paper's bunny figure: (generator, analyzer).
-PAPER_PAIRS: dict[str, tuple[State, State]] = {
+PAPER_PAIRS: dict[str, tuple[NamedStokes, NamedStokes]] = {
     "crossed_linear": ("vertical", "horizontal"),
     "aligned_linear": ("vertical", "vertical"),
     "crossed_circular": ("left", "right"),
@@ -133,7 +133,7 @@ def _near_half_turn(r: RealArray, twice_sine: RealArray, angle: RealArray) -> Re
     return np.asarray(axis * (sign * angle)[..., None])
 
 
-def between(m: RealArray, generator: State | ArrayLike, analyzer: State | ArrayLike) -> RealArray:
+def between(m: RealArray, generator: NamedStokes | ArrayLike, analyzer: NamedStokes | ArrayLike) -> RealArray:
     """Fraction of the light, generated in one state, that a polarizer for the other state passes after the sample.
 
     Parameters
@@ -150,7 +150,7 @@ def between(m: RealArray, generator: State | ArrayLike, analyzer: State | ArrayL
     return np.asarray(0.5 * np.einsum("i,...ij,j->...", a, np.asarray(m), g))
 
 
-def _stokes(state: State | ArrayLike, what: str) -> NDArray[np.float64]:
+def _stokes(state: NamedStokes | ArrayLike, what: str) -> NDArray[np.float64]:
     if isinstance(state, str):
         if state not in STATES:
             raise ValueError(f"{what} {state!r} is no state; known: {', '.join(STATES)}, or four Stokes parameters")

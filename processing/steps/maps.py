@@ -7,7 +7,7 @@ from pathlib import Path
 
 from processing.errors import ProcessError
 from processing.geometry.viewing import ViewingGeometry
-from processing.polarization.quantities import PAPER_PAIRS, State
+from processing.polarization.quantities import PAPER_PAIRS, NamedStokes
 from processing.steps.file_step import FileStep, Progress, beside
 from processing.storage.product import Product
 from processing.storage.provenance import Step, file_identity
@@ -19,7 +19,7 @@ class Quantities(FileStep):
 
     source: Path
     also: tuple[str, ...] = ()
-    pairs: dict[str, tuple[State, State]] = field(default_factory=lambda: dict(PAPER_PAIRS))
+    pairs: dict[str, tuple[NamedStokes, NamedStokes]] = field(default_factory=lambda: dict(PAPER_PAIRS))
 
     @property
     def usual_path(self) -> Path:
