@@ -101,9 +101,9 @@ def test_what_acquire_writes_in_stokes_mode_is_enough(acquire, small_rig, config
     (path,) = tmp_path.glob("*.h5")
     plain, out = tmp_path / "plain.yaml", tmp_path / "d.json"
     plain.write_text(FIRST_SURFACE)
-    given = ["--reflectance", plain, "--geometry", configs / "geometries/one_inch_sphere.yaml", "--json", out]
+    given = ["--reflectance", plain, "--geometry", configs / "geometries/one_inch_sphere.yaml"]
     stokes, mueller = (configs / f"instruments/{name}.yaml" for name in ("linear_stokes", "rgb950"))
-    assert run(diagnose, path, "--instrument", stokes, *given) == 0
+    assert run(diagnose, path, "--instrument", stokes, *given, "--json", out) == 0
     d = SurfaceDiagnosis.model_validate(json.loads(out.read_text()))
     assert (d.verdict, [e.kind for e in d.effects]) == ("explained", ["polarized_diffuse"])
     assert d.effects[0].parameters["a"].value == pytest.approx(0.17, abs=3.5 * d.effects[0].parameters["a"].stderr)
