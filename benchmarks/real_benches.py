@@ -26,7 +26,7 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def one(task: tuple[str, int, str], folder: Path, again: bool, oracle: bool) -> dict[str, Any]:
+def one(task: tuple[str, int, str], folder: Path, pixels: int, again: bool, oracle: bool) -> dict[str, Any]:
     """Judge one bench as (group, seed, captures given); from its file if it was judged before."""
     from simulators.blind.bench_oracle import known_oracle
     from simulators.blind.bench_run import judge_bench
@@ -37,7 +37,7 @@ def one(task: tuple[str, int, str], folder: Path, again: bool, oracle: bool) -> 
     kept = folder / "results" / f"{name}_{given}.json"
     if kept.exists() and not again:
         return dict(json.loads(kept.read_text(encoding="utf-8"))["judgement"])
-    truth = next(read_truth(folder, name), None) or make_bench(folder, seed, ROOT / "configs", group)
+    truth = next(read_truth(folder, name), None) or make_bench(folder, seed, ROOT / "configs", group, pixels)
     judgement, result = judge_bench(folder, truth, ROOT / "configs", given)
     if oracle:
         judgement = replace(judgement, oracle=known_oracle(folder, truth, ROOT / "configs", given))
@@ -57,7 +57,7 @@ def seeds(text: str) -> list[int]:
 def main() -> None:
     from simulators.blind.bench_judge import GIVEN, judgement_of
     from simulators.blind.bench_table import table
-    from simulators.blind.real_bench import GROUPS
+    from simulators.blind.real_bench import GROUPS, PIXELS
     from simulators.blind.reliability_diagram import draw
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -65,6 +65,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=seeds, default=seeds("1-12"), help="as 1-12,40")
     parser.add_argument("--group", nargs="+", choices=list(GROUPS), default=["real"])
     parser.add_argument("--given", nargs="+", choices=list(GIVEN), default=["joint"], help="captures that are given")
+    parser.add_argument("--pixels", type=int, default=PIXELS, help="side of the images that are made")
     parser.add_argument("--again", action="store_true", help="diagnose anew what was judged before")
     parser.add_argument("--no-oracle", action="store_true", help="without the fit of the true set")
     parser.add_argument("--figure", type=Path, help="reliability diagram of all that is judged")
@@ -72,7 +73,8 @@ def main() -> None:
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     tasks = list(product(options.group, options.seeds, options.given))
-    run = partial(one, folder=options.folder, again=options.again, oracle=not options.no_oracle)
+    more = {"pixels": options.pixels, "again": options.again, "oracle": not options.no_oracle}
+    run = partial(one, folder=options.folder, **more)
     found = []
     with ProcessPoolExecutor(options.workers) as workers:
         for k, raw in enumerate(workers.map(run, tasks), 1):
