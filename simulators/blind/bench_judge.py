@@ -13,10 +13,14 @@ Result = Mapping[str, Any]
 
 #: Captures that are given to `diagnose`, by name.
 GIVEN: dict[str, tuple[str, ...]] = {"joint": FITTED, **{name: (name,) for name in FITTED}}
+#: Mistakes of wiring that are a wrong ratio.
+TURNED_OTHERWISE = ("psg_reversed", "psa_reversed", "both_reversed", "ratio", "half_degrees", "double_degrees")
 #: Names that are true as well: in the counts the fault is that.
 TRUE_AS_WELL = {
     "lamp_beat": {"source_flicker"},
     "lamp_jump": {"source_flicker"},
+    **{name: {"rotation_ratio"} for name in TURNED_OTHERWISE},
+    "off_by_one": {"psg_azimuth", "psa_azimuth"},
     "psg_zero": {"psg_azimuth"},
     "psa_zero": {"psa_azimuth"},
     "analyzer_zero": {"analyzer_azimuth"},
