@@ -1,6 +1,7 @@
 """Kills `acquire` before each of its calls that change the disc, and cuts the power at each of them.
 
     python benchmarks/kill_points.py kill [EVERY [FIRST]]     each (or every n-th) call of a small campaign
+    python benchmarks/kill_points.py error [EVERY [FIRST]]    each call fails with an input/output error instead
     python benchmarks/kill_points.py power [CUTS]             states of the disc after a power cut, replayed
     python benchmarks/kill_points.py image [CUTS]             the same on copies of a block device (root, ext4)
     python benchmarks/kill_points.py night [CAPTURES [CALLS]] a night, killed at random again and again
@@ -113,8 +114,8 @@ def check(out: Path, whole: dict[str, bytes]) -> str:
     return "; ".join(wrong)
 
 
-def kill(options: list[str], every: int, first: int) -> int:
-    """Kill before every n-th call, go on, compare."""
+def kill(options: list[str], every: int, first: int, sent: signal.Signals | None) -> int:
+    """Kill before every n-th call, or have it fail, go on, compare."""
     captures = WORK / "captures"
     status, total = run(options, captures / "whole", lambda calls: calls.arm(0))
     assert status == 0, status
@@ -123,16 +124,19 @@ def kill(options: list[str], every: int, first: int) -> int:
     begin_s = time.monotonic()
     for number in range(first, total + 1, every):
         out = captures / f"run{number}"
-        status, _ = run(options, out, lambda calls, number=number: calls.arm(number))
-        killed = os.WIFSIGNALED(status)
+        status, _ = run(options, out, lambda calls, number=number: calls.arm(number, sent))
+        # An error is told with exit code 1, but where it concerns nothing that matters, as the figure of a capture.
+        killed = status != 0
+        crashed = "" if sent or not os.WIFSIGNALED(status) else f"crashed with signal {os.WTERMSIG(status)}"
         status, _ = run(options, out)
-        wrong = check(out, whole) if status == 0 else f"going on ended with {status}"
+        wrong = crashed or (check(out, whole) if status == 0 else f"going on ended with {status}")
         points += killed
         if wrong:
             lost += 1
             print(f"call {number}: {wrong}", flush=True)
         shutil.rmtree(out)
-    print(f"{points} kill points of {total} calls, {lost} with something lost, {time.monotonic() - begin_s:.0f} s")
+    what = "kill points" if sent else "errors told"
+    print(f"{points} {what} of {total} calls, {lost} with something lost, {time.monotonic() - begin_s:.0f} s")
     return lost
 
 
@@ -292,7 +296,7 @@ def _fresh_device(device: Path, mount: Path) -> None:
 
 
 def main() -> None:
-    """Run one of the four."""
+    """Run one of the five."""
     which, numbers = sys.argv[1], [int(text) for text in sys.argv[2:]]
     if "LD_PRELOAD" not in os.environ:
         shutil.rmtree(WORK, ignore_errors=True)
@@ -300,9 +304,10 @@ def main() -> None:
         restart_watched(build(WORK), WORK / "captures")
     captures = (numbers or [300])[0] if which == "night" else 1
     options = write_files(WORK, captures)
-    every, first = [*numbers, *(1, 1)[len(numbers) :]][:2] if which == "kill" else (1, 1)
+    every, first = [*numbers, *(1, 1)[len(numbers) :]][:2] if which in ("kill", "error") else (1, 1)
     work: dict[str, Callable[[], int]] = {
-        "kill": lambda: kill(options, every, first),
+        "kill": lambda: kill(options, every, first, signal.SIGKILL),
+        "error": lambda: kill(options, every, first, None),
         "power": lambda: power(options, (numbers or [0])[0]),
         "image": lambda: image(options, (numbers or [200])[0]),
         "night": lambda: night(options, captures, numbers[1] if len(numbers) > 1 else 45),

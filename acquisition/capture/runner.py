@@ -286,10 +286,19 @@ class CaptureRunner:
             "camera_temperature_c": exposed.temperature_c,
         }
         with self.ledger.time("writing"):
+            self._wait_for_disc()
             self.writer.put(StateRecord(exposed.state, frame.pixels, exposed.positions, columns))
         self.ledger.states += 1
         for observer in self.observers:
             observer.state_done(report)
+
+    def _wait_for_disc(self) -> None:
+        """Measure nothing while the disc takes nothing: the light is shut, and no further move begins."""
+        if self.writer.is_settled():
+            return
+        self.warn("the disc takes no data: the light is shut until it does")
+        self._set_light(False)
+        self.writer.settle()
 
     def _report(self, exposed: _Exposed, frame: Frame) -> StateReport:
         state, black = exposed.state, self.detector.black_level_counts

@@ -18,8 +18,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from acquisition.capture.layout import STATUS_AT, write_whole
 from acquisition.errors import AcquisitionError
-from processing.storage.capture_schema import fitted_json, json_bytes
+from processing.storage.capture_schema import STATUS_TYPE, Status, fitted_json, json_bytes
 from processing.storage.checksums import row_crc32, state_crc32
 from processing.storage.segments import decode_lines, encode_line
 
@@ -94,6 +95,7 @@ class StateFile:
             }
             self._row_sums = _Place(detector["row_crc32"])
             self._segments = _Place(entry["segments/json"], whole=True)
+            self._status_at = int(entry.attrs[STATUS_AT])
             self._closing = _Place(entry["closing/json"], whole=True)
             data = detector["data"]
             self.frame_shape: tuple[int, int] = data.shape[2:]
@@ -185,6 +187,11 @@ class StateFile:
         except OSError:
             return False
 
+    def write_status(self, status: Status) -> None:
+        """Replace the status, in the bytes that it has."""
+        self._write(self._status_at, np.frombuffer(status.encode().ljust(STATUS_TYPE.itemsize, b"\0"), np.uint8))
+        self.sync()
+
     def sync(self) -> None:
         """Return when all that was written is on the disc."""
         os.fdatasync(self._file)
@@ -205,7 +212,4 @@ class StateFile:
         return value
 
     def _write(self, offset: int, values: NDArray[Any]) -> None:
-        raw = np.ascontiguousarray(values).reshape(-1).view(np.uint8).data
-        while raw:
-            written = os.pwrite(self._file, raw, offset)
-            raw, offset = raw[written:], offset + written
+        write_whole(self._file, offset, np.ascontiguousarray(values).reshape(-1).view(np.uint8).data)

@@ -6,6 +6,7 @@ while the next state is under way. A finished file loses its `.partial` and is o
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import shutil
@@ -20,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acquisition.capture.closing import closing_of_killed
+from acquisition.capture.layout import put_layout
 from acquisition.capture.state_file import StateFile
 from acquisition.capture.synced import make_folder, sync
 from acquisition.errors import AcquisitionError
@@ -27,14 +29,15 @@ from drivers.clock import REAL, Clock
 from drivers.motion import Position
 from processing.instrument.states import StateTable
 from processing.storage.capture import Capture, CaptureError
-from processing.storage.capture_schema import CaptureHeader, Status, create_layout, json_bytes, write_status
+from processing.storage.capture_schema import CaptureHeader, Status, create_layout, json_bytes
 from processing.storage.segments import encode_line
 
 PARTIAL = ".partial"
 NEW = ".new"
 THREAD = "capture writer"
-#: How long the disc may take for one state before the run is ended.
+#: How long the disc may take for one state before nothing is measured any more, and before the run is ended.
 PATIENCE_S = 1.5
+DEAD_S = 30.0
 #: How often it is looked at.
 LOOK_S = 0.2
 #: Layout, notes and journals besides the frames, and the columns of a state, generously.
@@ -131,37 +134,34 @@ class CaptureWriter:
         needed = bytes_needed(len(table), len(header.channels), frame_shape)
         if path.exists() or partial.exists():
             raise AcquisitionError(f"{path if path.exists() else partial} exists already; nothing was changed")
+
+        def make(h5: h5py.File) -> None:
+            create_layout(h5, header, dict(table.angles_deg), table.role, frame_shape, np.uint16, start_time)
+            h5["entry/states/exposure_s"][...] = table.exposure_s
+            h5["entry/states/repeats"][...] = table.repeats
+            if begin is not None:
+                line = np.frombuffer(encode_line(json_bytes(begin)), np.uint8)
+                h5["entry/segments/json"][: line.size] = line
+
         try:
             make_folder(path.parent)
             check_space(path.parent, needed)
-            _try_room(new, needed)
+            put_layout(new, needed, make)
+            _require_layout(new, table)
+            os.rename(new, partial)
+            sync(partial.parent)
         except OSError as error:
-            new.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                new.unlink(missing_ok=True)
             if error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT):
                 raise _no_room(path.parent, needed, error) from error
             raise AcquisitionError(
                 f"{partial} cannot be created ({error}). Choose another folder with --out."
             ) from error
-        try:
-            with h5py.File(new, "w") as h5:
-                create_layout(h5, header, dict(table.angles_deg), table.role, frame_shape, np.uint16, start_time)
-                h5["entry/states/exposure_s"][...] = table.exposure_s
-                h5["entry/states/repeats"][...] = table.repeats
-                if begin is not None:
-                    line = np.frombuffer(encode_line(json_bytes(begin)), np.uint8)
-                    h5["entry/segments/json"][: line.size] = line
-            _reserve(new)
-            _require_layout(new, table)
-            sync(new)
-            os.rename(new, partial)
-            sync(partial.parent)
-        except (OSError, RuntimeError, KeyError, ValueError) as error:
-            new.unlink(missing_ok=True)
-            raise _no_room(path.parent, needed, error) from error
         return cls(partial, clock)
 
     def put(self, record: StateRecord) -> None:
-        """Hand over a state, when the one before is on the disc. Raises AcquisitionError after PATIENCE_S."""
+        """Hand over a state, when the one before is on the disc. Raises AcquisitionError after DEAD_S."""
         self.settle()
         self._require_there()
         with self._change:
@@ -211,11 +211,13 @@ class CaptureWriter:
             self.settle()
             self._require_there()
             self.file.write_closing(closing)
+            self.file.write_status(status)
+            if not keep_partial:
+                self.path = finish(self.path)
         except OSError as error:
             raise self._failure(error) from error
         finally:
             self.abandon()
-        self.path = finish(self.path, status, keep_name=keep_partial)
         return self.path
 
     def abandon(self) -> None:
@@ -223,31 +225,40 @@ class CaptureWriter:
         with self._change:
             self._ending = True
             self._change.notify_all()
-        self._thread.join(PATIENCE_S)
+        self._thread.join(min(PATIENCE_S, DEAD_S))
+
+    def is_settled(self) -> bool:
+        """Wait until every state handed over is on the disc, but for PATIENCE_S at most. Raises AcquisitionError."""
+        return self._settled(PATIENCE_S)
 
     def settle(self) -> None:
-        """Wait until every state handed over is on the disc. Raises AcquisitionError, after PATIENCE_S at most."""
+        """Wait until every state handed over is on the disc. Raises AcquisitionError, after DEAD_S at most."""
+        if not self._settled(DEAD_S):
+            raise self._blocked()
+
+    def _settled(self, patience_s: float) -> bool:
         with self._change:
             while self._record is not None and self._error is None:
-                if self._clock.now_s() - self._since_s > PATIENCE_S:
-                    raise self._blocked(self._record.state)
+                if self._clock.now_s() - self._since_s > patience_s:
+                    return False
                 self._change.wait(LOOK_S)
             if self._error is not None:
                 raise self._failure(self._error) from self._error
+        return True
 
     def _watch(self) -> None:
         """Tell of a disc that blocks although nobody hands over a state, as in a long exposure."""
         with self._change:
             while not self._ending and self._error is None:
                 self._change.wait(LOOK_S)
-                if self._record is not None and self._clock.now_s() - self._since_s > PATIENCE_S:
+                if self._record is not None and self._clock.now_s() - self._since_s > DEAD_S:
                     if self.on_failure is not None:
-                        self.on_failure(self._blocked(self._record.state))
+                        self.on_failure(self._blocked())
                     return
 
-    def _blocked(self, state: int) -> AcquisitionError:
+    def _blocked(self) -> AcquisitionError:
         return AcquisitionError(
-            f"{self.path}: the disc has not taken state {state} for {PATIENCE_S:g} s. States done before it are "
+            f"{self.path}: the disc has not taken a state for {DEAD_S:g} s. States done before it are "
             "intact; go on with --resume when the disc is well."
         )
 
@@ -286,16 +297,8 @@ class CaptureWriter:
         self.file.write_state(record.state, pixels, positions, {**record.columns, "segment": self.segment})
 
 
-def finish(partial: Path, status: Status, *, keep_name: bool = False) -> Path:
-    """Write the status of a file whose closing record is there, and give it its final name; returns that.
-
-    Every step may be the last one and every step may be done again.
-    """
-    with h5py.File(partial, "r+") as h5:
-        write_status(h5, status)
-    sync(partial)
-    if keep_name:
-        return partial
+def finish(partial: Path) -> Path:
+    """Give a file its final name; returns that."""
     final = partial.with_name(partial.name.removesuffix(PARTIAL))
     os.rename(partial, final)
     sync(final.parent)
@@ -315,26 +318,22 @@ def seal_whole(partial: Path) -> Path | None:
             return None
         complete = capture.status == "complete"
     if not complete:
-        file = StateFile(partial)
-        try:
+        with contextlib.closing(StateFile(partial)) as file:
             file.write_closing(closing_of_killed(file.segment_records()))
-        finally:
-            file.close()
-    return finish(partial, "complete")
+            file.write_status("complete")
+    return finish(partial)
 
 
 def mark_not_taken(path: Path, states: Sequence[int]) -> Path:
     """Have states of a capture taken again: not done, the capture failed and partial. Returns its name."""
     partial = as_partial(path)
-    file = StateFile(partial)
-    try:
+    with contextlib.closing(StateFile(partial)) as file:
+        file.write_status("failed")
         for name, value in (("done", 0), ("exposure_s", np.nan)):
             column = file.read_column(name)
             column[list(states)] = value
             file.write_column(name, column)
-    finally:
-        file.close()
-    return finish(partial, "failed", keep_name=True)
+    return partial
 
 
 def as_partial(path: Path) -> Path:
@@ -344,12 +343,6 @@ def as_partial(path: Path) -> Path:
     partial = path.rename(path.with_name(path.name + PARTIAL))
     sync(partial.parent)
     return partial
-
-
-def _try_room(path: Path, needed: int) -> None:
-    """Take the space and give it back: a write that fails inside HDF5 would bring the interpreter down."""
-    with path.open("wb") as file:
-        os.posix_fallocate(file.fileno(), 0, needed)
 
 
 def _require_layout(path: Path, table: StateTable) -> None:
@@ -372,10 +365,3 @@ def _no_room(folder: Path, needed: int, error: Exception) -> AcquisitionError:
         f"the capture needs {needed:,} bytes in {folder} and cannot get them ({error}; "
         f"{shutil.disk_usage(folder).free:,} free). Nothing was moved. Make room or choose another folder with --out."
     )
-
-
-def _reserve(path: Path) -> None:
-    """Have the file system set the blocks aside: an allocated HDF5 file may still be sparse."""
-    with path.open("r+b") as file:
-        size = file.seek(0, os.SEEK_END)
-        os.posix_fallocate(file.fileno(), 0, size)

@@ -2,8 +2,8 @@
 
 `python -m acquisition.rig.guard` is started by `acquire` (acquisition/rig/guarded.py) and listens at its standard
 input: first a line of JSON that says what to guard, then a short line ten times a second. The end of the input without
-the word `rest` means that `acquire` was killed; silence means that it hangs. A frozen `acquire` still holds the ports
-and knows nothing of what happens to its axes: it is killed first, which loses no state that is done.
+the word `rest` means that `acquire` was killed; silence means that it was stopped or hangs. A frozen `acquire` still
+holds the ports and knows nothing of what happens to its axes: it is killed first, which loses no state that is done.
 """
 
 from __future__ import annotations
@@ -28,8 +28,10 @@ from drivers.registry import open_source
 from drivers.serial_link import LineRegistry
 from processing.yaml_file import parse_yaml
 
-#: Silence after which `acquire` counts as frozen, and how often it is looked for.
-SILENT_S = 1.0
+#: Silence after which `acquire` counts as frozen: if it was stopped, and if it could run but does not.
+STOPPED_S = 1.0
+SILENT_S = 10.0
+#: How often it is looked for.
 LOOK_S = 0.05
 #: A look that came later than this was held up itself, as then was `acquire`: no more of it counts as silence.
 LATE_S = 0.2
@@ -102,7 +104,7 @@ class Guard:
                     elif beat == REST:
                         self.journal.note("guard rests")
                         return True
-            elif silent_s > SILENT_S:
+            elif silent_s > SILENT_S or (silent_s > STOPPED_S and _is_stopped(self.pid)):
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(self.pid, signal.SIGKILL)
                 return self._act("acquire was frozen and has been killed", beat)
@@ -154,6 +156,14 @@ class Guard:
             self.journal.note("alert", message=message)
         except OSError as error:
             self.journal.note("ALERT FAILED", error=str(error), message=message)
+
+
+def _is_stopped(pid: int) -> bool:
+    """Whether a process was stopped by a signal or a tracer, and not only kept waiting by a busy machine."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "Tt"
+    except OSError:
+        return False
 
 
 def main() -> None:

@@ -2,13 +2,15 @@
  * writes down what each of them does, so that any state of the disc can be made again.
  *
  * Loaded with LD_PRELOAD. Environment: UMOV_DISC_FOLDER, and UMOV_DISC_LOG for the record. Functions for the program
- * itself: disc_calls_arm(n, signal) sends the signal before the n-th call from now on; disc_calls_made() counts;
+ * itself: disc_calls_arm(n, signal) sends the signal before the n-th call from now on, or with signal 0 lets it fail
+ * if it is a write, a sync or the like; disc_calls_made() counts;
  * disc_calls_note(text) adds a remark to the record.
  *
  * A record is a line "call number path offset length", and after it the bytes of a write.
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>
+#include <errno.h>
 #include <fcntl.h>
 #include <limits.h>
 #include <pthread.h>
@@ -24,6 +26,8 @@
 static pthread_mutex_t lock = PTHREAD_RECURSIVE_MUTEX_INITIALIZER_NP;
 static long made, armed;
 static int armed_signal = SIGKILL;
+/* Set when the call that was armed is to fail with an input/output error instead. */
+static __thread int failing;
 static int record = -2;
 
 #define REAL(name, type) static __typeof__(type) real; if (!real) real = (__typeof__(type))dlsym(RTLD_NEXT, name)
@@ -75,11 +79,19 @@ static void put(const char *call, const char *path, long offset, const void *dat
 static void before(const char *call, const char *path, long offset, const void *data, size_t size) {
     made++;
     if (armed && made == armed) {
+        if (armed_signal == 0) { failing = 1; return; }
         kill(getpid(), armed_signal);
         /* A signal to the process may take a moment to arrive at this thread. */
         while (armed_signal == SIGKILL) pause();
     }
     put(call, path, offset, data, size);
+}
+
+static int failed(void) {
+    if (!failing) return 0;
+    failing = 0;
+    errno = EIO;
+    return 1;
 }
 
 void disc_calls_arm(long n, int number) { made = 0; armed = n; armed_signal = number; }
@@ -111,7 +123,7 @@ int creat(const char *path, mode_t mode) { return opened("creat", AT_FDCWD, path
     char path[PATH_MAX]; \
     if (!folder() || !path_of(fd, path)) return expression; \
     ssize_t result; \
-    LOCKED(before(call, path, offset, data, size); result = expression); \
+    LOCKED(before(call, path, offset, data, size); result = failed() ? -1 : expression); \
     return result
 
 ssize_t write(int fd, const void *data, size_t size) {

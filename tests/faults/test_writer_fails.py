@@ -1,16 +1,21 @@
 """Promises 16 and 21: whatever ends or blocks the writer ends the run in order; a changed byte is found at reading."""
 
+import errno
 import threading
 import time
 
 import h5py
 import pytest
 
-from acquisition.capture import writer
+from acquisition.capture import layout, writer
+from acquisition.capture.runner import CaptureRunner
 from acquisition.capture.state_file import StateFile
 from acquisition.errors import AcquisitionError
+from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
+from processing.instrument.states import rotating_retarders
 from processing.storage.capture import Capture, CaptureError
+from processing.storage.capture_schema import CaptureHeader
 
 SHORT = {"states": {"kind": "rotating_retarders", "states": 18, "step_deg": 20, "ratio": 4.91}, "darks": 1}
 
@@ -46,15 +51,45 @@ def test_any_exception_in_the_writer_ends_the_run_and_it_goes_on(run_with, intac
     assert intact(final) == 19
 
 
-def test_a_disc_that_takes_nothing_ends_the_run(run_with, intact, monkeypatch):
-    monkeypatch.setattr(writer, "PATIENCE_S", 0.3)
-    blocked = threading.Event()
-    _failing_at(monkeypatch, 5, blocked.wait)
-    error, path = run_with(plan=SHORT)
-    assert "the disc has not taken state 5" in str(error)
+def test_a_disc_that_takes_nothing_shuts_the_light_and_ends_the_run(run_with, intact, monkeypatch):
+    monkeypatch.setattr(writer, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(writer, "DEAD_S", 1.0)
+    blocked, rigs, lit = threading.Event(), [], []
+
+    class Told(Observer):
+        def warning(self, text):
+            lit.append((text, rigs[0].simulation.light()))
+
+    monkeypatch.setattr(CaptureRunner, "_set_light", _then(CaptureRunner._set_light, lambda: lit.append("set")))
+    with monkeypatch.context() as patch:
+        _failing_at(patch, 5, lambda: blocked.wait(60))
+        error, path = run_with(lambda rig, *_: rigs.append(rig), plan=SHORT, observers=(Told(),))
+    assert "the disc has not taken a state" in str(error)
+    told = [number for number, entry in enumerate(lit) if "the disc takes no data" in str(entry)]
+    # The light is shut right after it was told, not at the end of the run.
+    assert lit[told[0] + 1] == "set"
+    assert not rigs[0].simulation.light()
     blocked.set()
     _let_go(path)
     assert intact(path) >= 5
+
+
+def _then(function, act):
+    def both(*arguments):
+        function(*arguments)
+        act()
+
+    return both
+
+
+def test_a_disc_that_comes_back_is_waited_for(run_with, intact, monkeypatch):
+    monkeypatch.setattr(writer, "PATIENCE_S", 0.1)
+    _failing_at(monkeypatch, 5, lambda: time.sleep(0.5))
+    error, path = run_with(plan=SHORT)
+    assert error is None
+    assert intact(path) == 19
+    with Capture(path) as capture:
+        assert any("the disc takes no data" in text for text in capture.closing["messages"])
 
 
 def _let_go(path):
@@ -144,14 +179,14 @@ def test_a_folder_deleted_in_mid_run_is_noticed_with_the_next_state(run_with, tm
 
 def test_a_layout_that_a_disc_has_lost_is_no_capture(run_with, monkeypatch, tmp_path):
     """Zeros where the targets should be: an arm that was sent to 35 would be recorded as sent to 0."""
-    reserve = writer._reserve
+    put = writer.put_layout
 
-    def lose(path):
-        reserve(path)
+    def lose(path, *arguments):
+        put(path, *arguments)
         with h5py.File(path, "r+") as h5:
             h5["entry/instrument/arm/target_value"][...] = 0
 
-    monkeypatch.setattr(writer, "_reserve", lose)
+    monkeypatch.setattr(writer, "put_layout", lose)
     moved = []
     with pytest.raises(StopIteration):
         run_with(lambda *_: moved.append(1), plan=SHORT)
@@ -184,3 +219,22 @@ def test_doctor_says_that_a_light_was_left_on(small_rig):
         rig.source.close()
         with pytest.raises(AcquisitionError, match="LIGHT LEFT ON"):
             _source(rig)
+
+
+@pytest.fixture
+def new_writer(tmp_path):
+    """Makes a writer of a small capture in the test's own folder."""
+    header = CaptureHeader(title="test", simulated=True, mode="drr", wavelength_nm=662)
+    return lambda: writer.CaptureWriter.create(tmp_path / "x.h5", header, rotating_retarders(0.01), (4, 6), "now")
+
+
+def test_an_error_of_the_disc_in_the_layout_is_told_and_leaves_nothing(new_writer, monkeypatch, tmp_path):
+    """HDF5 never writes to the disc: its layout is copied by calls whose errors are seen."""
+
+    def failing(file, offset, raw):
+        raise OSError(errno.EIO, "injected")
+
+    monkeypatch.setattr(layout, "write_whole", failing)
+    with pytest.raises(AcquisitionError, match=r"cannot be created .*injected"):
+        new_writer()
+    assert not list(tmp_path.iterdir())
