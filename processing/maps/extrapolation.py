@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +14,15 @@ from processing.polarization import triply_degenerate
 from processing.storage.images import StokesImage
 from processing.storage.product import Plane, Product, ProductWriter, Step
 
+#: Kind of the product.
+EXTRAPOLATED = "extrapolated"
+
 PLANES = {
     "mueller": Plane((4, 4), "count", "Mueller matrix extrapolated by a TD model, row-major, not normalized"),
     "mueller_errors": Plane((4, 4), "count", "standard errors from the noise of xi0 and M00; not those of the model"),
+    "m00_correlation": Plane(
+        (), "", "between the errors of m00 and of alpha_0, the common factor of all other elements"
+    ),
     "valid": Plane((), "", "1 = xi0 is determined and physical", np.uint8),
 }
 
@@ -35,8 +42,7 @@ def extrapolate_mueller(
     found = estimate_from_stokes(StokesImage.load(source), m0)
     with np.errstate(invalid="ignore"):
         values = triply_degenerate.mueller_matrix(m0, found.xi0, found.m00)
-        weight = np.full(shape, np.nan) if found.alpha_0_stderr is None else found.alpha_0_stderr
-        errors = np.abs(m0) * weight[..., None, None]
+        errors = np.abs(m0) * found.alpha_0_stderr[..., None, None]
     errors[..., 0, 0] = found.m00_stderr
     valid = found.valid & ~found.unphysical
     facts: dict[str, Any] = {
@@ -47,12 +53,51 @@ def extrapolate_mueller(
         "median_xi0_error": float(np.median(found.xi0_stderr[valid])) if valid.any() else None,
         "warnings": ["extrapolated: elements that the capture did not measure are the model's"],
     }
-    with ProductWriter(out, "extrapolated", header, shape, PLANES, steps, overwrite) as writer:
+    with ProductWriter(out, EXTRAPOLATED, header, shape, PLANES, steps, overwrite) as writer:
         writer.write(
-            slice(0, shape[0]), mueller=_planar(values), mueller_errors=_planar(errors), valid=valid.astype(np.uint8)
+            slice(0, shape[0]),
+            mueller=_planar(values),
+            mueller_errors=_planar(errors),
+            m00_correlation=found.correlation * np.sign(4 * found.xi0 - 1),
+            valid=valid.astype(np.uint8),
         )
         writer.seal(facts)
     return facts
+
+
+@dataclass(frozen=True)
+class ExtrapolatedImage:
+    """An extrapolated Mueller image, or some rows of it, with what error propagation needs.
+
+    M = m00 e00 + alpha_0 (m0 - e00), e00 being the element 00 alone: all noise is that of m00 and alpha_0.
+
+    Attributes
+    ----------
+    values, errors : (4, 4, rows, columns), counts; NaN where the object is not.
+    correlation : (rows, columns), of the errors of m00 and alpha_0, with the sign of alpha_0.
+    """
+
+    values: NDArray[np.float32]
+    errors: NDArray[np.float32]
+    correlation: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, product: Product, rows: slice = slice(None)) -> Self:
+        """From an open product of `process extrapolate`."""
+        names = ("mueller", "mueller_errors", "m00_correlation")
+        return cls(*(product.get(name, rows) for name in names))
+
+    @property
+    def matrices(self) -> NDArray[np.float32]:
+        """View (rows, columns, 4, 4)."""
+        return np.moveaxis(self.values, (0, 1), (-2, -1))
+
+    def variance_of(self, gradient: NDArray[np.floating]) -> NDArray[np.float64]:
+        """First-order variance (rows, columns) of a quantity with gradient (rows, columns, 16) by the elements."""
+        signed = (np.sign(self.values) * self.errors).reshape(16, *self.correlation.shape)
+        own = gradient[..., 0] * self.errors[0, 0]
+        common = np.einsum("ixy,xyi->xy", signed[1:], gradient[..., 1:])
+        return np.asarray(own**2 + common**2 + 2 * self.correlation * own * common)
 
 
 def _planar(m: NDArray[np.floating]) -> NDArray[np.float32]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from processing.arrays import RealArray
 from processing.errors import ProcessError
+from processing.maps.extrapolation import EXTRAPOLATED, ExtrapolatedImage
 from processing.polarization import gradients
 from processing.polarization.decompositions.differential import differential
 from processing.polarization.decompositions.lu_chipman import lu_chipman
@@ -97,7 +98,7 @@ def quantities_of_mueller(
 
     Raises
     ------
-    ProductError : the source is no Mueller product.
+    ProductError : the source holds no whole Mueller matrices.
     ProcessError : an extra decomposition is unknown.
     """
     unknown = sorted(set(extra) - set(EXTRA))
@@ -109,17 +110,28 @@ def quantities_of_mueller(
         if plane.dtype is np.float32:
             planes[f"{name}_errors"] = Plane(plane.leading, plane.units, f"standard errors of {name}, first order")
     with Product(source) as product:
-        require_all_elements(product)
+        _require_matrices(product)
         steps = (*product.steps, step)
         with ProductWriter(out, "quantities", product.header, product.shape, planes, steps, overwrite) as writer:
             for rows in product.row_blocks(BLOCK_PIXELS):
                 if rows.stop > writer.rows_done:
-                    writer.write(rows, **_block(MuellerImage.of(product, rows), extra, pairs))
+                    writer.write(rows, **_block(_image(product, rows), extra, pairs))
                 if progress:
                     progress(rows.stop, product.shape[0])
             facts = _facts(writer, maps)
             writer.seal(facts)
     return facts
+
+
+def _require_matrices(product: Product) -> None:
+    if product.kind != EXTRAPOLATED:
+        require_all_elements(product)
+
+
+def _image(product: Product, rows: slice) -> MuellerImage | ExtrapolatedImage:
+    if product.kind == EXTRAPOLATED:
+        return ExtrapolatedImage.of(product, rows)
+    return MuellerImage.of(product, rows)
 
 
 def _planes(extra: Sequence[str], pairs: Mapping[str, tuple[NamedStokes, NamedStokes]]) -> dict[str, Plane]:
@@ -139,7 +151,7 @@ def _planes(extra: Sequence[str], pairs: Mapping[str, tuple[NamedStokes, NamedSt
 
 
 def _block(
-    image: MuellerImage, extra: Sequence[str], pairs: Mapping[str, tuple[NamedStokes, NamedStokes]]
+    image: MuellerImage | ExtrapolatedImage, extra: Sequence[str], pairs: Mapping[str, tuple[NamedStokes, NamedStokes]]
 ) -> dict[str, NDArray[Any]]:
     m = image.matrices.astype(float)
     # Where there is no light an eigenvalue solver only works on noise, slowly.

@@ -212,8 +212,19 @@ def estimate_from_stokes(image: StokesImage, m0: NDArray[np.float64]) -> Xi0Esti
     valid = np.isfinite(plain.xi0) & (total > 0) & (plain.condition <= MAX_CONDITION) & (noise <= MAX_STDERR)
     unphysical = valid & ((plain.xi0 < 0.25 - xi0_errors) | (plain.xi0 > 1 + xi0_errors))
     weight = np.sqrt(spread[0, 0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        correlation = (spread[0, 0] + spread[0, 1]) / (weight * m00_errors)
     return Xi0Estimate(
-        plain.xi0, xi0_errors, total, m00_errors, plain.condition, valid, unphysical, plain.chi_square, weight
+        plain.xi0,
+        xi0_errors,
+        total,
+        m00_errors,
+        plain.condition,
+        valid,
+        unphysical,
+        plain.chi_square,
+        weight,
+        correlation,
     )
 
 

@@ -16,6 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 from processing.arrays import Array, BoolArray
 from processing.computing.compiling import njit
 from processing.computing.threads import for_ranges
+from processing.errors import ProcessError
+from processing.polarization.mueller import coherency
+
+#: Rounding that a Mueller-Jones matrix may have (float32), and matrices that are looked at closely.
+TOLERANCE, LOOKED_AT = 1e-4, 2000
 
 
 @dataclass(frozen=True)
@@ -32,6 +37,7 @@ class Xi0Estimate:
     unphysical : valid, but outside [1/4, 1] by more than its standard error.
     chi_square : weighted sum of squared residuals over K - 2; NaN for an unweighted fit.
     alpha_0_stderr : standard error of alpha_0 = M00 (4 xi0 - 1)/3, the weight of m0 in the matrix.
+    correlation : between the errors of alpha_0 and M00.
     """
 
     xi0: Array
@@ -42,7 +48,8 @@ class Xi0Estimate:
     valid: BoolArray
     unphysical: BoolArray
     chi_square: Array
-    alpha_0_stderr: Array | None = None
+    alpha_0_stderr: Array
+    correlation: Array
 
 
 def estimate(
@@ -65,6 +72,10 @@ def estimate(
     m0 : (..., 4, 4), dominant Mueller-Jones matrix with element 00 equal to 1; NaN outside the object.
     weighted : weigh by 1/variance; else equal weights as in the paper, with the variance propagated.
     max_condition, max_stderr : limits of the validity mask.
+
+    Raises
+    ------
+    ProcessError : m0 is no Mueller-Jones matrix; xi0 would then not be what it is called.
     """
     p = np.asarray(intensities)
     rows = np.asarray(w, dtype=float).reshape(-1, 16)
@@ -77,11 +88,30 @@ def estimate(
     if weighted and v is None:
         raise ValueError("weights need a variance")
 
+    require_mueller_jones(model)
     sums = _Sums(p.shape[1:])
     for k, row in enumerate(rows):
         vk = None if v is None else np.asarray(v[k], dtype=float)
         sums.add(np.asarray(p[k], dtype=float), model @ row, row[0], vk, weighted)
     return sums.solve(len(rows), max_condition, max_stderr)
+
+
+def require_mueller_jones(m0: Array) -> None:
+    """Raise ProcessError unless matrices (..., 16) have element 00 equal to 1 and a coherency matrix of rank one.
+
+    The sum of squares, 4 for every Mueller-Jones matrix, is looked at everywhere; H^2 = H, which also finds unphysical
+    matrices of that size, in up to `LOOKED_AT` of them. NaN passes.
+    """
+    flat = m0.reshape(-1, 16)
+    size = np.einsum("pi,pi->p", flat, flat)
+    some = flat[:: max(1, len(flat) // LOOKED_AT)]
+    h = coherency(some[np.isfinite(some).all(axis=1)].reshape(-1, 4, 4)) / 2
+    off = (np.abs(size - 4) > TOLERANCE).sum() + (np.abs(h @ h - h).max(axis=(1, 2)) > TOLERANCE).sum()
+    if off:
+        raise ProcessError(
+            f"the dominant process is no Mueller-Jones matrix in {off} pixels: it must have m00 = 1 and no "
+            "depolarization of its own. Correct the reflectance model."
+        )
 
 
 class _Sums:
@@ -136,7 +166,20 @@ class _Sums:
             unphysical = valid & ((xi0 < 0.25 - slack) | (xi0 > 1 + slack))
         chi_square = reduced if self.scaled else np.full_like(a, np.nan)
         alpha_0_stderr = np.sqrt(cov[0])
-        return Xi0Estimate(xi0, xi0_stderr, total, m00_stderr, condition, valid, unphysical, chi_square, alpha_0_stderr)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            correlation = (cov[0] + cov[1]) / (alpha_0_stderr * m00_stderr)
+        return Xi0Estimate(
+            xi0,
+            xi0_stderr,
+            total,
+            m00_stderr,
+            condition,
+            valid,
+            unphysical,
+            chi_square,
+            alpha_0_stderr,
+            correlation,
+        )
 
 
 def _sandwich(inverse: tuple[Array, Array, Array], t: list[Array]) -> tuple[Array, Array, Array]:

@@ -20,6 +20,7 @@ from processing.instrument.determined import determined_basis, determined_elemen
 from processing.instrument.model import InstrumentModel
 from processing.polarization.physical import nearest
 from processing.reduction.counts_to_signal import BlockReader, Correction
+from processing.reduction.cut_off import without_cut_off
 from processing.reduction.effects_of_capture import capture_changes, counts_correction, extra_retardance, with_extra
 from processing.reduction.facts import mueller_facts
 from processing.reduction.noise import NoiseModel
@@ -207,7 +208,7 @@ def reduce_mueller(
     NotDetermined : W has a lower rank than states of this instrument can have.
     CaptureError : angles or frames are missing or not finite.
     """
-    states = sample_states(capture)
+    states, cut_off = without_cut_off(capture, sample_states(capture))
     changes = capture_changes(capture, model, states)
     w = measurement_matrix(capture, model, states, changes)
     inversion = Inversion.of(w.reshape(-1, 16), f"{capture.path}: ", determined_basis(model))
@@ -242,6 +243,7 @@ def reduce_mueller(
             facts = mueller_facts(inversion, noise, correction, product, len(states), choice.weighted)
         except CaptureError as error:
             raise CaptureError(f"{capture.path}: {error}{_without_numbers(capture, states)}") from error
+        facts["warnings"] += cut_off
         if choice.physical:
             facts["physical_estimate"] = f"{choice.physical}, as mueller_physical beside the plain one"
         product.seal(facts)

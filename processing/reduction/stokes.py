@@ -13,6 +13,7 @@ from processing.instrument.applied_effects import changes_at
 from processing.instrument.changes import Changes
 from processing.instrument.model import InstrumentModel
 from processing.reduction.counts_to_signal import Correction
+from processing.reduction.cut_off import without_cut_off
 from processing.reduction.effects_of_capture import capture_changes, counts_correction
 from processing.reduction.facts import in_words
 from processing.reduction.mosaic.layout import MosaicLayout
@@ -113,7 +114,7 @@ def reduce_stokes(
             "Split it with `process colours`."
         )
     layout = MosaicLayout.of(mosaic, [c.name for c in model.channels])
-    states = sample_states(capture)
+    states, cut_off = without_cut_off(capture, sample_states(capture))
     changes = capture_changes(capture, model, states)
     model_rows, analyzers = channel_rows(capture, model, states, changes)
     correction = correction or Correction.of(capture)
@@ -132,6 +133,7 @@ def reduce_stokes(
             values[..., lost | dark if name in RATIOS else lost] = np.nan
     rows, columns = channels.shape[1:]
     facts = _facts(found, analyzers, noise, correction, method, len(states))
+    facts["warnings"] += cut_off
     with ProductWriter(out, "stokes", capture.header, (rows, columns), PLANES, steps, overwrite) as product:
         product.array("measurement_matrix", model_rows, "", "W (channel, 16): intensity = W . vec(M), row-major")
         product.array("analyzers", analyzers, "", "rows (channel, 3): intensity = row . (S0, S1, S2)")

@@ -15,6 +15,7 @@ from processing.campaign.tasks import CaptureTask, measure
 from processing.errors import ProcessError
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
+from processing.polarization.quantities import between, depolarization_index
 from processing.reflectance.base import load_reflectance
 from processing.reflectance.tables import ScatteringTable
 from processing.storage.product import Product
@@ -208,6 +209,18 @@ def test_tables_and_material_and_extrapolation(folder, configs, process, tmp_pat
     pulls = (m - counts_per_unit * truth)[inner] / errors[inner]
     for i, j in ((0, 0), (0, 1), (1, 1), (2, 2), (3, 3)):
         assert np.median(np.abs(pulls[:, i, j])) / 0.6745 == pytest.approx(1, abs=0.15)
+
+    code, _, err = process("quantities", tmp_path / "e.h5", "--no-figure", "--out", tmp_path / "q.h5")
+    assert code == 0, err
+    lit = truth[inner]
+    expected = {
+        "depolarization_index": depolarization_index(lit),
+        "crossed_circular": between(lit, "left", "right") / lit[:, 0, 0],
+    }
+    with Product(tmp_path / "q.h5") as product:
+        for name, true in expected.items():
+            pull = (product.get(name)[inner] - true) / product.get(f"{name}_errors")[inner]
+            assert np.median(np.abs(pull)) / 0.6745 == pytest.approx(1, abs=0.15), name
 
 
 def test_design_recommends_vertical_light(configs, process, tmp_path):

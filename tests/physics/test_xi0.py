@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from processing.errors import ProcessError
 from processing.geometry.frames import ScatteringGeometry
 from processing.geometry.rusinkiewicz import directions
 from processing.instrument.model import InstrumentModel
@@ -97,12 +98,26 @@ def test_a_model_turned_by_45_degrees_gives_a_quarter_and_beyond_is_kept_and_fla
 
 
 def test_no_modulation_is_invalid_and_not_a_number_out_of_thin_air():
-    w = linear_stokes(HORIZONTAL)
-    m0 = np.stack([mueller.IDEAL_DEPOLARIZER, np.full((4, 4), np.nan)])
+    # A retarder does nothing to unpolarized light.
+    w = linear_stokes(np.array([1.0, 0, 0, 0]))
+    m0 = np.stack([mueller.retarder(0.3, 1.0), np.full((4, 4), np.nan)])
     p = np.full((4, 2), 0.25)
     e = estimate(p, np.full((4, 2), 1e-6), w, m0)
     assert not e.valid.any()
     assert not e.unphysical.any()
+
+
+@pytest.mark.parametrize("kind", ["depolarizing", "unphysical", "m00"])
+def test_a_dominant_process_that_is_no_mueller_jones_matrix_is_refused(red, kind):
+    m0 = red.mueller_jones(surface(50), 662)
+    wrong = {
+        "depolarizing": triply_degenerate.mueller_matrix(m0, 0.8),
+        "unphysical": np.tile(np.diag([1.0, 1.0, 1.0, -1.0]), (50, 1, 1)),
+        "m00": 1.2 * m0,
+    }[kind]
+    with pytest.raises(ProcessError, match="no Mueller-Jones matrix"):
+        estimate(np.ones((4, 50)), None, linear_stokes(VERTICAL), wrong)
+    estimate(np.ones((4, 50)), None, linear_stokes(VERTICAL), m0.astype(np.float32))
 
 
 def test_horizontal_light_loses_the_estimate_near_brewster_and_vertical_does_not(red):
