@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from drivers.errors import CommandRejected, DeviceError, PortBusy, ReplyTimeout, WrongDevice
 from drivers.serial_link import LineRegistry
 from drivers.source import LightSource
-from drivers.sources import dc4100, fw102c, manual, sc10
+from drivers.sources import dc2200, dc4100, fw102c, manual, sc10
 from simulators.clock import Clock, patient_clock
+from simulators.controllers.dc2200 import DC2200Emulator
 from simulators.controllers.dc4100 import DC4100Emulator
 from simulators.controllers.fw102c import FW102CEmulator
 from simulators.controllers.sc10 import SC10Emulator
@@ -35,6 +36,8 @@ class Bench:
 
     def open(self, **options: Any) -> Any:
         needed: dict[str, Any] = {"positions": {662.0: 3}, "dark_position": 6} if self.module is fw102c else {}
+        if self.module is dc2200:
+            needed = {"terminals": {662.0: 1, 451.0: 2}}
         config = self.module.Config(port=self.port.path, **{"reply_s": 0.2, **needed, **options})
         source = self.module.open(config, self.lines)
         if source.selects_wavelength:
@@ -45,17 +48,18 @@ class Bench:
         """Whether light really comes out, which no reply tells."""
         if isinstance(self.emulator, SC10Emulator):
             return self.emulator.is_open()
-        if isinstance(self.emulator, FW102CEmulator):
+        if isinstance(self.emulator, FW102CEmulator | DC2200Emulator):
             return bool(self.emulator.light_at(662.0))
         assert isinstance(self.emulator, DC4100Emulator)
         return bool(self.emulator.light())
 
 
-@pytest.fixture(params=["sc10", "dc4100", "fw102c"])
+@pytest.fixture(params=["sc10", "dc2200", "dc4100", "fw102c"])
 def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
     made: dict[str, tuple[ModuleType, Emulator]] = {
         "sc10": (sc10, SC10Emulator(Clock(base=patient_clock()))),
         "dc4100": (dc4100, DC4100Emulator(Clock(base=patient_clock()))),
+        "dc2200": (dc2200, DC2200Emulator(Clock(base=patient_clock()))),
         "fw102c": (fw102c, FW102CEmulator(Clock(50.0, base=patient_clock()))),
     }
     module, emulator = made[request.param]

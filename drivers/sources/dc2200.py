@@ -1,0 +1,181 @@
+"""Thorlabs DC2200 LED driver: one LED on each of two terminals, brightness in percent of the LED's limit, over USB.
+
+SCPI as USB Test and Measurement Class, ``/dev/usbtmc0`` on Linux: `*IDN?`, `SOURce1:MODe CB` (constant brightness),
+`SOURce1:CBRightness:BRIGhtness:AMPLitude 40`, `OUTPut1:STATe ON`, the same with a question mark to read,
+`SYSTem:ERRor?` number and text.
+
+Sources: Thorlabs' own PyVISA example for the DC2200, a public C++ and a public MATLAB driver (mode and brightness with
+their queries), the manual of 2020, page 43 (error query, LED head). Unverified: `OUTPut1:STATe?` (SCPI's own form), the
+word that `MODe?` answers, and USBTMC as a whole, which no emulator here speaks.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from drivers.errors import CommandRejected, DeviceError, ReplyError, ReplyTimeout, WrongDevice
+from drivers.message_device import MessageDevice
+from drivers.serial_link import LineRegistry
+from drivers.source import LightSource
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_STATE = re.compile(r"0|1|ON|OFF", re.IGNORECASE)
+_ERROR = re.compile(r"([+-]?\d+),.*")
+_IDENTITY = re.compile(r"[^,]+,[^,]+,[^,]+,[^,]+")
+_MODE = re.compile(r"\w+")
+
+
+class Config(BaseModel):
+    """DC2200 in a rig file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["dc2200"] = "dc2200"
+    port: str = Field(description="device file, such as /dev/usbtmc0")
+    held_by: str | None = Field(default=None, description="program that may hold it too: its simulator")
+    terminals: dict[float, Literal[1, 2]] = Field(min_length=1, description="wavelength in nm to terminal of its LED")
+    percent: dict[float, Annotated[float, Field(ge=0, le=100)]] = Field(
+        default={}, description="brightness by wavelength in nm, set when that is selected"
+    )
+    reply_s: float = Field(default=1.0, gt=0, description="longest wait for a reply")
+
+
+class LedDriver(LightSource):
+    """A DC2200 in constant-brightness mode; at most one LED is on after a call of `select` or `set_light`."""
+
+    selects_wavelength = True
+    has_level = True
+
+    def __init__(self, config: Config, device: MessageDevice, lines: LineRegistry) -> None:
+        self.config = config
+        self._device, self._lines = device, lines
+        self._name = f"LED driver on {config.port}"
+        maker, self._model, self._serial_number, self._firmware = self._ask("*IDN?", _IDENTITY).split(",")
+        if "DC2200" not in self._model.upper():
+            raise WrongDevice(
+                f"identify the {self._name}", f"{maker} {self._model} answers", "Correct `source` in the rig file"
+            )
+        self._used = sorted(set(config.terminals.values()))
+        self._selected = self._used[0] if len(self._used) == 1 else None
+
+    def select(self, wavelength_nm: float) -> None:
+        """Choose the LED of a wavelength, and its brightness where the rig file gives one."""
+        if wavelength_nm not in self.config.terminals:
+            known = ", ".join(f"{nm:g}" for nm in self.config.terminals)
+            raise DeviceError(
+                f"{self._name}, select {wavelength_nm:g} nm", f"its LEDs are {known} nm", "Correct `terminals`"
+            )
+        on = self.is_on()
+        self._selected = self.config.terminals[wavelength_nm]
+        for other in self._used:
+            if other != self._selected:
+                self._switch(other, False)
+        if wavelength_nm in self.config.percent:
+            self.set_level(self.config.percent[wavelength_nm])
+        if on:
+            self._switch(self._selected, True)
+
+    def set_light(self, on: bool) -> None:
+        """Switch the selected LED and wait until the box agrees; off switches both off."""
+        if not on:
+            for terminal in self._used:
+                self._switch(terminal, False)
+            return
+        if self._selected is None:
+            raise DeviceError(f"{self._name}, light on", "no wavelength was selected", "Select one first")
+        self._switch(self._selected, True)
+
+    def is_on(self) -> bool:
+        """True if any LED is on: light of another wavelength is light as well."""
+        return any(self._output(terminal) for terminal in self._used)
+
+    def set_level(self, percent: float) -> float:
+        """Set the brightness of the selected LED; a change of mode shuts it off first."""
+        asked = f"{self._name}, level {percent:g} %"
+        if not 0 <= percent <= 100:
+            raise CommandRejected(asked, "the range is 0 to 100 %", "Correct the level")
+        if self._selected is None:
+            raise DeviceError(asked, "no wavelength was selected", "Select one first")
+        source = f"SOURce{self._selected}"
+        if self._ask(f"{source}:MODe?", _MODE).upper() != "CB":
+            self._switch(self._selected, False)
+            self._tell(f"{source}:MODe CB", asked)
+        self._tell(f"{source}:CBRightness:BRIGhtness:AMPLitude {percent:g}", asked)
+        back = float(self._ask(f"{source}:CBRightness:BRIGhtness:AMPLitude?", _NUMBER))
+        # The box may round to tenths of a percent.
+        if abs(back - percent) > 0.1:
+            raise CommandRejected(asked, f"it reads back {back:g} %", "Look at the box and its LED")
+        return back
+
+    def interlock_open(self) -> bool:
+        """False: the box has no interlock input."""
+        return False
+
+    def describe(self) -> dict[str, str]:
+        """Kind, model, serial number, firmware and port."""
+        return {
+            "kind": "dc2200",
+            "model": self._model.strip(),
+            "serial_number": self._serial_number.strip(),
+            "firmware": self._firmware.strip(),
+            "port": self.config.port,
+        }
+
+    def close(self) -> None:
+        """Give the port back; the light stays as it is."""
+        self._lines.release(self.config.port)
+
+    def _switch(self, terminal: int, on: bool) -> None:
+        asked = f"{self._name}, LED {terminal} {'on' if on else 'off'}"
+        if self._output(terminal) == on:
+            return
+        # Sent once: what became of it is read and not assumed.
+        self._tell(f"OUTPut{terminal}:STATe {'ON' if on else 'OFF'}", asked)
+        if self._output(terminal) != on:
+            raise CommandRejected(asked, "its output did not follow", "Look at the box and its LED")
+
+    def _output(self, terminal: int) -> bool:
+        # One changed character must not make light of darkness.
+        answers = [self._ask(f"OUTPut{terminal}:STATe?", _STATE).upper() in ("1", "ON") for _ in range(2)]
+        if answers[0] != answers[1]:
+            raise ReplyError(f"{self._name}, LED {terminal}", "two readings differ", "Check the cable")
+        return answers[0]
+
+    def _tell(self, command: str, asked: str) -> None:
+        with self._device.lock:
+            self._device.write(command)
+            code = int(self._ask("SYSTem:ERRor?", _ERROR).partition(",")[0])
+        if code != 0:
+            raise CommandRejected(asked, f"error {code}", "The manual lists the errors")
+
+    def _ask(self, query: str, form: re.Pattern[str]) -> str:
+        """One query; without an answer of its form it is asked once more.
+
+        An error is read once and would be lost with a garbled answer; what was set is read back as well.
+        """
+        seen: list[str] = []
+        with self._device.lock:
+            for _ in range(2):
+                self._device.drop_input()
+                self._device.write(query)
+                answer = self._device.read(self.config.reply_s)
+                if answer is not None and form.fullmatch(answer):
+                    return answer
+                seen += [] if answer is None else [answer]
+        asked = f"{self._name}, {query}"
+        if seen:
+            raise ReplyError(asked, f"no sense in {seen}", "Check the cable")
+        raise ReplyTimeout(asked, f"no reply in {self.config.reply_s:g} s, twice", "Check power and cable")
+
+
+def open(config: Config, lines: LineRegistry) -> LedDriver:
+    """Open the LED driver; asks who it is and changes nothing."""
+    device = lines.take(config.port, MessageDevice, lambda _: MessageDevice(config.port, lines.clock, config.held_by))
+    try:
+        return LedDriver(config, device, lines)
+    except BaseException:
+        lines.release(config.port)
+        raise
