@@ -44,11 +44,23 @@ def show(d: Diagnosis) -> None:
 
 
 def _show_effect(effect: FoundEffect) -> None:
-    doubt = "" if effect.confident else " (it helps, but its name may be wrong)"
     where = f" of {effect.element}" if effect.element else ""
-    typer.echo(f"  {effect.kind}{where}: evidence {effect.evidence:.0f}{doubt}")
+    where += f", {effect.capture}" if effect.capture else ""
+    typer.echo(f"  {effect.kind}{where}: {_answer(effect)}")
     for name, p in effect.parameters.items():
         unit, note = "" if p.unit == "1" else f" {p.unit}", f" ({p.note})" if p.note else ""
         typer.echo(f"      {name}: {p.told}{unit}{note}")
     if effect.indistinguishable_from:
         typer.echo(f"      cannot be told from: {', '.join(effect.indistinguishable_from)}")
+
+
+def _answer(effect: FoundEffect) -> str:
+    """How sure the name is, in words and numbers."""
+    explains = f"explains {effect.evidence:.0f} in chi-square"
+    if not effect.confident:
+        return f"{explains}; it helps, but its name may be wrong"
+    if effect.answer is None or effect.probability is None:
+        return explains
+    # Not more nines than a calibration can show.
+    probability = f"{effect.probability:.3f}" if effect.probability < 0.999 else "over 0.999"
+    return f"{effect.answer}, probability {probability}; {explains}"
