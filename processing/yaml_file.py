@@ -82,20 +82,26 @@ class _BoundedComposer(Composer):
 def parse_yaml(text: str, model: type[Model], source: str = "text") -> Model:
     """Validate YAML text as `model`; `source` names it in errors. Raises ConfigError."""
     tree = _tree(text, source)
-    endless = [
-        f"{source}:{_line(tree, where)}: {'.'.join(map(str, where))}: must be a finite number"
-        for where, value in _scalars(tree)
-        if isinstance(value, float) and not math.isfinite(value)
-    ]
     try:
         value = model.model_validate(_plain(tree))
     except ValidationError as error:
         lines = [_describe(source, tree, entry) for entry in error.errors()]
         told = {line.split(" ", 1)[0] for line in lines}
-        raise _refusal(source, lines + [line for line in endless if line.split(" ", 1)[0] not in told]) from error
-    if endless:
-        raise _refusal(source, endless)
+        more = [line for line in _not_finite(source, tree, tree) if line.split(" ", 1)[0] not in told]
+        raise _refusal(source, lines + more) from error
+    # As the model understood them: the text "nan" becomes a number where one is asked for.
+    lines = _not_finite(source, tree, value.model_dump(exclude_unset=True))
+    if lines:
+        raise _refusal(source, lines)
     return value
+
+
+def _not_finite(source: str, tree: CommentedMap, values: Any) -> list[str]:
+    return [
+        f"{source}:{_line(tree, where)}: {'.'.join(map(str, where))}: must be a finite number"
+        for where, value in _scalars(values)
+        if isinstance(value, float) and not math.isfinite(value)
+    ]
 
 
 def _refusal(source: str, lines: list[str]) -> ConfigError:
@@ -175,8 +181,9 @@ def _has(node: CommentedMap | CommentedSeq, part: int | str) -> bool:
 
 
 def _scalars(node: Any, where: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
-    if isinstance(node, (dict, list)):
+    if isinstance(node, (dict, list, tuple)):
         for part, item in node.items() if isinstance(node, dict) else enumerate(node):
+            yield (*where, part), part
             yield from _scalars(item, (*where, part))
     else:
         yield where, node

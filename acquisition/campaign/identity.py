@@ -11,11 +11,15 @@ from typing import Any
 from acquisition.campaign.plan import Campaign, CampaignCapture
 from acquisition.capture.identity import differences, files_of, lasting, plain, rig_content
 from acquisition.capture.job import Job
-from acquisition.errors import AcquisitionError, Differs
+from acquisition.errors import Differs
 from acquisition.rig.config import RigConfig
 from acquisition.rig.rig import Rig
+from processing.doors import read_json
+from processing.errors import ProcessError
 
 IDENTITY = "identity.json"
+#: What it holds by name, several of each.
+KINDS = ("rig", "plan", "instrument")
 #: Differences that are told one by one.
 SHOWN = 20
 
@@ -72,7 +76,7 @@ def _found(then: dict[str, Any], now: dict[str, Any]) -> Iterator[str]:
     for key in now:
         if key not in then and key == "device":
             continue
-        if key in ("rig", "plan", "instrument"):
+        if key in KINDS:
             # The same of several modes and captures is said once.
             for name in now[key]:
                 yield from differences(then.get(key, {}).get(name), now[key][name], key)
@@ -81,18 +85,13 @@ def _found(then: dict[str, Any], now: dict[str, Any]) -> Iterator[str]:
 
 
 def read_identity(folder: Path) -> dict[str, Any] | None:
-    """What the campaign in a folder was begun with; None if it has not begun. Raises AcquisitionError."""
+    """What the campaign in a folder was begun with; None if it has not begun. Raises ProcessError."""
     path = folder / IDENTITY
     if not path.exists():
         return None
-    try:
-        facts = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise AcquisitionError(
-            f"{path} cannot be read ({error}). It says what the campaign was begun with; take it from a copy."
-        ) from error
-    if not isinstance(facts, dict):
-        raise AcquisitionError(f"{path} does not say what the campaign was begun with; take it from a copy.")
+    facts = read_json(path)
+    if not isinstance(facts, dict) or not all(isinstance(facts.get(key, {}), dict) for key in KINDS):
+        raise ProcessError(f"{path} does not say what the campaign was begun with; take it from a copy.")
     return facts
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from processing.arrays import Array
+from processing.doors import read_text
 from processing.errors import ProcessError
 from processing.instrument.determined import determined_elements
 from processing.instrument.model import InstrumentModel, Retarder, rank
@@ -124,10 +125,7 @@ def read_table(path: Path, axes: Sequence[str]) -> StateTable:
     ------
     ProcessError : a column is missing, or a value is no number.
     """
-    try:
-        lines = [line for line in path.read_text().splitlines() if line.strip()]
-    except UnicodeDecodeError as error:
-        raise ProcessError(f"{path} is not text; a table of states is a CSV file") from error
+    lines = [line for line in read_text(path).splitlines() if line.strip()]
     header = [name.strip() for name in lines[0].split(",")] if lines else []
     missing = [axis for axis in axes if axis not in header]
     if missing or len(lines) < 2:

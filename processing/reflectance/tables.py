@@ -19,7 +19,7 @@ from processing.computing.threads import for_ranges
 from processing.errors import ProcessError
 from processing.geometry.rusinkiewicz import Angles
 from processing.reflectance.table_axes import SHAPE, Layout, TableAxes
-from processing.storage.h5_door import damage_as, open_h5, require_dataset
+from processing.storage.h5_door import damage_as, mark_of, open_h5, require_dataset
 from processing.storage.provenance import Step, read_steps, sign, write_steps
 
 SCHEMA_VERSION = 1
@@ -198,16 +198,13 @@ class ScatteringTable:
 
 def is_table(path: Path | str) -> bool:
     """Whether a file is a table that `ScatteringTable.save` wrote."""
-    try:
-        with h5py.File(path, "r") as h5:
-            return "umov_table" in h5.attrs
-    except OSError:
-        return False
+    return mark_of(Path(path), "umov_table") is not None
 
 
 def table_steps(path: Path | str) -> tuple[Step, ...]:
     """Steps that led to a table, oldest first."""
-    with h5py.File(path, "r") as h5:
+    failing = damage_as(TableError, f"{path} cannot be read as a scattering table")
+    with failing, open_h5(Path(path), TableError) as h5:
         return read_steps(h5)
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from processing.doors import read_text, require_file
 from processing.errors import ProcessError
 from processing.reflectance.tables import ScatteringTable, is_table
 from processing.reports.figure_style import map_figure, png, thin
@@ -21,12 +22,15 @@ from processing.reports.mueller_maps import mueller_maps
 from processing.reports.tables import table_section
 from processing.reports.template import Figure, Section, render
 from processing.storage.capture import Capture, CaptureError
+from processing.storage.h5_door import DAMAGE
 from processing.storage.product import Product, is_product
 from processing.storage.provenance import read_steps, steps_text
 
 #: File types that a report takes in.
 PICTURES = (".png", ".svg")
 SUFFIXES = (".h5", ".csv", *PICTURES)
+#: Largest picture that a report takes in, bytes.
+MOST_PICTURE_BYTES = 64 << 20
 #: Rows of a CSV that are shown.
 ROWS = 200
 
@@ -66,7 +70,8 @@ def _date(path: Path) -> str:
             steps = read_steps(h5.get("entry", h5))
             started = h5.get("entry/start_time")
             return steps[-1].date if steps else "" if started is None else str(started.asstr()[()])
-    except OSError:
+    except DAMAGE:
+        # Its section says what is wrong with it.
         return ""
 
 
@@ -94,6 +99,7 @@ def write_report(
         elif file.suffix == ".csv":
             section = _curve(file)
         else:
+            require_file(file, most_bytes=MOST_PICTURE_BYTES)
             section = Section(file.name, [], [Figure(file.read_bytes(), file.name, _media_type(file))])
         sections.append(section)
         if progress:
@@ -212,9 +218,8 @@ def _product(path: Path) -> Section:
 
 def _curve(path: Path) -> Section:
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = [row for row in csv.reader(file) if row]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        rows = [row for row in csv.reader(read_text(path).splitlines(keepends=True)) if row]
+    except csv.Error as error:
         raise ProcessError(f"{path}: cannot be read as CSV ({error})") from error
     shown = [rows[0], *([_rounded(cell) for cell in row] for row in rows[1 : ROWS + 1])] if rows else []
     name = path.name if len(rows) <= ROWS + 1 else f"{path.name}: first {ROWS} of {len(rows) - 1} rows"

@@ -35,6 +35,17 @@ def open_h5(path: Path, error: type[ProcessError], hint: str = "") -> h5py.File:
         raise error(text.strip()) from why
 
 
+def mark_of(path: Path, name: str) -> Any:
+    """An attribute of an HDF5 file; None if the file is none, is damaged, or has no such attribute."""
+    if not path.is_file():
+        return None
+    try:
+        with h5py.File(path, "r") as h5:
+            return h5.attrs.get(name)
+    except DAMAGE:
+        return None
+
+
 @contextmanager
 def damage_as(error: type[ProcessError], what: str) -> Iterator[None]:
     """Damage found while reading becomes `error`: one line that starts with `what`."""

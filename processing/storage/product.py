@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from processing.errors import ProcessError
 from processing.storage.capture_schema import CaptureHeader
-from processing.storage.h5_door import damage_as, open_h5, require_dataset, text_attribute
+from processing.storage.h5_door import damage_as, mark_of, open_h5, require_dataset, text_attribute
 from processing.storage.provenance import Step as Step
 from processing.storage.provenance import file_identity as file_identity
 from processing.storage.provenance import jsonable, read_steps, sign, write_steps
@@ -266,11 +266,7 @@ def refuse_existing(path: Path, overwrite: bool) -> None:
 
 def is_product(path: Path) -> bool:
     """Whether a file is a product of `process` (and not a capture, or anything else)."""
-    try:
-        with h5py.File(path, "r") as h5:
-            return "umov_product" in h5.attrs
-    except OSError:
-        return False
+    return mark_of(path, "umov_product") is not None
 
 
 def _early(parent: h5py.Group, name: str, shape: tuple[int, ...], dtype: Any) -> h5py.Dataset:

@@ -15,6 +15,8 @@ from typing import Any
 import h5py
 import numpy as np
 
+from processing.storage.h5_door import mark_of
+
 #: Attribute of a product's root: `Step.made_of` of its last step.
 MADE_OF = "made_of"
 
@@ -67,11 +69,7 @@ def file_identity(path: Path, role: str = "") -> dict[str, Any]:
 
 def made_of(path: Path) -> str | None:
     """`Step.made_of` of a product; None for a file that is not there, or does not say."""
-    try:
-        with h5py.File(path, "r") as h5:
-            found = h5.attrs.get(MADE_OF)
-    except OSError:
-        return None
+    found = mark_of(path, MADE_OF)
     return None if found is None else str(found)
 
 

@@ -104,6 +104,17 @@ def test_yaml(acquire_refuses, tmp_path, name):
     assert str(plan) in said
 
 
+@pytest.mark.parametrize("text", [".nan", "nan", "'inf'", "1e999", "{.inf: 90}"])
+def test_a_retardance_that_is_no_number(tmp_path, text):
+    from processing.instrument.model import InstrumentModel
+
+    path = tmp_path / "instrument.yaml"
+    text_of_file = INSTRUMENT.with_name("drr_imaging_630nm.yaml").read_text()
+    path.write_text(text_of_file.replace("retardance_deg: 90}", f"retardance_deg: {text}}}", 1))
+    with pytest.raises(ConfigError, match=r"instrument\.yaml:\d+: .*retardance_deg.*finite"):
+        load_yaml(path, InstrumentModel)
+
+
 def test_yaml_of_any_size_is_not_even_read(tmp_path):
     from acquisition.capture.plan import MeasurementPlan
 
@@ -167,6 +178,15 @@ def test_damaged_books_of_a_campaign(tmp_path, caplog, text):
     (tmp_path / "campaign.yaml").write_bytes(b"\xff\xfe kind: \x00")
     with pytest.raises(ConfigError, match=r"campaign\.yaml"):
         CampaignFolder(tmp_path, campaign)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"rig": 3}', "\x00", "[" * 5000], ids=range(5))
+def test_damaged_identity_of_a_campaign(tmp_path, text):
+    from acquisition.campaign.identity import read_identity
+
+    (tmp_path / "identity.json").write_text(text)
+    with pytest.raises(ProcessError, match=r"identity\.json"):
+        read_identity(tmp_path)
 
 
 def test_json_is_finite_and_shallow():
