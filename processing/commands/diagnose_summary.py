@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from processing.diagnosis.search.result import Diagnosis, FoundEffect
+from processing.diagnosis.search.result import Correction, Diagnosis, FoundEffect
 
 
 def show(d: Diagnosis) -> None:
@@ -28,6 +28,8 @@ def show(d: Diagnosis) -> None:
             typer.echo(f"  closure of {c.name}: {c.closure_before_percent:.3f} % -> {c.closure_after_percent:.3f} %")
     for effect in d.effects:
         _show_effect(effect)
+    if d.correction is not None:
+        _show_correction(d.correction)
     if d.unexplained is not None:
         typer.echo("  unexplained structure is left:")
         for line in d.unexplained.description:
@@ -52,6 +54,15 @@ def _show_effect(effect: FoundEffect) -> None:
         typer.echo(f"      {name}: {p.told}{unit}{note}")
     if effect.indistinguishable_from:
         typer.echo(f"      cannot be told from: {', '.join(effect.indistinguishable_from)}")
+
+
+def _show_correction(correction: Correction) -> None:
+    """What would be written, apart from names: how much of it, and the figures that were looked at."""
+    kinds = ", ".join(dict.fromkeys(e.kind for e in correction.effects)) or "nothing"
+    fate = f"refused: {correction.refused}" if correction.refused else "holds"
+    typer.echo(f"  correction (means over what the data leave open): {kinds}; {fate}")
+    for check in correction.checks:
+        typer.echo(f"      {check.name}: {check.before:.4g} -> {check.after:.4g}")
 
 
 def _answer(effect: FoundEffect) -> str:
