@@ -136,6 +136,12 @@ class Capture:
         """A column of the state table (exposure_s, host_time_s, ...) for the states done."""
         return self.planned_column(name)[self.done]
 
+    def seen(self, model: InstrumentModel) -> InstrumentModel:
+        """The model with the mosaic as this capture's frames have it: an odd offset of the region shifts it."""
+        if model.mosaic is None or self.header.mosaic is None:
+            return model
+        return model.model_copy(update={"mosaic": self.header.mosaic})
+
     @property
     def start_time(self) -> str:
         """When the capture began, ISO 8601."""

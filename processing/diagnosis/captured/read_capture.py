@@ -44,7 +44,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     states = sample_states(capture)
     angles_of(capture, model, states)
     correction = Correction.of(capture)
-    raw, clipped, clipped_states, zero = _frames(capture, model, states, correction)
+    raw, clipped, clipped_states, zero = _frames(capture, capture.seen(model), states, correction)
     cut_off = zero.mean(axis=(1, 2)) > MOST_CUT_OFF
     if cut_off.all():
         raise CaptureError(f"{capture.path}: the counts of every state are cut off at zero. Raise the black level.")
