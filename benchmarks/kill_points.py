@@ -37,6 +37,8 @@ from simulators.disc.watched import RECORD, DiscCalls, build, restart_watched
 
 ROOT = Path(__file__).resolve().parents[1]
 WORK = Path(tempfile.gettempdir()) / f"umov_kill_points_{os.getuid()}"
+#: Longest time for the points of one run, seconds.
+LIMIT_S = float(os.environ.get("UMOV_LIMIT_S", "inf"))
 #: What differs between two runs of one plan.
 TIMES = ("host_time_s", "camera_time_ns", "frame_id", "start_time", "closing/json", "segments/json", "segment", "crc32")
 
@@ -123,6 +125,9 @@ def kill(options: list[str], every: int, first: int, sent: signal.Signals | None
     lost = points = 0
     begin_s = time.monotonic()
     for number in range(first, total + 1, every):
+        if time.monotonic() - begin_s > LIMIT_S:
+            print(f"stopped before call {number}: no time left")
+            break
         out = captures / f"run{number}"
         status, _ = run(options, out, lambda calls, number=number: calls.arm(number, sent))
         # An error is told with exit code 1, but where it concerns nothing that matters, as the figure of a capture.
@@ -150,6 +155,8 @@ def night(options: list[str], captures: int, calls: int, seed: int = 1) -> int:
         if not os.WIFSIGNALED(status):
             break
         kills += 1
+        if kills % 50 == 0:
+            print(f"{kills} kills, {time.monotonic() - begin_s:.0f} s", flush=True)
     wrong = [f"{f.what}: {f.found}" for f in verify(out / "night") if f.well is not True]
     complete = len(list((out / "night").glob("*.h5")))
     states = _states(out / "night")
