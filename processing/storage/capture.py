@@ -18,13 +18,10 @@ from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture_door import check_capture
 from processing.storage.capture_schema import SCHEMA_VERSION, CaptureHeader
-from processing.storage.checksums import NONE, row_crc32, state_crc32
+from processing.storage.checksums import NONE, row_crc32, state_crc32, summed_values
 from processing.storage.h5_door import damage_as, open_h5, text_attribute
 from processing.storage.segments import Segment, decode_lines, segments_of
 from processing.yaml_file import parse_yaml
-
-#: Columns that are no part of a state's checksum: the mark that it is there, and the checksum itself.
-UNSUMMED = ("done", "crc32")
 
 
 class CaptureError(ProcessError):
@@ -90,16 +87,13 @@ class Capture:
 
     def _verified_sums(self, entry: h5py.Group) -> NDArray[np.uint32] | None:
         """Checksums of the rows (states done, channels, rows), None without any; the states' own are verified here."""
-        columns = {name: column[...][self.done] for name, column in entry["states"].items() if name != "role"}
-        told = columns["crc32"]
+        told = entry["states/crc32"][...][self.done]
         if np.all(told == NONE):
             return None
         sums: NDArray[np.uint32] = entry["instrument/detector/row_crc32"][...][self.done]
-        for axis in self.angles_deg:
-            for name in ("value", "raw_value"):
-                columns[f"{axis}/{name}"] = entry[f"instrument/{axis}/{name}"][...][self.done]
+        columns = {name: column[self.done] for name, column in summed_values(entry).items()}
         for k in np.flatnonzero(told != NONE):
-            values = {name: column[k] for name, column in columns.items() if name not in UNSUMMED}
+            values = {name: column[k] for name, column in columns.items()}
             if state_crc32(sums[k], values) != told[k]:
                 self._contradictory.append(int(k))
         if self._verifying and self._contradictory:

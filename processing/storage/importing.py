@@ -20,6 +20,7 @@ from processing.computing.threads import thread_count
 from processing.doors import one_line, read_text
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture_schema import CaptureHeader, Detector, Sample, create_layout, write_closing
+from processing.storage.checksums import row_crc32, write_checksums
 from processing.storage.frame_files import check_stack, open_stack, read_picture
 from processing.storage.h5_door import read_npy
 from processing.storage.state_csv import ImportFailed, StatesFile, read_states
@@ -107,11 +108,13 @@ def _write(
     now = datetime.now(UTC).isoformat(timespec="seconds")
     create_layout(h5, header, states.angles_deg, states.role, source.shape[1:], source.dtype, now)
     data = h5["entry/instrument/detector/data"]
+    row_sums = np.zeros(data.shape[:3], np.uint32)
     count = 0
     for count, frame in enumerate(source.frames(), 1):
         if frame.dtype.kind == "f" and not np.isfinite(frame).any():
             raise ImportFailed(f"{states.path}:{states.line[count - 1]}: the frame of this state has no finite value")
         data[count - 1] = frame
+        row_sums[count - 1] = row_crc32(frame.astype(data.dtype, copy=False))
         if progress:
             progress(count, len(states))
     for axis, angle in states.angles_deg.items():
@@ -123,6 +126,7 @@ def _write(
     if states.time_s is not None:
         table["host_time_s"][...] = states.time_s
     table["done"][...] = 1
+    write_checksums(h5["entry"], row_sums)
     write_closing(h5, "complete", {"imported": now})
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import RGB950_RATIO, RGB950_STATES, RGB950_STEP_DEG
 from processing.storage.capture_schema import CaptureHeader, Sample, create_layout, write_closing
+from processing.storage.checksums import row_crc32, write_checksums
 from simulators.bench.bench import SimulatedBench
 
 
@@ -64,6 +65,7 @@ def write_virtual_capture(
         if "repeats" in h5["entry/states"]:
             h5["entry/states/repeats"][...] = 1
         h5["entry/states/done"][...] = 1
+        write_checksums(h5["entry"], row_crc32(frames[...]))
         write_closing(h5, "complete", {})
 
 

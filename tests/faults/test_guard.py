@@ -33,7 +33,7 @@ def _moving(simulation):
 
 
 def _until(condition):
-    """Wait; `benchmarks/guard_time.py` measures how long it takes."""
+    # How long it takes is measured by benchmarks/guard_time.py.
     while not condition():
         time.sleep(0.01)
 

@@ -24,7 +24,6 @@ def _run(*arguments, work):
         [sys.executable, str(PROGRAM), *map(str, arguments)],
         capture_output=True,
         text=True,
-        timeout=100,
         check=False,
         env=os.environ | {"TMPDIR": str(work)},
     )
