@@ -79,17 +79,34 @@ def _summary(judged: Judged) -> str:
 
 def _effects(judged: Judged) -> str:
     rows = []
+    several = len(judged.diagnosis.captures) > 1
     for e in judged.diagnosis.effects:
         for name, p in e.parameters.items():
             # What is told of the effect as a whole stands in its first row.
             kind = e.kind if e.confident else f"{e.kind} (the name may be wrong)"
-            whole = (kind, e.element or "", f"{e.evidence:.0f}", ", ".join(e.indistinguishable_from))
-            kind, element, evidence, also = whole if name == next(iter(e.parameters)) else ("", "", "", "")
-            rows.append([kind, element, name, p.told, p.unit, evidence, also])
+            place = ", ".join(filter(None, (e.element, e.capture if several else None)))
+            sure = e.answer or ""
+            if e.probability is not None:
+                sure += f", {e.probability:.3f}" if e.probability < 0.999 else ", over 0.999"
+            whole = (kind, place, sure, f"{e.evidence:.0f}", ", ".join(e.indistinguishable_from))
+            first = whole if name == next(iter(e.parameters)) else ("",) * len(whole)
+            # Non-breaking spaces: a number stays on one line with its error and unit.
+            value = f"{p.told} {p.unit if p.unit != '1' else ''}".strip().replace(" ", "\u00a0")
+            rows.append([*first[:2], name, value, *first[2:]])
     if not rows:
-        return "<p>No effect is named.</p>"
-    head = ["effect", "element", "parameter", "value", "unit", "evidence", "cannot be told from"]
-    return "<h2>Effects</h2>" + _table(head, rows)
+        return "<p>No effect is named.</p>" + _correction(judged)
+    head = ["effect", "of", "parameter", "value", "name", "chi2 explained", "or it is"]
+    return "<h2>Effects</h2>" + _table(head, rows) + _correction(judged)
+
+
+def _correction(judged: Judged) -> str:
+    """What is written, apart from names: its fate, and the figures that the guard looked at."""
+    found = judged.diagnosis.correction
+    if found is None:
+        return ""
+    fate = f"Refused: {found.refused}" if found.refused else "It holds, and is what --write puts into the file."
+    rows = [[c.name, f"{c.before:.4g}", f"{c.after:.4g}"] for c in found.checks]
+    return f"<h2>Correction</h2><p>{fate}</p>" + _table(["figure", "before", "after"], rows)
 
 
 def _ranking(judged: Judged) -> str:
