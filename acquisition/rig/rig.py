@@ -215,7 +215,11 @@ class Rig:
         return motions
 
     def _check_way(self, targets_deg: Mapping[str, float]) -> None:
-        found = find_obstacle(self.config, here := self._where_known(), here | dict(targets_deg), targets_deg)
+        if not concerned(self.config) & targets_deg.keys():
+            # Not even a position is read then: most moves are of rotators that nothing can hit.
+            return
+        here = self._where_known()
+        found = find_obstacle(self.config, here, here | dict(targets_deg), targets_deg)
         if found is not None:
             raise AcquisitionError(f"move to {dict(targets_deg)} meets {found}. Nothing was moved.")
 

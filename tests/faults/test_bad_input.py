@@ -2,8 +2,6 @@
 
 import json
 import struct
-import subprocess
-import sys
 import time
 import zlib
 from pathlib import Path
@@ -123,7 +121,7 @@ def test_yaml_of_any_size_is_not_even_read(tmp_path):
         file.truncate(50 << 20)
     with pytest.raises(ConfigError, match="at most"):
         load_yaml(path, MeasurementPlan)
-    path.write_text("#\n" * (MOST_BYTES // 2 - 10))
+    path.write_text("#\n" * (MOST_BYTES // 8))
     start_s = time.process_time()
     with pytest.raises(ConfigError, match="keys and values"):
         load_yaml(path, MeasurementPlan)
@@ -392,15 +390,3 @@ def test_pbsdf_of_other_shapes(tmp_path):
     path.write_bytes(data)
     with pytest.raises(ProcessError, match="truncated"):
         load_pbsdf(path)
-
-
-# --- at random --------------------------------------------------------------------------------------------
-
-
-def test_random_damage_at_every_door():
-    """A fixed seed and few inputs, about half a minute in all: CI has little time. An hour a door: `--seconds 3600`."""
-    found = subprocess.run(
-        [sys.executable, str(ROOT / "benchmarks" / "fuzz_doors.py"), "--inputs", "15", "--seed", "20"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert found.returncode == 0, found.stdout[-3000:] + found.stderr[-2000:]

@@ -55,7 +55,7 @@ class MachineClocks:
         monkeypatch.setattr(aravis_stream.FrameStream, "take", stamped)
 
 
-@pytest.mark.parametrize("step_s", [3600.0, -3600.0, 1.5, -1.5])
+@pytest.mark.parametrize("step_s", [3600.0, -1.5])
 def test_a_clock_that_is_set_in_mid_run_leaves_order_and_frames_right(run_with, intact, monkeypatch, step_s):
     clocks, before = MachineClocks(monkeypatch), time.time()
 

@@ -197,7 +197,7 @@ def test_footprints_keep_the_distance_that_can_be_worked_out():
     assert gap_mm(corner, box) == pytest.approx(49 - 10 * math.sqrt(2))
 
 
-def test_no_move_brings_solids_together(small_rig):
+def test_no_move_brings_solids_together(small_rig, monkeypatch):
     """On an open rig, and in the check of a plan; nothing moves."""
     path = small_rig(top={"solids": {"margin_mm": 10, "parts": [ARM, POST]}, "park_deg": {}, "homing": {
         "arm": {"passes_deg": [-1, 60], "ends_deg": 0}}})  # fmt: skip
@@ -209,6 +209,9 @@ def test_no_move_brings_solids_together(small_rig):
         with pytest.raises(AcquisitionError, match="solids 'arm' and 'post' nearer than 10 mm"):
             rig.move({"arm": 135.0})
         assert rig.simulation.true_angles_deg() == before
+        # A rotator that nothing can hit moves without a question to the arm.
+        monkeypatch.setattr(rig.axes["arm"], "read_position", lambda: pytest.fail("asked"))
+        rig.move({"psg": 10.0})
     with pytest.raises(PlanRefused, match="solids 'arm' and 'post'"):
         prepare(MeasurementPlan(omega_deg=90), config)
 
