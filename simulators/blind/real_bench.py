@@ -148,17 +148,11 @@ def make_bench(folder: Path, seed: int, configs: Path, group: str = "real", pixe
     text, model = file.read_text(encoding="utf-8"), InstrumentModel.load(file)
     nm = MOSAIC_NM if mosaic else WAVELENGTHS_NM[seed % 2]
     electrons = float(random.uniform(10_000, 25_000))
-    kinds = draw_kinds(random) if group == "real" else list(GROUPS[group])
     draws = [
         _Draw(kind, int(random.integers(1 << 31)), str(random.choice(["psg", "psa"])), str(random.choice(FITTED)))
-        for kind in (kinds if group == "real" else kinds[seed % len(kinds) :][:1] if kinds else [])
+        for kind in _kinds(group, seed, random)
     ]
-    scenes = {
-        "sphere": Disc(random),
-        "flat": Scene(random, flat_mueller(random), brightness=0.3),
-        "air": Scene(random, np.eye(4)),
-        VALIDATION: Scene(random),
-    }
+    scenes = _scenes(random)
     angles = state_angles(STATES[mosaic], mosaic, any(d.kind == "rotation_backlash" for d in draws))
     if mosaic:
         del angles["psa"]
@@ -184,6 +178,24 @@ def make_bench(folder: Path, seed: int, configs: Path, group: str = "real", pixe
     truth = RealBench(name, group, seed, file.name, nm, tuple(found[k] for k in sorted(found, key=str)))
     (away / "truth.json").write_text(json.dumps(asdict(truth), indent=1), encoding="utf-8")
     return truth
+
+
+def _kinds(group: str, seed: int, random: np.random.Generator) -> list[str]:
+    """Kinds of fault of one bench: many small ones, or one of the group, in turn."""
+    if group == "real":
+        return draw_kinds(random)
+    kinds = list(GROUPS[group])
+    return [kinds[seed % len(kinds)]] if kinds else []
+
+
+def _scenes(random: np.random.Generator) -> dict[str, Scene]:
+    """What stands at the sample's place in each capture."""
+    return {
+        "sphere": Disc(random),
+        "flat": Scene(random, flat_mueller(random), brightness=0.3),
+        "air": Scene(random, np.eye(4)),
+        VALIDATION: Scene(random),
+    }
 
 
 @dataclass(frozen=True)
