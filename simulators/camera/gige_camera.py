@@ -279,14 +279,21 @@ class GigeCamera:
             return
         self._armed_at_s = exposed_s + self._arming_s
         self._live_memory().write(features.TRIGGER_ARMED, 0)
+        self._arm_later()
+
+    def _arm_later(self) -> None:
         # A little late, so that what the register says holds.
-        wait_s = max(0.0, self._armed_at_s - self._clock.now_s() + 2e-3)
-        timer = threading.Timer(wait_s, self._arm)
+        timer = threading.Timer(max(0.0, self._armed_at_s - self._clock.now_s()) + 2e-3, self._arm)
         timer.daemon = True
         timer.start()
 
     def _arm(self) -> None:
-        if self._memory is not None:
+        if self._memory is None:
+            return
+        # The timer counts real seconds, which may be ahead of our clock.
+        if self._clock.now_s() < self._armed_at_s:
+            self._arm_later()
+        else:
             self._memory.write(features.TRIGGER_ARMED, 1)
 
     def _info(self, buffer: int, exposure_us: int, gain_raw: int) -> ExposureInfo:

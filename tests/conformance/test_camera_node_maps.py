@@ -15,6 +15,7 @@ from drivers.errors import SettingRefused
 from drivers.pixel_formats import pixel_format
 from simulators.camera.gige_camera import ExposureInfo, GigeCamera
 from simulators.camera.node_map import NodeMap, node_map, node_maps
+from simulators.clock import patient_clock
 
 SIZE = (64, 48)
 
@@ -25,7 +26,9 @@ class MakersCamera:
     def __init__(self, name: str, stack: ExitStack) -> None:
         self.table: NodeMap = node_map(name)
         self.scale = 1
-        self.simulated = stack.enter_context(GigeCamera("MAKER1", *SIZE, self.show, bits=16, description=name))
+        self.simulated = stack.enter_context(
+            GigeCamera("MAKER1", *SIZE, self.show, bits=16, description=name, clock=patient_clock())
+        )
         self._stack = stack
 
     def show(self, info: ExposureInfo) -> NDArray[np.uint16]:
@@ -35,7 +38,11 @@ class MakersCamera:
 
     def open(self, **config: object) -> aravis.AravisCamera:
         return self._stack.enter_context(
-            aravis.open("camera", aravis.Config(device="127.0.0.1", packet_size=9000, **config))  # type: ignore[arg-type]
+            aravis.open(
+                "camera",
+                aravis.Config(device="127.0.0.1", packet_size=9000, **config),  # type: ignore[arg-type]
+                patient_clock(),
+            )
         )
 
 
