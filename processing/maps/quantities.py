@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from processing.arrays import RealArray
 from processing.errors import ProcessError
+from processing.maps.coherency_noise import coherency_noise
 from processing.maps.extrapolation import EXTRAPOLATED, ExtrapolatedImage
+from processing.maps.first_order_limits import limit
 from processing.polarization import gradients
 from processing.polarization.decompositions.differential import differential
 from processing.polarization.decompositions.lu_chipman import lu_chipman
@@ -55,6 +57,10 @@ _MAPS: dict[str, Plane] = {
     "retardance_deg": Plane((), "degree", "Lu-Chipman retardance, 0 to 180 degrees"),
     "retardance_linear_deg": Plane((), "degree", "linear part of the Lu-Chipman retardance vector"),
     "retardance_fast_axis_deg": Plane((), "degree", f"fast axis of the linear part, {_AXES}"),
+    "retardance_axis_or_90_deg": Plane((), "degree", "fast or slow axis, 0 to 90: known at 180 degrees too"),
+    "retardance_vector_deg": Plane(
+        (3,), "degree", "retardance along horizontal, 45 degrees, right circular; v and v - 360 v/|v| are one retarder"
+    ),
     "retardance_circular_deg": Plane((), "degree", "circular part; positive: right circular is fast"),
     "depolarization_power": Plane((), "", "Lu-Chipman depolarization power"),
 }
@@ -69,6 +75,15 @@ _DIFFERENTIAL = {
     "differential_retardance_circular_deg": Plane((), "degree", "its circular part; positive: right circular is fast"),
     "differential_diattenuation_linear": Plane((), "", "linear diattenuation exponent, ln(T_max / T_min) / 2"),
 } | {f"differential_depolarization_{k}": Plane((), "", f"depolarization exponent of S{k}") for k in (1, 2, 3)}
+
+#: Without error bars of their own.
+_NOISE = {
+    "td_missed_noise": Plane((), "", "td_missed of a triply degenerate matrix, by noise alone; taken off"),
+    "retardance_axis_flip": Plane((), "", "probability that the fast axis told is the slow one"),
+    "retardance_vector_covariance": Plane(
+        (6,), "degree2", "covariance of retardance_vector_deg: 00, 11, 22, 01, 02, 12"
+    ),
+}
 
 _GROUPS: tuple[Callable[[RealArray], dict[str, Derived]], ...] = (
     gradients.coherency,
@@ -108,14 +123,17 @@ def quantities_of_mueller(
     planes = dict(maps)
     for name, plane in maps.items():
         if plane.dtype is np.float32:
-            planes[f"{name}_errors"] = Plane(plane.leading, plane.units, f"standard errors of {name}, first order")
+            planes[f"{name}_errors"] = Plane(
+                plane.leading, plane.units, f"standard errors of {name}; NaN: not determined"
+            )
+    planes |= _NOISE
     with Product(source) as product:
         _require_matrices(product)
         steps = (*product.steps, step)
         with ProductWriter(out, "quantities", product.header, product.shape, planes, steps, overwrite) as writer:
             for rows in product.row_blocks(BLOCK_PIXELS):
                 if rows.stop > writer.rows_done:
-                    writer.write(rows, **_block(_image(product, rows), extra, pairs))
+                    writer.write(rows, **quantities_block(_image(product, rows), extra, pairs))
                 if progress:
                     progress(rows.stop, product.shape[0])
             facts = _facts(writer, maps)
@@ -150,9 +168,10 @@ def _planes(extra: Sequence[str], pairs: Mapping[str, tuple[NamedStokes, NamedSt
     return found
 
 
-def _block(
+def quantities_block(
     image: MuellerImage | ExtrapolatedImage, extra: Sequence[str], pairs: Mapping[str, tuple[NamedStokes, NamedStokes]]
 ) -> dict[str, NDArray[Any]]:
+    """Planes of the product for an image, or for some rows of it."""
     m = image.matrices.astype(float)
     # Where there is no light an eigenvalue solver only works on noise, slowly.
     lit = np.where((image.values[0, 0] > LIT_ERRORS * np.nan_to_num(image.errors[0, 0]))[..., None, None], m, np.nan)
@@ -171,8 +190,12 @@ def _block(
             each = gradient.reshape(-1, *m.shape[:2], 16)
             errors = [np.sqrt(image.variance_of(g)) for g in each]
             found[f"{name}_errors"] = np.stack(errors).reshape(value.shape).astype(np.float32)
-    found["lit"] = np.isfinite(lit[..., 0, 0]).astype(np.uint8)
+    found["retardance_vector_covariance"] = _covariance(image, derived["retardance_vector_deg"].gradient)
+    found["td_missed_noise"] = np.zeros_like(found["td_missed"])
     polar = lu_chipman(m)
+    noise = coherency_noise(image) if isinstance(image, MuellerImage) else None
+    limit(found, noise, _relative_error(image), polar.depolarizer)
+    found["lit"] = np.isfinite(lit[..., 0, 0]).astype(np.uint8)
     found["lu_chipman_defined"] = polar.defined.astype(np.uint8)
     found["negative_determinant"] = polar.negative_determinant.astype(np.uint8)
     if "symmetric" in extra:
@@ -180,6 +203,20 @@ def _block(
     if "differential" in extra:
         found["differential_defined"] = differential(lit).defined.astype(np.uint8)
     return found
+
+
+def _covariance(image: MuellerImage | ExtrapolatedImage, gradient: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Covariance (6, rows, columns) of 3 quantities with gradients (3, rows, columns, 16): 00, 11, 22, 01, 02, 12."""
+    own = [image.variance_of(g) for g in gradient]
+    mixed = [(image.variance_of(gradient[i] + gradient[j]) - own[i] - own[j]) / 2 for i, j in ((0, 1), (0, 2), (1, 2))]
+    return np.stack([*own, *mixed]).astype(np.float32)
+
+
+def _relative_error(image: MuellerImage | ExtrapolatedImage) -> NDArray[np.float64]:
+    """Root mean square error of the elements other than m00, over m00."""
+    square = np.square(image.errors.astype(float))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.sqrt((square.sum(axis=(0, 1)) - square[0, 0]) / 15) / image.values[0, 0])
 
 
 def _facts(writer: ProductWriter, maps: Mapping[str, Plane]) -> dict[str, Any]:
@@ -199,7 +236,7 @@ def _facts(writer: ProductWriter, maps: Mapping[str, Plane]) -> dict[str, Any]:
     for name in maps:
         if name.endswith("_defined") or name == "negative_determinant":
             facts[f"pixels_{name}"] = int(np.sum(writer.get(name)[known]))
-    if not np.isfinite(xi_errors[:, known]).any():
+    if not np.isfinite(writer.get("polarizance_circular_errors")[known]).any():
         facts["warnings"].append("the product holds no standard errors, so neither do the maps")
         return facts
     unphysical = (xi[3] < -3 * xi_errors[3]) & known

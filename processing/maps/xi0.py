@@ -11,8 +11,9 @@ from scipy import ndimage
 
 from processing.errors import ProcessError
 from processing.geometry.viewing import ViewingGeometry
-from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
-from processing.polarization.eigenvalue_noise import TRIPLE, EigenvalueNoise, corrected
+from processing.maps.coherency_noise import coherency_noise
+from processing.polarization.cloude import coherency_eigenvalues
+from processing.polarization.eigenvalue_noise import corrected
 from processing.polarization.xi0 import Xi0Estimate, estimate
 from processing.reduction.mosaic.methods import REACH
 from processing.reduction.mueller import Progress
@@ -89,7 +90,7 @@ def xi0_of_mueller(source: Path, out: Path, step: Step, overwrite: bool, progres
 def eigenvalue_block(image: MuellerImage) -> dict[str, NDArray[Any]]:
     """Planes `MUELLER_PLANES` of an image, or of some rows of it."""
     eigenvalues = coherency_eigenvalues(image.matrices)
-    noise = eigenvalue_noise(image)
+    noise = coherency_noise(image)
     found = corrected(eigenvalues.astype(float), noise)
     known = np.isfinite(found.xi0)
     # Without standard errors nothing can be taken off.
@@ -106,24 +107,6 @@ def eigenvalue_block(image: MuellerImage) -> dict[str, NDArray[Any]]:
         "eigenvalue_spread_noise": np.sqrt(noise.others),
         "valid": valid.astype(np.uint8),
     }
-
-
-def eigenvalue_noise(image: MuellerImage) -> EigenvalueNoise:
-    """Noise of the coherency matrix about the dominant process of each pixel, from the image's own covariance.
-
-    To first order d xi0 = <dM, m0 - 4 xi0 e00> / (4 m00), m0 being the dominant process.
-    """
-    xi0, m0 = xi0_and_dominant(image.matrices)
-    process = np.asarray(m0, dtype=np.float32).reshape(*m0.shape[:2], 16)
-    m00 = image.values[0, 0].astype(float)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        diagonal = image.variance_of(process) / (4 * m00) ** 2
-        row = image.product_of(TRIPLE, process) / m00**2
-        total = np.square(image.errors).sum(axis=(0, 1)) / (4 * m00**2)
-        gradient = process.copy()
-        gradient[..., 0] -= 4 * xi0
-        along = np.sqrt(image.variance_of(gradient)) / (4 * m00)
-    return EigenvalueNoise.of(total, row, diagonal, along)
 
 
 def xi0_of_stokes(

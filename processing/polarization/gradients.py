@@ -119,9 +119,17 @@ def lu_chipman_quantities(m: RealArray) -> dict[str, Derived]:
     def values(mueller: RealArray) -> RealArray:
         factors = lu_chipman(mueller)
         vector = quantities.retardance_vector(factors.retarder)
-        return np.stack([*_retardance_deg(vector), depolarization_power(factors.depolarizer)], axis=-1)
+        axes = [np.rad2deg(vector[..., k]) for k in range(3)]
+        return np.stack([*_retardance_deg(vector), depolarization_power(factors.depolarizer), *axes], axis=-1)
 
-    return _numeric(values, m, (*RETARDER, "depolarization_power"), (*_RETARDER_PERIOD, np.inf))
+    axes = tuple(f"axis{k}" for k in range(3))
+    period = (*_RETARDER_PERIOD, *4 * (np.inf,))
+    found = _numeric(values, m, (*RETARDER, "depolarization_power", *axes), period)
+    parts = [found.pop(name) for name in axes]
+    vector = Derived(np.stack([p.value for p in parts]), np.stack([p.gradient for p in parts]))
+    fast = found["retardance_fast_axis_deg"]
+    either = Derived(np.mod(fast.value, 90.0), fast.gradient)
+    return found | {"retardance_axis_or_90_deg": either, "retardance_vector_deg": vector}
 
 
 def symmetric_quantities(m: RealArray) -> dict[str, Derived]:

@@ -1,0 +1,27 @@
+"""Noise of the coherency matrices of a Mueller image, from the image's own covariance."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from processing.polarization.cloude import xi0_and_dominant
+from processing.polarization.eigenvalue_noise import TRIPLE, EigenvalueNoise
+from processing.storage.images import MuellerImage
+
+
+def coherency_noise(image: MuellerImage) -> EigenvalueNoise:
+    """Noise of the coherency matrix about the dominant process of each pixel.
+
+    To first order d xi0 = <dM, m0 - 4 xi0 e00> / (4 m00), m0 being the dominant process.
+    """
+    xi0, m0 = xi0_and_dominant(image.matrices)
+    process = np.asarray(m0, dtype=np.float32).reshape(*m0.shape[:2], 16)
+    m00 = image.values[0, 0].astype(float)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        diagonal = image.variance_of(process) / (4 * m00) ** 2
+        row = image.product_of(TRIPLE, process) / m00**2
+        total = np.square(image.errors).sum(axis=(0, 1)) / (4 * m00**2)
+        gradient = process.copy()
+        gradient[..., 0] -= 4 * xi0
+        along = np.sqrt(image.variance_of(gradient)) / (4 * m00)
+    return EigenvalueNoise.of(total, row, diagonal, along)

@@ -1,0 +1,66 @@
+"""Every error bar of `process quantities` on five kinds of sample: a short form of `benchmarks/error_bars.py`."""
+
+import numpy as np
+import pytest
+from error_bars import entries
+from noisy_images import five_samples, noisy_image
+
+from processing.maps.quantities import EXTRA, quantities_block
+from processing.polarization import mueller, triply_degenerate
+
+PIXELS = 400
+
+
+@pytest.mark.parametrize("electrons", [20, 200, 20_000])
+@pytest.mark.parametrize("sample", five_samples())
+def test_pulls_have_unit_variance_where_there_is_an_error_bar(sample, electrons):
+    found = list(entries(sample, electrons, PIXELS, EXTRA))
+    # Sampling scatters by 0.035 (more where components are few and tails wide); second order is what 20 electrons show.
+    room = 0.45 if electrons == 20 else 0.2
+    for e in found:
+        if e.determined > 0.85:
+            assert e.rms == pytest.approx(1, abs=room), e
+    # Something must be left of them.
+    assert sum(e.determined > 0.85 for e in found) > (6 if electrons == 20 else 15)
+
+
+def block(matrix: np.ndarray, electrons: float) -> dict[str, np.ndarray]:
+    return quantities_block(noisy_image(np.tile(matrix, (PIXELS, 1, 1)), electrons, 2), (), {})
+
+
+@pytest.mark.parametrize("electrons", [200, 20_000])
+def test_near_180_degrees_the_axis_is_not_determined_but_the_pair_of_axes_is(electrons):
+    found = block(triply_degenerate.mueller_matrix(mueller.retarder(0.4, np.pi), 0.9), electrons)
+    fast, errors = found["retardance_fast_axis_deg"], found["retardance_fast_axis_deg_errors"]
+    assert np.std(fast) > 20  # it flips
+    assert np.isfinite(errors).mean() < 0.05
+    assert found["retardance_axis_flip"].mean() > 0.1
+    pull = (found["retardance_axis_or_90_deg"] - np.rad2deg(0.4)) / found["retardance_axis_or_90_deg_errors"]
+    assert np.sqrt(np.mean(pull**2)) == pytest.approx(1, abs=0.15)
+
+
+def test_farther_from_180_degrees_the_axis_is_determined():
+    found = block(triply_degenerate.mueller_matrix(mueller.retarder(0.4, np.deg2rad(170)), 0.9), 20_000)
+    pull = (found["retardance_fast_axis_deg"] - np.rad2deg(0.4)) / found["retardance_fast_axis_deg_errors"]
+    assert np.sqrt(np.mean(pull**2)) == pytest.approx(1, abs=0.15)
+    assert found["retardance_axis_flip"].max() < 1e-3
+
+
+def test_the_joint_region_of_the_retardance_vector_covers():
+    m = triply_degenerate.mueller_matrix(mueller.retarder(0.4, 1.2) @ mueller.rotation(0.2), 0.9)
+    found, truth = block(m, 200), block(m, 1e13)
+    error = (found["retardance_vector_deg"] - truth["retardance_vector_deg"].mean(axis=-1, keepdims=True)).reshape(
+        3, -1
+    )
+    packed = found["retardance_vector_covariance"].reshape(6, -1)
+    covariance = np.moveaxis(packed[[0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(3, 3, -1), -1, 0)
+    distance = np.einsum("ip,pij,jp->p", error, np.linalg.inv(covariance.astype(float)), error)
+    # Chi-square of three degrees of freedom.
+    assert np.mean(distance) == pytest.approx(3, abs=0.5)
+    assert np.mean(distance < 7.815) == pytest.approx(0.95, abs=0.04)
+
+
+def test_noise_alone_is_taken_off_what_td_misses():
+    found = block(triply_degenerate.mueller_matrix(five_samples()["non-depolarizing"], 0.6), 200)
+    assert np.median(found["td_missed"]) < 0.3 * np.median(found["td_missed_noise"])
+    assert np.isnan(found["td_missed_errors"]).mean() > 0.9
