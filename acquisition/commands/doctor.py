@@ -129,7 +129,8 @@ def _source(rig: Rig) -> str:
 def _camera(camera: Camera, config: RigConfig, frames: int) -> str:
     """Take frames and count those that were lost; the dark ones of a shut source serve as well."""
     exposure_s = max(EXPOSURE_S, config.exposure_s[0])
-    camera.configure(CameraSettings(exposure_s=exposure_s, frame_average=1))
+    # By software, whatever triggers a capture: nobody fires a hardware trigger for this.
+    camera.configure(CameraSettings(exposure_s=exposure_s, frame_average=1, trigger="software"))
     who = camera.describe()
     lost = 0
     for _ in range(frames):

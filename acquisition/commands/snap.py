@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from acquisition.errors import AcquisitionError
 from acquisition.rig.config import RigConfig
 from acquisition.rig.rig import Rig
+from drivers.camera import CameraSettings
 from processing.instrument.model import InstrumentModel
 from processing.yaml_file import ConfigError
 
@@ -49,8 +50,9 @@ def take_frame(
             model = InstrumentModel.load(next(iter(config.modes.values())).instrument)
             rig.simulation.prepare(sample, model, wavelength_nm or config.wavelengths_nm[0])
         before = rig.source.is_on() if rig.source is not None else None
-        settings = rig.set_exposure(exposure_s, 1)
         camera = rig.require_camera()
+        # By software, whatever triggers a capture: nobody fires a hardware trigger for this.
+        settings = camera.configure(CameraSettings(exposure_s=exposure_s, frame_average=1, trigger="software"))
         try:
             if rig.source is not None:
                 if wavelength_nm is not None:

@@ -204,3 +204,14 @@ def test_a_colour_polarization_camera_is_reduced_colour_by_colour(
     run_process("colours", path, "--out", tmp_path / "colours")
     for part in ("red", "green_b"):
         assert_horizontal(tmp_path / "colours" / f"{path.stem}.{part}.h5")
+
+
+def test_doctor_and_snap_need_no_signal_on_a_rig_with_a_hardware_trigger(
+    acquire: Acquire, small_rig: Rig, tmp_path: Path
+) -> None:
+    rig = small_rig(top={"camera": CAMERA | {"settings": {"trigger": "hardware"}, "trigger_timeout_s": 0.5}})
+    code, out, err = acquire("doctor", "--rig", rig, "--frames", 2)
+    assert code == 0, out + err
+    assert "0 of 2 frames lost" in out
+    code, _, err = acquire("snap", "--rig", rig, "--out", tmp_path / "frame.npy", "--sample", "red_flat")
+    assert code == 0, err
