@@ -12,6 +12,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from processing.doors import read_text, require_file
 from processing.errors import ProcessError
@@ -143,6 +144,10 @@ def _is_simulated(path: Path) -> bool:
         return opened.simulated
 
 
+def _range(states: NDArray[np.int64]) -> str:
+    return f"{states.min()} to {states.max()}" if states.size else "none"
+
+
 def _capture(path: Path) -> Section:
     with Capture(path) as capture:
         header, closing = capture.header, capture.closing
@@ -150,6 +155,11 @@ def _capture(path: Path) -> Section:
         if cut := closing.get("left_out"):
             told = ", ".join(f"{number} of {name}" for name, number in cut.items())
             warnings.append(f"the closing record was too long for its place; left out: {told}")
+        if len(capture.segments) > 1:
+            runs = "; ".join(
+                f"{run.begun}, {run.status}, states {_range(capture.done[run.states])}" for run in capture.segments
+            )
+            warnings.append(f"taken in {len(capture.segments)} runs, between which the light may have jumped: {runs}")
         if capture.status != "complete":
             warnings.append(f"the capture is {capture.status}: {len(capture.role)} of {capture.planned_states} states")
         saturated = capture.column("saturated_fraction")

@@ -13,6 +13,7 @@ from acquisition.errors import Differs
 from acquisition.rig.config import load_rig
 from drivers.camera import CameraSettings
 from drivers.errors import DeviceError
+from processing.reports.report import write_report
 from processing.storage.capture import Capture
 
 SHORT = {"states": {"kind": "rotating_retarders", "states": 18, "step_deg": 20, "ratio": 4.91}, "darks": 1}
@@ -136,7 +137,7 @@ def test_as_new_keeps_apart(partial, quick_rig, acquire, intact):
     assert intact(partial.parent / "run-2.h5") == 19
 
 
-def test_a_resume_is_a_recorded_segment_and_nothing_is_forgotten(run_with):
+def test_a_resume_is_a_recorded_segment_and_nothing_is_forgotten(run_with, tmp_path):
     def door(rig, state, retake):
         if state == 4:
             rig.simulation.emulators["shutter"].trip(True)
@@ -161,6 +162,9 @@ def test_a_resume_is_a_recorded_segment_and_nothing_is_forgotten(run_with):
     assert closing["ledger"]["total_s"] == pytest.approx(first.ledger["total_s"] + second.ledger["total_s"], abs=1e-3)
     assert closing["segments"] == 2
     assert "the door is open" in json.dumps(closing)
+    page = tmp_path / "report.html"
+    write_report([final], page, "two runs")
+    assert "taken in 2 runs, between which the light may have jumped" in page.read_text()
 
 
 def test_the_lamp_is_held_against_the_light_before_the_resume(run_with):
