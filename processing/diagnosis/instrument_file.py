@@ -40,6 +40,7 @@ def extended(model: InstrumentModel, diagnosis: Diagnosis) -> InstrumentModel:
         "analyzer": swap(model.analyzer),
         "channels": channels,
         "effects": (*model.effects, *diagnosis.applied()),
+        "systematic": (*model.systematic, *diagnosis.systematic()),
     }
     return model.model_copy(update=update)
 

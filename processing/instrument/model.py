@@ -124,6 +124,23 @@ class AppliedEffect(_Part):
     probability: float | None = None
 
 
+class SystematicError(_Part):
+    """What stays uncertain after a correction, as independent directions of one standard deviation each.
+
+    Together they are the covariance of all values of the posterior, as far as a Mueller matrix notices it. Each
+    direction is a set of small effects that belong together.
+
+    Attributes
+    ----------
+    directions : effects of each direction, the one that a Mueller matrix notices most first.
+    rms_over_m00 : standard error of the elements of M/m00 that all of them make in the captures they were found in.
+    """
+
+    directions: tuple[tuple[AppliedEffect, ...], ...]
+    rms_over_m00: float
+    wavelength_nm: float | None = None
+
+
 class EffectParameter(_Part):
     """A fitted value with its standard error (None: it has none, `note` says why)."""
 
@@ -150,6 +167,7 @@ class InstrumentModel(_Part):
     row from the top left, e.g. (("90", "45"), ("135", "0")).
     `calibrate` names values ("element.field") that are only nominal: `diagnose` fits them to captures of known samples.
     An effect of scope "capture" holds for the captures that it names and for no other.
+    `systematic` is what `diagnose` leaves uncertain; `process reduce` carries it into its error bars.
     """
 
     kind: Literal["instrument"] = "instrument"
@@ -162,6 +180,7 @@ class InstrumentModel(_Part):
     mosaic: tuple[tuple[str, ...], ...] | None = None
     calibrate: tuple[str, ...] = ()
     effects: tuple[AppliedEffect, ...] = ()
+    systematic: tuple[SystematicError, ...] = ()
 
     @model_validator(mode="after")
     def _names_are_unique(self) -> Self:
@@ -212,6 +231,9 @@ class InstrumentModel(_Part):
         # An effect was found at one wavelength and is not carried over to another.
         resolved["effects"] = [
             e for e in resolved["effects"] if e["wavelength_nm"] is None or _listed(wavelength_nm, [e["wavelength_nm"]])
+        ]
+        resolved["systematic"] = [
+            s for s in resolved["systematic"] if _listed(wavelength_nm, [s["wavelength_nm"] or wavelength_nm])
         ]
         return InstrumentModel.model_validate(resolved | {"wavelengths_nm": (wavelength_nm,)})
 
@@ -330,4 +352,5 @@ def _resolve(node: Any, wavelength_nm: float, name: str) -> Any:
 
 
 AppliedEffect.model_rebuild()
+SystematicError.model_rebuild()
 InstrumentModel.model_rebuild()

@@ -21,12 +21,19 @@ from processing.instrument.model import InstrumentModel
 from processing.polarization.physical import nearest
 from processing.reduction.counts_to_signal import BlockReader, Correction
 from processing.reduction.cut_off import without_cut_off
-from processing.reduction.effects_of_capture import capture_changes, counts_correction, extra_retardance, with_extra
+from processing.reduction.effects_of_capture import (
+    CountsCorrection,
+    capture_changes,
+    counts_correction,
+    extra_retardance,
+    with_extra,
+)
 from processing.reduction.facts import mueller_facts
 from processing.reduction.noise import NoiseModel
 from processing.reduction.solvers.field import Field, FieldSolver
 from processing.reduction.solvers.inversion import ELEMENTS, Inversion
 from processing.reduction.solvers.plain import MuellerSolver
+from processing.reduction.systematic import Systematic
 from processing.storage.capture import Capture, CaptureError
 from processing.storage.mueller_planes import MUELLER_PLANES
 from processing.storage.pixel_mask import Mask
@@ -43,6 +50,9 @@ Progress = Callable[[int, int], None]
 BLOCK_PIXELS = 1 << 18
 
 CHI_SQUARE = Plane((), "", "squared residual over what the noise model expects; 1 if the model is complete")
+SYSTEMATIC = Plane(
+    (4, 4), "count", "systematic standard errors of mueller (of M/m00, times m00): what the diagnosis leaves uncertain"
+)
 COVARIANCE = Plane(
     (ELEMENTS * (ELEMENTS + 1) // 2,),
     "count2",
@@ -223,6 +233,9 @@ def reduce_mueller(
         )
     solver = choice.solver(MuellerSolver(inversion, reader, noise), field_of(capture, model, states, changes))
     planes = choice.planes(known_noise=noise is not None)
+    systematic = _systematic(capture, model, states, inversion)
+    if systematic is not None:
+        planes["mueller_systematic"] = SYSTEMATIC
     with ProductWriter(out, "mueller", capture.header, capture.frame_shape, planes, steps, overwrite) as product:
         product.array("measurement_matrix", w, "", "W (state, channel, 16): intensity = W . vec(M), row-major")
         _store_noise(product, noise, solver)
@@ -231,7 +244,7 @@ def reduce_mueller(
             stored: Future[None] | None = None
             for rows in capture.row_blocks(BLOCK_PIXELS):
                 if rows.stop > product.rows_done:
-                    block = _block(solver, rows, planes)
+                    block = _block(solver, rows, planes, systematic)
                     if stored:
                         stored.result()
                     stored = storing.submit(product.write, rows, **block)
@@ -259,7 +272,24 @@ def _store_noise(product: ProductWriter, noise: NoiseModel | None, solver: Solve
     product.array("noise_floor", floor, "count2", "variance without light, for each row of W")
 
 
-def _block(solver: Solver, rows: slice, planes: Mapping[str, Plane]) -> dict[str, NDArray[Any]]:
+def _systematic(
+    capture: Capture, model: InstrumentModel, states: NDArray[np.int64], inversion: Inversion
+) -> Systematic | None:
+    if not model.systematic or inversion.rank < ELEMENTS:
+        return None
+
+    def matrix(other: InstrumentModel) -> NDArray[np.float64]:
+        return measurement_matrix(capture, other, states, capture_changes(capture, other, states))
+
+    def counts(other: InstrumentModel) -> CountsCorrection | None:
+        return counts_correction(capture_changes(capture, other, states), other)
+
+    return Systematic.of(model, matrix, counts, inversion.pinv)
+
+
+def _block(
+    solver: Solver, rows: slice, planes: Mapping[str, Plane], systematic: Systematic | None
+) -> dict[str, NDArray[Any]]:
     frames = solver.reader.read(rows)
     found = solver.solve(frames)
     mask = found["pixel_mask"]
@@ -268,6 +298,8 @@ def _block(solver: Solver, rows: slice, planes: Mapping[str, Plane]) -> dict[str
     if unseen.any():
         found["mueller"][unseen] = np.nan
         found["mueller_errors"][unseen] = np.nan
+    if systematic is not None:
+        found["mueller_systematic"] = systematic.errors(found["mueller"])
     for name, values in found.items():
         if lost.any() and name != "pixel_mask":
             values[..., lost] = np.nan

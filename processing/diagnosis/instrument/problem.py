@@ -263,6 +263,40 @@ class InstrumentProblem:
             if block.rows.size:
                 add_block(block, a, c, da, dc, self.moments[k], out)
 
+    def mueller_slopes(self, space: Space, values: Array) -> tuple[Array, float]:
+        """How values move the Mueller matrices that the counts give: products (K, K), and the sum of m00 squared.
+
+        The products are those of the derivatives of M, summed over elements and pixels, a common factor of M left out.
+        """
+        other, local = self.near(space, values)
+        if other is not self:
+            return other.mueller_slopes(space, local)
+        products, light = np.zeros((space.size, space.size)), 0.0
+        for k, moments in enumerate(self.moments):
+            changes = self.changes(k, space, values)
+            columns = partial(self._all_columns, k)
+            w, c = columns(changes), self.coefficients(k, changes)
+            back = np.linalg.pinv(w * moments.counts[:, None], rcond=RANK)
+            dw, dc = self._slopes(k, space, values, w, columns), self._slopes_of_counts(k, space, values, c)
+            scale = 1 / moments.sigma[:, None]
+            for block in moments.blocks[:: self.folds if moments.tiles is None else 1]:
+                m = back @ (np.einsum("fl,flr->lr", c, block.z) * scale)
+                slopes = -np.einsum("el,klm,mr->ker", back, dw, m, optimize=True)
+                for j in np.flatnonzero(np.any(dc, axis=(1, 2))):
+                    slopes[j] += back @ (np.einsum("fl,flr->lr", dc[j], block.z) * scale)
+                bright = float(m[0] @ m[0])
+                slopes -= (slopes[:, 0] @ m[0] / max(bright, 1e-300))[:, None, None] * m
+                flat = slopes.reshape(space.size, -1)
+                products += flat @ flat.T
+                light += bright
+        return products, light
+
+    def _all_columns(self, k: int, changes: Changes) -> Array:
+        """Rows (L, 16) of the measurement matrix in units of their noise, whatever the sample."""
+        data = self.captures[k]
+        w = self.model.rows(data.conditions.angles_deg, changes).reshape(-1, 16) * data.row_exposure[:, None]
+        return np.asarray(w / self.moments[k].sigma[:, None])
+
     def _slopes(self, k: int, space: Space, values: Array, a: Array, columns: Columns) -> Array:
         """Derivatives (values, ..., L, K) of a (..., L, K), which `columns` makes of the changes."""
         da = np.zeros((space.size, *a.shape))

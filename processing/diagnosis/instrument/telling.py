@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 
-from processing.arrays import Array
 from processing.diagnosis.instrument.closure import closure
 from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.stored import parameters_of, scope_of
 from processing.diagnosis.instrument.structure import Residual
+from processing.diagnosis.instrument.systematic import systematic_error
 from processing.diagnosis.instrument.whole_bench import Solution
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause
@@ -22,9 +21,7 @@ from processing.instrument.effects.base import (
     CountsEffect,
     FieldEffect,
     ImageShift,
-    OfOneCapture,
     Switch,
-    ValuePerState,
 )
 from processing.instrument.model import AppliedEffect, EffectParameter
 
@@ -36,6 +33,8 @@ NOISE_ERROR = 0.05
 
 def error(problem: InstrumentProblem, out: HeldOut) -> Error:
     held = "; ".join(dict.fromkeys(m.held_out for m in problem.moments))
+    if problem.folds == 1:
+        held = "nothing: too few values; each fitted value takes a degree of freedom"
     return Error(rms_percent=100 * out.rms, chi2_reduced=out.chi2_reduced, held_out=held)
 
 
@@ -44,18 +43,6 @@ def floor(problem: InstrumentProblem) -> float | None:
     if not problem.noise_known:
         return None
     return 100 * float(np.sqrt(np.mean([m.noise_floor**2 for m in problem.moments])))
-
-
-def _parameters(candidate: Candidate, values: Array, stderr: Array) -> dict[str, EffectParameter]:
-    if isinstance(candidate.effect, Switch):
-        return {"left_out": EffectParameter(value=1.0, unit="1", note="pixels with a clipped state are left out")}
-    if isinstance(candidate.effect, ValuePerState):
-        unit = candidate.parameters[0].unit
-        return {"states": EffectParameter(value=tuple(values.tolist()), stderr=tuple(stderr.tolist()), unit=unit)}
-    return {
-        p.name: EffectParameter(value=float(v), stderr=float(s), unit=p.unit)
-        for p, v, s in zip(candidate.parameters, values, stderr, strict=True)
-    }
 
 
 def told_effects(problem: InstrumentProblem, cause: Cause, confident: bool) -> list[FoundEffect]:
@@ -74,10 +61,10 @@ def told_effects(problem: InstrumentProblem, cause: Cause, confident: bool) -> l
             FoundEffect(
                 kind=candidate.kind,
                 element=candidate.place or None,
-                parameters=_parameters(candidate, values, np.sqrt(np.diag(covariance))),
+                parameters=parameters_of(candidate, values, np.sqrt(np.diag(covariance))),
                 evidence=2 * cause.log_odds,
                 indistinguishable_from=tuple(dict.fromkeys(c.short for c in cause.alternatives)),
-                scope=_scope(candidate),
+                scope=scope_of(candidate),
                 capture=None if candidate.capture is None else problem.captures[candidate.capture].name,
                 removal_chance=1 - cause.probability,
                 confident=confident,
@@ -103,10 +90,10 @@ def told_switches(problem: InstrumentProblem, solved: Solution) -> list[FoundEff
                 FoundEffect(
                     kind=candidate.kind,
                     element=candidate.place or None,
-                    parameters=_parameters(candidate, values[part], values[part]),
+                    parameters=parameters_of(candidate, values[part], values[part]),
                     evidence=gain,
                     indistinguishable_from=(),
-                    scope=_scope(candidate),
+                    scope=scope_of(candidate),
                     capture=None if candidate.capture is None else problem.captures[candidate.capture].name,
                     removal_chance=0.0,
                     confident=True,
@@ -138,18 +125,15 @@ def correction(
             AppliedEffect(
                 kind=candidate.kind,
                 element=candidate.place or None,
-                parameters=_parameters(candidate, solved.fit.values[where], spread[part[candidate]]),
+                parameters=parameters_of(candidate, solved.fit.values[where], spread[part[candidate]]),
                 probability=float(chance[candidate]),
                 captures=names if candidate.capture is None else (names[candidate.capture],),
-                scope=_scope(candidate),
+                scope=scope_of(candidate),
                 wavelength_nm=problem.captures[0].wavelength_nm,
             )
         )
-    return Correction(effects=tuple(effects), checks=guard, refused=refused)
-
-
-def _scope(candidate: Candidate) -> Literal["instrument", "capture"]:
-    return "capture" if isinstance(candidate.effect, OfOneCapture) else "instrument"
+    error = systematic_error(problem, found)
+    return Correction(effects=tuple(effects), systematic=error, checks=guard, refused=refused)
 
 
 def calibrated(problem: InstrumentProblem, found: Posterior, solved: Solution) -> dict[str, EffectParameter]:

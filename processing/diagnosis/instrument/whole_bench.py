@@ -15,7 +15,14 @@ from processing.diagnosis.search.fit import Fit, HeldOut, held_out, minimize, pr
 from processing.diagnosis.search.posterior import Posterior, Say, posterior
 from processing.diagnosis.search.rules import DECISIVE, TAKES_PART
 from processing.diagnosis.search.space import Space
-from processing.instrument.effects.base import FieldEffect, ImageShift, SourceEffect, Switch, ValuePerState
+from processing.instrument.effects.base import (
+    FieldEffect,
+    ImageShift,
+    PointwiseEffect,
+    SourceEffect,
+    Switch,
+    ValuePerState,
+)
 
 #: Relative rms residual above which nominal values, and what else has far starts, are searched for from many starts.
 FAR_OFF = 0.05
@@ -68,6 +75,7 @@ class WholeBench:
         self.whole = problem.undivided() if problem.holds_out_states else problem
         self.base = Space(problem.nominal())
         self.pool = problem.pool()
+        self._free = [c.values_per_pixel - self._unknowns(k) for k, c in enumerate(self.whole.captures)]
         self._start = self._first()
 
     def run(self) -> Posterior:
@@ -86,6 +94,9 @@ class WholeBench:
             found = self._posterior(list(found.space.candidates), fixed, found)
         return found
 
+    def _unknowns(self, k: int) -> int:
+        return int(np.linalg.matrix_rank(self.whole.columns(k, self.whole.changes(k, Space(()), np.zeros(0)))))
+
     def _offered(self, candidate: Candidate) -> bool:
         effect = candidate.effect
         if isinstance(effect, FieldEffect | Switch):
@@ -94,6 +105,9 @@ class WholeBench:
         mine = captures if candidate.capture is None else [captures[candidate.capture]]
         if isinstance(effect, ImageShift):
             return all(min(c.signal.shape[2:]) > 2 * MARGIN + 2 for c in mine)
+        if isinstance(effect, PointwiseEffect):
+            # With one number a pixel to test, a bend of the response and gains of the channels explain each other.
+            return any(free > 1 for free in self._free)
         if isinstance(effect, ValuePerState) and not self.whole.noise_known:
             # A value for each intensity would be noise by another name.
             return len(self.whole.model.channels) > 1

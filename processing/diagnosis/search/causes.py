@@ -75,7 +75,9 @@ def causes(found: Posterior, left: float) -> tuple[Cause, ...]:
             errors.append(fit.covariance[np.ix_(at, at)] * np.outer(typical[part], typical[part]))
         members = [k, *others, *_alternatives_of_family(found, k)]
         names = tuple(found.space.candidates[found.members[j][0]] for j in others)
-        probability = samples.any_of(members)
+        # The sets that were visited, and the odds beside the likeliest, each err on the sure side.
+        total = float(np.logaddexp.reduce(odds[members]))
+        probability = min(samples.any_of(members), float(1 / (1 + np.exp(-np.clip(total, -50, 50)))))
         out.append(Cause(candidates, tuple(values), tuple(errors), probability, float(odds[k]), names))
     return tuple(sorted(out, key=lambda c: -c.log_odds))
 

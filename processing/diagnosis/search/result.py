@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from processing.instrument.model import AppliedEffect, EffectParameter
+from processing.instrument.model import AppliedEffect, EffectParameter, SystematicError
 
 Verdict = Literal["consistent", "explained", "partly_explained", "unexplained"]
 
@@ -85,11 +85,13 @@ class Correction(_Part):
     Attributes
     ----------
     effects : as an instrument file stores them, with their standard errors.
+    systematic : what stays uncertain, as a Mueller matrix notices it.
     checks : figures before and after; one that gets worse refuses the correction.
     refused : why nothing is written; None if the correction holds.
     """
 
     effects: tuple[AppliedEffect, ...]
+    systematic: SystematicError | None = None
     checks: tuple[Check, ...] = ()
     refused: str | None = None
 
@@ -135,3 +137,10 @@ class Diagnosis(_Part):
         if self.correction is None or self.correction.refused is not None:
             return ()
         return self.correction.effects
+
+    def systematic(self) -> tuple[SystematicError, ...]:
+        """What an instrument file stores of the uncertainty; nothing where nothing is written."""
+        if not self.applied() and not self.calibrated:
+            return ()
+        told = self.correction.systematic if self.correction is not None else None
+        return () if told is None else (told,)

@@ -39,6 +39,10 @@ SAMPLES, SAMPLES_BEFORE = 300, 80
 #: What is less likely moves the mean by less than its own error.
 TAKES_PART = 0.25
 
+#: Share of benches on which an effect is there at its typical size, for what the data say nothing of: a bench that is
+#: new has a third of the list.
+UNSEEN = 0.3
+
 # ---- names ---------------------------------------------------------------------------------------------------------
 #: Probabilities from which on a cause is called sure, and likely.
 SURE, LIKELY = 0.99, 0.9

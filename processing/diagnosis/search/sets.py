@@ -192,6 +192,14 @@ class Sets:
         log_odds = np.where(self.free, log_odds + np.log((1 + others) / rest / self.share), np.inf)
         return Conditional(fit.active, fit.mean, fit.covariance, fit.left, fit.score, log_odds, weights)
 
+    def given_others(self, state: State) -> dict[int, tuple[Array, Array]]:
+        """Curvature (n, n) and gradient (n,) about zero of every group that may be absent, given the others."""
+        return {
+            int(k): (s[j], q[j])
+            for members, s, q in self._cavities(state, *self._solved(state))
+            for j, k in enumerate(members)
+        }
+
     def _cavities(
         self, state: State, fit: Fitted, inverse: Array, right: Array
     ) -> Iterator[tuple[NDArray[np.int64], Array, Array]]:
