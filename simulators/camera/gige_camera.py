@@ -12,6 +12,7 @@ from __future__ import annotations
 import ctypes
 import tempfile
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.aravis_library import load_aravis
-from drivers.clock import REAL, Clock
 from drivers.errors import CameraError
 from drivers.pixel_formats import PixelFormat, pixel_format, pixel_format_of
 from simulators.camera import gige_features as features
@@ -99,9 +99,7 @@ class GigeCamera:
     description : str
         Name of a table in `node_maps/`, or "aravis" for Aravis' own description with older names (ExposureTimeAbs).
     wait_s : float
-        How long to wait for the address if another simulated camera has it; real time, as that one is another program.
-    clock : drivers.clock.Clock
-        What exposures are counted by; the driver's own.
+        How long to wait for the address if another simulated camera has it.
     arming_s : float
         Time after an exposure in which a trigger is ignored; None for that of the table.
     """
@@ -117,7 +115,6 @@ class GigeCamera:
         address: str = "127.0.0.1",
         description: str = "loopback",
         wait_s: float = 60.0,
-        clock: Clock = REAL,
         arming_s: float | None = None,
     ) -> None:
         self.serial = serial
@@ -128,7 +125,6 @@ class GigeCamera:
         self._lost_ratio = lost_ratio
         self._table = None if description == "aravis" else node_map(description)
         self._wait_s = wait_s
-        self._clock = clock
         self._arming_s = arming_s if arming_s is not None else self._table.arming_s if self._table else 0.0
         self._armed_at_s = 0.0
         #: Triggers that came before the camera was armed.
@@ -250,7 +246,7 @@ class GigeCamera:
     # --- the exposure, in the camera's own thread --------------------------------------------------------
 
     def _fill(self, buffer: int, _: int, exposure_us: int, gain_raw: int, code: int) -> None:
-        start_s, delay_s = self._clock.now_s(), self.delivery_delay_s
+        start_s, delay_s = time.monotonic(), self.delivery_delay_s
         camera = self._camera
         if start_s < self._armed_at_s and camera is not None:
             self.ignored_triggers += 1
@@ -270,30 +266,21 @@ class GigeCamera:
         del camera
         self._arm_after(start_s + exposure_us * 1e-6)
         # The frame is sent when this returns, and no frame leaves a camera before its exposure has ended.
-        end_s = start_s + exposure_us * 1e-6 + delay_s
-        while (left_s := end_s - self._clock.now_s()) > 0 and not self._gone.wait(left_s):
-            pass
+        # Real time: the same thread answers commands, and Aravis gives up a camera that is silent for three seconds.
+        self._gone.wait(max(0.0, start_s + exposure_us * 1e-6 + delay_s - time.monotonic()))
 
     def _arm_after(self, exposed_s: float) -> None:
         if self._arming_s <= 0 or self._gone.is_set():
             return
         self._armed_at_s = exposed_s + self._arming_s
         self._live_memory().write(features.TRIGGER_ARMED, 0)
-        self._arm_later()
-
-    def _arm_later(self) -> None:
         # A little late, so that what the register says holds.
-        timer = threading.Timer(max(0.0, self._armed_at_s - self._clock.now_s()) + 2e-3, self._arm)
+        timer = threading.Timer(max(0.0, self._armed_at_s - time.monotonic()) + 2e-3, self._arm)
         timer.daemon = True
         timer.start()
 
     def _arm(self) -> None:
-        if self._memory is None:
-            return
-        # The timer counts real seconds, which may be ahead of our clock.
-        if self._clock.now_s() < self._armed_at_s:
-            self._arm_later()
-        else:
+        if self._memory is not None:
             self._memory.write(features.TRIGGER_ARMED, 1)
 
     def _info(self, buffer: int, exposure_us: int, gain_raw: int) -> ExposureInfo:

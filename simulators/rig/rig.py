@@ -109,7 +109,6 @@ class SimulatedRig:
             address=config.camera_address,
             description=config.camera,
             wait_s=config.camera_wait_s,
-            clock=self.clock.base,
         )
         self.camera.start()
 

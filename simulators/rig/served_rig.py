@@ -15,6 +15,10 @@ from processing.yaml_file import ConfigError, load_yaml
 from simulators.rig.model import SCHEME, SimulatorConfig
 from simulators.rig.rig import SimulatedRig
 
+#: Longest wait for a reply where the rig file says nothing: on a busy machine the emulators, which are in another
+#: program than the drivers, may be kept from running for seconds.
+REPLY_S = 10.0
+
 
 class _RigFile(BaseModel):
     # Only the section that concerns the simulator; the rest belongs to acquisition, which checks it.
@@ -58,6 +62,7 @@ def _fill_in(tree: Any, simulation: SimulatedRig, folder: Path) -> None:
     for entry in (*tree["axes"].values(), tree.get("source")):
         if entry is not None and str(entry.get("port", "")).startswith(SCHEME):
             entry["port"] = simulation.port(str(entry["port"]).removeprefix(SCHEME))
+            entry.setdefault("reply_s", REPLY_S)
     for mode in tree["modes"].values():
         mode["instrument"] = str(folder / mode["instrument"])
     tree["camera"]["device"] = simulation.camera_device()

@@ -57,7 +57,7 @@ def scene() -> Scene:
 
 @pytest.fixture
 def simulated(scene: Scene) -> Iterator[GigeCamera]:
-    with GigeCamera("FAULT1", *SIZE, scene, clock=patient_clock()) as camera:
+    with GigeCamera("FAULT1", *SIZE, scene) as camera:
         yield camera
 
 
@@ -255,7 +255,7 @@ def test_an_error_of_the_pixel_source_is_raised_and_its_frame_not_sent() -> None
     def broken(info: ExposureInfo) -> NDArray[np.uint16]:
         raise ZeroDivisionError("the bench is broken")
 
-    simulated = GigeCamera("FAULT2", *SIZE, broken, clock=patient_clock())
+    simulated = GigeCamera("FAULT2", *SIZE, broken)
     with simulated, aravis.open("camera", aravis.Config(device="127.0.0.1", retakes=0), patient_clock()) as camera:
         camera.configure(CameraSettings(exposure_s=1e-3))
         with pytest.raises(FrameLost):
@@ -268,7 +268,7 @@ def test_an_error_of_the_pixel_source_is_raised_and_its_frame_not_sent() -> None
     "wrong", [np.zeros((64, 128)), np.zeros((2, 2), np.uint16), np.full((64, 128), 5000, np.uint16)]
 )
 def test_counts_that_the_camera_cannot_send_are_an_error_of_the_source(wrong: NDArray[np.uint16]) -> None:
-    simulated = GigeCamera("FAULT3", *SIZE, lambda _: wrong, clock=patient_clock())
+    simulated = GigeCamera("FAULT3", *SIZE, lambda _: wrong)
     with simulated, aravis.open("camera", aravis.Config(device="127.0.0.1"), patient_clock()) as camera:
         camera.configure(CameraSettings(exposure_s=1e-3))
         camera.trigger().wait_exposed()

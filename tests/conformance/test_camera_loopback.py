@@ -48,7 +48,7 @@ def bench() -> Iterator[Bench]:
             config: aravis.Config | None = None,
             **options: object,
         ) -> tuple[GigeCamera, aravis.AravisCamera]:
-            simulated = stack.enter_context(GigeCamera("LOOP1", *size, source, clock=patient_clock(), **options))  # type: ignore[arg-type]
+            simulated = stack.enter_context(GigeCamera("LOOP1", *size, source, **options))  # type: ignore[arg-type]
             config = config or aravis.Config(device="127.0.0.1", packet_size=9000, bits=12)
             return simulated, stack.enter_context(aravis.open("camera", config, patient_clock()))
 

@@ -26,9 +26,7 @@ class MakersCamera:
     def __init__(self, name: str, stack: ExitStack) -> None:
         self.table: NodeMap = node_map(name)
         self.scale = 1
-        self.simulated = stack.enter_context(
-            GigeCamera("MAKER1", *SIZE, self.show, bits=16, description=name, clock=patient_clock())
-        )
+        self.simulated = stack.enter_context(GigeCamera("MAKER1", *SIZE, self.show, bits=16, description=name))
         self._stack = stack
 
     def show(self, info: ExposureInfo) -> NDArray[np.uint16]:

@@ -20,7 +20,7 @@ import pytest
 
 from processing.storage.capture import Capture
 
-STATES = 300
+STATES = 1000
 
 
 class Browser:
@@ -106,7 +106,7 @@ def running(small_rig, configs, tmp_path):
 
     Yields process, address and folder.
     """
-    rig = small_rig(clock_speed=1.5, rows=256, columns=320)
+    rig = small_rig(clock_speed=1.5, rows=64, columns=320)
     plan = tmp_path / "long.yaml"
     text = (configs / "plans" / "drr.yaml").read_text()
     assert "states: 40" in text

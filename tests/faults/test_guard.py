@@ -32,9 +32,10 @@ def _moving(simulation):
     return any(axis.is_moving() for emulator in simulation.emulators.values() for axis in emulator.axes)
 
 
-def _until(condition):
+def _until(condition, child=None):
     # How long it takes is measured by benchmarks/guard_time.py.
     while not condition():
+        assert child is None or child.poll() is None, child.communicate()
         time.sleep(0.01)
 
 
@@ -43,7 +44,7 @@ def test_killed_or_frozen_the_light_is_shut_and_the_axes_stop(kind, spawn, parti
     simulation, rig, told = served
     child = spawn("--omega", 35, "--rig", rig, "--out", tmp_path / "out")
     partial = partial_of(tmp_path / "out", child, states=5)
-    _until(lambda: _lit(simulation) and _moving(simulation))
+    _until(lambda: _lit(simulation) and _moving(simulation), child)
     child.send_signal(kind)
     _until(lambda: not _lit(simulation) and not _moving(simulation))
     journal = tmp_path / "out" / "guard.jsonl"
