@@ -123,3 +123,11 @@ class FrameStream:
         # Ours is the only reference, so this ends Aravis' thread; an explicit stop would make it complain later.
         self._stream = self._unread = None
         self._memory.clear()
+
+
+def let_go(left: list[Any]) -> None:
+    """Close the stream that comes first in the list, if any, and drop the last references to what follows it."""
+    stream = left[0]
+    if stream is not None:
+        stream.close()
+    left.clear()

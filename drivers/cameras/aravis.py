@@ -17,7 +17,7 @@ from drivers.aravis_frames import counts_of, other_layout
 from drivers.aravis_identity import identify
 from drivers.aravis_library import load_aravis, open_camera
 from drivers.aravis_setup import Config, Setup, structure_of
-from drivers.aravis_stream import Arrival, FrameStream
+from drivers.aravis_stream import Arrival, FrameStream, let_go
 from drivers.camera import Camera, CameraIdentity, CameraSettings, Frame, StreamStatistics
 from drivers.camera_clock import CameraClock
 from drivers.clock import REAL, Clock
@@ -157,7 +157,7 @@ class AravisCamera(Camera):
             return
         with self._features.asking("stop the stream"):
             self._camera.stop_acquisition()
-        _let_go([self._forget_stream()])
+        let_go([self._forget_stream()])
 
     def _forget_stream(self) -> FrameStream | None:
         stream, self._stream = self._stream, None
@@ -391,13 +391,6 @@ class AravisCamera(Camera):
         self._setup.release()
         if lost:
             # Aravis takes leave with four commands, each of which waits 2.5 s for a camera that is gone.
-            threading.Thread(target=_let_go, args=(left,), name=f"leave camera {self.name}", daemon=True).start()
+            threading.Thread(target=let_go, args=(left,), name=f"leave camera {self.name}", daemon=True).start()
         else:
-            _let_go(left)
-
-
-def _let_go(left: list[Any]) -> None:
-    stream = left[0]
-    if stream is not None:
-        stream.close()
-    left.clear()
+            let_go(left)
