@@ -18,6 +18,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -114,39 +115,38 @@ class Guard:
 
     def _act(self, why: str, beat: str) -> bool:
         self.journal.note(why, last=beat)
-        light = threading.Thread(target=self._shut_light)
-        light.start()
-        self._stop_axes()
-        light.join()
-        self._call(f"{why}; light shut and axes stopped by the guard. Go on with --resume, or the same campaign")
+        with ThreadPoolExecutor(1) as beside:
+            light = beside.submit(self._shut_light)
+            axes = self._stop_axes()
+        self._call(f"{why}. The guard: {light.result()}, {axes}. Go on with --resume, or the same campaign")
         return False
 
-    def _shut_light(self) -> None:
+    def _shut_light(self) -> str:
         if self.config.source is None:
-            return
+            return "this rig has no source to shut"
         end_s = time.monotonic() + LET_GO_S
         while True:
-            with LineRegistry() as lines:
-                try:
-                    source = open_source(self.config.source, lines)
-                    source.set_light(False)
-                    self.journal.note("light shut")
-                    return
-                except PortBusy as error:
-                    if time.monotonic() > end_s:
-                        self.journal.note("LIGHT NOT SHUT", error=str(error))
-                        return
-                except DeviceError as error:
+            try:
+                with LineRegistry() as lines:
+                    open_source(self.config.source, lines).set_light(False)
+                self.journal.note("light shut")
+                return "light shut"
+            except DeviceError as error:
+                # One that dies holds its ports a moment longer.
+                if not isinstance(error, PortBusy) or time.monotonic() > end_s:
                     self.journal.note("LIGHT NOT SHUT", error=str(error))
-                    return
+                    return "LIGHT NOT SHUT"
             time.sleep(LOOK_S)
 
-    def _stop_axes(self) -> None:
+    def _stop_axes(self) -> str:
         try:
             stopped = stop_axes(self.config, lambda text: self.journal.note("axis", told=text), let_go=(self.pid,))
-            self.journal.note("axes at rest" if stopped else "AXES NOT AT REST")
         except DeviceError as error:
             self.journal.note("AXES NOT STOPPED", error=str(error))
+            return "AXES NOT STOPPED"
+        told = "axes at rest" if stopped else "AXES NOT AT REST"
+        self.journal.note(told)
+        return told
 
     def _call(self, message: str) -> None:
         if not self.alert:
