@@ -26,6 +26,7 @@ from processing.diagnosis.instrument.telling import (
     unobservable,
 )
 from processing.diagnosis.instrument.whole_bench import Solution, WholeBench, predicts, solution
+from processing.diagnosis.instrument.wiring import miswired
 from processing.diagnosis.search.causes import Cause, causes
 from processing.diagnosis.search.posterior import Posterior, Say, resampled
 from processing.diagnosis.search.result import Diagnosis, Unexplained, Verdict
@@ -50,6 +51,10 @@ class Judged:
 
 def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
     """Find the posterior, test what is left, guard the correction, and name causes."""
+    wiring = miswired(problem)
+    if wiring is not None:
+        say(wiring.told)
+        problem = wiring.problem
     bench = WholeBench(problem, say)
     found = bench.run()
     solved = solution(bench, found)
@@ -65,7 +70,7 @@ def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
         solved = solution(bench, found)
         after = tuple(residual(asked, k, solved.space, solved.fit) for k in captures)
     guard = checks(asked, solved)
-    refused = refusal(guard)
+    refused = f"change this first: {wiring.told}" if wiring is not None else refusal(guard)
     structure = _structure(problem, after)
     left = sum(r.left for r in after) if structure else 0.0
     named = _told(found, left)
@@ -77,7 +82,7 @@ def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
     sure = [c for c in named if c.answer != "unknown" and c not in doubt]
     switched = told_switches(asked, solved)
     verdict = _verdict((*named, *switched), (*sure, *switched), structure or bool(untold))
-    if refused is not None and named:
+    if wiring is not None or (refused is not None and named):
         verdict = "unexplained"
     rivals = [(c.candidates[0], *c.alternatives) for c in named if c.alternatives]
     unexplained = None
@@ -109,6 +114,7 @@ def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
         wavelength_nm=problem.captures[0].wavelength_nm,
         simulated=any(c.simulated for c in problem.captures),
         correction=correction_told,
+        wiring=None if wiring is None else wiring.told,
     )
     return Judged(diagnosis, kept, before, after if refused is None else before)
 

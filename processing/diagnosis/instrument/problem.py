@@ -154,6 +154,11 @@ class InstrumentProblem:
                 candidate.apply(changes, self.model, values)
         return changes.shift_px / self.captures[capture].pitch
 
+    def forget_linearizations(self) -> None:
+        """Drop what was built for another model or other states; the moments of the counts stay."""
+        self._others = []
+        self._built = [{} for _ in self.captures]
+
     def undivided(self) -> InstrumentProblem:
         """The same with nothing held out: one set of unknowns for all states, not one for each part of them."""
         return InstrumentProblem(self.model, self.still, folds=1)

@@ -131,6 +131,7 @@ class Diagnosis(_Part):
     wavelength_nm: float
     simulated: bool
     correction: Correction | None = None
+    wiring: str | None = None
 
     def applied(self) -> tuple[AppliedEffect, ...]:
         """The effects as an instrument file stores them; none where the correction does not hold."""

@@ -43,6 +43,10 @@ TAKES_PART = 0.25
 #: new has a third of the list.
 UNSEEN = 0.3
 
+# ---- wiring --------------------------------------------------------------------------------------------------------
+#: Factor by which less must be left over without a mistake of wiring (tests/physics/test_diagnosis_wiring.py).
+WIRING = 5.0
+
 # ---- names ---------------------------------------------------------------------------------------------------------
 #: Probabilities from which on a cause is called sure, and likely.
 SURE, LIKELY = 0.99, 0.9

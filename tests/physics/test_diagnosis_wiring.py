@@ -1,0 +1,52 @@
+"""Mistakes of wiring are told in words, with the line to change, and none is seen where there is none."""
+
+import numpy as np
+import pytest
+
+from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.wiring import miswired
+from processing.instrument.model import InstrumentModel
+from processing.storage.capture import Capture
+from processing.storage.capture_schema import Sample
+from simulators.blind.suite import state_angles
+from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
+
+
+def problem(folder, configs, bench, told, air):
+    """A capture whose file tells the angles `told`; the bench knows the true ones."""
+    random = np.random.default_rng(4)
+    angles = state_angles(40, False, False)
+    counts = digitize(bench, expose(bench, Scene(random, np.eye(4) if air else None), angles), random)
+    path, file = folder / "capture.h5", configs / "instruments/rgb950.yaml"
+    write_capture(path, bench, counts, told(angles), Sample(kind="air" if air else "unknown"), file.read_text())
+    model = InstrumentModel.load(file).at(662)
+    with Capture(path) as capture:
+        return InstrumentProblem(model, [read_capture(capture, model)])
+
+
+@pytest.mark.parametrize("air", [True, False])
+@pytest.mark.parametrize(
+    ("told", "word"),
+    [
+        (lambda a: a | {"psa": -a["psa"]}, "'psa' turns the other way"),
+        (lambda a: {"psg": a["psa"], "psa": a["psg"]}, "each other's place"),
+        (lambda a: a | {"psg": 2 * a["psg"]}, "'psg' are told in half degrees"),
+        (lambda a: a | {"psa": a["psa"] * 4.91 / 5}, "5 instead of 4.91"),
+        (lambda a: {k: np.roll(v, 1) for k, v in a.items()}, "one early"),
+    ],
+)
+def test_a_mistake_is_told(configs, tmp_path, told, word, air):
+    # Beside small faults of the optics, which are no mistake.
+    bench = Bench(dg=np.deg2rad(128.0), lp=np.deg2rad(-0.2))
+    found = miswired(problem(tmp_path, configs, bench, told, air))
+    assert found is not None
+    assert word in found.told
+
+
+@pytest.mark.parametrize("air", [True, False])
+@pytest.mark.parametrize("degrees", [0.0, 1.0, 10.0])
+def test_what_is_no_mistake_is_not_called_one(configs, tmp_path, air, degrees):
+    bench = Bench(og=np.deg2rad(-17.02 + degrees), dg=np.deg2rad(127.12 + degrees))
+    bench.level.append(lambda k, a: 1 + 0.02 * np.sin(k))
+    assert miswired(problem(tmp_path, configs, bench, lambda a: a, air)) is None
