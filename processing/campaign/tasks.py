@@ -13,6 +13,7 @@ from processing.geometry.errors import OutlineNotFound
 from processing.geometry.frames import GeometryImage
 from processing.geometry.outline import find_sphere, registered
 from processing.geometry.viewing import ViewingGeometry
+from processing.maps.tables import xi0_samples
 from processing.maps.xi0 import estimate_from_stokes
 from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
 from processing.polarization.gradients import dominant
@@ -21,7 +22,8 @@ from processing.reflectance.base import load_reflectance
 from processing.reflectance.tables import ScatteringTable
 from processing.steps.maps import geometry_identities
 from processing.steps.reduction import Reduction
-from processing.storage.images import MuellerImage, StokesImage
+from processing.storage.images import MuellerImage, StokesImage, neighbour_correlation
+from processing.storage.product import Product
 from processing.storage.provenance import Step, file_identity
 
 #: Standard error of the Mueller image's xi0 above which a pixel does not count: beyond it the largest eigenvalue is
@@ -194,8 +196,10 @@ def _table(
     # samples: xi0, its standard error, and which pixels count, all (N,).
     xi0, stderr, good = samples
     table = ScatteringTable(("xi0", "xi0_variance"), wavelength_nm, simulated=simulated)
-    spread = np.where(np.isfinite(stderr), stderr, 0.0) ** 2
-    values = np.where(good, np.stack([xi0, spread]).astype(float), np.nan)
+    with Product(product) as opened:
+        correlation = neighbour_correlation(opened)
+    values = xi0_samples(table, geometry, xi0, np.where(good, stderr, np.nan), correlation)
+    values[:, ~good] = np.nan
     table.add(geometry.points.angles, values, simulated)
     material = file_identity(Path(task.material), "material")
     inputs = (file_identity(product, "source"), *geometry_identities(Path(task.geometry)), material)

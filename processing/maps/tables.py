@@ -6,14 +6,39 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from processing.errors import ProcessError
+from processing.geometry.frames import GeometryImage
 from processing.geometry.viewing import ViewingGeometry
 from processing.reduction.mueller import Progress
 from processing.reflectance.pbsdf import MUELLER, to_renderer_frames
+from processing.reflectance.shared_noise import shared_variance
 from processing.reflectance.table_axes import Layout
 from processing.reflectance.tables import ScatteringTable
+from processing.storage.images import neighbour_correlation as noise_between
 from processing.storage.product import Product
+
+
+def xi0_samples(
+    table: ScatteringTable,
+    image: GeometryImage,
+    xi0: NDArray[np.floating],
+    stderr: NDArray[np.floating],
+    correlation: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """xi0 and its variance (2, N) on the pixels of an object, covariances within each bin of the table included.
+
+    Parameters
+    ----------
+    xi0, stderr : (N,); a standard error of NaN does not count.
+    correlation : of the noise of two pixels by their distance, see `shared_variance`.
+    """
+    bins = np.full(image.mask.shape, -1, np.int32)
+    bins[image.mask] = table.axes.bins(image.points.angles)
+    sigma = np.full(image.mask.shape, np.nan)
+    sigma[image.mask] = stderr
+    return np.stack([xi0, shared_variance(bins, sigma, correlation)[image.mask]]).astype(float)
 
 
 def tabulate(
@@ -26,7 +51,8 @@ def tabulate(
     """Add the images of products to a table; a new one is made if none is given.
 
     Mueller matrices are turned into the renderer's axes pixel by pixel, so that pixels of one bin are alike.
-    xi0 products add their valid pixels, with the variance of each, so that tables can be compared with their noise.
+    xi0 products add their valid pixels, with the variance of each and its covariances with the other pixels of the bin,
+    so that tables can be compared with their noise. Those of Mueller images are not averaged over neighbours.
 
     Raises
     ------
@@ -47,7 +73,9 @@ def tabulate(
                     f"{source} is at {header.wavelength_nm:g} nm, the table at {table.wavelength_nm:g} nm; "
                     "make one table for each wavelength."
                 )
-            for rows in product.row_blocks():
+            # Neighbours share noise across the borders of blocks.
+            blocks = product.row_blocks() if kind == "mueller" else [slice(0, product.shape[0])]
+            for rows in blocks:
                 image = view.at(header.omega_deg, *product.shape, block=rows)
                 if not image.mask.any():
                     continue
@@ -57,7 +85,8 @@ def tabulate(
                 else:
                     valid = product.get("valid", rows)[image.mask] > 0
                     xi0, error = (product.get(name, rows)[image.mask] for name in ("xi0", "xi0_errors"))
-                    values = np.where(valid, np.stack([xi0, np.nan_to_num(error) ** 2]), np.nan)
+                    values = xi0_samples(table, image, xi0, np.where(valid, error, np.nan), noise_between(product))
+                    values[:, ~valid] = np.nan
                 table.add(image.points.angles, values, simulated)
         if progress:
             progress(done, len(sources))

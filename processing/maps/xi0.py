@@ -143,6 +143,8 @@ def xi0_of_stokes(
     facts["unphysical_pixels"] = int(found.unphysical.sum())
     shape = image.mask.shape
     with ProductWriter(out, "xi0", header, (shape[0], shape[1]), STOKES_PLANES, steps, overwrite) as writer:
+        text = "of the noise of pixels by distance in rows and columns"
+        writer.array("neighbour_correlation", image.neighbour_correlation, "", text)
         writer.write(slice(0, shape[0]), **planes)
         writer.seal(facts)
     return facts

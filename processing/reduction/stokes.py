@@ -19,7 +19,7 @@ from processing.reduction.facts import in_words
 from processing.reduction.mosaic.layout import MosaicLayout
 from processing.reduction.mosaic.merge import MergedFrame, merge
 from processing.reduction.mosaic.methods import demosaic
-from processing.reduction.mosaic.noise import stokes_covariance
+from processing.reduction.mosaic.noise import neighbour_correlation, stokes_covariance
 from processing.reduction.mosaic.pixel_response import corrected_frame
 from processing.reduction.mueller import Progress, sample_states
 from processing.reduction.noise import NoiseModel
@@ -136,6 +136,10 @@ def reduce_stokes(
     facts["warnings"] += cut_off
     with ProductWriter(out, "stokes", capture.header, (rows, columns), PLANES, steps, overwrite) as product:
         product.array("measurement_matrix", model_rows, "", "W (channel, 16): intensity = W . vec(M), row-major")
+        correlation = neighbour_correlation(layout, method, tuple(map(tuple, np.linalg.pinv(analyzers).tolist())))
+        product.array(
+            "neighbour_correlation", correlation, "", "of the noise of S1, S2 by distance in rows and columns"
+        )
         product.array("analyzers", analyzers, "", "rows (channel, 3): intensity = row . (S0, S1, S2)")
         product.write(slice(0, rows), **found)
         product.seal(facts)

@@ -171,6 +171,13 @@ class MuellerImage:
         return np.asarray(np.linalg.pinv(self.w))
 
 
+def neighbour_correlation(product: Product) -> NDArray[np.float64]:
+    """Correlation of the noise of pixels by distance; 1 at distance 0 alone for a product that holds none."""
+    if product.has_array("neighbour_correlation"):
+        return product.array("neighbour_correlation")
+    return np.ones((1, 1))
+
+
 @dataclass(frozen=True)
 class StokesImage:
     """A reduced linear Stokes image.
@@ -181,6 +188,7 @@ class StokesImage:
     covariance : (rows, columns, 3, 3), counts^2.
     w, analyzers : (channels, 16) and (channels, 3), from the Mueller matrix and from S to intensities.
     mask : (rows, columns) uint8, bits of `processing.reduction.counts_to_signal.Mask`.
+    neighbour_correlation : (2 R + 1, 2 R + 1), of the noise of S1 and S2 between pixels, by rows and columns.
     """
 
     values: NDArray[np.float32]
@@ -188,6 +196,7 @@ class StokesImage:
     mask: NDArray[np.uint8]
     w: NDArray[np.float64]
     analyzers: NDArray[np.float64]
+    neighbour_correlation: NDArray[np.float64]
     header: CaptureHeader
     steps: tuple[Step, ...]
     simulated: bool
@@ -205,6 +214,7 @@ class StokesImage:
                 mask=product.get("pixel_mask", rows),
                 w=product.array("measurement_matrix"),
                 analyzers=product.array("analyzers"),
+                neighbour_correlation=neighbour_correlation(product),
                 header=product.header,
                 steps=product.steps,
                 simulated=product.simulated,

@@ -242,6 +242,10 @@ class Product:
         with damage_as(ProductError, f"{self.path} is damaged"):
             return np.asarray(self._h5[f"entry/reduction/{name}"][...])
 
+    def has_array(self, name: str) -> bool:
+        """Whether /entry/reduction holds an array."""
+        return f"entry/reduction/{name}" in self._h5
+
     def row_blocks(self, pixels: int = 1 << 17) -> Iterable[slice]:
         """Row slices of about `pixels` pixels."""
         step = max(1, pixels // max(self.shape[1], 1))

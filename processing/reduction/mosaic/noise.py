@@ -11,10 +11,11 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import correlate
 
 from processing.reduction.mosaic import oriented
 from processing.reduction.mosaic.layout import MosaicLayout
-from processing.reduction.mosaic.methods import METHODS, demosaic
+from processing.reduction.mosaic.methods import METHODS, REACH, demosaic
 
 #: Frame on which impulses are followed, and the level under them.
 _SIZE, _LEVEL = 32, 1000.0
@@ -51,6 +52,31 @@ def noise_gain(layout: MosaicLayout, method: str, solve: tuple[tuple[float, ...]
                 part = moved[:, i::2, j::2]
                 out[i, j, channel] = np.einsum("sxy,txy->st", part, part)
     return out
+
+
+@lru_cache(maxsize=32)
+def neighbour_correlation(
+    layout: MosaicLayout, method: str, solve: tuple[tuple[float, ...], ...]
+) -> NDArray[np.float64]:
+    """Correlation of the noise of S1 and S2 between pixels, (2 R + 1, 2 R + 1) by row and column distance.
+
+    Neighbours are made of the same raw pixels. Mean of S1 and S2 and of the four positions in the super-pixel, for even
+    light; `superpixel` has none.
+    """
+    matrix = np.asarray(solve)
+    flat = np.full((_SIZE, _SIZE), _LEVEL, np.float32)
+    still = demosaic(flat, layout, method)
+    middle, reach = _SIZE // 2, 2 * REACH[method]
+    total = np.zeros((2 * reach + 1, 2 * reach + 1))
+    for r, c in layout.offsets:
+        poked = flat.copy()
+        poked[middle + r, middle + c] += _STEP
+        moved = np.einsum("sc,crk->srk", matrix, (demosaic(poked, layout, method) - still) / _STEP)
+        for image in moved[1:]:
+            rows, columns = image.shape
+            whole = correlate(image, image, mode="full", method="fft")
+            total += whole[rows - 1 - reach : rows + reach, columns - 1 - reach : columns + reach]
+    return np.asarray(total / total[reach, reach])
 
 
 def stokes_covariance(
