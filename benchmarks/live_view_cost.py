@@ -105,6 +105,7 @@ def main() -> None:
         for _ in range(options.runs):
             alone.append(dead_time_s(Path(folder), 0, options.busy))
             watched.append(dead_time_s(Path(folder), options.clients, options.busy))
+            print(f"  pair {len(watched)}: {alone[-1]:.3f} s alone, {watched[-1]:.3f} s watched", flush=True)
     ratio = np.array(watched) / np.array(alone)
     error = ratio.std(ddof=1) / np.sqrt(len(ratio))
     print(
