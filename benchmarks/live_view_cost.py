@@ -5,7 +5,8 @@ Run: .venv/bin/python benchmarks/live_view_cost.py [--runs 8] [--clients 4] [--b
 Captures on the simulated rig, by turns with the page closed and with so many browsers asking for state, frame and quick
 look as the page does (twice a second; with --busy without a pause). Dead time is what a capture takes beyond moves,
 settling, exposure and the camera's own reading out. Printed are the medians, their ratio with its standard error from
-pairs of neighbours, and the processor time that the measuring program's own thread spends on the page.
+pairs of neighbours, and the processor time that the measuring thread itself spends on the page, with and without
+busy browsers, which a loaded machine does not change much.
 Needs a quiet machine: on a loaded one the standard error says how little the ratio tells.
 """
 
@@ -78,17 +79,26 @@ def dead_time_s(folder: Path, clients: int, busy: bool) -> float:
     return float(ledger["excess"] * ledger["unavoidable_s"])
 
 
-def own_cost_ms(rows: int = 2048, columns: int = 2448) -> float:
-    """Processor time of the measuring thread for one state of a 5-megapixel camera, milliseconds."""
+def own_cost_ms(clients: int, rows: int = 2048, columns: int = 2448) -> float:
+    """Processor time of the measuring thread for one state of a 5-megapixel camera, milliseconds.
+
+    The browsers ask without a pause.
+    """
     pixels = np.ones((rows, columns), dtype=np.uint16)
     report = StateReport(0, "sample", {"psg": Position(0.0, 0)}, 0.01, 0.0, 0.0, 1.0, pixels)
-    spent = []
+    spent, end = [], threading.Event()
     with LiveView(True, 64.0, 4095, StopRequest()) as view:
+        browsers = [threading.Thread(target=browse, args=(view.url, True, end)) for _ in range(clients)]
+        for browser in browsers:
+            browser.start()
         for _ in range(40):
             start_s = time.thread_time()
             view.state_done(report)
             spent.append(time.thread_time() - start_s)
             time.sleep(0.05)
+        end.set()
+        for browser in browsers:
+            browser.join()
     return 1e3 * float(np.median(spent))
 
 
@@ -99,7 +109,11 @@ def main() -> None:
     parser.add_argument("--clients", type=int, default=4)
     parser.add_argument("--busy", action="store_true", help="browsers that ask without a pause")
     options = parser.parse_args()
-    print(f"measuring thread: {own_cost_ms():.2f} ms a state of 2048 x 2448 pixels")
+    for clients in (0, options.clients):
+        cost_ms = own_cost_ms(clients)
+        print(
+            f"measuring thread: {cost_ms:.2f} ms a state of 2048 x 2448 pixels with {clients} busy browsers", flush=True
+        )
     alone, watched = [], []
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(options.runs):
