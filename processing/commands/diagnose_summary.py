@@ -12,6 +12,8 @@ def show(d: Diagnosis) -> None:
     if d.simulated:
         typer.echo("SIMULATED data")
     typer.echo(f"{d.instrument}, {d.wavelength_nm:g} nm: {d.verdict.replace('_', ' ')}")
+    if d.wiring is not None:
+        typer.echo(f"  first of all: {d.wiring}")
     before, after = d.error_before, d.error_after
     typer.echo(f"  error before  {before.rms_percent:8.4f} % of the mean signal, chi2/dof {before.chi2_reduced:.4g}")
     typer.echo(f"  error after   {after.rms_percent:8.4f} % of the mean signal, chi2/dof {after.chi2_reduced:.4g}")
