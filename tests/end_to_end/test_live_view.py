@@ -169,6 +169,9 @@ def test_page_shows_the_capture_and_its_button_stops_it(running, browser):
         browser.wait_for("document.getElementById('bar').value >= 25")
         time.sleep(1)
         browser.screenshot(path)
+    # An answer that fails once must not take the button away.
+    browser.evaluate("document.getElementById('stop').disabled = true")
+    browser.wait_for("!document.getElementById('stop').disabled")
     browser.evaluate("document.getElementById('stop').click()")
     out, err = child.communicate()
     assert child.returncode == 130, out + err
