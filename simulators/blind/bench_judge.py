@@ -15,6 +15,25 @@ Result = Mapping[str, Any]
 GIVEN: dict[str, tuple[str, ...]] = {"joint": FITTED, **{name: (name,) for name in FITTED}}
 #: Mistakes of wiring that are a wrong ratio.
 TURNED_OTHERWISE = ("psg_reversed", "psa_reversed", "both_reversed", "ratio", "half_degrees", "double_degrees")
+#: What a sentence about a mistake of wiring has to say.
+WIRING_WORDS = {
+    "psg_reversed": "axis 'psg' turns the other way",
+    "psa_reversed": "axis 'psa' turns the other way",
+    "both_reversed": "both axes turn the other way",
+    "axes_swapped": "each other's place",
+    "ratio": "axis 'psa' was driven with a ratio of",
+    "psg_zero": "'psg_retarder' is a quarter turn off",
+    "psa_zero": "'psa_retarder' is a quarter turn off",
+    "analyzer_zero": "'analyzer' is a quarter turn off",
+    "frame_order": "in reverse order",
+    "off_by_one": "the states are one ",
+    "half_degrees": "in units of two degrees",
+    "double_degrees": "in half degrees",
+    "wavelength": "wavelength",
+    "mirrored_image": "mirrored left and right",
+    "rotated_image": "turned by 180 degrees",
+    "mosaic_order": "mirrored up and down",
+}
 #: Names that are true as well: in the counts the fault is that.
 TRUE_AS_WELL = {
     "lamp_beat": {"source_flicker"},
@@ -173,10 +192,9 @@ def told_of(result: Result, truth: RealBench, given: Sequence[str]) -> tuple[Mat
 
 
 def wiring_of(result: Result, truth: RealBench) -> tuple[Cause, ...]:
-    """Mistakes of wiring that are told, against the truth."""
-    kinds = {f.kind for f in truth.faults}
-    return tuple(
-        Cause(w["name"], "sure" if w["probability"] >= WORDS["sure"] else "likely", w["probability"], good, good)
-        for w in result.get("wiring") or ()
-        for good in [w["name"] in kinds]
-    )
+    """The mistake of wiring that is told, against the truth."""
+    told = result.get("wiring")
+    if not told:
+        return ()
+    right = any(WIRING_WORDS[f.kind] in told for f in truth.faults if f.kind in WIRING_WORDS)
+    return (Cause(told, "sure", WORDS["sure"], right, right),)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
-from simulators.blind.bench_judge import Judgement, names_of, told_of
+from simulators.blind.bench_judge import WIRING_WORDS, Judgement, names_of, told_of, wiring_of
 from simulators.blind.bench_oracle import known_oracle
 from simulators.blind.bench_run import judge_bench
 from simulators.blind.bench_table import is_worse, reliability, sure_and_wrong, table
@@ -168,6 +168,15 @@ def test_a_name_is_right_at_its_place_and_in_its_capture():
     assert [m.told for m in told_of(result, truth, ("flat", "air"))] == ["named", "in a set"]
     # What acts in another capture only is not asked of these.
     assert [m.label for m in told_of(result, truth, ("sphere",))] == ["psg_extinction[psg_polarizer]"]
+
+
+def test_sentence_about_wiring_has_to_say_what_is_wrong():
+    assert set(WIRING_WORDS) == {*GROUPS["wiring"], *GROUPS["mosaic_wiring"]}
+    truth = truth_of(TrueFault("psa_reversed", "", {}, None))
+    (right,) = wiring_of({"wiring": "axis 'psa' turns the other way: in the instrument file, 'x': ratio: -1"}, truth)
+    (wrong,) = wiring_of({"wiring": "axis 'psg' turns the other way: in the instrument file, 'x': ratio: -1"}, truth)
+    assert (right.right, wrong.right) == (True, False)
+    assert wiring_of({"wiring": None}, truth) == wiring_of({}, truth) == ()
 
 
 def test_table_counts_what_is_worse_and_what_is_sure_and_wrong():
