@@ -8,27 +8,36 @@ import pytest
 
 from processing.storage.capture import Capture
 
+#: Where the campaign was taken, once, and a copy of it as it was then: its files name each other by whole paths.
+TAKEN = {}
+
 
 @pytest.fixture
 def campaign(quick_rig, configs, tmp_path, acquire):
-    """A campaign of one short capture, its rig and plan, all of them files of the test's own; taken once."""
-    plan = tmp_path / "plan.yaml"
+    """A campaign of one short capture, complete; its rig and plan are files that a test may edit."""
+    home = TAKEN.setdefault("home", tmp_path)
+    rig, plan, file = home / "rig.yaml", home / "plan.yaml", home / "campaign.yaml"
+
+    def run(*options, rig=rig):
+        chosen = () if rig is None else ("--rig", rig)
+        return acquire("--campaign", file, *chosen, "--out", home, "--yes", *options)
+
+    copy = home.with_name(home.name + " as it was")
+    if copy.exists():
+        shutil.rmtree(home)
+        shutil.copytree(copy, home)
+        return run, rig, plan, home / "night"
     text = (configs / "plans" / "drr.yaml").read_text()
     plan.write_text(text.replace("states: 40, step_deg: 9", "states: 18, step_deg: 20").replace("darks: 4", "darks: 1"))
-    file = tmp_path / "campaign.yaml"
     file.write_text(
         f"kind: campaign\nname: night\nplans: {{drr: {plan}}}\nsamples: [{{name: red_sphere}}]\n"
         "wavelengths_nm: [662]\nomega_deg: [35]\n"
     )
-    rig = quick_rig()
-
-    def run(*options, rig=rig):
-        chosen = () if rig is None else ("--rig", rig)
-        return acquire("--campaign", file, *chosen, "--out", tmp_path, "--yes", *options)
-
+    assert quick_rig() == rig
     code, _, err = run()
     assert code == 0, err
-    return run, rig, plan, tmp_path / "night"
+    shutil.copytree(home, copy)
+    return run, rig, plan, home / "night"
 
 
 def _only(folder):

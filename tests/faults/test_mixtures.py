@@ -27,12 +27,21 @@ def broken_at(number):
     return act
 
 
+#: The partial capture that the tests below begin with, taken once.
+TAKEN = {}
+
+
 @pytest.fixture
-def partial(run_with):
-    error, path = run_with(broken_at(6), plan=SHORT)
-    assert isinstance(error, DeviceError)
-    assert path.name == "run.h5.partial"
-    return path
+def partial(run_with, tmp_path):
+    if not TAKEN:
+        error, path = run_with(broken_at(6), plan=SHORT)
+        assert isinstance(error, DeviceError)
+        assert path.name == "run.h5.partial"
+        TAKEN["bytes"] = path.read_bytes()
+    copy = tmp_path / "copy" / "run.h5.partial"
+    copy.parent.mkdir()
+    copy.write_bytes(TAKEN["bytes"])
+    return copy
 
 
 def _edited(rig_file, **changes):
