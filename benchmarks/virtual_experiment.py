@@ -107,6 +107,7 @@ COLUMNS = {
     "noise of xi0": ("xi0_noise_percent", 2),
     "common": ("common", 2),
     "eigenvalues": ("eigenvalue_deviation", 3),
+    "their noise": ("eigenvalue_noise", 3),
 }
 
 
@@ -117,12 +118,12 @@ def table(result: CampaignResult) -> list[str]:
         for r in (r for r in result.rows if r.wavelength_nm == nm):
             cells = [f"{getattr(r, name):.{digits}f}" for name, digits in COLUMNS.values()]
             out.append(f"| {r.omega_deg:g} | " + " | ".join(cells) + " |")
-        means = [f"{result.average(nm, name):.2f}" for name, _ in list(COLUMNS.values())[:-1]]
-        out.append("| mean | " + " | ".join(means) + " | |")
+        means = [f"{result.average(nm, name):.2f}" for name, _ in list(COLUMNS.values())[:-2]]
+        out.append("| mean | " + " | ".join(means) + " | | |")
         paper = PAPER[round(nm)]
         most = "0.09" if nm == 451 else "0.03"
         cells = [f"{paper.psi_deg:.2f}", "", f"{paper.magnitude_percent:.2f}", "", f"{paper.xi0_percent:.2f}", "", ""]
-        out.append("| paper | " + " | ".join([*cells, f"{most} at most"]) + " |")
+        out.append("| paper | " + " | ".join([*cells, f"{most} at most", ""]) + " |")
         out.append("")
     return out
 

@@ -49,7 +49,8 @@ class Row:
 
     `psi_noise_deg`, `magnitude_noise_percent` and `xi0_noise_percent` are what the noise alone, first order, makes of
     the deviation (xi0: of both instruments), `common` the fraction of the virtual sphere where both have a value,
-    `eigenvalue_deviation` the 99th percentile of the largest deviation of xi1..xi3 from their mean.
+    `eigenvalue_deviation` the 99th percentile of the largest deviation of xi1..xi3 from their mean, without what
+    noise alone makes of it, which is `eigenvalue_noise`.
     """
 
     wavelength_nm: float
@@ -62,6 +63,7 @@ class Row:
     xi0_noise_percent: float = np.nan
     common: float = np.nan
     eigenvalue_deviation: float = np.nan
+    eigenvalue_noise: float = np.nan
 
 
 @dataclass(frozen=True)
@@ -243,7 +245,7 @@ def _rows(
                 m = here["mueller"]
                 values |= {"psi_deg": m.psi_deg, "magnitude_percent": m.magnitude_percent}
                 values |= {"psi_noise_deg": m.psi_noise_deg, "magnitude_noise_percent": m.magnitude_noise_percent}
-                values["eigenvalue_deviation"] = m.eigenvalue_deviation
+                values |= {"eigenvalue_deviation": m.eigenvalue_deviation, "eigenvalue_noise": m.eigenvalue_noise}
             if "stokes" in here and len(loaded) == 2:
                 values |= compare_on_sphere(
                     loaded["mueller"], loaded["stokes"], views["stokes"], omega, here["stokes"].shape

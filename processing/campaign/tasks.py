@@ -13,11 +13,14 @@ from processing.geometry.errors import OutlineNotFound
 from processing.geometry.frames import GeometryImage
 from processing.geometry.outline import find_sphere, registered
 from processing.geometry.viewing import ViewingGeometry
+from processing.maps.coherency_noise import coherency_noise, largest_deviation_by_noise
 from processing.maps.tables import xi0_samples
 from processing.maps.xi0 import estimate_from_stokes
 from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
+from processing.polarization.eigenvalue_noise import corrected
 from processing.polarization.gradients import dominant
 from processing.polarization.image_difference import linear_diattenuation, magnitude, orientation_difference, rmsd
+from processing.polarization.quantities import deviation_from_td
 from processing.reflectance.base import load_reflectance
 from processing.reflectance.tables import ScatteringTable
 from processing.steps.maps import geometry_identities
@@ -67,6 +70,8 @@ class CaptureMeasure:
     #: What the noise alone makes of psi_deg and magnitude_percent.
     psi_noise_deg: float = np.nan
     magnitude_noise_percent: float = np.nan
+    #: What the noise alone makes of the eigenvalues' deviation; taken off it.
+    eigenvalue_noise: float = np.nan
 
 
 def measure(task: CaptureTask) -> CaptureMeasure:
@@ -110,21 +115,18 @@ def _measure_mueller(task: CaptureTask, product: Path, view: ViewingGeometry) ->
     m = image.matrices
     geometry = view.at(float(image.header.omega_deg or 0.0), *image.mask.shape)
     model = load_reflectance(task.material).mueller_jones(geometry.points, image.header.wavelength_nm)
-    inside = m[geometry.mask].astype(float)
-    xi0, m0 = xi0_and_dominant(inside)
-    eigenvalues = coherency_eigenvalues(inside)
-    # First order: d xi0 = <dM, m0 - 4 xi0 e00> / (4 m00).
-    gradient = np.zeros((*image.mask.shape, 16))
-    direction = np.asarray(m0).reshape(-1, 16).copy()
-    direction[:, 0] -= 4 * xi0
-    gradient[geometry.mask] = direction / (4 * inside[:, :1, 0])
-    stderr = np.sqrt(image.variance_of(gradient)[geometry.mask])
-    good = np.isfinite(xi0) & ~(stderr > MAX_STDERR) & _inner(geometry, task.border_px)
+    inside = geometry.mask
+    m0 = xi0_and_dominant(m[inside].astype(float))[1]
+    eigenvalues, noise = coherency_eigenvalues(m).astype(float), coherency_noise(image)
+    found = corrected(eigenvalues, noise)
+    xi0, stderr = found.xi0[inside], (found.interval_68[1] - found.interval_68[0])[inside] / 2
+    # A limit on the noise: one on the outcome would keep upward fluctuations only.
+    good = np.isfinite(xi0) & ~(noise.coupling[inside] > MAX_STDERR) & _inner(geometry, task.border_px)
     measured, modelled = linear_diattenuation(m0), linear_diattenuation(model)
     psi = orientation_difference(modelled, measured)[good]
     psi_noise, magnitude_noise = _noise_of_dominant(image, np.flatnonzero(geometry.mask)[good])
-    small = eigenvalues[:, 1:]
-    deviation = np.abs(small - small.mean(axis=-1, keepdims=True)).max(axis=-1)[good]
+    deviation = np.abs(deviation_from_td(eigenvalues)).max(axis=-1)[inside][good]
+    most, by_noise = (_most(v) for v in (deviation, largest_deviation_by_noise(image)[inside][good]))
     return CaptureMeasure(
         kind="mueller",
         wavelength_nm=image.header.wavelength_nm,
@@ -133,11 +135,17 @@ def _measure_mueller(task: CaptureTask, product: Path, view: ViewingGeometry) ->
         table=_table(task, product, geometry, (xi0, stderr, good), image.header.wavelength_nm, image.simulated),
         psi_deg=float(np.rad2deg(rmsd(psi))),
         magnitude_percent=100 * rmsd((magnitude(modelled) - magnitude(measured))[good]),
-        eigenvalue_deviation=float(np.percentile(deviation, 99)) if good.any() else float("nan"),
+        eigenvalue_deviation=float(np.sqrt(max(most**2 - by_noise**2, 0.0))),
+        eigenvalue_noise=by_noise,
         pixels=int(good.sum()),
         psi_noise_deg=psi_noise,
         magnitude_noise_percent=100 * magnitude_noise,
     )
+
+
+def _most(values: NDArray[np.floating]) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.percentile(finite, 99)) if finite.size else float("nan")
 
 
 def _noise_of_dominant(image: MuellerImage, pixels: NDArray[np.int64]) -> tuple[float, float]:

@@ -66,6 +66,7 @@ COLUMNS = (
     ("xi0_noise_percent", "its noise"),
     ("common", "common"),
     ("eigenvalue_deviation", "eigenvalues"),
+    ("eigenvalue_noise", "their noise"),
 )
 
 
@@ -89,7 +90,7 @@ def lines(result: CampaignResult) -> list[str]:
             out.append(row("paper", [p.psi_deg, None, p.magnitude_percent, None, p.xi0_percent]))
     out.append(
         "common: part of the virtual sphere where both instruments have a value; eigenvalues: 99th percentile of "
-        "the largest deviation of xi1..xi3 from their mean, noise included; -: no capture for it"
+        "the largest deviation of xi1..xi3 from their mean, without its noise; -: no capture for it"
     )
     return out
 

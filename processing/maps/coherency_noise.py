@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from processing.polarization.cloude import xi0_and_dominant
+from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
 from processing.polarization.eigenvalue_noise import TRIPLE, EigenvalueNoise
+from processing.polarization.quantities import deviation_from_td
+from processing.polarization.triply_degenerate import mueller_matrix
 from processing.storage.images import MuellerImage
 
 
@@ -25,3 +28,14 @@ def coherency_noise(image: MuellerImage) -> EigenvalueNoise:
         gradient[..., 0] -= 4 * xi0
         along = np.sqrt(image.variance_of(gradient)) / (4 * m00)
     return EigenvalueNoise.of(total, row, diagonal, along)
+
+
+def largest_deviation_by_noise(image: MuellerImage) -> NDArray[np.float64]:
+    """The largest deviation of xi1, xi2, xi3 from their mean that noise alone makes, (rows, columns).
+
+    One draw a pixel, always the same: of the triply degenerate matrix of its dominant process, with the image's noise.
+    """
+    xi0, m0 = xi0_and_dominant(image.matrices)
+    even = mueller_matrix(m0, xi0, image.values[0, 0])
+    drawn = image.drawn_noise(np.random.default_rng(0)).T.reshape(*image.mask.shape, 4, 4)
+    return np.asarray(np.abs(deviation_from_td(coherency_eigenvalues(even + drawn))).max(axis=-1), dtype=float)

@@ -160,6 +160,15 @@ class MuellerImage:
         found = np.einsum("np,np->p", each.astype(np.float32) @ g.T.astype(np.float32), self.intensity_variance)
         return np.asarray((found * self._told).reshape(self.mask.shape))
 
+    def drawn_noise(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """One draw (16, pixels) of the noise of the elements, counts, with their covariance."""
+        if self.facts["weighted"]:
+            factor = np.linalg.cholesky(np.nan_to_num(self._covariance.reshape(-1, 16, 16)) + 1e-12 * np.eye(16))
+            return np.asarray(np.einsum("pij,jp->ip", factor, rng.normal(size=(16, len(factor)))))
+        variance = self.intensity_variance
+        noise = self._inverse @ (np.sqrt(variance) * rng.normal(size=variance.shape))
+        return np.asarray(noise * np.sqrt(self._told))
+
     @cached_property
     def _told(self) -> NDArray[np.float64]:
         # Flats, dark frames and left-out states change all errors of a pixel much alike.

@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 from noisy_images import five_samples, noisy_image, rgb950
 
+from processing.maps.coherency_noise import largest_deviation_by_noise
 from processing.maps.xi0 import eigenvalue_block
 from processing.polarization import triply_degenerate
 from processing.polarization.cloude import coherency_eigenvalues
 from processing.polarization.eigenvalue_noise import THETA, EigenvalueNoise, corrected
+from processing.polarization.quantities import deviation_from_td
 
 PIXELS = 2500
 PURE = five_samples()["non-depolarizing"]
@@ -51,6 +53,15 @@ def test_noise_alone_is_told_and_taken_off_the_spread_of_eigenvalues(electrons):
     rms = np.sqrt(np.mean(np.sum((raw - raw.mean(axis=0)) ** 2, axis=0)))
     assert np.median(degenerate["eigenvalue_spread_noise"]) == pytest.approx(rms, rel=0.06)
     assert np.median(degenerate["eigenvalue_spread"]) < 0.3 * rms
+
+
+@pytest.mark.parametrize("electrons", [200, 20_000])
+def test_the_largest_deviation_by_noise_alone_has_its_distribution(electrons):
+    image = noisy_image(np.tile(triply_degenerate.mueller_matrix(PURE, 0.6), (PIXELS, 1, 1)), electrons, 3)
+    measured = np.abs(deviation_from_td(coherency_eigenvalues(image.matrices))).max(axis=-1)
+    alone = largest_deviation_by_noise(image)
+    for percent in (50, 99):
+        assert np.percentile(alone, percent) == pytest.approx(np.percentile(measured, percent), rel=0.1)
 
 
 def test_a_real_spread_stays():
