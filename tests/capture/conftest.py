@@ -131,9 +131,16 @@ class RecordedWriter:
         self.records: list[Any] = []
         self.exposures: list[Any] = []
         self.asked: Counter[str] = Counter()
+        self.blocked = False
 
     def put(self, record: Any) -> None:
         self.records.append(record)
+
+    def is_settled(self) -> bool:
+        return not self.blocked
+
+    def settle(self) -> None:
+        self.asked["settle"] += 1
 
     def forget(self) -> None:
         self.asked["forget"] += 1

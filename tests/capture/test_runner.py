@@ -190,6 +190,15 @@ def test_light_is_switched_where_it_changes(rig, runner_of):
     assert names[:3] == ["arrived", "light", "trigger"]
 
 
+def test_a_disc_that_takes_nothing_shuts_the_light_until_it_does(rig, runner_of):
+    runner = runner_of(psg=(0.0,) * 3)
+    runner.writer.blocked = True
+    assert runner.run(range(3))
+    assert [event[2] for event in rig.events if event[1] == "light"] == [True, False, True, False, True, False]
+    assert runner.writer.asked["settle"] == 3
+    assert len(runner.writer.records) == 3
+
+
 def test_a_rig_without_a_source_takes_light_states(rig, runner_of):
     rig.source = None
     assert runner_of().run(range(3))
