@@ -267,7 +267,7 @@ def _end_segment(
     end = end_record(runner, rig, writer.segment, status, failure)
     closing = closing_record([], end)
     try:
-        writer.settle()
+        writer.settle(in_haste=failure is not None)
         records = writer.file.segment_records()
         closing = closing_record(records, end)
         # Half of what is left, so that there is room for the next.

@@ -8,6 +8,7 @@ its lock nor Python's.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
 from collections.abc import Mapping
@@ -68,8 +69,7 @@ class StateFile:
             raise AcquisitionError(f"{path} cannot be opened to go on ({error.strerror}).") from error
         try:
             self._find_places()
-            # The lock that HDF5 takes as well: nobody opens the file while it is written.
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._lock()
         except BlockingIOError:
             os.close(self._file)
             raise AcquisitionError(
@@ -81,6 +81,15 @@ class StateFile:
                 f"{path} cannot be opened to go on ({error}). If another program has it open, end that one; if the "
                 "file is damaged, begin a new capture."
             ) from error
+
+    def _lock(self) -> None:
+        """Take the lock that HDF5 takes as well, so that nobody opens the file while it is written."""
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            # Some file systems of other machines have no locks; HDF5 goes without there too.
+            if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
+                raise
 
     def _find_places(self) -> None:
         with h5py.File(self.path, "r") as h5:

@@ -231,9 +231,14 @@ class CaptureWriter:
         """Wait until every state handed over is on the disc, but for PATIENCE_S at most. Raises AcquisitionError."""
         return self._settled(PATIENCE_S)
 
-    def settle(self) -> None:
-        """Wait until every state handed over is on the disc. Raises AcquisitionError, after DEAD_S at most."""
-        if not self._settled(DEAD_S):
+    def settle(self, *, in_haste: bool = False) -> None:
+        """Wait until every state handed over is on the disc. Raises AcquisitionError, after DEAD_S at most.
+
+        Parameters
+        ----------
+        in_haste : for a run that has failed already, wait for PATIENCE_S only.
+        """
+        if not self._settled(PATIENCE_S if in_haste else DEAD_S):
             raise self._blocked()
 
     def _settled(self, patience_s: float) -> bool:
@@ -258,7 +263,7 @@ class CaptureWriter:
 
     def _blocked(self) -> AcquisitionError:
         return AcquisitionError(
-            f"{self.path}: the disc has not taken a state for {DEAD_S:g} s. States done before it are "
+            f"{self.path}: the disc takes no data. States done before it are "
             "intact; go on with --resume when the disc is well."
         )
 

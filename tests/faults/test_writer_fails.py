@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import pytest
 
-from acquisition.capture import layout, writer
+from acquisition.capture import layout, state_file, writer
 from acquisition.capture.runner import CaptureRunner
 from acquisition.capture.state_file import StateFile
 from acquisition.errors import AcquisitionError
@@ -65,7 +65,7 @@ def test_a_disc_that_takes_nothing_shuts_the_light_and_ends_the_run(run_with, in
     with monkeypatch.context() as patch:
         _failing_at(patch, 5, lambda: blocked.wait(60))
         error, path = run_with(lambda rig, *_: rigs.append(rig), plan=SHORT, observers=(Told(),))
-    assert "the disc has not taken a state" in str(error)
+    assert "the disc takes no data" in str(error)
     told = [number for number, entry in enumerate(lit) if "the disc takes no data" in str(entry)]
     # The light is shut right after it was told, not at the end of the run.
     assert lit[told[0] + 1] == "set"
@@ -73,6 +73,24 @@ def test_a_disc_that_takes_nothing_shuts_the_light_and_ends_the_run(run_with, in
     blocked.set()
     _let_go(path)
     assert intact(path) >= 5
+
+
+def test_a_run_stopped_at_once_does_not_wait_for_a_disc_that_blocks(run_with, monkeypatch):
+    """Ctrl-C twice while the disc blocks: the run ends after the short patience, not after the long one."""
+    monkeypatch.setattr(writer, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(writer, "DEAD_S", 3600.0)
+    blocked = threading.Event()
+
+    class Twice(Observer):
+        def warning(self, text):
+            if "the disc takes no data" in text:
+                raise KeyboardInterrupt
+
+    _failing_at(monkeypatch, 5, blocked.wait)
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        run_with(plan=SHORT, observers=(Twice(),))
+    blocked.set()
+    assert any("the end of the run could not be recorded" in note for note in stopped.value.__notes__)
 
 
 def _then(function, act):
@@ -239,6 +257,19 @@ def test_an_error_of_the_disc_in_the_layout_is_told_and_leaves_nothing(new_write
     with pytest.raises(AcquisitionError, match=r"cannot be created .*injected"):
         new_writer()
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("number", "refused"), [(errno.ENOLCK, False), (errno.EAGAIN, True), (errno.EIO, True)])
+def test_a_file_system_without_locks_is_no_obstacle(new_writer, monkeypatch, number, refused):
+    def flock(file, operation):
+        raise OSError(number, "injected")
+
+    monkeypatch.setattr(state_file.fcntl, "flock", flock)
+    if refused:
+        with pytest.raises(AcquisitionError, match="cannot be opened to go on"):
+            new_writer()
+    else:
+        new_writer().abandon()
 
 
 def test_captures_leave_no_thread_and_no_descriptor(run_with):
