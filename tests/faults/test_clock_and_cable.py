@@ -149,6 +149,10 @@ def test_repeated_states_are_compared_only_where_they_repeat():
     noise = np.random.default_rng(2).normal(0, 20, frame.shape)
     assert repeated.look(3, 0.01, (0.0, 0.0), frame + noise) is None
     assert "-2." in repeated.look(3, 0.01, (0.0, 0.0), 64 + 0.975 * (frame - 64))
+    # It is told once.
+    assert repeated.look(4, 0.01, (0.0, 0.0), 64 + 0.5 * (frame - 64)) is None
+    repeated = RepeatedState(64)
+    repeated.look(0, 0.01, (0.0, 0.0), frame)
     tilted = 64 + (frame - 64) * np.linspace(0.9, 1.1, 80)
     assert "from place to place by 5" in repeated.look(3, 0.01, (0.0, 0.0), tilted)
 
