@@ -14,7 +14,7 @@ from processing.diagnosis.instrument.run import diagnose_captures
 from processing.diagnosis.instrument_file import extended
 from processing.instrument.model import InstrumentModel
 from simulators.blind.bench_judge import GIVEN, Judgement, names_of, told_of, wiring_of
-from simulators.blind.mueller_error import Reduced, error_of
+from simulators.blind.mueller_error import coverage_of, error_of
 from simulators.blind.real_bench import VALIDATION, RealBench
 
 
@@ -34,7 +34,7 @@ def judge_bench(
     result, corrected = _diagnosed(captures, declared)
     seconds = time.perf_counter() - begun
     away = folder / "truth" / truth.name
-    covered = Reduced.of(away / f"{VALIDATION}_noisy.h5", corrected).coverage(_truth(away, VALIDATION))
+    covered = coverage_of(away / f"{VALIDATION}_noisy.h5", corrected, _truth(away, VALIDATION))
     judgement = Judgement(
         name=truth.name,
         group=truth.group,

@@ -93,6 +93,14 @@ def error_of(path: Path, model: InstrumentModel, truth: Array) -> float:
         return float("inf")
 
 
+def coverage_of(path: Path, model: InstrumentModel, truth: Array) -> Coverage:
+    """Coverage of M / m00 of a capture, reduced with a model; NaN where it can not be reduced."""
+    try:
+        return Reduced.of(path, model).coverage(truth)
+    except ProcessError:
+        return Coverage(float("nan"), float("nan"))
+
+
 def _patches(values: Array | NDArray[np.bool_]) -> Array:
     """(..., patches, PATCH^2) of (..., rows, columns)."""
     lead, (rows, columns) = values.shape[:-2], (n // PATCH for n in values.shape[-2:])

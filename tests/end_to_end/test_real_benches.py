@@ -14,7 +14,7 @@ from simulators.blind.bench_judge import WIRING_WORDS, Judgement, names_of, told
 from simulators.blind.bench_oracle import known_oracle
 from simulators.blind.bench_run import judge_bench
 from simulators.blind.bench_table import is_worse, reliability, sure_and_wrong, table
-from simulators.blind.mueller_error import Reduced
+from simulators.blind.mueller_error import Reduced, coverage_of, error_of
 from simulators.blind.real_bench import GROUPS, INSTRUMENTS, STATES, RealBench, TrueFault, make_bench, read_truth
 from simulators.blind.suite import declared_bench, state_angles
 from simulators.blind.undeclared_captures import Scene, digitize, expose
@@ -131,6 +131,15 @@ def test_answer_to_a_small_bench_harms_nothing(group, seed, given, configs, tmp_
     assert not any(is_worse(*pair) for pair in judgement.own.values())
     if group == "none":
         assert result["verdict"] == "consistent"
+
+
+def test_what_cannot_be_reduced_has_an_infinite_error(tmp_path, configs):
+    truth = make_bench(tmp_path, list(GROUPS["wiring"]).index("ratio"), configs, "wiring", pixels=16)
+    away = tmp_path / "truth" / truth.name
+    declared = InstrumentModel.load(configs / "instruments" / truth.instrument)
+    exact = np.load(away / "validation.npy").astype(float)
+    assert error_of(away / "validation.h5", declared, exact) == np.inf
+    assert np.isnan(coverage_of(away / "validation_noisy.h5", declared, exact).pixels)
 
 
 def truth_of(*faults):
