@@ -49,6 +49,8 @@ class RecordedExposure:
 
     def wait_exposed(self) -> None:
         settings = self.rig.settings
+        if self.number in self.rig.never_exposed:
+            raise FrameLost("camera, expose", "it still exposes", "Capture the state again")
         self.rig.clock.sleep_s((settings.exposure_s or 0.0) * (settings.frame_average or 1) + LATE_S)
         self.rig.note("exposed", self.number)
         self.rig.during_exposure(self.number)
@@ -69,6 +71,7 @@ class RecordedRig:
     time_scale: float = 1.0
     settings: CameraSettings = field(default_factory=CameraSettings)
     lost: set[int] = field(default_factory=set)
+    never_exposed: set[int] = field(default_factory=set)
     picture: Callable[[int], np.ndarray] = lambda number: np.full((4, 5), 500 + number, np.uint16)
     during_exposure: Callable[[int], None] = lambda number: None
     door_open: bool = False

@@ -69,6 +69,11 @@ def test_the_longest_move_starts_first(rig, runner_of):
     assert [event[3] for event in rig.events if event[1] == "start"][1] == ["psa", "psg"]
 
 
+def test_the_length_of_a_move_is_from_where_the_axis_stands(rig, runner_of):
+    runner_of(psg=(20.0, 21.0), psa=(0.0, 5.0)).run(range(2))
+    assert [event[3] for event in rig.events if event[1] == "start"][1] == ["psa", "psg"]
+
+
 def test_an_axis_that_something_moved_ends_the_run(rig, runner_of):
     runner = runner_of(psg=(5.0, 5.0, 5.0))
     rig.during_exposure = lambda number: setattr(rig.axes["psg"], "off_deg", 0.02)
@@ -114,6 +119,16 @@ def test_a_state_that_is_lost_in_every_try_ends_the_run(rig, runner_of):
         runner.run(range(3))
     assert runner.writer.states() == [0, 1]
     assert rig.events[-1][1] == "stop"
+
+
+def test_an_exposure_that_does_not_end_is_taken_again(rig, runner_of):
+    heard = Heard()
+    rig.never_exposed = {2}
+    runner = runner_of(observers=(heard,))
+    assert runner.run(range(3))
+    assert heard.exposed == [(0, 0), (1, 0), (1, 1), (2, 0)]
+    assert runner.writer.states() == [0, 1, 2]
+    assert "state 1: frame lost (it still exposes), taken again" in heard.warnings[0]
 
 
 def test_tries_are_counted_anew_in_the_next_run(rig, runner_of):
@@ -179,6 +194,7 @@ def test_the_ledger_adds_up_what_cannot_be_avoided(rig, runner_of):
     spent = runner.ledger.spent_s
     assert spent["moving"] == pytest.approx(MOVE_S / 3)
     assert spent["settling"] == pytest.approx(SETTLE_S)
+    assert set(spent) == {"moving", "settling", "setting", "exposure", "transfer", "writing", "shutter"}
     assert spent["exposure"] == pytest.approx(2 * (light_s + LATE_S))
     assert runner.ledger.summary()["excess"] == pytest.approx(0.0, abs=1e-6)
 
@@ -282,6 +298,21 @@ def test_a_door_that_nobody_waits_for_ends_the_run(rig, runner_of):
     with pytest.raises(InterlockOpened, match="the door is open in state 0"):
         runner.run(range(3))
     assert runner.writer.records == []
+
+
+def test_a_saturated_state_is_discarded_where_the_rig_file_says_so(rig, runner_of):
+    from types import SimpleNamespace
+
+    rig.config.interlocks = (SimpleNamespace(kind="saturation", limit=0.05),)
+    rig.picture = lambda number: np.full((4, 5), 4095 if number == 2 else 500, np.uint16)
+    runner = runner_of(psg=(0.0, 0.0), exposure_s=(0.5, 0.9))
+    assert runner.run(range(2))
+    # The same exposure as the shortest one is not meant to saturate.
+    runner = runner_of(psg=(0.0, 0.0))
+    rig.picture = lambda number: np.full((4, 5), 4095 if number == 4 else 500, np.uint16)
+    with pytest.raises(InterlockOpened, match=r"100.00 % of the pixels are saturated. State 1 was discarded"):
+        runner.run(range(2))
+    assert runner.writer.states() == [0]
 
 
 def test_a_stop_that_fails_as_well_is_told_with_the_first_error(rig, runner_of):
