@@ -16,7 +16,7 @@ app = application("diagnose", "Compare captures with an instrument model and fin
 
 @app.command()
 def diagnose_command(
-    captures: Annotated[list[Path], typer.Argument(help="Captures of one instrument at one wavelength.")],
+    captures: Annotated[list[Path], typer.Argument(help="Captures of one instrument, at one wavelength or several.")],
     instrument: Annotated[Path, typer.Option(help="Instrument file that the intensities are compared with.")],
     write: Annotated[
         Path | None, typer.Option(help="New file with the effects found: instrument, or material.")

@@ -11,7 +11,8 @@ def show(d: Diagnosis) -> None:
     """Print a summary."""
     if d.simulated:
         typer.echo("SIMULATED data")
-    typer.echo(f"{d.instrument}, {d.wavelength_nm:g} nm: {d.verdict.replace('_', ' ')}")
+    wavelengths = ", ".join(f"{w:g}" for w in d.wavelengths_nm)
+    typer.echo(f"{d.instrument}, {wavelengths} nm: {d.verdict.replace('_', ' ')}")
     if d.wiring is not None:
         typer.echo(f"  first of all: {d.wiring}")
     before, after = d.error_before, d.error_after
@@ -21,6 +22,10 @@ def show(d: Diagnosis) -> None:
         typer.echo(f"  noise floor   {d.noise_floor_percent:8.4f} %")
     typer.echo(f"  held out: {before.held_out}")
     for c in d.captures:
+        if len(d.wavelengths_nm) > 1 and c.rms_before_percent is not None:
+            typer.echo(
+                f"  {c.wavelength_nm:g} nm: {c.rms_before_percent:.4f} % -> {c.rms_after_percent:.4f} %, {c.name}"
+            )
         if c.cut_off:
             states = f"state{'s' if len(c.cut_off) > 1 else ''} {', '.join(str(k) for k in c.cut_off)}"
             typer.echo(f"  left out: {states} of {c.name}, cut off at zero counts; raise the black level")
@@ -49,6 +54,7 @@ def show(d: Diagnosis) -> None:
 
 def _show_effect(effect: FoundEffect) -> None:
     where = f" of {effect.element}" if effect.element else ""
+    where += f" at {effect.wavelength_nm:g} nm" if effect.wavelength_nm is not None else ""
     where += f", {effect.capture}" if effect.capture else ""
     typer.echo(f"  {effect.kind}{where}: {_answer(effect)}")
     for name, p in effect.parameters.items():

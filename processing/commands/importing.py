@@ -18,7 +18,8 @@ def import_command(
     states: Annotated[
         Path,
         typer.Option(
-            help="CSV: state, a column per axis in degrees; optional time_s, exposure_s, role, file, channel_<name>."
+            help="CSV: state, a column <axis>_deg for each axis; optional time_s, exposure_s, sigma, role, file, "
+            "channel_<name>."
         ),
     ],
     wavelength_nm: Annotated[float, typer.Option(help="Wavelength of the measurement.")],

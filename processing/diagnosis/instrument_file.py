@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from processing.diagnosis.search.result import Diagnosis
 from processing.errors import ProcessError
-from processing.instrument.model import InstrumentModel
+from processing.instrument.model import Dispersive, EffectParameter, InstrumentModel
 from processing.yaml_file import dump_yaml
 
 
@@ -21,28 +20,28 @@ def extended(model: InstrumentModel, diagnosis: Diagnosis) -> InstrumentModel:
     Effects come behind those that it has; values that the file calls nominal are replaced by what was fitted. An
     effect of the same kind, place and wavelength is replaced: its new values are on top of the old ones.
     """
-    values: dict[str, dict[str, Any]] = {}
+    values: dict[str, dict[str, Dispersive]] = {}
     for name, entry in diagnosis.calibrated.items():
         element, _, field = name.rpartition(".")
-        old = next(getattr(e, field) for e in model.elements() if e.name == element)
-        new: Any = entry.value
-        if isinstance(old, dict):
-            key = next((k for k in old if abs(k - diagnosis.wavelength_nm) < 0.5), diagnosis.wavelength_nm)
-            new = {**old, key: entry.value}
-        values.setdefault(element, {})[field] = new
-
-    def swap(elements: tuple[Any, ...]) -> tuple[Any, ...]:
-        return tuple(e.model_copy(update=values.get(e.name, {})) for e in elements)
-
-    channels = tuple(c.model_copy(update={"elements": swap(c.elements)}) for c in model.channels)
+        old: Dispersive = next(getattr(e, field) for e in model.elements() if e.name == element)
+        values.setdefault(element, {})[field] = _merged(old, entry, diagnosis.wavelengths_nm)
     update = {
-        "generator": swap(model.generator),
-        "analyzer": swap(model.analyzer),
-        "channels": channels,
         "effects": (*model.effects, *diagnosis.applied()),
         "systematic": (*model.systematic, *diagnosis.systematic()),
     }
-    return model.model_copy(update=update)
+    return model.with_values(values).model_copy(update=update)
+
+
+def _merged(old: Dispersive, entry: EffectParameter, wavelengths_nm: tuple[float, ...]) -> Dispersive:
+    """A value as the file holds it, with what was fitted in place of what it says at the same wavelengths."""
+    if not isinstance(entry.value, tuple):
+        if not isinstance(old, dict):
+            return entry.value
+        new = dict.fromkeys(wavelengths_nm, entry.value)
+    else:
+        new = dict(zip(entry.wavelengths_nm or (), entry.value, strict=True))
+    kept = {} if not isinstance(old, dict) else old
+    return {k: v for k, v in kept.items() if all(abs(k - w) >= 0.5 for w in new)} | new
 
 
 def write_instrument(path: Path, model: InstrumentModel, diagnosis: Diagnosis) -> None:

@@ -142,12 +142,13 @@ class SystematicError(_Part):
 
 
 class EffectParameter(_Part):
-    """A fitted value with its standard error (None: it has none, `note` says why)."""
+    """A fitted value with its standard error (None: it has none, `note` says why); or one at each wavelength."""
 
     value: float | tuple[float, ...]
     stderr: float | tuple[float, ...] | None = None
     unit: str
     note: str | None = None
+    wavelengths_nm: tuple[float, ...] | None = None
 
     @property
     def told(self) -> str:
@@ -168,6 +169,8 @@ class InstrumentModel(_Part):
     `calibrate` names values ("element.field") that are only nominal: `diagnose` fits them to captures of known samples.
     An effect of scope "capture" holds for the captures that it names and for no other.
     `systematic` is what `diagnose` leaves uncertain; `process reduce` carries it into its error bars.
+    `free_source`: the source has a level of its own in every state, so only ratios of the channels of one state count
+    where the sample is known.
     """
 
     kind: Literal["instrument"] = "instrument"
@@ -179,6 +182,7 @@ class InstrumentModel(_Part):
     channels: tuple[Channel, ...] = (Channel(name="camera"),)
     mosaic: tuple[tuple[str, ...], ...] | None = None
     calibrate: tuple[str, ...] = ()
+    free_source: bool = False
     effects: tuple[AppliedEffect, ...] = ()
     systematic: tuple[SystematicError, ...] = ()
 
@@ -191,6 +195,8 @@ class InstrumentModel(_Part):
         channels = [c.name for c in self.channels]
         if len(set(channels)) != len(channels):
             raise ValueError("channel names must be unique")
+        if self.free_source and len(channels) < 2:
+            raise ValueError("free_source needs two channels or more: with one, nothing is left over")
         if self.mosaic is not None and sorted(n for row in self.mosaic for n in row) != sorted(channels):
             raise ValueError("the mosaic must name each channel exactly once")
         return self
@@ -228,14 +234,43 @@ class InstrumentModel(_Part):
                 f"asked for {wavelength_nm:g} nm. Use an instrument file that has it."
             )
         resolved = _resolve(self.model_dump(), wavelength_nm, self.name)
-        # An effect was found at one wavelength and is not carried over to another.
-        resolved["effects"] = [
-            e for e in resolved["effects"] if e["wavelength_nm"] is None or _listed(wavelength_nm, [e["wavelength_nm"]])
-        ]
+
+        def holds(found: dict[str, Any]) -> bool:
+            # What was found at one wavelength is not carried over to another, unless it belongs to none.
+            return found["wavelength_nm"] is None or _listed(wavelength_nm, [found["wavelength_nm"]])
+
+        resolved["effects"] = [e for e in resolved["effects"] if holds(e)]
         resolved["systematic"] = [
-            s for s in resolved["systematic"] if _listed(wavelength_nm, [s["wavelength_nm"] or wavelength_nm])
+            s | {"directions": [[e for e in d if holds(e)] for d in s["directions"]]}
+            for s in resolved["systematic"]
+            if holds(s)
         ]
         return InstrumentModel.model_validate(resolved | {"wavelengths_nm": (wavelength_nm,)})
+
+    def nominal_at(self, wavelength_nm: float) -> InstrumentModel:
+        """`at`, where values that are nominal anyway (`calibrate`) come from the nearest wavelengths that have them.
+
+        For whoever fits them: between two wavelengths a straight line, beyond the last one its value.
+        """
+        values: dict[str, dict[str, Dispersive]] = {}
+        for name in self.calibrate:
+            element, _, field = name.rpartition(".")
+            given = next((getattr(e, field, None) for e in self.elements() if e.name == element), None)
+            if isinstance(given, dict) and not _listed(wavelength_nm, tuple(given)):
+                known = sorted(given)
+                near = float(np.interp(wavelength_nm, known, [given[k] for k in known]))
+                values.setdefault(element, {})[field] = {**given, wavelength_nm: near}
+        return self.with_values(values).at(wavelength_nm)
+
+    def with_values(self, values: Mapping[str, Mapping[str, Any]]) -> InstrumentModel:
+        """The model with other values of its elements: element to field to value."""
+
+        def swap(elements: tuple[AnyElement, ...]) -> tuple[AnyElement, ...]:
+            return tuple(e.model_copy(update=dict(values.get(e.name, {}))) for e in elements)
+
+        channels = tuple(c.model_copy(update={"elements": swap(c.elements)}) for c in self.channels)
+        update = {"generator": swap(self.generator), "analyzer": swap(self.analyzer), "channels": channels}
+        return self.model_copy(update=update)
 
     def generator_states(self, angles_deg: Mapping[str, ArrayLike], changes: Changes | None = None) -> Array:
         """Stokes vectors g (states, 4): first column of the generator train's Mueller matrix."""

@@ -137,6 +137,11 @@ class Capture:
         return model.model_copy(update={"mosaic": self.header.mosaic})
 
     @property
+    def sigma(self) -> NDArray[np.float64] | None:
+        """Standard deviation of the noise of one value of each state done, counts; None if none is stated."""
+        return np.asarray(self.column("sigma"), dtype=float) if "sigma" in self._h5["entry/states"] else None
+
+    @property
     def start_time(self) -> str:
         """When the capture began, ISO 8601."""
         with self._damage():

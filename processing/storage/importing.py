@@ -125,6 +125,8 @@ def _write(
         table["exposure_s"][...] = states.exposure_s
     if states.time_s is not None:
         table["host_time_s"][...] = states.time_s
+    if states.sigma is not None:
+        table["sigma"] = states.sigma
     table["done"][...] = 1
     write_checksums(h5["entry"], row_sums)
     write_closing(h5, "complete", {"imported": now})

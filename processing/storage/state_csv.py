@@ -19,7 +19,7 @@ from processing.storage.capture_schema import NOT_AXES
 ROLES = ("sample", "air", "dark", "flat")
 CHANNEL_PREFIX = "channel_"
 #: Columns that are no axes.
-KNOWN = ("state", "role", "file", "time_s", "exposure_s")
+KNOWN = ("state", "role", "file", "time_s", "exposure_s", "sigma")
 #: What a column must look like, as a name in the capture file.
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_ .-]{0,63}")
 MOST_COLUMNS = 200
@@ -41,6 +41,7 @@ class StatesFile:
     angles_deg : axis name to (N,); NaN in dark and flat states that have none.
     role : N roles; "sample" unless a `role` column says otherwise.
     time_s, exposure_s : (N,) or None.
+    sigma : (N,) standard deviation of the noise of one value of the state, in counts, or None.
     files : N paths or None.
     channels : channel name to (N,) flux; empty if there are none.
     """
@@ -51,6 +52,7 @@ class StatesFile:
     role: tuple[str, ...]
     time_s: NDArray[np.float64] | None
     exposure_s: NDArray[np.float64] | None
+    sigma: NDArray[np.float64] | None
     files: tuple[Path, ...] | None
     channels: dict[str, NDArray[np.float64]]
 
@@ -63,12 +65,13 @@ def read_states(path: Path, axes: Sequence[str]) -> StatesFile:
 
     Parameters
     ----------
-    axes : names that must have a column (the instrument's axes); any other column that is not one of `state`, `role`,
-        `time_s`, `exposure_s`, `file` or `channel_<name>` is an axis too. A suffix `_deg` is left away.
+    axes : names that must have a column (the instrument's axes), with or without a suffix `_deg`; any other column
+        with that suffix is an axis too. Else there are `state`, `role`, `time_s`, `exposure_s`, `sigma`, `file` and
+        `channel_<name>`, and no others.
 
     Raises
     ------
-    ImportFailed : not readable, a column is missing or given twice, a number is none, a state number is repeated.
+    ImportFailed : not readable, a column is missing, unknown or given twice, a number is none, a state is repeated.
     """
     header, rows = _table(path)
     names = [_axis_name(h) for h in header]
@@ -82,6 +85,12 @@ def read_states(path: Path, axes: Sequence[str]) -> StatesFile:
             f"{path}:1: no column {', '.join(missing)}. Found: {', '.join(header)}. Every state needs its number and "
             "the angle in degrees of each axis that the instrument turns."
         )
+    unknown = [h for h, n in zip(header, names, strict=True) if not _is_known(h, n, axes)]
+    if unknown:
+        raise ImportFailed(
+            f"{path}:1: unknown column {', '.join(unknown)}. An axis is called <axis>_deg; else there are "
+            f"{', '.join(KNOWN)} and {CHANNEL_PREFIX}<name>."
+        )
     columns = {name: [row[k] for _, row in rows] for k, name in enumerate(names)}
     lines = [line for line, _ in rows]
     order = _order(path, lines, columns["state"])
@@ -90,6 +99,7 @@ def read_states(path: Path, axes: Sequence[str]) -> StatesFile:
     role = _roles(path, lines, columns)
     numbers = {n: _numbers(path, lines, n, columns[n], role) for n in names if n not in ("state", "role", "file")}
     files = _files(path, lines, columns["file"]) if "file" in columns else None
+    _check_sigma(path, lines, numbers.get("sigma"))
     return StatesFile(
         path=path,
         line=tuple(lines),
@@ -97,6 +107,7 @@ def read_states(path: Path, axes: Sequence[str]) -> StatesFile:
         role=role,
         time_s=numbers.get("time_s"),
         exposure_s=numbers.get("exposure_s"),
+        sigma=numbers.get("sigma"),
         files=files,
         channels={n.removeprefix(CHANNEL_PREFIX): v for n, v in numbers.items() if n.startswith(CHANNEL_PREFIX)},
     )
@@ -128,6 +139,16 @@ def _check_names(path: Path, names: Sequence[str]) -> None:
             raise ImportFailed(f"{path}:1: column {column}: {shown}; a name is letters, digits and _ and begins so")
         if name in NOT_AXES:
             raise ImportFailed(f"{path}:1: column {column}: no axis can be called {name!r}; give it another name")
+
+
+def _is_known(header: str, name: str, axes: Sequence[str]) -> bool:
+    return name in KNOWN or name in axes or name.startswith(CHANNEL_PREFIX) or header.endswith("_deg")
+
+
+def _check_sigma(path: Path, lines: list[int], sigma: NDArray[np.float64] | None) -> None:
+    for line, value in zip(lines, () if sigma is None else sigma, strict=sigma is not None):
+        if value <= 0:
+            raise ImportFailed(f"{path}:{line}: column sigma: {value:g}; the noise of a value is above 0")
 
 
 def _axis_name(header: str) -> str:

@@ -85,8 +85,14 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
         excess = correction.black.excess(noise, capture.column("exposure_s")[states])
         slope, floor = noise.slope / repeats / top, noise.averaged_floor(repeats, excess) / top**2
         data = replace(data, slope=slope, floor=floor, noise_known=True, noise_source=noise.source)
+    stated = capture.sigma
+    if stated is not None:
+        floor = (stated[states] / top) ** 2
+        data = replace(
+            data, slope=np.zeros(len(states)), floor=floor, noise_known=True, noise_source="stated per state"
+        )
     data = _binned(data)
-    if noise is None and data.usable.sum() >= FEWEST_PIXELS:
+    if not data.noise_known and data.usable.sum() >= FEWEST_PIXELS:
         data = estimated_noise(data)
     return without_dark_pixels(data) if data.noise_known else data
 

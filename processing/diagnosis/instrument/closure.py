@@ -12,7 +12,7 @@ from processing.diagnosis.search.space import Space
 
 def closure(problem: InstrumentProblem, k: int, space: Space, values: Array) -> float | None:
     """Mean of I0 + I90 - I45 - I135 over mean S0, percent, of corrected counts over the gains of their channels."""
-    model, data = problem.model, problem.captures[k]
+    model, data = problem.models[k], problem.captures[k]
     if model.mosaic is None or {c.name for c in model.channels} != {"0", "45", "90", "135"}:
         return None
     changes = problem.changes(k, space, values)

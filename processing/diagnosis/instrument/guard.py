@@ -66,7 +66,7 @@ def _stretch(problem: InstrumentProblem, solved: Solution) -> float:
 
 def _of_rows(problem: InstrumentProblem, k: int, space: Space, fit: Fit) -> tuple[int, float]:
     changes = problem.changes(k, space, fit.values)
-    w = problem.model.rows(problem.captures[k].conditions.angles_deg, changes).reshape(-1, 16)
+    w = problem.models[k].rows(problem.captures[k].conditions.angles_deg, changes).reshape(-1, 16)
     size = np.linalg.svd(w, compute_uv=False)
     size = size[size > RANK * size[0]]
     return size.size, float(size[0] / size[-1])

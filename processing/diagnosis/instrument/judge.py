@@ -111,7 +111,7 @@ def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
         ranking=ranking(found, solved.before),
         captures=tuple(capture_report(asked, k, kept, before[k], after[k]) for k in captures),
         instrument=problem.model.name,
-        wavelength_nm=problem.captures[0].wavelength_nm,
+        wavelengths_nm=tuple(sorted(set(problem.wavelengths_nm))),
         simulated=any(c.simulated for c in problem.captures),
         correction=correction_told,
         wiring=None if wiring is None else wiring.told,

@@ -22,13 +22,13 @@ from processing.diagnosis.instrument.moments import (
     FEATURES,
     FOLDS_OF_STATES,
     FOLDS_OF_TILES,
-    MARGIN,
     Moments,
     holds_out_states,
     moments_of,
 )
 from processing.diagnosis.instrument.projection import RANK, add_block, noise_information
 from processing.diagnosis.instrument.tile_sums import add_tiles, tile_columns
+from processing.diagnosis.instrument.undone import distance, exactly_undone, movable, undone_signal
 from processing.diagnosis.search.candidate import Candidate, nominal_values, pool
 from processing.diagnosis.search.space import Space, Sums
 from processing.instrument.applied_effects import apply_to, changes_of
@@ -39,6 +39,7 @@ from processing.instrument.effects.base import (
     FromAState,
     ImageShift,
     PointwiseEffect,
+    SourceEffect,
     Switch,
     ValuePerState,
     turned_by,
@@ -66,7 +67,7 @@ class InstrumentProblem:
 
     def __init__(
         self,
-        model: InstrumentModel,
+        models: InstrumentModel | Sequence[InstrumentModel],
         captures: Sequence[CaptureData],
         undone: Mapping[Candidate, Array] | None = None,
         folds: int | None = None,
@@ -75,11 +76,14 @@ class InstrumentProblem:
         self.undone = dict(undone or {})
         self._others: list[InstrumentProblem] = []
         self._noise_at: dict[Candidate, Array] = {}
-        self.model = model
+        self.models = (models,) * len(captures) if isinstance(models, InstrumentModel) else tuple(models)
+        self.model = self.models[0]
+        self.wavelengths_nm = tuple(c.wavelength_nm for c in captures)
         # The captures as taken, by how many of their pixels each frame is moved back, and what of that the model says.
         self.still = tuple(captures)
-        own = (changes_of(model, c.conditions, c.name).shift_px / c.pitch for c in captures)
-        self.own_px = tuple(s if _movable(s) else np.zeros_like(s) for s in own)
+        pairs = zip(self.models, captures, strict=True)
+        own = (changes_of(m, c.conditions, c.name).shift_px / c.pitch for m, c in pairs)
+        self.own_px = tuple(s if movable(s) else np.zeros_like(s) for s in own)
         self.shifts_px = tuple(self.own_px if moved_px is None else moved_px)
         self.captures = self._moved_back()
         self.folds = folds or (FOLDS_OF_STATES if any(holds_out_states(c) for c in self.captures) else FOLDS_OF_TILES)
@@ -92,11 +96,14 @@ class InstrumentProblem:
     def nominal(self) -> tuple[Candidate, ...]:
         """Values that the instrument file calls nominal, if a known sample is there to fit them to."""
         known = any(c.sample is not None for c in self.captures)
-        return nominal_values(self.model, self.captures[0].conditions) if known else ()
+        return nominal_values(self.model, self.captures[0].conditions, self.wavelengths_nm) if known else ()
 
     def pool(self) -> tuple[Candidate, ...]:
         """Every effect at every place of the captures."""
-        return pool(self.model, [c.conditions for c in self.captures])
+        found = pool(self.model, [c.conditions for c in self.captures], self.wavelengths_nm)
+        # The level of a free source is projected out already.
+        free = [self._free_source(k) for k in range(len(self.captures))]
+        return tuple(c for c in found if not isinstance(c.effect, SourceEffect) or not free[c.capture or 0])
 
     def powers(self) -> list[tuple[int, Array]]:
         """Rows that the unknowns leave over, and the power of each component of the signal, for each capture."""
@@ -118,11 +125,11 @@ class InstrumentProblem:
 
     def near(self, space: Space, values: Array) -> tuple[InstrumentProblem, Array]:
         """The problem expanded nearest to these values, and what is left of the values there."""
-        best, least = self, _distance({}, space, values)
+        best, least = self, distance({}, space, values)
         for other in self._others:
-            distance = _distance(other.undone, space, values)
-            if set(other.undone) <= set(space.candidates) and distance < least:
-                best, least = other, distance
+            away = distance(other.undone, space, values)
+            if set(other.undone) <= set(space.candidates) and away < least:
+                best, least = other, away
         local = values.copy()
         for candidate, part in zip(space.candidates, space.slices, strict=True):
             if candidate in best.undone:
@@ -132,15 +139,15 @@ class InstrumentProblem:
     def relinearize(self, space: Space, values: Array) -> bool:
         """Expand about these values from now on, unless a point as close is known."""
         known, _ = self.near(space, values)
-        if _distance(known.undone, space, values) < EXACT:
+        if distance(known.undone, space, values) < EXACT:
             return False
-        undone = _exact(space, values)
+        undone = exactly_undone(space, values)
         bent = {c: v for c, v in undone.items() if isinstance(c.effect, PointwiseEffect)}
         shifts = [own + self._shift_px(k, undone) for k, own in enumerate(self.own_px)]
-        if not all(_movable(s) for s in shifts):
+        if not all(movable(s) for s in shifts):
             return False
-        still = [c.undone(*_undone(c, bent)) if bent else c for c in self.still]
-        self._others.append(InstrumentProblem(self.model, still, undone, self.folds, shifts))
+        still = [c.undone(*undone_signal(c, bent)) if bent else c for c in self.still]
+        self._others.append(InstrumentProblem(self.models, still, undone, self.folds, shifts))
         return True
 
     def _moved_back(self) -> tuple[CaptureData, ...]:
@@ -150,8 +157,8 @@ class InstrumentProblem:
     def _shift_px(self, capture: int, undone: Mapping[Candidate, Array]) -> Array:
         changes = Changes(self.captures[capture].conditions)
         for candidate, values in undone.items():
-            if isinstance(candidate.effect, ImageShift) and candidate.capture in (None, capture):
-                candidate.apply(changes, self.model, values)
+            if isinstance(candidate.effect, ImageShift) and candidate.acts(capture, self.wavelengths_nm[capture]):
+                candidate.apply(changes, self.models[capture], values)
         return changes.shift_px / self.captures[capture].pitch
 
     def forget_linearizations(self) -> None:
@@ -161,7 +168,7 @@ class InstrumentProblem:
 
     def undivided(self) -> InstrumentProblem:
         """The same with nothing held out: one set of unknowns for all states, not one for each part of them."""
-        return InstrumentProblem(self.model, self.still, folds=1)
+        return InstrumentProblem(self.models, self.still, folds=1)
 
     def adopt_noise(self, space: Space, values: Array) -> bool:
         """Take the noise from the light that these values tell, for all that follows; False if that is as before.
@@ -169,14 +176,14 @@ class InstrumentProblem:
         The evidence for an effect is always taken with one and the same noise; else a correction could gain by the
         noise that it pretends.
         """
-        at = _exact(space, values, pointwise=True)
+        at = exactly_undone(space, values, pointwise=True)
         gone = any(candidate not in at for candidate in self._noise_at)
-        near = not gone and _distance(self._noise_at, space, values, pointwise=True) < EXACT
+        near = not gone and distance(self._noise_at, space, values, pointwise=True) < EXACT
         if near or any(c.noise_estimated for c in self.captures):
             return False
         self._noise_at = at
         self.still = tuple(
-            c.with_noise_of(*_undone(c, at)) if at else replace(c, true_variance=None) for c in self.still
+            c.with_noise_of(*undone_signal(c, at)) if at else replace(c, true_variance=None) for c in self.still
         )
         self.captures = self._moved_back()
         self.moments = tuple(moments_of(c, self.folds) for c in self.captures)
@@ -184,29 +191,42 @@ class InstrumentProblem:
         self._others.clear()
         return True
 
+    def at(self, wavelength_nm: float) -> InstrumentProblem:
+        """The captures at one wavelength alone, nothing held out."""
+        mine = [k for k, w in enumerate(self.wavelengths_nm) if w == wavelength_nm]
+        return InstrumentProblem([self.models[k] for k in mine], [self.still[k] for k in mine], folds=1)
+
     def changes(self, capture: int, space: Space, values: Array) -> Changes:
         """Changes of one capture with the instrument's own effects and the active candidates."""
         data = self.captures[capture]
         built = self._built[capture]
         if len(built) > MOST_BUILT:
             built.clear()
+        model = self.models[capture]
         changes = Changes(data.conditions, built=built)
-        for applied in self.model.effects:
+        for applied in model.effects:
             if applied.scope == "instrument" or data.name in applied.captures:
-                apply_to(changes, self.model, applied)
+                apply_to(changes, model, applied)
         changes.shift_px = changes.shift_px - self.own_px[capture] * data.pitch
         for candidate, part in zip(space.candidates, space.slices, strict=True):
             # At zero an effect does nothing: there is no need to ask it.
-            if candidate.capture in (None, capture) and values[part].any():
-                candidate.apply(changes, self.model, values[part])
+            if candidate.acts(capture, data.wavelength_nm) and values[part].any():
+                candidate.apply(changes, model, values[part])
         return changes
 
     def columns(self, capture: int, changes: Changes) -> Array:
         """A (L, K), rows in units of their noise."""
         data = self.captures[capture]
-        w = self.model.rows(data.conditions.angles_deg, changes).reshape(-1, 16) * data.row_exposure[:, None]
+        w = self.models[capture].rows(data.conditions.angles_deg, changes).reshape(-1, 16) * data.row_exposure[:, None]
         a = w if data.sample is None else (w @ data.sample)[:, None]
+        if self._free_source(capture):
+            # A throughput of its own for every state: its rows have a column of their own.
+            state = np.arange(len(a)) // len(data.conditions.channels)
+            a = np.where(state[:, None] == np.arange(data.conditions.states), a, 0.0)
         return np.asarray(a / self.moments[capture].sigma[:, None])
+
+    def _free_source(self, capture: int) -> bool:
+        return self.models[capture].free_source and self.captures[capture].sample is not None
 
     def coefficients(self, capture: int, changes: Changes) -> Array:
         """Coefficient of every feature (F, L) in the corrected counts."""
@@ -227,13 +247,17 @@ class InstrumentProblem:
         other, local = self.near(space, values)
         if other is not self:
             return other.sums(space, local, derivatives=derivatives)
-        out = Sums.empty(self.folds, space.size if derivatives else 0)
-        for k in range(len(self.captures)):
-            changes = self.changes(k, space, values)
-            if changes.field_retardance_rad or (derivatives and self._has_field(space)):
-                self._tile_sums(k, space, values, changes, out, derivatives)
+        out = Sums.empty(self.folds, space.size if derivatives else 0, len(self.captures))
+        for k, data in enumerate(self.captures):
+            mine, index = space.acting(k, data.wavelength_nm)
+            own = values[index]
+            part = Sums.empty(self.folds, mine.size if derivatives else 0)
+            changes = self.changes(k, mine, own)
+            if changes.field_retardance_rad or (derivatives and self._has_field(mine)):
+                self._tile_sums(k, mine, own, changes, part, derivatives)
             else:
-                self._block_sums(k, space, values, changes, out, derivatives)
+                self._block_sums(k, mine, own, changes, part, derivatives)
+            out.add(k, part, index)
         return out
 
     def noise_information(self, space: Space, values: Array) -> Array:
@@ -243,11 +267,12 @@ class InstrumentProblem:
             return other.noise_information(space, local)
         out = np.zeros((space.size, space.size))
         for k, moments in enumerate(self.moments):
-            changes = self.changes(k, space, values)
+            mine, index = space.acting(k, self.wavelengths_nm[k])
+            changes = self.changes(k, mine, values[index])
             a = self.columns(k, changes)
-            dc = self._slopes_of_counts(k, space, values, self.coefficients(k, changes))
+            dc = self._slopes_of_counts(k, mine, values[index], self.coefficients(k, changes))
             if np.any(dc[:, -DERIVATIVES:]):
-                out += sum(noise_information(block, a, dc, moments) for block in moments.blocks)
+                out[np.ix_(index, index)] += sum(noise_information(block, a, dc, moments) for block in moments.blocks)
         return out
 
     def _has_field(self, space: Space) -> bool:
@@ -278,11 +303,13 @@ class InstrumentProblem:
             return other.mueller_slopes(space, local)
         products, light = np.zeros((space.size, space.size)), 0.0
         for k, moments in enumerate(self.moments):
-            changes = self.changes(k, space, values)
+            mine, index = space.acting(k, self.wavelengths_nm[k])
+            own = values[index]
+            changes = self.changes(k, mine, own)
             columns = partial(self._all_columns, k)
             w, c = columns(changes), self.coefficients(k, changes)
             back = np.linalg.pinv(w * moments.counts[:, None], rcond=RANK)
-            dw, dc = self._slopes(k, space, values, w, columns), self._slopes_of_counts(k, space, values, c)
+            dw, dc = self._slopes(k, mine, own, w, columns), self._slopes_of_counts(k, mine, own, c)
             scale = 1 / moments.sigma[:, None]
             for block in moments.blocks[:: self.folds if moments.tiles is None else 1]:
                 m = back @ (np.einsum("fl,flr->lr", c, block.z) * scale)
@@ -291,15 +318,15 @@ class InstrumentProblem:
                     slopes[j] += back @ (np.einsum("fl,flr->lr", dc[j], block.z) * scale)
                 bright = float(m[0] @ m[0])
                 slopes -= (slopes[:, 0] @ m[0] / max(bright, 1e-300))[:, None, None] * m
-                flat = slopes.reshape(space.size, -1)
-                products += flat @ flat.T
+                flat = slopes.reshape(mine.size, -1)
+                products[np.ix_(index, index)] += flat @ flat.T
                 light += bright
         return products, light
 
     def _all_columns(self, k: int, changes: Changes) -> Array:
         """Rows (L, 16) of the measurement matrix in units of their noise, whatever the sample."""
         data = self.captures[k]
-        w = self.model.rows(data.conditions.angles_deg, changes).reshape(-1, 16) * data.row_exposure[:, None]
+        w = self.models[k].rows(data.conditions.angles_deg, changes).reshape(-1, 16) * data.row_exposure[:, None]
         return np.asarray(w / self.moments[k].sigma[:, None])
 
     def _slopes(self, k: int, space: Space, values: Array, a: Array, columns: Columns) -> Array:
@@ -308,7 +335,7 @@ class InstrumentProblem:
         conditions = self.captures[k].conditions
         channels = len(conditions.channels)
         whole: dict[str, Array] = {}
-        for candidate, part in self._active(k, space):
+        for candidate, part in self._fitted(space):
             if isinstance(candidate.effect, CountsEffect):
                 continue
             if isinstance(candidate.effect, ValuePerState):
@@ -327,7 +354,7 @@ class InstrumentProblem:
                 first = candidate.effect.first_state(candidate.place)
                 if axis not in whole:
                     turned = self.changes(k, space, values)
-                    turned.turn_axis(axis, np.full(conditions.states, STEP), turned_by(self.model, axis))
+                    turned.turn_axis(axis, np.full(conditions.states, STEP), turned_by(self.models[k], axis))
                     whole[axis] = (columns(turned) - a) / STEP
                 da[part.start, ..., first * channels :, :] = whole[axis][..., first * channels :, :]
                 continue
@@ -338,16 +365,17 @@ class InstrumentProblem:
     def _slopes_of_counts(self, k: int, space: Space, values: Array, c: Array) -> Array:
         """Derivatives (values, F, L) of the coefficients c (F, L)."""
         dc = np.zeros((space.size, *c.shape))
-        for candidate, part in self._active(k, space):
+        for candidate, part in self._fitted(space):
             if isinstance(candidate.effect, CountsEffect):
                 for j, (moved, step) in enumerate(self._stepped(candidate, part, values)):
                     dc[part.start + j] = (self.coefficients(k, self.changes(k, space, moved)) - c) / step
         return dc
 
-    def _active(self, k: int, space: Space) -> list[tuple[Candidate, slice]]:
-        """Candidates that act on capture k and have values to fit."""
+    @staticmethod
+    def _fitted(space: Space) -> list[tuple[Candidate, slice]]:
+        """Candidates that have values to fit."""
         pairs = zip(space.candidates, space.slices, strict=True)
-        return [(c, part) for c, part in pairs if c.capture in (None, k) and not isinstance(c.effect, Switch)]
+        return [(c, part) for c, part in pairs if not isinstance(c.effect, Switch)]
 
     @staticmethod
     def _stepped(candidate: Candidate, part: slice, values: Array) -> Iterator[tuple[Array, float]]:
@@ -362,7 +390,7 @@ class InstrumentProblem:
         data, moments = self.captures[k], self.moments[k]
         if moments.tiles is None:
             return
-        columns = partial(tile_columns, self.model, data, moments)
+        columns = partial(tile_columns, self.models[k], data, moments)
         a, c = columns(changes), self.coefficients(k, changes)
         da, dc = np.zeros((0, *a.shape)), np.zeros((0, *c.shape))
         if derivatives:
@@ -371,38 +399,3 @@ class InstrumentProblem:
         add_tiles(data, moments, moments.tiles, a, c, da, dc, out)
         if moments.clipped is not None and not changes.drop_clipped:
             add_tiles(data, moments, moments.clipped, a, c, da, dc, out)
-
-
-def _movable(shift_px: Array) -> bool:
-    """Whether frames can be moved back by (N, 2) pixels and no used pixel needs what lies beyond the edge."""
-    return bool(np.abs(shift_px).max() <= MARGIN)
-
-
-def _distance(undone: Mapping[Candidate, Array], space: Space, values: Array, *, pointwise: bool = False) -> float:
-    """Largest distance of a correction from where it was undone, in typical sizes; of the `pointwise` ones alone."""
-    away = [0.0]
-    for candidate, part in zip(space.candidates, space.slices, strict=True):
-        if _exactly_undone(candidate, pointwise):
-            away.append(float(np.max(np.abs(values[part] - undone.get(candidate, 0.0)) / candidate.typical)))
-    return max(away)
-
-
-def _exactly_undone(candidate: Candidate, pointwise: bool) -> bool:
-    """Whether a correction can be undone exactly; with `pointwise`, in each pixel by itself."""
-    return isinstance(candidate.effect, PointwiseEffect if pointwise else PointwiseEffect | ImageShift)
-
-
-def _exact(space: Space, values: Array, *, pointwise: bool = False) -> dict[Candidate, Array]:
-    """Values of what can be undone exactly; of the `pointwise` corrections alone."""
-    active = zip(space.candidates, space.slices, strict=True)
-    return {c: values[p] for c, p in active if _exactly_undone(c, pointwise) and values[p].any()}
-
-
-def _undone(data: CaptureData, undone: Mapping[Candidate, Array]) -> tuple[Array, Array]:
-    """Signal with the effects undone exactly, and its slope over the old one."""
-    signal, slope = data.signal.astype(float), np.ones(())
-    for candidate, values in undone.items():
-        if isinstance(candidate.effect, PointwiseEffect):
-            signal, step = candidate.effect.undo(signal, data.conditions, values)
-            slope = slope * step
-    return signal, slope

@@ -56,9 +56,8 @@ def _table(head: list[str], rows: list[list[Any]]) -> str:
 def _summary(judged: Judged) -> str:
     d = judged.diagnosis
     out = "<p class='warn'>SIMULATED data</p>" if d.simulated else ""
-    out += (
-        f"<p><b>{d.verdict.replace('_', ' ')}</b> at {d.wavelength_nm:g} nm. Held out: {d.error_before.held_out}.</p>"
-    )
+    at = ", ".join(f"{w:g}" for w in d.wavelengths_nm)
+    out += f"<p><b>{d.verdict.replace('_', ' ')}</b> at {at} nm. Held out: {d.error_before.held_out}.</p>"
     floor = "not known" if d.noise_floor_percent is None else f"{d.noise_floor_percent:.4f}"
     rows = [
         ["before", f"{d.error_before.rms_percent:.4f}", f"{d.error_before.chi2_reduced:.4g}"],
@@ -190,7 +189,7 @@ def _mueller(problem: InstrumentProblem, k: int, space: Space, fit: Fit) -> Arra
     problem, values = problem.near(space, fit.values)
     data = problem.captures[k]
     changes = problem.changes(k, space, values)
-    w = problem.model.rows(data.conditions.angles_deg, changes).reshape(-1, 16) * data.row_exposure[:, None]
+    w = problem.models[k].rows(data.conditions.angles_deg, changes).reshape(-1, 16) * data.row_exposure[:, None]
     if np.linalg.matrix_rank(w, rtol=1e-8) < 16:
         return None
     rows, shape = w.shape[0], data.signal.shape[2:]

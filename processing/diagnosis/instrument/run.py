@@ -11,7 +11,7 @@ from processing.diagnosis.instrument.judge import Judged, diagnose
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.posterior import Say
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture, CaptureError
+from processing.storage.capture import Capture
 
 
 def diagnose_captures(
@@ -21,21 +21,19 @@ def diagnose_captures(
 
     Parameters
     ----------
-    captures : of one instrument at one wavelength; what is known of each sample is in the file.
+    captures : of one instrument, at one wavelength or several; what is known of each sample is in the file.
     model : as loaded from its file.
 
     Raises
     ------
-    CaptureError : a file cannot be used, or the captures do not belong together.
+    CaptureError : a file cannot be used.
     """
+    models: list[InstrumentModel] = []
     data: list[CaptureData] = []
     for path in captures:
         say(f"reading {path.name}")
         with Capture(path) as capture:
-            data.append(read_capture(capture, model.at(capture.header.wavelength_nm)))
-    wavelengths = {c.wavelength_nm for c in data}
-    if len(wavelengths) != 1:
-        found = ", ".join(f"{w:g}" for w in sorted(wavelengths))
-        raise CaptureError(f"the captures are at {found} nm; effects differ with wavelength. Give one wavelength.")
-    problem = InstrumentProblem(model.at(wavelengths.pop()), data)
+            models.append(model.nominal_at(capture.header.wavelength_nm))
+            data.append(read_capture(capture, models[-1]))
+    problem = InstrumentProblem(models, data)
     return diagnose(problem, say), problem

@@ -147,7 +147,9 @@ def _parts(
     tiles = moments.tiles
     if not changes.field_retardance_rad or tiles is None:
         return [(used, a)]
-    columns = tile_columns(problem.model, problem.captures[capture], moments, changes) * moments.sigma[:, None]
+    columns = (
+        tile_columns(problem.models[capture], problem.captures[capture], moments, changes) * moments.sigma[:, None]
+    )
     return [(used & (tiles.index == t), columns[t]) for t in range(tiles.x.size)]
 
 

@@ -50,7 +50,7 @@ def systematic_error(problem: InstrumentProblem, found: Posterior) -> Systematic
     return SystematicError(
         directions=tuple(told),
         rms_over_m00=float(np.sqrt(total / light / ELEMENTS)),
-        wavelength_nm=problem.captures[0].wavelength_nm,
+        wavelength_nm=problem.wavelengths_nm[0] if len(set(problem.wavelengths_nm)) == 1 else None,
     )
 
 
@@ -92,6 +92,7 @@ def _as_effects(space: Space, direction: Array, matters: Array, names: tuple[str
                     parameters=_without_errors(parameters_of(candidate, direction[part], direction[part])),
                     captures=names if candidate.capture is None else (names[candidate.capture],),
                     scope=scope_of(candidate),
+                    wavelength_nm=candidate.wavelength_nm,
                 )
             )
     return tuple(effects)

@@ -21,6 +21,7 @@ from processing.instrument.effects.base import (
     CountsEffect,
     FieldEffect,
     ImageShift,
+    InstrumentEffect,
     Switch,
 )
 from processing.instrument.model import AppliedEffect, EffectParameter
@@ -66,6 +67,7 @@ def told_effects(problem: InstrumentProblem, cause: Cause, confident: bool) -> l
                 indistinguishable_from=tuple(dict.fromkeys(c.short for c in cause.alternatives)),
                 scope=scope_of(candidate),
                 capture=None if candidate.capture is None else problem.captures[candidate.capture].name,
+                wavelength_nm=candidate.wavelength_nm,
                 removal_chance=1 - cause.probability,
                 confident=confident,
                 probability=cause.probability,
@@ -113,7 +115,6 @@ def correction(
     refused: str | None,
 ) -> Correction:
     """What an instrument file would hold: means, with the spread over the sets."""
-    names = tuple(c.name for c in problem.captures)
     part = dict(zip(found.space.candidates, found.space.slices, strict=True))
     spread = np.sqrt(np.maximum(np.diag(found.covariance), 0.0))
     chance = {found.space.candidates[m]: p for g, p in enumerate(found.samples.probability) for m in found.members[g]}
@@ -127,28 +128,49 @@ def correction(
                 element=candidate.place or None,
                 parameters=parameters_of(candidate, solved.fit.values[where], spread[part[candidate]]),
                 probability=float(chance[candidate]),
-                captures=names if candidate.capture is None else (names[candidate.capture],),
+                captures=tuple(c.name for k, c in enumerate(problem.captures) if candidate.acts(k, c.wavelength_nm)),
                 scope=scope_of(candidate),
-                wavelength_nm=problem.captures[0].wavelength_nm,
+                wavelength_nm=_wavelength(problem, candidate),
             )
         )
     error = systematic_error(problem, found)
     return Correction(effects=tuple(effects), systematic=error, checks=guard, refused=refused)
 
 
+def _wavelength(problem: InstrumentProblem, candidate: Candidate) -> float | None:
+    """Wavelength at which the values hold; None for all of them."""
+    several = sorted(set(problem.wavelengths_nm))
+    effect = candidate.effect
+    if isinstance(effect, InstrumentEffect) and effect.belongs_to == "mechanics":
+        return None
+    if candidate.capture is not None:
+        return problem.wavelengths_nm[candidate.capture]
+    return several[0] if len(several) == 1 else candidate.wavelength_nm
+
+
 def calibrated(problem: InstrumentProblem, found: Posterior, solved: Solution) -> dict[str, EffectParameter]:
-    out = {}
+    """Nominal values as fitted: one number, or one for each wavelength where they differ."""
     part = dict(zip(found.space.candidates, found.space.slices, strict=True))
+    values: dict[str, dict[float, tuple[float, float]]] = {}
     for candidate, where in zip(solved.base.candidates, solved.base.slices, strict=True):
         element, _, field = candidate.place.rpartition(".")
-        start = float(next(getattr(e, field) for e in problem.model.elements() if e.name == element))
         index = part[candidate].start
-        out[candidate.place] = EffectParameter(
-            value=start + float(solved.fit.values[where.start]),
-            stderr=float(np.sqrt(found.covariance[index, index])),
-            unit=candidate.parameters[0].unit,
-        )
-    return out
+        stderr = float(np.sqrt(found.covariance[index, index]))
+        for model, wavelength in zip(problem.models, problem.wavelengths_nm, strict=True):
+            if candidate.wavelength_nm in (None, wavelength):
+                start = float(next(getattr(e, field) for e in model.elements() if e.name == element))
+                value = start + float(solved.fit.values[where.start])
+                values.setdefault(candidate.place, {})[wavelength] = value, stderr
+    unit = {c.place: c.parameters[0].unit for c in solved.base.candidates}
+    return {place: _by_wavelength(each, unit[place]) for place, each in values.items()}
+
+
+def _by_wavelength(values: dict[float, tuple[float, float]], unit: str) -> EffectParameter:
+    at = tuple(sorted(values))
+    value, stderr = zip(*(values[w] for w in at), strict=True)
+    if len(set(value)) == 1:
+        return EffectParameter(value=value[0], stderr=stderr[0], unit=unit)
+    return EffectParameter(value=value, stderr=stderr, unit=unit, wavelengths_nm=at)
 
 
 def ranking(found: Posterior, before: HeldOut) -> tuple[Ranked, ...]:
@@ -215,6 +237,9 @@ def capture_report(
         clipped_fraction=float(np.mean(data.clipped)),
         dark_fraction=data.dark_fraction,
         cut_off=data.cut_off,
+        wavelength_nm=data.wavelength_nm,
+        rms_before_percent=100 * solved.before.rms_of(k),
+        rms_after_percent=100 * solved.after.rms_of(k),
         tests_before=before.tests,
         tests_after=after.tests,
         closure_before_percent=closure(problem, k, solved.base, solved.before_fit.values),

@@ -23,7 +23,7 @@ def unevenness(problem: InstrumentProblem, candidate: Candidate, space: Space, v
     out, count = 0.0, 0
     for k, moments in enumerate(problem.moments):
         tiles = moments.tiles
-        if tiles is None or candidate.capture not in (None, k):
+        if tiles is None or not candidate.acts(k, problem.wavelengths_nm[k]):
             continue
         a = problem.columns(k, problem.changes(k, space, local))
         moved = local.copy()

@@ -10,23 +10,14 @@ import numpy as np
 from processing.arrays import Array
 from processing.diagnosis.instrument.moments import MARGIN
 from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.starts import first_values
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit, HeldOut, held_out, minimize, prior, score
 from processing.diagnosis.search.posterior import Posterior, Say, posterior
 from processing.diagnosis.search.rules import DECISIVE, TAKES_PART
 from processing.diagnosis.search.space import Space
-from processing.instrument.effects.base import (
-    FieldEffect,
-    ImageShift,
-    PointwiseEffect,
-    SourceEffect,
-    Switch,
-    ValuePerState,
-)
+from processing.instrument.effects.base import FieldEffect, ImageShift, PointwiseEffect, Switch, ValuePerState
 
-#: Relative rms residual above which nominal values, and what else has far starts, are searched for from many starts.
-FAR_OFF = 0.05
-STARTS = 24
 #: Groups of single values that may take part where every tile of the image has a matrix of its own.
 BESIDE_FIELD = 90
 
@@ -76,7 +67,7 @@ class WholeBench:
         self.base = Space(problem.nominal())
         self.pool = problem.pool()
         self._free = [c.values_per_pixel - self._unknowns(k) for k, c in enumerate(self.whole.captures)]
-        self._start = self._first()
+        self._start = first_values(self.whole, self.base, self.pool, say)
 
     def run(self) -> Posterior:
         """The posterior; again with the noise that its light tells, and with what varies over the image."""
@@ -102,7 +93,7 @@ class WholeBench:
         if isinstance(effect, FieldEffect | Switch):
             return False
         captures = self.whole.captures
-        mine = captures if candidate.capture is None else [captures[candidate.capture]]
+        mine = [c for k, c in enumerate(captures) if candidate.acts(k, c.wavelength_nm)]
         if isinstance(effect, ImageShift):
             return all(min(c.signal.shape[2:]) > 2 * MARGIN + 2 for c in mine)
         if isinstance(effect, PointwiseEffect):
@@ -122,43 +113,6 @@ class WholeBench:
             start |= {c: old.values[p] for c, p in zip(old.space.candidates, old.space.slices, strict=True)}
         x = np.concatenate([np.zeros(0), *(start.get(c, np.zeros(c.size)) for c in space.candidates)])
         return posterior(self.whole, space, fixed, x, self.say)
-
-    def _first(self) -> dict[Candidate, Array]:
-        """Values to begin with: zero, or the best of many starts where that is far off."""
-        space = self.base
-        fit = minimize(self.whole, space, np.zeros(space.size))
-        if _rms(fit) < FAR_OFF:
-            return _by_candidate(space, fit.values)
-        self.say("far off: searching from many starts")
-        if not space.size:
-            return self._far(fit)
-        # Nominal values are not found beside a source or channels that are as far off.
-        free = [
-            c
-            for c in self.pool
-            if c.kind == "channel_gain" or (isinstance(c.effect, SourceEffect) and isinstance(c.effect, ValuePerState))
-        ]
-        wide = Space((*space.candidates, *free))
-        random, best = np.random.default_rng(0), fit.excess
-        values = np.concatenate([fit.values, np.zeros(wide.size - space.size)])
-        width = np.concatenate(
-            [np.full(c.size, 45.0 if "azimuth" in c.place else 10.0) for c in space.candidates]
-            + [np.zeros(c.size) for c in free]
-        )
-        for k in range(STARTS + 1):
-            tried = minimize(self.whole, wide, random.uniform(-2, 2, wide.size) * width if k else values, expansions=0)
-            if tried.excess < best:
-                values, best = tried.values, tried.excess
-        return _by_candidate(wide, values)
-
-    def _far(self, fit: Fit) -> dict[Candidate, Array]:
-        best, out = 0.5 * fit.excess, {}
-        for candidate in self.pool:
-            for start in candidate.starts:
-                tried = minimize(self.whole, Space((candidate,)), start)
-                if tried.excess < best:
-                    best, out = tried.excess, {candidate: tried.values}
-        return out
 
     def _clipped(self) -> list[Candidate]:
         """The switch that leaves clipped pixels out, if they say something else than the others."""
@@ -223,11 +177,3 @@ def solution(bench: WholeBench, found: Posterior) -> Solution:
 
 def _values_of(bench: WholeBench, space: Space) -> Array:
     return np.concatenate([np.zeros(0), *(bench._start.get(c, np.zeros(c.size)) for c in space.candidates)])
-
-
-def _by_candidate(space: Space, values: Array) -> dict[Candidate, Array]:
-    return {c: values[p] for c, p in zip(space.candidates, space.slices, strict=True)}
-
-
-def _rms(fit: Fit) -> float:
-    return float(np.sqrt(fit.sums.square.sum() / max(fit.sums.count.sum(), 1.0)))

@@ -7,7 +7,7 @@ element a quarter turn off, angles told in other units, states that are one off,
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -72,7 +72,7 @@ def _mistakes(problem: InstrumentProblem) -> Iterator[Wiring]:
         swap = dict(zip(axes, reversed(axes), strict=True))
         elements = {e.name: {"axis": swap[e.axis]} for e in model.elements() if e.axis in swap}
         change = f"in the instrument file give each element the other axis ({axes[0]} and {axes[1]})"
-        yield Wiring("the two axes are in each other's place", change, _with_model(problem, _changed(model, elements)))
+        yield Wiring("the two axes are in each other's place", change, _with_values(problem, elements))
     for axis in axes:
         yield _scaled(problem, (axis,), 0.5, f"angles of {axis!r} are told in half degrees")
         yield _scaled(problem, (axis,), 2.0, f"angles of {axis!r} are told in units of two degrees")
@@ -80,9 +80,9 @@ def _mistakes(problem: InstrumentProblem) -> Iterator[Wiring]:
             yield _scaled(problem, (axis,), factor, f"axis {axis!r} was driven with a ratio of {name}")
     for element in model.elements():
         azimuth = float(element.azimuth_deg)  # type: ignore[arg-type]
-        moved = _changed(model, {element.name: {"azimuth_deg": azimuth + 90.0}})
+        moved = _with_values(problem, {element.name: {"azimuth_deg": azimuth + 90.0}})
         change = f"in the instrument file, element {element.name!r}: azimuth_deg: {azimuth + 90:g}"
-        yield Wiring(f"{element.name!r} is a quarter turn off (its axes confused)", change, _with_model(problem, moved))
+        yield Wiring(f"{element.name!r} is a quarter turn off (its axes confused)", change, moved)
     for step, where in ((1, "late"), (-1, "early")):
         change = "shift the angle columns of states.csv by one row"
         yield Wiring(f"the states are one {where}", change, _with_states(problem, lambda v, s=step: np.roll(v, s)))
@@ -94,7 +94,7 @@ def _mistakes(problem: InstrumentProblem) -> Iterator[Wiring]:
 def _scaled(problem: InstrumentProblem, axes: tuple[str, ...], factor: float, what: str) -> Wiring:
     elements = {e.name: {"ratio": e.ratio * factor} for e in problem.model.elements() if e.axis in axes}
     lines = ", ".join(f"{name!r}: ratio: {update['ratio']:g}" for name, update in elements.items())
-    return Wiring(what, f"in the instrument file, {lines}", _with_model(problem, _changed(problem.model, elements)))
+    return Wiring(what, f"in the instrument file, {lines}", _with_values(problem, elements))
 
 
 def _turned_mosaics(problem: InstrumentProblem) -> Iterator[Wiring]:
@@ -111,25 +111,20 @@ def _turned_mosaics(problem: InstrumentProblem) -> Iterator[Wiring]:
         now = {str(a): str(b) for a, b in zip(layout.reshape(-1), turned.reshape(-1), strict=True)}
         # The pixels that were read as channel a show what channel b shows.
         channels = tuple(by_name[now[c.name]].model_copy(update={"name": c.name}) for c in model.channels)
-        new = _with_model(problem, model.model_copy(update={"channels": channels}))
+        new = _changed(problem, lambda m, c=channels: m.model_copy(update={"channels": c}))  # type: ignore[misc]
         yield Wiring(f"the image is {what}", f"in the instrument file, mosaic: {turned.tolist()}", new)
 
 
-def _changed(model: InstrumentModel, updates: Mapping[str, Mapping[str, Any]]) -> InstrumentModel:
-    def swap(elements: tuple[Any, ...]) -> tuple[Any, ...]:
-        return tuple(e.model_copy(update=dict(updates.get(e.name, {}))) for e in elements)
-
-    channels = tuple(c.model_copy(update={"elements": swap(c.elements)}) for c in model.channels)
-    return model.model_copy(
-        update={"generator": swap(model.generator), "analyzer": swap(model.analyzer), "channels": channels}
-    )
-
-
-def _with_model(problem: InstrumentProblem, model: InstrumentModel) -> InstrumentProblem:
+def _changed(problem: InstrumentProblem, change: Callable[[InstrumentModel], InstrumentModel]) -> InstrumentProblem:
     out = copy.copy(problem)
-    out.model = model
+    out.models = tuple(change(m) for m in problem.models)
+    out.model = out.models[0]
     out.forget_linearizations()
     return out
+
+
+def _with_values(problem: InstrumentProblem, updates: Mapping[str, Mapping[str, Any]]) -> InstrumentProblem:
+    return _changed(problem, lambda model: model.with_values(updates))
 
 
 def _with_states(problem: InstrumentProblem, move: Any) -> InstrumentProblem:

@@ -13,13 +13,13 @@ from processing.effect import Effect, Parameter
 from processing.errors import ProcessError
 from processing.instrument.applied_effects import instrument_effects
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import FromAState, FromFileOnly, InstrumentEffect, OfOneCapture
+from processing.instrument.effects.base import FromAState, FromFileOnly, InstrumentEffect
 from processing.instrument.model import InstrumentModel
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One effect at one place; of scope "capture", in one capture.
+    """One effect at one place; in one capture or at one wavelength, if its values belong to that alone.
 
     `starts` are values from which a fit starts, besides zero.
     """
@@ -29,6 +29,11 @@ class Candidate:
     parameters: tuple[Parameter, ...]
     capture: int | None = None
     starts: tuple[Array, ...] = field(default=(), compare=False)
+    wavelength_nm: float | None = None
+
+    def acts(self, capture: int, wavelength_nm: float) -> bool:
+        """Whether it acts on a capture, by its number and wavelength."""
+        return self.capture in (None, capture) and self.wavelength_nm in (None, wavelength_nm)
 
     @property
     def kind(self) -> str:
@@ -64,7 +69,8 @@ class Candidate:
     @property
     def label(self) -> str:
         """Name for people."""
-        return self.short + (f" in capture {self.capture + 1}" if self.capture is not None else "")
+        where = f" in capture {self.capture + 1}" if self.capture is not None else ""
+        return self.short + where + (f" at {self.wavelength_nm:g} nm" if self.wavelength_nm is not None else "")
 
     def apply(self, changes: Changes, model: InstrumentModel, values: Array) -> None:
         """Add the effect of these values to the changes of an instrument, if it is one of an instrument."""
@@ -107,6 +113,11 @@ class NominalValue(InstrumentEffect):
                 f"instrument and a field of {', '.join(self.FIELDS)}"
             )
 
+    @property
+    def shared(self) -> bool:
+        """A mount, the same at every wavelength."""
+        return self.field == "azimuth_deg"
+
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return (f"{self.element}.{self.field}",)
 
@@ -123,32 +134,46 @@ class NominalValue(InstrumentEffect):
             target[self.element] = target[self.element] + value
 
 
-def nominal_values(model: InstrumentModel, conditions: Conditions) -> tuple[Candidate, ...]:
-    """Candidates for the values that the instrument file calls nominal."""
+def nominal_values(
+    model: InstrumentModel, conditions: Conditions, wavelengths_nm: Sequence[float]
+) -> tuple[Candidate, ...]:
+    """Candidates for the values that the instrument file calls nominal: azimuths once, all else at every wavelength."""
     out = []
+    several = sorted(set(wavelengths_nm))
     for name in model.calibrate:
         effect = NominalValue(name, model)
-        out.append(Candidate(effect, name, effect.parameters(model, conditions, name)))
+        shared = effect.shared or len(several) == 1
+        for wavelength in (None,) if shared else several:
+            parameters = effect.parameters(model, conditions, name)
+            out.append(Candidate(effect, name, parameters, wavelength_nm=wavelength))
     return tuple(out)
 
 
-def pool(model: InstrumentModel, conditions: Sequence[Conditions]) -> tuple[Candidate, ...]:
-    """Every effect of the instrument at every place of the captures.
+def pool(
+    model: InstrumentModel, conditions: Sequence[Conditions], wavelengths_nm: Sequence[float] | None = None
+) -> tuple[Candidate, ...]:
+    """Every effect of the instrument at every place of the captures, by default all at one wavelength.
 
     What shifts a value that is fitted as nominal is left out: the same number under two names would be a false pair of
     indistinguishable effects.
     """
-    found: dict[tuple[str, str, int | None], Candidate] = {}
+    wavelengths_nm = wavelengths_nm or (0.0,) * len(conditions)
+    found: dict[tuple[str, str, int | None, float | None], Candidate] = {}
     fitted = set(model.calibrate)
+    several = len(set(wavelengths_nm)) > 1
+    one_scale = len({c.full_scale for c in conditions}) == 1
     for effect in instrument_effects().values():
         if isinstance(effect, FromFileOnly):
             continue
-        for k, condition in enumerate(conditions):
-            number = k if isinstance(effect, OfOneCapture) else None
+        dispersive = several and (
+            effect.belongs_to == "wavelength" or (effect.belongs_to == "detector" and not one_scale)
+        )
+        for k, (condition, wavelength) in enumerate(zip(conditions, wavelengths_nm, strict=True)):
+            number = k if effect.belongs_to == "capture" else None
+            own = wavelength if dispersive else None
             for place in effect.places(model, condition):
                 if fitted.isdisjoint(effect.shifts(model, place)):
-                    candidate = Candidate(
-                        effect, place, effect.parameters(model, condition, place), number, effect.starts()
-                    )
-                    found.setdefault((effect.kind, place, number), candidate)
+                    parameters = effect.parameters(model, condition, place)
+                    candidate = Candidate(effect, place, parameters, number, effect.starts(), own)
+                    found.setdefault((effect.kind, place, number, own), candidate)
     return tuple(found.values())

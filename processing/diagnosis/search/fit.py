@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,12 +130,21 @@ def score(sums: Sums, active: int, new: slice, weak: Array) -> tuple[float, Arra
 
 @dataclass(frozen=True)
 class HeldOut:
-    """How well every fold is predicted by a fit to the others; see `Sums`."""
+    """How well every fold is predicted by a fit to the others; see `Sums`.
+
+    `shares` (captures, 2): what each capture has of `square` and `count`.
+    """
 
     excess: float
     freedom: float
     square: float
     count: float
+    shares: Array = field(default_factory=lambda: np.zeros((0, 2)))
+
+    def rms_of(self, capture: int) -> float:
+        """`rms` of one capture alone."""
+        square, count = self.shares[capture]
+        return float(np.sqrt(square / max(count, 1e-300)))
 
     @property
     def chi2_reduced(self) -> float:
@@ -164,7 +173,7 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
     local = np.zeros(space.size, dtype=bool)
     for candidate, part in zip(space.candidates, space.slices, strict=True):
         local[part] = isinstance(candidate.effect, ValuePerState) and by_state
-    total = np.zeros(4)
+    total, shares = np.zeros(4), np.zeros((full.sums.shares.shape[0], 2))
     for fold in range(problem.folds):
         others = [f for f in range(problem.folds) if f != fold]
         if problem.far_from_linear:
@@ -181,7 +190,18 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
         else:
             sums = problem.sums(space, values, derivatives=False)
         total += (sums.excess[fold], sums.freedom[fold], sums.square[fold], sums.count[fold])
-    return HeldOut(*(float(t) for t in total))
+        shares += sums.shares[:, :, fold]
+    if by_state:
+        _count_values(space, shares)
+    excess, freedom, square, count = map(float, total)
+    return HeldOut(excess, freedom, square, count, shares)
+
+
+def _count_values(space: Space, shares: Array) -> None:
+    """Each value of a single state takes a degree of freedom of its capture away."""
+    for candidate in space.candidates:
+        if isinstance(candidate.effect, ValuePerState) and candidate.capture is not None:
+            shares[candidate.capture, 1] -= candidate.size
 
 
 def _in_sample(space: Space, full: Fit, weak: Array) -> HeldOut:
@@ -190,7 +210,9 @@ def _in_sample(space: Space, full: Fit, weak: Array) -> HeldOut:
     freedom = float(full.sums.freedom.sum())
     share = max(1 - fitted / max(freedom, 1e-300), 0.2)
     square, count = float(full.sums.square.sum()), float(full.sums.count.sum())
-    return HeldOut(float(full.sums.excess.sum()), max(share * freedom, 1e-300), square, max(share * count, 1e-300))
+    shares = full.sums.shares.sum(axis=2) * [1.0, share]
+    excess = float(full.sums.excess.sum())
+    return HeldOut(excess, max(share * freedom, 1e-300), square, max(share * count, 1e-300), shares)
 
 
 def _one_step(full: Fit, space: Space, folds: Sequence[int], weak: Array) -> Array:

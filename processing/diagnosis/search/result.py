@@ -37,6 +37,7 @@ class FoundEffect(_Part):
     indistinguishable_from: tuple[str, ...]
     scope: Literal["instrument", "capture"]
     capture: str | None = None
+    wavelength_nm: float | None = None
     removal_chance: float
     confident: bool
     probability: float | None = None
@@ -97,7 +98,10 @@ class Correction(_Part):
 
 
 class CaptureReport(_Part):
-    """One capture: what is known of it, and how far its residual is from noise, before and after."""
+    """One capture: what is known of it, and how far its residual is from noise, before and after.
+
+    `rms_before_percent`, `rms_after_percent`: on held-out data, as `Error.rms_percent`, of this capture alone.
+    """
 
     name: str
     sample: str
@@ -109,6 +113,9 @@ class CaptureReport(_Part):
     cut_off: tuple[int, ...] = ()
     tests_before: dict[str, float]
     tests_after: dict[str, float]
+    wavelength_nm: float | None = None
+    rms_before_percent: float | None = None
+    rms_after_percent: float | None = None
     closure_before_percent: float | None = None
     closure_after_percent: float | None = None
 
@@ -128,7 +135,7 @@ class Diagnosis(_Part):
     ranking: tuple[Ranked, ...]
     captures: tuple[CaptureReport, ...]
     instrument: str
-    wavelength_nm: float
+    wavelengths_nm: tuple[float, ...]
     simulated: bool
     correction: Correction | None = None
     wiring: str | None = None

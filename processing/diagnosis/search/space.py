@@ -21,6 +21,7 @@ class Sums:
     excess : (F,) sum of squares in units of the noise, minus what noise is expected to give (`freedom`, (F,)).
     square : (F,) sum of squares relative to the mean signal; count : (F,) the degrees of freedom behind it.
     gradient, curvature : (F, K), (F, K, K), half of the derivatives of the excess.
+    shares : (captures, 2, F) what each capture has of `square` and `count`.
     stretch : (F, K) half of the derivatives of `freedom`: a bend of the response stretches noise and structure alike.
     """
 
@@ -31,13 +32,27 @@ class Sums:
     gradient: Array
     curvature: Array
     stretch: Array
+    shares: Array
 
     @classmethod
-    def empty(cls, folds: int, parameters: int) -> Sums:
+    def empty(cls, folds: int, parameters: int, captures: int = 0) -> Sums:
         """All zero."""
         f, k = folds, parameters
-        zero = np.zeros(f)
-        return cls(zero, zero.copy(), zero.copy(), zero.copy(), np.zeros((f, k)), np.zeros((f, k, k)), np.zeros((f, k)))
+        a, b, c, d = np.zeros((4, f))
+        gradient, stretch = np.zeros((2, f, k))
+        return cls(a, b, c, d, gradient, np.zeros((f, k, k)), stretch, np.zeros((captures, 2, f)))
+
+    def add(self, capture: int, part: Sums, index: NDArray[np.int64]) -> None:
+        """Add the sums of one capture, by whose parameters at `index` it is derived."""
+        self.excess += part.excess
+        self.freedom += part.freedom
+        self.square += part.square
+        self.count += part.count
+        self.shares[capture] += part.square, part.count
+        if part.gradient.shape[1]:
+            self.gradient[:, index] += part.gradient
+            self.stretch[:, index] += part.stretch
+            self.curvature[:, index[:, None], index] += part.curvature
 
 
 @dataclass
@@ -59,6 +74,12 @@ class Space:
     def fixed(self) -> NDArray[np.bool_]:
         """(K,) values that are on or off and not fitted."""
         return np.array([isinstance(c.effect, Switch) for c in self.candidates for _ in c.parameters], dtype=bool)
+
+    def acting(self, capture: int, wavelength_nm: float) -> tuple[Space, NDArray[np.int64]]:
+        """What acts on a capture, and where its values stand in the common vector."""
+        chosen = [k for k, c in enumerate(self.candidates) if c.acts(capture, wavelength_nm)]
+        index = [np.zeros(0, dtype=np.int64), *(np.r_[self.slices[k]] for k in chosen)]
+        return Space(tuple(self.candidates[k] for k in chosen)), np.concatenate(index).astype(np.int64)
 
     def joined(self, name: str) -> Array:
         """A property of all candidates, end to end."""

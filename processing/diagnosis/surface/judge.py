@@ -108,7 +108,7 @@ def diagnose_surface(problem: SurfaceProblem, material: str, say: Say) -> Surfac
         ),
         captures=tuple(_capture(problem, k, before[k], after[k]) for k in captures),
         instrument=problem.model.name,
-        wavelength_nm=problem.captures[0].wavelength_nm,
+        wavelengths_nm=(problem.captures[0].wavelength_nm,),
         simulated=any(c.simulated for c in problem.captures),
         material=material,
         constants=constants(problem, found.space, found.fit.values),

@@ -69,7 +69,7 @@ def write_surface_report(path: Path, judged: SurfaceJudged, problem: SurfaceProb
     title = f"diagnose: {d.material} with {d.instrument}"
     try:
         with path.open("x", encoding="utf-8") as file:
-            file.write(render(title, d.simulated, f"{d.wavelength_nm:g} nm", sections))
+            file.write(render(title, d.simulated, f"{d.wavelengths_nm[0]:g} nm", sections))
     except FileExistsError as error:
         raise ProcessError(f"{path} exists and is not replaced. Give another --report.") from error
 

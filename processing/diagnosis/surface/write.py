@@ -25,10 +25,10 @@ def corrected_material(
     for nm, c in material.constants.items():
         a, b = (c.a, c.b) if isinstance(c, polarized_diffuse.Constants) else (0.0, 2.0)
         known[nm] = polarized_diffuse.Constants(n=c.n, k=c.k, a=a, b=b)
-    key = next((nm for nm in known if abs(nm - diagnosis.wavelength_nm) < 0.5), diagnosis.wavelength_nm)
+    key = next((nm for nm in known if abs(nm - diagnosis.wavelengths_nm[0]) < 0.5), diagnosis.wavelengths_nm[0])
     known[key] = polarized_diffuse.Constants(**diagnosis.constants)
     names = ", ".join(c.name for c in diagnosis.captures)
-    source = f"diagnose, {diagnosis.wavelength_nm:g} nm, from {names}"
+    source = f"diagnose, {diagnosis.wavelengths_nm[0]:g} nm, from {names}"
     return polarized_diffuse.Model(name=f"{material.name}, corrected", source=source, constants=known)
 
 

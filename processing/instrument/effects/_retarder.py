@@ -39,6 +39,8 @@ class Retardance(RetarderEffect):
 class Azimuth(RetarderEffect):
     """The fast axis stands elsewhere than in the model."""
 
+    belongs_to = "mechanics"
+
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         return (Parameter("azimuth", "degree", -45, 45, 1.0),)
 

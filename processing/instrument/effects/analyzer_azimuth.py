@@ -27,6 +27,8 @@ def polarizers(model: InstrumentModel) -> tuple[str, ...]:
 class AnalyzerAzimuth(OpticsEffect):
     """All polarizers behind the sample are turned together, in degrees."""
 
+    belongs_to = "mechanics"
+
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if polarizers(model) and model.mosaic is None else ()
 

@@ -21,6 +21,8 @@ from processing.instrument.model import InstrumentModel
 class AnalyzerRoll(FromFileOnly):
     """Degrees by which every element of the analyzer is turned."""
 
+    belongs_to = "mechanics"
+
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",)
 

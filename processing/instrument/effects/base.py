@@ -16,9 +16,15 @@ from processing.effect import Effect, Parameter
 from processing.instrument.changes import Changes, Conditions
 from processing.instrument.model import InstrumentModel, Retarder
 
+#: What the values of an effect belong to: mounts and mechanics, the same at every wavelength; the detector, the same as
+#: long as its full scale is; optics, with other values at another wavelength; one capture alone.
+Belongs = Literal["mechanics", "detector", "wavelength", "capture"]
+
 
 class InstrumentEffect(Effect, ABC):
     """One thing that an instrument model can lack."""
+
+    belongs_to: ClassVar[Belongs] = "wavelength"
 
     @abstractmethod
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
@@ -56,6 +62,8 @@ class FieldEffect(InstrumentEffect):
 class CountsEffect(InstrumentEffect):
     """Undone in the counts; it does not change the rows of W."""
 
+    belongs_to: ClassVar[Belongs] = "detector"
+
 
 class PointwiseEffect(CountsEffect):
     """Undone in each pixel by itself; what `apply` adds is a series about the last point of `undo`."""
@@ -71,6 +79,8 @@ class ImageShift(CountsEffect):
 
 class OfOneCapture(InstrumentEffect):
     """Would have other values in another capture of the same instrument."""
+
+    belongs_to: ClassVar[Belongs] = "capture"
 
 
 class Switch(OfOneCapture):

@@ -20,6 +20,8 @@ from processing.instrument.model import InstrumentModel
 class BeamWander(ImageShift):
     """Amplitudes in pixels of cos and sin of the turned angle, x to the right and y down."""
 
+    belongs_to = "mechanics"
+
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         axes = moving_axes(model, conditions)
         return tuple(e.name for e in model.elements() if e.axis in axes)

@@ -18,6 +18,8 @@ from processing.instrument.model import InstrumentModel
 class ChannelAzimuth(ChannelEffect):
     """Azimuth error of each channel's polarizer in degrees."""
 
+    belongs_to = "mechanics"
+
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         return tuple(Parameter(f"channel_{c.name}", "degree", -20, 20, 1.0) for c in model.channels)
 

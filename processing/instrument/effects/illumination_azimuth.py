@@ -22,6 +22,8 @@ from processing.polarization import mueller
 class IlluminationAzimuth(FromFileOnly):
     """Degrees by which the polarization behind the generator is turned."""
 
+    belongs_to = "mechanics"
+
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",)
 

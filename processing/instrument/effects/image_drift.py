@@ -18,6 +18,8 @@ from processing.instrument.model import InstrumentModel
 class ImageDrift(ImageShift, OfOneCapture):
     """Pixels from the first to the last state, x to the right and y down."""
 
+    belongs_to = "capture"
+
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if conditions.states > 1 else ()
 

@@ -28,6 +28,8 @@ def direction(angle_deg: Array) -> Array:
 class RotationBacklash(InstrumentEffect):
     """Half of the play in degrees: angle = reading - backlash * direction."""
 
+    belongs_to = "mechanics"
+
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         axes = moving_axes(model, conditions)
         return tuple(a for a in axes if np.ptp(direction(conditions.angles_deg[a])) > 0)

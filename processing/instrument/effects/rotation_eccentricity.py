@@ -20,6 +20,8 @@ from processing.instrument.model import InstrumentModel
 class RotationEccentricity(InstrumentEffect):
     """Angle error in degrees: cos and sin of the axis angle, then of twice the angle."""
 
+    belongs_to = "mechanics"
+
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return moving_axes(model, conditions)
 

@@ -24,6 +24,8 @@ REVERSED = -2.0
 class RotationRatio(InstrumentEffect):
     """(true turn - turn read) / turn read; -2 is the opposite sense."""
 
+    belongs_to = "mechanics"
+
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return moving_axes(model, conditions)
 

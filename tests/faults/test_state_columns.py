@@ -1,0 +1,57 @@
+"""Columns of states.csv: the noise stated for each state, and names that nobody knows."""
+
+import numpy as np
+import pytest
+
+from processing.diagnosis.captured.read_capture import read_capture
+from processing.instrument.model import InstrumentModel
+from processing.storage.capture import Capture
+from processing.storage.importing import ImportRequest, import_capture
+from processing.storage.state_csv import ImportFailed, read_states
+
+HEAD = "state,psg_deg,channel_left,channel_right"
+
+
+def written(folder, head, rows):
+    path = folder / "states.csv"
+    path.write_text("\n".join([head, *rows]) + "\n", encoding="utf-8")
+    return path
+
+
+def test_noise_of_each_state_is_what_the_file_says(tmp_path, configs):
+    rows = [f"{k},{4 * k},{1000 + k},{500 + 3 * k},{2 + k}" for k in range(46)]
+    instrument = configs / "instruments/drr_wollaston.yaml"
+    out = tmp_path / "c.h5"
+    import_capture(ImportRequest(written(tmp_path, HEAD + ",sigma", rows), out, 1200, instrument=instrument))
+    with Capture(out) as capture:
+        assert capture.sigma == pytest.approx(2.0 + np.arange(46))
+        data = read_capture(capture, InstrumentModel.load(instrument).at(1200))
+    assert data.noise_known
+    full_scale = data.conditions.full_scale
+    assert np.sqrt(data.variance()[:, 1, 0, 0]) * full_scale == pytest.approx(2.0 + np.arange(46))
+
+
+def test_a_capture_without_stated_noise_has_none(tmp_path):
+    out = tmp_path / "c.h5"
+    import_capture(ImportRequest(written(tmp_path, HEAD, ["0,0,1.0,2.0", "1,4,1.5,2.5"]), out, 1200))
+    with Capture(out) as capture:
+        assert capture.sigma is None
+
+
+@pytest.mark.parametrize("value", ["0", "-1"])
+def test_noise_is_above_zero(tmp_path, value):
+    path = written(tmp_path, HEAD + ",sigma", ["0,0,1,2,1", f"1,4,1,2,{value}"])
+    with pytest.raises(ImportFailed, match=r"states.csv:3: column sigma"):
+        read_states(path, ("psg",))
+
+
+@pytest.mark.parametrize("column", ["exposure", "stderr", "psa", "temperature_c"])
+def test_an_unknown_column_is_refused(tmp_path, column):
+    path = written(tmp_path, f"{HEAD},{column}", ["0,0,1,2,1", "1,4,1,2,1"])
+    with pytest.raises(ImportFailed, match=f"unknown column {column}"):
+        read_states(path, ("psg",))
+
+
+def test_axes_may_be_called_by_their_bare_name_where_the_instrument_has_them(tmp_path):
+    path = written(tmp_path, "state,psg,stage_deg,channel_left", ["0,0,1,2", "1,4,1,2"])
+    assert set(read_states(path, ("psg",)).angles_deg) == {"psg", "stage"}
