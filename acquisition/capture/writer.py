@@ -238,8 +238,9 @@ class CaptureWriter:
         ----------
         in_haste : for a run that has failed already, wait for PATIENCE_S only.
         """
-        if not self._settled(PATIENCE_S if in_haste else DEAD_S):
-            raise self._blocked()
+        patience_s = PATIENCE_S if in_haste else DEAD_S
+        if not self._settled(patience_s):
+            raise self._blocked(patience_s)
 
     def _settled(self, patience_s: float) -> bool:
         with self._change:
@@ -258,12 +259,12 @@ class CaptureWriter:
                 self._change.wait(LOOK_S)
                 if self._record is not None and self._clock.now_s() - self._since_s > DEAD_S:
                     if self.on_failure is not None:
-                        self.on_failure(self._blocked())
+                        self.on_failure(self._blocked(DEAD_S))
                     return
 
-    def _blocked(self) -> AcquisitionError:
+    def _blocked(self, waited_s: float) -> AcquisitionError:
         return AcquisitionError(
-            f"{self.path}: the disc takes no data. States done before it are "
+            f"{self.path}: the disc has not taken a state for {waited_s:g} s. States done before it are "
             "intact; go on with --resume when the disc is well."
         )
 

@@ -65,7 +65,7 @@ def test_a_disc_that_takes_nothing_shuts_the_light_and_ends_the_run(run_with, in
     with monkeypatch.context() as patch:
         _failing_at(patch, 5, lambda: blocked.wait(60))
         error, path = run_with(lambda rig, *_: rigs.append(rig), plan=SHORT, observers=(Told(),))
-    assert "the disc takes no data" in str(error)
+    assert "the disc has not taken a state for 1 s" in str(error)
     told = [number for number, entry in enumerate(lit) if "the disc takes no data" in str(entry)]
     # The light is shut right after it was told, not at the end of the run.
     assert lit[told[0] + 1] == "set"
