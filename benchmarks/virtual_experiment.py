@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -79,12 +79,12 @@ def declared(name: str, azimuth_deg: float) -> InstrumentModel:
     return instrument.model_copy(update={"generator": (polarizer,)})
 
 
-def take(scene: Scene, folder: Path, azimuth_deg: float) -> None:
+def take(scene: Scene, folder: Path, azimuth_deg: float, omegas_deg: Sequence[float]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name, (size, states) in INSTRUMENTS.items():
         instrument = declared(name, azimuth_deg)
         for nm in WAVELENGTHS_NM:
-            for omega in OMEGA_DEG:
+            for omega in omegas_deg:
                 path = folder / f"{name}_{nm:g}_{omega:g}.h5"
                 if path.exists():
                     continue
@@ -152,6 +152,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="Markdown file of the tables")
     parser.add_argument("--figures", type=Path, help="folder for the figures")
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--omega", nargs="+", type=float, default=list(OMEGA_DEG), help="arm angles in degrees")
     parser.add_argument("--cases", nargs="+", choices=list(CASES), default=list(CASES))
     given = parser.parse_args()
     text: list[str] = []
@@ -159,7 +160,7 @@ def main() -> None:
         case = CASES[name]
         folder = given.work / f"{case.scene.__name__}_{case.azimuth_deg:g}"
         begin = time.perf_counter()
-        take(case.scene(), folder, case.azimuth_deg)
+        take(case.scene(), folder, case.azimuth_deg, given.omega)
         taken = time.perf_counter()
         with executor(given.workers) as pool:
             out = given.work / f"out_{name}"
