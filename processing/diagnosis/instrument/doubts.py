@@ -24,7 +24,7 @@ UNEVEN, UNEVEN_SHARE = 6.0, 0.01
 TESTABLE = 0.75
 #: With structure left something is there that is not in the list, and causes that are may be parts of it: one alone has
 #: to explain this many times what is left, the second strongest four times as much, the third nine times, ...
-TIMES = 50.0
+TIMES = 100.0
 #: Log odds that a name needs where nothing but what is left tells the noise: part of it may be structure. What can
 #: describe any pattern (a bend of the response, a value for each state) has to explain `TIMES` what is left.
 UNKNOWN_NOISE = 25.0

@@ -28,7 +28,7 @@ from processing.diagnosis.instrument.telling import (
 from processing.diagnosis.instrument.whole_bench import Solution, WholeBench, predicts, solution
 from processing.diagnosis.instrument.wiring import miswired
 from processing.diagnosis.search.causes import Cause, causes
-from processing.diagnosis.search.posterior import Posterior, Say, resampled
+from processing.diagnosis.search.posterior import Posterior, Say
 from processing.diagnosis.search.result import Diagnosis, Unexplained, Verdict
 from processing.diagnosis.search.rules import LIKELY
 from processing.instrument.effects.base import ValuePerState
@@ -63,22 +63,26 @@ def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
     captures = range(len(problem.captures))
     before = tuple(residual(asked, k, solved.base, solved.before_fit) for k in captures)
     after = tuple(residual(asked, k, solved.space, solved.fit) for k in captures)
-    unit = 1 + sum(r.left for r in after) / found.sets.noise.directions
-    if problem.noise_known and unit > GROWTH * found.samples.best.unit:
+    units = np.array([1 + r.left / directions(asked, k) for k, r in enumerate(after)])
+    if problem.noise_known and units.max() > GROWTH * found.samples.best.unit:
         # Single tests see structure that the sum of squares does not.
-        found = resampled(found, unit)
+        found = bench.weighed(found, units)
         solved = solution(bench, found)
         after = tuple(residual(asked, k, solved.space, solved.fit) for k in captures)
+    else:
+        units = np.ones(len(after))
     guard = checks(asked, solved)
     refused = f"change this first: {wiring.told}" if wiring is not None else refusal(guard)
     structure = _structure(problem, after)
-    left = sum(r.left for r in after) if structure else 0.0
+    left = float(sum(r.left / u for r, u in zip(after, units, strict=True))) if structure else 0.0
     named = _told(found, left)
-    doubt = doubts(asked, found, solved, named, left)
     untold = [
         c for c in named if isinstance(c.candidates[0].effect, ValuePerState) and not testable(asked, solved, c, named)
     ]
     named = tuple(c for c in named if c not in untold)
+    # What as many values as the data have took away may be any structure.
+    left += sum(2 * c.log_odds * found.samples.best.unit for c in untold)
+    doubt = doubts(asked, found, solved, named, left)
     sure = [c for c in named if c.answer != "unknown" and c not in doubt]
     switched = told_switches(asked, solved)
     verdict = _verdict((*named, *switched), (*sure, *switched), structure or bool(untold))
@@ -117,6 +121,12 @@ def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
         wiring=None if wiring is None else wiring.told,
     )
     return Judged(diagnosis, kept, before, after if refused is None else before)
+
+
+def directions(problem: InstrumentProblem, k: int) -> float:
+    """Independent directions over which structure spreads in one capture."""
+    free, power = problem.powers()[k]
+    return max(free * float(power.sum() ** 2 / np.sum(power**2)), 1.0)
 
 
 def _told(found: Posterior, left: float) -> tuple[Cause, ...]:

@@ -89,6 +89,8 @@ class InstrumentProblem:
         self.folds = folds or (FOLDS_OF_STATES if any(holds_out_states(c) for c in self.captures) else FOLDS_OF_TILES)
         self.moments: tuple[Moments, ...] = tuple(moments_of(c, self.folds) for c in self.captures)
         self._built: list[dict[tuple[str, bytes], Array]] = [{} for _ in self.captures]
+        #: What a chi-square of each capture counts; less where structure is left in it.
+        self.weights = np.ones(len(self.captures))
         self.noise_known = all(c.noise_known for c in self.captures)
         self.holds_out_states = any(m.tiles is None for m in self.moments)
         self.spread = max(m.spread for m in self.moments)
@@ -246,6 +248,7 @@ class InstrumentProblem:
         """Excess, and with `derivatives` its half gradient and curvature, of every fold."""
         other, local = self.near(space, values)
         if other is not self:
+            other.weights = self.weights
             return other.sums(space, local, derivatives=derivatives)
         out = Sums.empty(self.folds, space.size if derivatives else 0, len(self.captures))
         for k, data in enumerate(self.captures):
@@ -257,7 +260,7 @@ class InstrumentProblem:
                 self._tile_sums(k, mine, own, changes, part, derivatives)
             else:
                 self._block_sums(k, mine, own, changes, part, derivatives)
-            out.add(k, part, index)
+            out.add(k, part, index, float(self.weights[k]))
         return out
 
     def noise_information(self, space: Space, values: Array) -> Array:

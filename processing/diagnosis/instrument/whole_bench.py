@@ -12,9 +12,10 @@ from processing.diagnosis.instrument.moments import MARGIN
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.starts import first_values
 from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.fit import Fit, HeldOut, held_out, minimize, prior, score
-from processing.diagnosis.search.posterior import Posterior, Say, posterior
-from processing.diagnosis.search.rules import DECISIVE, TAKES_PART
+from processing.diagnosis.search.posterior import Posterior, Say, posterior, quadratic, resampled
+from processing.diagnosis.search.rules import DECISIVE, LIKELY, SHARES, TAKES_PART
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import FieldEffect, ImageShift, PointwiseEffect, Switch, ValuePerState
 
@@ -88,6 +89,14 @@ class WholeBench:
     def _unknowns(self, k: int) -> int:
         return int(np.linalg.matrix_rank(self.whole.columns(k, self.whole.changes(k, Space(()), np.zeros(0)))))
 
+    def weighed(self, found: Posterior, units: Array) -> Posterior:
+        """The same with a unit of chi-square of its own for each capture: structure in one does not devalue others."""
+        self.whole.weights = 1 / units
+        sums = self.whole.sums(found.space, found.values)
+        form = quadratic(self.whole, found.space, found.values, sums)
+        self.whole.weights = np.ones(units.size)
+        return resampled(found, form)
+
     def _offered(self, candidate: Candidate) -> bool:
         effect = candidate.effect
         if isinstance(effect, FieldEffect | Switch):
@@ -150,6 +159,12 @@ class WholeBench:
 def applied(found: Posterior, base: Space) -> tuple[Space, Array]:
     """Space and values of the correction: the mean of the posterior, of what is likely enough to take part."""
     keep = set(base.candidates)
+    by_label = {found.label(g): g for g in range(len(found.members))}
+    for cause in causes(found, 0.0):
+        # That one of a class is there can be certain while none of it is likely by itself: each gets its share.
+        if cause.probability >= LIKELY:
+            shares = [by_label[c] for c in cause.alternatives if found.samples.probability[by_label[c]] > SHARES]
+            keep |= {found.space.candidates[m] for g in shares for m in found.members[g]} | set(cause.candidates)
     for g, probability in enumerate(found.samples.probability):
         if probability > TAKES_PART:
             keep |= {found.space.candidates[m] for m in found.members[g]}

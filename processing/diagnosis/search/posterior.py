@@ -7,7 +7,7 @@ captures are one group; a slip is one of as many alternatives as there are state
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -123,9 +123,9 @@ def _everything(problem: Problem, space: Space, fixed: Sequence[Candidate], x: A
     return out
 
 
-def resampled(found: Posterior, floor: float) -> Posterior:
-    """The same with a unit of chi-square that is at least `floor`."""
-    sets = Sets(found.sets.form, found.sets.groups, replace(found.sets.noise, floor=floor))
+def resampled(found: Posterior, form: Quadratic) -> Posterior:
+    """The same with another chi-square, from the likeliest set on."""
+    sets = Sets(form, found.sets.groups, found.sets.noise)
     samples = sample(sets, climb(sets, found.samples.best), SAMPLES)
     return _posterior_of(found.space, found.members, sets, samples)
 

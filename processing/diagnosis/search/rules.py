@@ -43,6 +43,9 @@ TAKES_PART = 0.25
 #: new has a third of the list.
 UNSEEN = 0.3
 
+#: Probability from which on a member of a class that is likely as a whole takes its share in the correction.
+SHARES = 0.01
+
 # ---- wiring --------------------------------------------------------------------------------------------------------
 #: Factor by which less must be left over without a mistake of wiring (tests/physics/test_diagnosis_wiring.py).
 WIRING = 5.0

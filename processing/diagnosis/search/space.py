@@ -42,17 +42,17 @@ class Sums:
         gradient, stretch = np.zeros((2, f, k))
         return cls(a, b, c, d, gradient, np.zeros((f, k, k)), stretch, np.zeros((captures, 2, f)))
 
-    def add(self, capture: int, part: Sums, index: NDArray[np.int64]) -> None:
-        """Add the sums of one capture, by whose parameters at `index` it is derived."""
-        self.excess += part.excess
-        self.freedom += part.freedom
+    def add(self, capture: int, part: Sums, index: NDArray[np.int64], weight: float = 1.0) -> None:
+        """Add the sums of one capture, by whose parameters at `index` it is derived; its chi-square counts `weight`."""
+        self.excess += weight * part.excess
+        self.freedom += weight * part.freedom
         self.square += part.square
         self.count += part.count
         self.shares[capture] += part.square, part.count
         if part.gradient.shape[1]:
-            self.gradient[:, index] += part.gradient
-            self.stretch[:, index] += part.stretch
-            self.curvature[:, index[:, None], index] += part.curvature
+            self.gradient[:, index] += weight * part.gradient
+            self.stretch[:, index] += weight * part.stretch
+            self.curvature[:, index[:, None], index] += weight * part.curvature
 
 
 @dataclass
