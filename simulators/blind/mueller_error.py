@@ -86,7 +86,12 @@ class Reduced:
 
 
 def error_of(path: Path, model: InstrumentModel, truth: Array) -> float:
-    """Error of M / m00 of a capture, reduced with a model; infinite where it can not be reduced."""
+    """Error of M / m00 of a capture, reduced with a model; infinite where it can not be reduced.
+
+    NaN for a polarization camera: its super-pixels are reduced by other means, and M is not asked of it here.
+    """
+    if model.mosaic is not None:
+        return float("nan")
     try:
         return Reduced.of(path, model).error(truth)
     except ProcessError:
@@ -94,7 +99,9 @@ def error_of(path: Path, model: InstrumentModel, truth: Array) -> float:
 
 
 def coverage_of(path: Path, model: InstrumentModel, truth: Array) -> Coverage:
-    """Coverage of M / m00 of a capture, reduced with a model; NaN where it can not be reduced."""
+    """Coverage of M / m00 of a capture, reduced with a model; NaN where `error_of` has no number."""
+    if model.mosaic is not None:
+        return Coverage(float("nan"), float("nan"))
     try:
         return Reduced.of(path, model).coverage(truth)
     except ProcessError:
