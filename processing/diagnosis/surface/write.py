@@ -7,11 +7,12 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from processing.diagnosis.instrument_file import WriteError, extended
+from processing.diagnosis.instrument_file import WriteError
+from processing.diagnosis.search.result import FoundEffect
 from processing.diagnosis.surface.judge import SurfaceDiagnosis
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.applied_effects import instrument_effects
-from processing.instrument.model import InstrumentModel
+from processing.instrument.model import AppliedEffect, InstrumentModel
 from processing.reflectance import first_surface, polarized_diffuse
 from processing.reflectance.effects.base import GeometryEffect, MaterialEffect, reflectance_effects
 from processing.yaml_file import dump_yaml
@@ -47,6 +48,20 @@ def targets(path: Path) -> tuple[Path, Path, Path]:
     return path, path.with_suffix(".geometry.yaml"), path.with_suffix(".instrument.yaml")
 
 
+def _applied(effect: FoundEffect, diagnosis: SurfaceDiagnosis) -> AppliedEffect:
+    """An effect of the instrument as its file stores it."""
+    return AppliedEffect(
+        kind=effect.kind,
+        element=effect.element,
+        parameters=effect.parameters,
+        evidence=effect.evidence,
+        captures=tuple(c.name for c in diagnosis.captures) if effect.capture is None else (effect.capture,),
+        scope=effect.scope,
+        wavelength_nm=diagnosis.wavelengths_nm[0],
+        indistinguishable_from=effect.indistinguishable_from,
+    )
+
+
 def write_surface(
     path: Path, diagnosis: SurfaceDiagnosis, material: Any, view: ViewingGeometry, instrument: InstrumentModel
 ) -> list[Path]:
@@ -58,7 +73,7 @@ def write_surface(
     """
     kinds = {e.kind for e in diagnosis.effects}
     of_surface = [effect for kind, effect in reflectance_effects().items() if kind in kinds]
-    of_instrument = tuple(e for e in diagnosis.effects if e.kind in instrument_effects())
+    of_instrument = tuple(_applied(e, diagnosis) for e in diagnosis.effects if e.kind in instrument_effects())
     models: list[tuple[Path, BaseModel]] = []
     for_material, for_geometry, for_instrument = targets(path)
     if any(isinstance(e, MaterialEffect) for e in of_surface):
@@ -66,7 +81,8 @@ def write_surface(
     if any(isinstance(e, GeometryEffect) for e in of_surface):
         models.append((for_geometry, corrected_geometry(view, diagnosis)))
     if of_instrument:
-        models.append((for_instrument, extended(instrument, diagnosis.model_copy(update={"effects": of_instrument}))))
+        changed = instrument.model_copy(update={"effects": (*instrument.effects, *of_instrument)})
+        models.append((for_instrument, changed))
     if not models:
         found = f" {', '.join(sorted(kinds))} has no place in a file: mend it at the bench." if kinds else ""
         raise WriteError(f"nothing was found that could go into {path}; it was not written.{found}")
