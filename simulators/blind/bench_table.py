@@ -87,9 +87,9 @@ def _matrix_lines(judgements: Sequence[Judgement]) -> list[str]:
             lines.append(f"error of M/m00, {name}: median {middle:.5f} ({low:.5f} to {high:.5f})")
     reached, nearly = ([j.corrected <= times * j.oracle + FLOOR for j in known] for times in (REACHED, NEARLY))
     own = [any(is_worse(*pair) for pair in j.own.values()) for j in judgements]
-    patches, pixels = (
-        100 * np.nanmean([getattr(j, f"coverage_{n}") for j in judgements]) for n in ("patches", "pixels")
-    )
+    reduced = [j for j in judgements if np.isfinite(j.coverage_pixels)]
+    patches = 100 * sum(j.coverage_patches for j in reduced) / max(len(reduced), 1)
+    pixels = 100 * sum(j.coverage_pixels for j in reduced) / max(len(reduced), 1)
     return [
         *lines,
         f"at most {REACHED} times the fit with the true set: {_share(reached)} (goal 90 %); "
