@@ -9,6 +9,7 @@ from processing.diagnosis.instrument.starts import along_wavelengths, rms
 from processing.diagnosis.instrument_file import extended
 from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.result import Correction, Diagnosis, Error
+from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import Changes, Conditions
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
@@ -115,6 +116,16 @@ def test_a_free_source_leaves_no_residual():
     assert left[True] < 1e-5
     assert left[False] > 0.1
     assert not any(c.kind.startswith("source") for c in problem.pool())
+
+
+def test_sets_are_weighed_beside_far_steeper_directions():
+    # Photon noise of 1e-5 makes some directions 1e16 times steeper than what the prior holds.
+    random = np.random.default_rng(0)
+    turn, _ = np.linalg.qr(random.normal(size=(40, 40)))
+    h = (turn * np.logspace(16, -6, 40)) @ turn.T
+    form = Quadratic(0.0, np.zeros(40), (h + h.T) / 2)
+    sets = Sets(form, [Group(np.arange(39), fixed_tau=10.0), Group(np.array([39]))], Noise(True, 10.0))
+    assert np.isfinite(sets.fitted(sets.empty()).score)
 
 
 def test_a_free_source_needs_two_channels():

@@ -38,8 +38,6 @@ STEPS = 6
 EXPANSIONS = 8
 #: Unit of chi-square, after the first choice of groups, from which on the first linearization is not believed.
 BENT = 2.0
-#: Curvature, relative to the largest, that is rounding.
-ROUNDING = 1e-12
 #: The descent ends when a step gains less than this in chi-square, or this fraction of it.
 LEAST_GAIN, LEAST_RELATIVE = 0.05, 1e-7
 
@@ -179,8 +177,7 @@ def quadratic(problem: Problem, space: Space, x: Array, sums: Sums) -> Quadratic
     told = _told(problem, space, x, h, typical)
     h, g = h * np.outer(told, told), g * told
     value, vector = np.linalg.eigh(h)
-    # Rounding must not make it indefinite, however steep it is in other directions.
-    h = (vector * np.maximum(value, ROUNDING * max(value[-1], 0.0))) @ vector.T if value.size else h
+    h = (vector * np.maximum(value, 0.0)) @ vector.T
     z = x / typical
     total = excess if problem.noise_known else excess + freedom
     return Quadratic(float(total - 2 * g @ z + z @ h @ z), g - h @ z, h)

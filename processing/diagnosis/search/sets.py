@@ -161,7 +161,7 @@ class Sets:
         on = np.flatnonzero(tau > 0)
         active = np.concatenate([np.zeros(0, dtype=np.int64), *(self.groups[i].index for i in on)])
         prior = np.concatenate([np.zeros(0), *(np.full(self.groups[i].index.size, tau[i] ** -2.0) for i in on)])
-        lower = np.linalg.cholesky(self.form.curvature[np.ix_(active, active)] / u + np.diag(prior))
+        lower = _root(self.form.curvature[np.ix_(active, active)] / u + np.diag(prior))
         inverse = solve_triangular(lower, np.eye(active.size), lower=True) if active.size else lower
         right = inverse @ self.form.gradient[active] / u
         left = self.form.excess - u * float(right @ right)
@@ -223,3 +223,14 @@ class Sets:
                 s[k] = own - np.eye(at.size) * state.tau[members[k]] ** -2.0
                 q[k] = -own @ fit.mean[at]
             yield members, s, q
+
+
+def _root(matrix: Array) -> Array:
+    """Cholesky factor; where rounding has made the matrix indefinite, beside far steeper directions, of what it was."""
+    try:
+        return np.asarray(np.linalg.cholesky(matrix))
+    except np.linalg.LinAlgError:
+        value, vector = np.linalg.eigh(matrix)
+        least = matrix.shape[0] * np.finfo(float).eps * value[-1]
+        mended = (vector * np.maximum(value, 4 * least)) @ vector.T + least * np.eye(len(value))
+        return np.asarray(np.linalg.cholesky(mended))
