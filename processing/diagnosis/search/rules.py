@@ -1,8 +1,4 @@
-"""Constants by which the diagnosis decides, shared by instrument and surface.
-
-Each has its unit, its reason, and the test that fails when it is changed much (`tests/physics/test_diagnosis_rules.py`
-unless another file is named).
-"""
+"""Constants by which the diagnosis decides, shared by instrument and surface; each with its unit and its reason."""
 
 from __future__ import annotations
 
