@@ -2,7 +2,8 @@
 
 Facts: Newport's own Python library, as newportxps and pyepics carry it (calls, ``code,values,EndOfAPI``), EPICS' and
 BLISS' drivers (status codes; a move or homing holds up its connection until it ends, so every axis has a second one
-for them). A group is homed after GroupInitialize and GroupHomeSearch; GroupKill ends a homing.
+for them, and a third for stops: nobody waits for their answers, which must not be taken for another question's).
+A group is homed after GroupInitialize and GroupHomeSearch; GroupKill ends a homing.
 Unverified on hardware: everything; that no Login is asked; the text behind an error code. The unit must be degrees,
 which is not asked. The position compare output is not used.
 """
@@ -108,10 +109,12 @@ def _values(answer: str, asked: str) -> str:
 class XPSAxis(MotionAxis):
     """One group with one positioner."""
 
-    def __init__(self, name: str, config: Config, line: XPSLine, lines: LineRegistry, moving: SerialLink) -> None:
+    def __init__(
+        self, name: str, config: Config, line: XPSLine, lines: LineRegistry, moving: SerialLink, stopping: SerialLink
+    ) -> None:
         super().__init__(name, config)
         self.config: Config = config
-        self._line, self._lines, self._moving = line, lines, moving
+        self._line, self._lines, self._moving, self._stopping = line, lines, moving, stopping
         self._homing = False
         positioner = f"{config.group}.{config.positioner}"
         self._positioner = positioner
@@ -195,9 +198,9 @@ class XPSAxis(MotionAxis):
         self._homing = False
 
     def _do_stop(self) -> None:
-        # A homing cannot be aborted, only killed; the answer is skipped by the next question, which it does not fit.
+        # A homing cannot be aborted, only killed.
         call = "GroupKill" if self._homing else "GroupMoveAbort"
-        self._line.link.write(f"{call}({self.config.group})".encode("ascii"))
+        self._stopping.write(f"{call}({self.config.group})".encode("ascii"))
 
     def _do_check_fault(self) -> None:
         while (frame := self._moving.read_frame(0.0)) is not None:
@@ -212,18 +215,20 @@ class XPSAxis(MotionAxis):
 
     def _do_close(self) -> None:
         self._moving.close()
+        self._stopping.close()
         self._lines.release(self.config.port)
 
 
 def open(name: str, config: Config, lines: LineRegistry) -> XPSAxis:
     """Open one axis; reads identity, limits and speed and moves nothing."""
     line = lines.take(config.port, XPSLine, lambda transcript: XPSLine(config, transcript, lines.clock))
-    moving: SerialLink | None = None
+    own: list[SerialLink] = []
     try:
-        moving = SerialLink(config.port, 9600, framer, clock=lines.clock)
-        return XPSAxis(name, config, line, lines, moving)
+        for _ in range(2):
+            own.append(SerialLink(config.port, 9600, framer, clock=lines.clock))
+        return XPSAxis(name, config, line, lines, *own)
     except BaseException:
-        if moving is not None:
-            moving.close()
+        for link in own:
+            link.close()
         lines.release(config.port)
         raise
