@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
@@ -53,7 +53,15 @@ class AxisConfig(BaseModel):
 
     The user angle is ``direction * (device angle - zero_deg)``: `zero_deg` is the angle that the controller
     shows where the user's angle is zero, and the only offset there is. Angles are never wrapped.
+
+    Attributes
+    ----------
+    identified_by : str
+        Name of the entry that says which device this is; a kind without `serial_number` names another. The driver
+        refuses a device that does not answer to it (WrongDevice).
     """
+
+    identified_by: ClassVar[str] = "serial_number"
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -74,6 +82,15 @@ class AxisConfig(BaseModel):
     stall_s: float = Field(default=1.5, gt=0, le=600, description="moving without progress for so long is a stall")
     home_allowed_s: float | None = Field(default=None, gt=0, le=7200, description="longest homing; default from speed")
     reply_s: float | None = Field(default=None, gt=0, le=60, description="longest wait for a reply; default by kind")
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        super().__pydantic_init_subclass__(**kwargs)
+        if "kind" in cls.model_fields and cls.identified_by not in cls.model_fields:
+            raise TypeError(
+                f"{cls.__module__}.{cls.__qualname__} has no field {cls.identified_by!r}: a rig file must be able to "
+                "say which device it means. Add the field, or name another one in `identified_by`"
+            )
 
     def place(self) -> str:
         """What tells this axis from others on its line, in words; "" where a line has one axis only."""

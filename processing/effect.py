@@ -51,13 +51,15 @@ def found_in(package: str, family: type[E], group: str) -> dict[str, E]:
 
     Raises
     ------
-    EffectError : a module defines no effect of the family, or more than one.
+    EffectError : a module defines no effect of the family, or more than one; a plug-in offers one that exists.
     """
     found: dict[str, E] = {}
     for info in sorted(pkgutil.iter_modules(importlib.import_module(package).__path__), key=lambda i: i.name):
         if info.name != BASE and not info.name.startswith("_"):
             found[info.name] = _only_effect(f"{package}.{info.name}", family)()
     for entry in entry_points(group=group):
+        if entry.name in found:
+            raise EffectError(f"plug-in {entry.value} offers the effect {entry.name!r}, which exists already")
         found[entry.name] = entry.load()()
     for kind, effect in found.items():
         effect.kind = kind

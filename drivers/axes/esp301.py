@@ -8,7 +8,7 @@ whether an axis is homed. Use RS-232: USB is reported unusable on Linux.
 from __future__ import annotations
 
 import re
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -44,6 +44,8 @@ class Config(SessionReferenceConfig):
 
     `stage_id` is compared with the start of what ``ID?`` answers (stage model and serial number).
     """
+
+    identified_by: ClassVar[str] = "stage_id"
 
     kind: Literal["esp301"] = "esp301"
     axis: int = Field(default=1, ge=1, le=3)

@@ -8,7 +8,7 @@ PR50CC as a member of it.
 from __future__ import annotations
 
 import re
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -72,6 +72,8 @@ class Config(AxisConfig):
     The protocol shows no serial number: name a CONEX by its ``/dev/serial/by-id`` path, and any stage by
     `stage_id`, which is compared with the start of what ``ID?`` answers.
     """
+
+    identified_by: ClassVar[str] = "stage_id"
 
     kind: Literal["smc100"] = "smc100"
     address: int = Field(default=1, ge=1, le=31)

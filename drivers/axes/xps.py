@@ -11,7 +11,7 @@ which is not asked. The position compare output is not used.
 from __future__ import annotations
 
 import re
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -40,6 +40,8 @@ _ERROR = r"-\d+,.*"
 
 class Config(AxisConfig):
     """A single-axis group of an XPS in a rig file; `port` is ``socket://ADDRESS:5001``."""
+
+    identified_by: ClassVar[str] = "group"
 
     kind: Literal["xps"] = "xps"
     group: str = Field(pattern=r"^\w+$", description="name of the group")

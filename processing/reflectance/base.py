@@ -68,7 +68,10 @@ def normalized_mueller(jones: ComplexArray) -> Array:
 
 @cache
 def kinds() -> dict[str, type[BaseModel]]:
-    """Model classes by kind: each module of this folder that has a class `Model`, then plug-ins."""
+    """Model classes by kind: each module of this folder that has a class `Model`, then plug-ins.
+
+    Raises ConfigError for a plug-in that offers a kind that exists already.
+    """
     import processing.reflectance as folder
 
     found: dict[str, type[BaseModel]] = {}
@@ -77,6 +80,8 @@ def kinds() -> dict[str, type[BaseModel]]:
         if hasattr(module, "Model"):
             found[info.name] = module.Model
     for entry in entry_points(group=ENTRY_POINT_GROUP):
+        if entry.name in found:
+            raise ConfigError(f"plug-in {entry.value} offers the model {entry.name!r}, which exists already")
         found[entry.name] = entry.load()
     return found
 

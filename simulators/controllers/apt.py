@@ -53,6 +53,16 @@ def kbd101() -> APTModel:
 class APTEmulator(Emulator):
     """One unit with one channel; `true_deg()` is the angle of its stage."""
 
+    pieces = (
+        b"\x53\x04\x06\x00\xd0\x01",
+        b"\x43\x04\x01\x00\x50\x01",
+        b"\x11\x00\x00\x00\x50\x01",
+        b"\x50\x01",
+        # A whole question so often that it is heard behind any length that noise has announced.
+        b"\x11\x04\x01\x00\x50\x01" * 50,
+    )
+    tells_limits = False
+
     def __init__(self, model: APTModel, axis: EmulatedAxis, clock: Clock, faults: FaultSchedule | None = None) -> None:
         super().__init__([axis], clock, faults)
         self.model = model

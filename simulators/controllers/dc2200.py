@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 
+from drivers.sources.dc2200 import Config
 from simulators.clock import Clock
 from simulators.serial.emulator import Emulator
 from simulators.serial.reply_faults import FaultSchedule
@@ -92,6 +93,11 @@ class DC2200Emulator(Emulator):
 def make(options: ServeOptions) -> DC2200Emulator:
     """One box with LEDs of 662 and 451 nm, both off."""
     return DC2200Emulator(options.clock, options.faults)
+
+
+def source_configs(emulator: DC2200Emulator, port: str) -> list[Config]:
+    """Rig entry for the box."""
+    return [Config(port=port, terminals=dict(zip(emulator.wavelengths_nm, (1, 2), strict=True)))]
 
 
 SERVES = {"dc2200": make}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from drivers.sources.dc4100 import Config
 from simulators.clock import Clock
 from simulators.serial.emulator import Emulator
 from simulators.serial.reply_faults import FaultSchedule
@@ -166,6 +167,11 @@ class DC4100Emulator(Emulator):
 def make(options: ServeOptions) -> DC4100Emulator:
     """One box with four LEDs, all off."""
     return DC4100Emulator(options.clock, options.faults, model=options.model or "DC4100")
+
+
+def source_configs(emulator: DC4100Emulator, port: str) -> list[Config]:
+    """Rig entry for the box, each LED at full brightness."""
+    return [Config(port=port, percent={nm: 100.0 for nm in emulator.wavelengths_nm if nm is not None})]
 
 
 SERVES = {"dc4100": make}

@@ -149,6 +149,9 @@ def _signed(digits: str) -> int:
 class ElliptecEmulator(Emulator):
     """Modules on one line; `true_deg(i)` belongs to the i-th module."""
 
+    pieces = (b"0ma", b"1mr0000", b"0ho0", b"0gp", b"0gs", b"1in", b"0sj", b"0fw", b"0st", b"\r\n")
+    tells_limits = False
+
     def __init__(self, modules: Sequence[ElliptecModule], clock: Clock, faults: FaultSchedule | None = None) -> None:
         super().__init__([module.axis for module in modules], clock, faults)
         self.modules = list(modules)

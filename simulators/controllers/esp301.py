@@ -61,6 +61,8 @@ class ESPAxis:
 class ESP301Emulator(Emulator):
     """A controller with up to three axes; `true_deg(i)` belongs to axis i + 1."""
 
+    pieces = (b"1PA", b"1OR1", b"1MO", b"TB?", b"1DH", b"1SL", b";", b"\r", b"AB", b"2TP?")
+
     def __init__(self, stages: Sequence[ESPAxis], clock: Clock, faults: FaultSchedule | None = None) -> None:
         super().__init__([stage.axis for stage in stages], clock, faults)
         self.stages = list(stages)

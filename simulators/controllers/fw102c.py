@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from drivers.sources.fw102c import Config
 from simulators.clock import Clock
 from simulators.serial.emulator import Emulator
 from simulators.serial.reply_faults import FaultSchedule
@@ -94,6 +95,11 @@ class FW102CEmulator(Emulator):
 def make(options: ServeOptions) -> FW102CEmulator:
     """One wheel at its opaque position."""
     return FW102CEmulator(options.clock, options.faults)
+
+
+def source_configs(emulator: FW102CEmulator, port: str) -> list[Config]:
+    """Rig entry for the box."""
+    return [Config(port=port, positions={nm: k for k, nm in FILTERS_NM.items()}, dark_position=OPAQUE)]
 
 
 SERVES = {"fw102c": make}

@@ -45,6 +45,19 @@ class Stage:
 class GCS2Emulator(Emulator):
     """A controller with axes 1, 2, ...; `true_deg(i)` belongs to axis i + 1."""
 
+    pieces = (
+        b"MOV 1 ",
+        b"FRF",
+        b"SVO 1 1\n",
+        b"POS?\n",
+        b"HLT 2",
+        b"VEL 1 ",
+        b"\x05",
+        b"\x18",
+        b"ERR?\n",
+        b"\n",
+    )
+
     def __init__(self, stages: Sequence[Stage], clock: Clock, faults: FaultSchedule | None = None) -> None:
         super().__init__([stage.axis for stage in stages], clock, faults)
         self.stages = list(stages)

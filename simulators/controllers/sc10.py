@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from drivers.sources.sc10 import Config
 from simulators.clock import Clock
 from simulators.serial.emulator import Emulator
 from simulators.serial.reply_faults import FaultSchedule
@@ -99,6 +100,11 @@ class SC10Emulator(Emulator):
 def make(options: ServeOptions) -> SC10Emulator:
     """One shutter box, shut, its interlock circuit closed."""
     return SC10Emulator(options.clock, options.faults)
+
+
+def source_configs(emulator: SC10Emulator, port: str) -> list[Config]:
+    """Rig entry for the box."""
+    return [Config(port=port)]
 
 
 SERVES = {"sc10": make}

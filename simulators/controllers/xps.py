@@ -53,6 +53,11 @@ class Group:
 class XPSEmulator(Emulator):
     """A controller; `true_deg(i)` belongs to the i-th group. `connect` begins a conversation on one connection."""
 
+    pieces = (
+        *(b"GroupStatusGet(Group1,int *)", b"GroupMoveAbsolute(Group1.Pos,", b"GroupKill(Group2)", b")", b"("),
+        *(b"GroupInitialize(Group1)", b"GroupHomeSearch(Group1)", b"GroupMoveAbort(Group1)", b"double *,"),
+    )
+
     def __init__(self, groups: Sequence[Group], clock: Clock, faults: FaultSchedule | None = None) -> None:
         super().__init__([group.axis for group in groups], clock, faults)
         self.groups = {group.name: group for group in groups}

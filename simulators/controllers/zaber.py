@@ -230,6 +230,8 @@ class ZaberEmulator(Emulator):
         In chain order.
     """
 
+    pieces = (b"/1 1 move abs ", b"/1 home", b"/0 0 01 get pos:", b"/2 set maxspeed ", b"/1 move vel ", b"stop", b"\n")
+
     def __init__(self, devices: Sequence[ZaberDevice], clock: Clock, faults: FaultSchedule | None = None) -> None:
         super().__init__([device.axis for device in devices], clock, faults)
         self.devices = list(devices)

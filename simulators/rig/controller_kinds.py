@@ -6,6 +6,9 @@ import importlib
 import pkgutil
 from collections.abc import Callable
 from importlib.metadata import entry_points
+from typing import Any
+
+from pydantic import BaseModel
 
 import simulators.controllers
 from drivers.motion import AxisConfig
@@ -21,8 +24,7 @@ def axis_configs(emulator: Emulator, port: str, *, homed: bool = False) -> list[
     homed : bool
         State it in the rig entry where the device cannot tell; for an emulator that starts with a reference.
     """
-    module = importlib.import_module(type(emulator).__module__)
-    configs: list[AxisConfig] = module.axis_configs(emulator, port) if hasattr(module, "axis_configs") else []
+    configs: list[AxisConfig] = _entries("axis_configs", emulator, port)
     if homed:
         configs = [
             config.model_copy(update={"assume_homed": True}) if "assume_homed" in type(config).model_fields else config
@@ -31,12 +33,31 @@ def axis_configs(emulator: Emulator, port: str, *, homed: bool = False) -> list[
     return configs
 
 
+def source_configs(emulator: Emulator, port: str) -> list[BaseModel]:
+    """Return the rig entry for an emulated light source behind `port`; none for what is not one."""
+    return _entries("source_configs", emulator, port)
+
+
+def _entries(function: str, emulator: Emulator, port: str) -> list[Any]:
+    module = importlib.import_module(type(emulator).__module__)
+    return list(getattr(module, function)(emulator, port)) if hasattr(module, function) else []
+
+
 def served_kinds() -> dict[str, Callable[[ServeOptions], Emulator]]:
-    """Find what can be served: the `SERVES` table of every module in `simulators/controllers/`, and of plug-ins."""
+    """Find what can be served: the `SERVES` table of every module in `simulators/controllers/`, and of plug-ins.
+
+    Raises
+    ------
+    ValueError
+        A plug-in serves a kind that exists already.
+    """
     kinds: dict[str, Callable[[ServeOptions], Emulator]] = {}
     for entry in pkgutil.iter_modules(simulators.controllers.__path__):
         module = importlib.import_module(f"simulators.controllers.{entry.name}")
         kinds.update(getattr(module, "SERVES", {}))
     for plugin in entry_points(group="umov.emulators"):
-        kinds.update(plugin.load().SERVES)
+        serves = plugin.load().SERVES
+        if taken := kinds.keys() & serves.keys():
+            raise ValueError(f"plug-in {plugin.value} serves {', '.join(sorted(taken))}, which exists already")
+        kinds.update(serves)
     return dict(sorted(kinds.items()))

@@ -177,7 +177,17 @@ class Emulator(ABC):
     ----------
     axes : sequence of EmulatedAxis
     faults : FaultSchedule, optional
+
+    Attributes
+    ----------
+    pieces : sequence of bytes
+        Pieces of real commands: with them the noise of the conformance tests gets past the first letter.
+    tells_limits : bool
+        False where the controller does not tell the limits of its travel.
     """
+
+    pieces: Sequence[bytes] = ()
+    tells_limits: bool = True
 
     def __init__(self, axes: Sequence[EmulatedAxis], clock: Clock, faults: FaultSchedule | None = None) -> None:
         self.axes = list(axes)

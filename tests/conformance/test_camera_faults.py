@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from drivers.camera import CameraSettings
 from drivers.cameras import aravis
-from drivers.errors import CameraBusy, CameraError, CameraLost, FrameLost
+from drivers.errors import CameraError, FrameLost
 from simulators.camera.gige_camera import ExposureInfo, GigeCamera
 from simulators.camera.pixel_stamp import read_stamp, stamp
 from simulators.clock import patient_clock
@@ -80,34 +80,6 @@ def test_an_incomplete_frame_is_retaken_logged_and_counted(
     assert [record.getMessage() for record in caplog.records if "retake 1 of 3" in record.getMessage()]
 
 
-def test_a_frame_of_which_nothing_came_is_retaken(
-    scene: Scene, simulated: GigeCamera, camera: aravis.AravisCamera
-) -> None:
-    scene.before = lambda number: setattr(simulated, "lost_ratio", 1.0 if number == 2 else 0.0)
-    assert [read_stamp(frame.pixels)[2] for frame in camera.capture(3)] == [1, 3, 4]
-    assert camera.statistics().retakes == 1
-
-
-def test_after_the_last_retake_the_frame_is_lost(simulated: GigeCamera, camera: aravis.AravisCamera) -> None:
-    simulated.lost_ratio = 0.5
-    with pytest.raises(FrameLost, match="4 tries in a row failed"):
-        camera.capture()
-    simulated.lost_ratio = 0.0
-    camera.capture()
-
-
-def test_a_split_exposure_is_never_retaken_by_itself(
-    scene: Scene, simulated: GigeCamera, camera: aravis.AravisCamera
-) -> None:
-    # After wait_exposed the bench may have moved, so only the caller can take it again.
-    simulated.lost_ratio = 0.5
-    exposure = camera.trigger()
-    exposure.wait_exposed()
-    with pytest.raises(FrameLost):
-        exposure.frame()
-    assert scene.exposures == 1
-
-
 def test_two_percent_of_packets_lost_costs_time_and_nothing_else(scene: Scene, simulated: GigeCamera) -> None:
     # 14 packets a frame: one frame in four is hit, and that none of 40 is happens once in 80 000 runs.
     config = aravis.Config(device="127.0.0.1", packet_size=1500, bits=12, retakes=12)
@@ -123,39 +95,6 @@ def test_two_percent_of_packets_lost_costs_time_and_nothing_else(scene: Scene, s
     assert statistics.retakes > 0
     assert scene.exposures == 40 + statistics.retakes
     assert statistics.completed == 40
-
-
-def test_every_frame_of_a_40_state_run_belongs_to_its_angle(scene: Scene, camera: aravis.AravisCamera) -> None:
-    # The bench starts to move as soon as the exposure has ended, while the frame is still on its way.
-    seen = []
-    for state in range(40):
-        scene.angle_deg = 9.0 * state
-        exposure = camera.trigger()
-        exposure.wait_exposed()
-        scene.angle_deg = -1.0
-        seen.append(read_stamp(exposure.frame().pixels)[0])
-    assert seen == [9.0 * state for state in range(40)]
-    assert camera.statistics().stale_discarded == 0
-
-
-def test_a_frame_in_flight_when_a_setting_changes_is_thrown_away(scene: Scene, camera: aravis.AravisCamera) -> None:
-    camera.configure(CameraSettings(exposure_s=0.1))
-    camera.trigger()
-    camera.configure(CameraSettings(exposure_s=0.02))
-    for frame in camera.capture(2):
-        assert read_stamp(frame.pixels)[1] == pytest.approx(0.02)
-    assert camera.statistics().stale_discarded == 1
-    assert scene.exposures == 3
-
-
-def test_an_exposure_that_nobody_collects_does_not_become_the_next_frame(
-    scene: Scene, camera: aravis.AravisCamera
-) -> None:
-    scene.angle_deg = 1.0
-    camera.trigger().wait_exposed()
-    scene.angle_deg = 2.0
-    assert read_stamp(camera.trigger().frame().pixels)[0] == 2.0
-    assert camera.statistics().stale_discarded == 1
 
 
 @pytest.mark.parametrize("pause_s", [0.9, 0.3])
@@ -192,33 +131,6 @@ def test_a_stray_frame_that_arrives_after_the_trigger_is_not_taken_for_its_own(
         assert read_stamp(frame.pixels)[0] == 2.0
     assert camera.statistics().stale_discarded == 3
     assert camera.statistics().retakes == 0
-
-
-def test_a_camera_that_vanishes_is_noticed_and_can_be_opened_again(
-    scene: Scene, simulated: GigeCamera, camera: aravis.AravisCamera
-) -> None:
-    camera.capture(2)
-    exposure = camera.trigger()
-    simulated.vanish()
-    gone_s = patient_clock().now_s()
-    with pytest.raises(CameraLost, match=r"does not answer|obeys another"):
-        exposure.frame()
-    assert patient_clock().now_s() - gone_s < 10
-    with pytest.raises(CameraLost):
-        camera.capture()
-    closing_s = patient_clock().now_s()
-    camera.close()
-    assert patient_clock().now_s() - closing_s < 1
-    simulated.start()
-    with aravis.open("camera", aravis.Config(device="127.0.0.1", bits=12), patient_clock()) as again:
-        again.configure(CameraSettings(exposure_s=1e-3))
-        assert read_stamp(again.capture()[0].pixels)[2] == scene.exposures
-
-
-def test_a_second_program_is_refused_and_the_first_goes_on(camera: aravis.AravisCamera) -> None:
-    with pytest.raises(CameraBusy, match="another program controls it"):
-        aravis.open("second", aravis.Config(device="127.0.0.1"), patient_clock())
-    camera.capture()
 
 
 @pytest.fixture

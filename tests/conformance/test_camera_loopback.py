@@ -189,36 +189,6 @@ def test_left_aligned_counts_are_shifted_and_a_wrong_shift_is_noticed(bench: Ben
                 wrong.capture()
 
 
-def test_an_average_keeps_saturated_pixels_saturated(bench: Bench) -> None:
-    shown: list[int] = []
-
-    def flicker(info: ExposureInfo) -> NDArray[np.uint16]:
-        shown.append(info.frame_id)
-        pixels = np.full((info.height, info.width), 100 + 3 * len(shown), np.uint16)
-        pixels[0, 0] = 4095 if len(shown) == 2 else 0
-        return pixels
-
-    _, camera = bench(flicker)
-    camera.configure(CameraSettings(exposure_s=1e-4, frame_average=4))
-    exposure = camera.trigger()
-    exposure.wait_exposed()
-    assert len(shown) == 4
-    frame = exposure.frame()
-    assert frame.pixels[1, 1] == 108  # the mean of 103, 106, 109, 112 is 107.5
-    assert frame.pixels[0, 0] == 4095
-    assert frame.frame_id == shown[-1]
-    assert len(camera.capture(2)) == 2
-    assert len(shown) == 12
-
-
-def test_frames_stay_as_they_were_when_more_come(bench: Bench) -> None:
-    _, camera = bench()
-    camera.configure(DARK)
-    frames = camera.capture(12)
-    for frame in frames:
-        assert frame.pixels[0, 0] == frame.frame_id % 4096
-
-
 def test_frame_numbers_go_round(bench: Bench) -> None:
     _, camera = bench(size=(8, 4))
     camera.configure(DARK)
@@ -291,14 +261,6 @@ def test_packets_larger_than_the_interface_takes_are_refused(bench: Bench, monke
 def test_another_interface_than_the_rig_file_names_is_refused(bench: Bench) -> None:
     with pytest.raises(CameraError, match="reached over lo"):
         bench(config=aravis.Config(device="127.0.0.1", interface="eth7"))
-
-
-def test_a_closed_camera_says_so(bench: Bench) -> None:
-    _, camera = bench()
-    camera.close()
-    camera.close()
-    with pytest.raises(CameraError, match="closed"):
-        camera.configure(DARK)
 
 
 def test_without_gi_the_driver_can_be_imported_and_opening_says_what_is_missing() -> None:

@@ -3,136 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from types import ModuleType
-from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import CommandRejected, DeviceError, PortBusy, ReplyTimeout, WrongDevice
+from drivers.errors import CommandRejected, DeviceError
+from drivers.registry import device_kinds
 from drivers.serial_link import LineRegistry
 from drivers.source import LightSource
-from drivers.sources import dc2200, dc4100, fw102c, manual, sc10
+from drivers.sources import dc4100, manual
 from simulators.clock import Clock, patient_clock
-from simulators.controllers.dc2200 import DC2200Emulator
+from simulators.conformance import SourceConformance
+from simulators.conformance.source import source_kinds
 from simulators.controllers.dc4100 import DC4100Emulator
-from simulators.controllers.fw102c import FW102CEmulator
-from simulators.controllers.sc10 import SC10Emulator
-from simulators.serial.emulator import Emulator
+from simulators.rig.controller_kinds import served_kinds, source_configs
 from simulators.serial.pty_port import PtyPort
-from simulators.serial.reply_faults import parse_fault
+from simulators.serial.serve_options import ServeOptions
 
 
-@dataclass
-class Bench:
-    """A source behind its emulator."""
-
-    module: ModuleType
-    emulator: Emulator
-    port: PtyPort
-    lines: LineRegistry
-
-    def open(self, **options: Any) -> Any:
-        needed: dict[str, Any] = {"positions": {662.0: 3}, "dark_position": 6} if self.module is fw102c else {}
-        if self.module is dc2200:
-            needed = {"terminals": {662.0: 1, 451.0: 2}}
-        config = self.module.Config(port=self.port.path, **{"reply_s": 0.2, **needed, **options})
-        source = self.module.open(config, self.lines)
-        if source.selects_wavelength:
-            source.select(662.0)
-        return source
-
-    def true_light(self) -> bool:
-        """Whether light really comes out, which no reply tells."""
-        if isinstance(self.emulator, SC10Emulator):
-            return self.emulator.is_open()
-        if isinstance(self.emulator, FW102CEmulator | DC2200Emulator):
-            return bool(self.emulator.light_at(662.0))
-        assert isinstance(self.emulator, DC4100Emulator)
-        return bool(self.emulator.light())
+class TestEverySource(SourceConformance):
+    @pytest.fixture(params=source_kinds())
+    def kind(self, request: pytest.FixtureRequest) -> str:
+        return str(request.param)
 
 
-@pytest.fixture(params=["sc10", "dc2200", "dc4100", "fw102c"])
-def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
-    made: dict[str, tuple[ModuleType, Emulator]] = {
-        "sc10": (sc10, SC10Emulator(Clock(base=patient_clock()))),
-        "dc4100": (dc4100, DC4100Emulator(Clock(base=patient_clock()))),
-        "dc2200": (dc2200, DC2200Emulator(Clock(base=patient_clock()))),
-        "fw102c": (fw102c, FW102CEmulator(Clock(50.0, base=patient_clock()))),
+def test_every_kind_of_source_with_a_cable_has_an_emulator() -> None:
+    covered = {
+        config.kind  # type: ignore[attr-defined]
+        for kind in source_kinds()
+        for config in source_configs(served_kinds()[kind](ServeOptions()), "none")
     }
-    module, emulator = made[request.param]
-    port = PtyPort(emulator)
-    with LineRegistry(clock=patient_clock()) as lines:
-        yield Bench(module, emulator, port, lines)
-    port.close()
-
-
-def test_opening_and_closing_change_nothing(bench: Bench) -> None:
-    source = bench.open()
-    assert isinstance(source, LightSource)
-    assert not bench.true_light()
-    source.set_light(True)
-    source.close()
-    assert bench.true_light()
-    again = bench.open()
-    assert bench.true_light()
-    assert again.is_on()
-
-
-def test_light_goes_on_and_off_and_is_read_back(bench: Bench) -> None:
-    source = bench.open()
-    for on in (True, True, False, False, True):
-        source.set_light(on)
-        assert source.is_on() is on
-        assert bench.true_light() is on
-    assert source.interlock_open() is False
-
-
-def test_it_says_what_it_is(bench: Bench) -> None:
-    described = bench.open().describe()
-    assert described["kind"] == bench.module.__name__.rpartition(".")[2]
-    assert described["port"] == bench.port.path
-    assert described["model"]
-
-
-def test_a_silent_device_is_an_error_in_bounded_time(bench: Bench) -> None:
-    source = bench.open()
-    bench.emulator.faults.add(parse_fault("silent"))
-    start_s = patient_clock().now_s()
-    with pytest.raises(ReplyTimeout, match=bench.port.path):
-        source.set_light(True)
-    assert patient_clock().now_s() - start_s < 3
-
-
-@pytest.mark.parametrize("fault", ["silent", "garbled", "foreign"])
-@pytest.mark.parametrize("command", [1, 2, 3, 4])
-def test_one_bad_reply_never_leads_to_a_wrong_state(bench: Bench, fault: str, command: int) -> None:
-    source = bench.open()
-    counted = bench.emulator.faults.commands
-    bench.emulator.faults.add(parse_fault(f"{fault}@{counted + command}x1"))
-    try:
-        source.set_light(True)
-    except DeviceError:
-        return
-    assert bench.true_light()
-
-
-def test_another_device_on_the_port_is_named(bench: Bench) -> None:
-    bench.emulator.faults.add(parse_fault("foreign"))
-    with pytest.raises((WrongDevice, DeviceError), match=bench.port.path):
-        bench.open()
-
-
-def test_a_port_in_use_by_another_protocol_is_refused(bench: Bench) -> None:
-    bench.open()
-
-    class Other:
-        def close(self) -> None: ...
-
-    with pytest.raises(PortBusy):
-        bench.lines.take(bench.port.path, Other, lambda _: Other())
+    assert covered == set(device_kinds("sources")) - {"manual"}
 
 
 def test_a_source_without_a_choice_says_so() -> None:

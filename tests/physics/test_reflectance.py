@@ -10,6 +10,7 @@ from processing.polarization import mueller
 from processing.reflectance import fresnel, polarized_diffuse
 from processing.reflectance.base import kinds, load_reflectance, normalized_mueller
 from processing.yaml_file import ConfigError
+from simulators.conformance import ReflectanceConformance
 
 CONSTANTS = {"n": 1.3, "k": 0.08, "a": 0.17, "b": 2.0}
 
@@ -72,30 +73,17 @@ def test_first_surface_polarizes_vertically_and_fully_at_brewster():
     assert m[0, 1] == pytest.approx(-1)
 
 
-@pytest.mark.parametrize("kind", sorted(kinds()))
-def test_every_model_is_a_physical_mueller_jones_matrix(kind):
-    m = model(kind).mueller_jones(geometry(), 662)
-    values = np.linalg.eigvalsh(mueller.coherency(m)) / 2
-    np.testing.assert_allclose(m[:, 0, 0], 1)
-    np.testing.assert_allclose(values[:, 3], 1, atol=1e-12)
-    np.testing.assert_allclose(values[:, :3], 0, atol=1e-12)
+class TestFirstSurface(ReflectanceConformance):
+    material = "{kind: first_surface, name: test, constants: {662: {n: 1.3, k: 0.08}}}"
 
 
-@pytest.mark.parametrize("kind", sorted(kinds()))
-def test_every_model_is_reciprocal(kind):
-    # Each beam runs backwards: its x turns round, y stays.
-    flip = np.diag([1.0, 1.0, -1.0, 1.0])
-    g = geometry()
-    forward = model(kind).mueller_jones(g, 662)
-    backward = model(kind).mueller_jones(g.reversed(), 662)
-    np.testing.assert_allclose(backward, flip @ np.swapaxes(forward, -1, -2) @ flip, atol=1e-11)
+class TestPolarizedDiffuse(ReflectanceConformance):
+    material = "{kind: polarized_diffuse, name: test, constants: {662: {n: 1.3, k: 0.08, a: 0.17, b: 2.0}}}"
 
 
-@pytest.mark.parametrize("kind", sorted(kinds()))
-def test_jones_and_mueller_agree(kind):
-    g = geometry(50)
-    m = mueller.from_jones(model(kind).jones(g, 662))
-    np.testing.assert_allclose(model(kind).mueller_jones(g, 662), m / m[:, :1, :1], atol=1e-12)
+def test_every_model_passes_the_conformance_kit():
+    materials = (TestFirstSurface.material, TestPolarizedDiffuse.material)
+    assert {material.split(",")[0].removeprefix("{kind: ") for material in materials} == set(kinds())
 
 
 def test_first_surface_does_not_know_the_normal():

@@ -1,0 +1,84 @@
+"""An emulated axis for the conformance tests: a fast clock, short waits, a port of its own."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
+import pytest
+
+from drivers.motion import AxisConfig, MotionAxis
+from drivers.registry import open_axis
+from drivers.serial_link import LineRegistry
+from simulators.clock import Clock, patient_clock
+from simulators.rig.controller_kinds import axis_configs, served_kinds
+from simulators.serial.emulator import Emulator
+from simulators.serial.pty_port import PtyPort
+from simulators.serial.reply_faults import FaultSchedule
+from simulators.serial.serve_options import ServeOptions
+from simulators.serial.tcp_port import TcpPort, port_for
+
+WIDE = (-1000.0, 1000.0)
+FAST = 200.0
+
+
+class ServedAxis:
+    """What every conformance class of an axis needs: the name under which its emulator is served.
+
+    Attributes
+    ----------
+    emulator : str
+        As `simulate serve` calls it: a key of the `SERVES` table of the emulator's module.
+    """
+
+    emulator: ClassVar[str] = ""
+
+    @pytest.fixture
+    def kind(self) -> str:
+        """The emulator's name; a class for several kinds overrides this by a fixture with parameters."""
+        return self.emulator
+
+
+@dataclass
+class Bench:
+    """An emulator behind a port, and the rig entries that open it."""
+
+    emulator: Emulator
+    port: PtyPort | TcpPort
+    lines: LineRegistry
+    configs: list[AxisConfig]
+
+    def open(self, index: int = 0, **changes: object) -> MotionAxis:
+        """Open an axis with short waits, as the emulator is fast."""
+        config = self.configs[index]
+        short = {"poll_s": 0.002, "margin_s": 0.3, "stall_s": 0.3, "reply_s": 0.25, "pause_before_move_s": 0.0}
+        known = {name: value for name, value in short.items() if name in type(config).model_fields}
+        config = config.model_copy(update=known | changes)
+        return open_axis(f"axis{index}", type(config).model_validate(config.model_dump()), self.lines)
+
+
+@contextlib.contextmanager
+def served(kind: str, homed: bool = True, speed: float = FAST, **options: object) -> Iterator[Bench]:
+    """Serve one kind; homed by default, so that a test need not wait for homing."""
+    options = {"limits_deg": WIDE, "faults": FaultSchedule(seed=7)} | options
+    emulator = served_kinds()[kind](ServeOptions(homed=homed, clock=Clock(speed, base=patient_clock()), **options))  # type: ignore[arg-type]
+    with port_for(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
+        yield Bench(emulator, port, lines, axis_configs(emulator, port.path, homed=homed))
+
+
+def motion_kinds(axes: int = 1) -> list[str]:
+    """Emulators of motion controllers, those of plug-ins too, that can serve so many axes."""
+    kinds = []
+    for kind, make in served_kinds().items():
+        # A controller of one axis refuses to be made with more.
+        with contextlib.suppress(ValueError):
+            if len(axis_configs(make(ServeOptions(axes=axes)), "none")) == axes:
+                kinds.append(kind)
+    return kinds
+
+
+def serial_kinds() -> list[str]:
+    """Those behind a serial port: a controller on the network takes several programs at once."""
+    return [kind for kind in motion_kinds() if not hasattr(served_kinds()[kind](ServeOptions()), "connect")]

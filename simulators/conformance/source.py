@@ -1,0 +1,136 @@
+"""What every light source owes: its light follows, is read back, and never ends in a state that nobody knows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
+import pytest
+from pydantic import BaseModel
+
+from drivers.errors import DeviceError, PortBusy, ReplyTimeout
+from drivers.registry import open_source
+from drivers.serial_link import LineRegistry
+from drivers.source import LightSource
+from simulators.clock import Clock, patient_clock
+from simulators.rig.controller_kinds import served_kinds, source_configs
+from simulators.serial.emulator import Emulator
+from simulators.serial.pty_port import PtyPort
+from simulators.serial.reply_faults import parse_fault
+from simulators.serial.serve_options import ServeOptions
+
+
+@dataclass
+class SourceBench:
+    """A source behind its emulator, and the rig entry that opens it."""
+
+    emulator: Emulator
+    port: PtyPort
+    lines: LineRegistry
+    config: BaseModel
+    wavelength_nm: float
+
+    def open(self) -> LightSource:
+        """Open it with a short wait for replies and choose the wavelength, where it has a choice."""
+        known = {"reply_s": 0.2} if "reply_s" in type(self.config).model_fields else {}
+        source = open_source(self.config.model_copy(update=known), self.lines)
+        if source.selects_wavelength:
+            source.select(self.wavelength_nm)
+        return source
+
+    def true_light(self) -> bool:
+        """Whether light really comes out, which no reply tells."""
+        return self.emulator.light_at(self.wavelength_nm) > 0
+
+
+def source_kinds() -> list[str]:
+    """Emulators of light sources, those of plug-ins too."""
+    return [kind for kind, make in served_kinds().items() if source_configs(make(ServeOptions()), "none")]
+
+
+class SourceConformance:
+    """Tests of a light source on its emulator.
+
+    Attributes
+    ----------
+    emulator : str
+        As `simulate serve` calls it: a key of the `SERVES` table of the emulator's module, which makes the rig entry
+        by its function `source_configs`.
+    wavelength_nm : float
+        One that the emulated source has.
+    """
+
+    emulator: ClassVar[str] = ""
+    wavelength_nm: ClassVar[float] = 662.0
+
+    @pytest.fixture
+    def kind(self) -> str:
+        """The emulator's name; a class for several kinds overrides this by a fixture with parameters."""
+        return self.emulator
+
+    @pytest.fixture
+    def bench(self, kind: str) -> Iterator[SourceBench]:
+        """The emulator behind a port, dark as it is when it is switched on."""
+        emulator = served_kinds()[kind](ServeOptions(clock=Clock(50.0, base=patient_clock())))
+        with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
+            (config,) = source_configs(emulator, port.path)
+            yield SourceBench(emulator, port, lines, config, self.wavelength_nm)
+
+    def test_opening_and_closing_change_nothing(self, bench: SourceBench) -> None:
+        source = bench.open()
+        assert not bench.true_light()
+        source.set_light(True)
+        source.close()
+        assert bench.true_light()
+        again = bench.open()
+        assert bench.true_light()
+        assert again.is_on()
+
+    def test_light_goes_on_and_off_and_is_read_back(self, bench: SourceBench) -> None:
+        source = bench.open()
+        for on in (True, True, False, False, True):
+            source.set_light(on)
+            assert source.is_on() is on
+            assert bench.true_light() is on
+        assert source.interlock_open() is False
+
+    def test_it_says_what_it_is(self, bench: SourceBench) -> None:
+        described = bench.open().describe()
+        assert described["kind"] == bench.config.kind  # type: ignore[attr-defined]
+        assert described["port"] == bench.port.path
+        assert described["model"]
+
+    def test_a_silent_device_is_an_error_in_bounded_time(self, bench: SourceBench) -> None:
+        source = bench.open()
+        bench.emulator.faults.add(parse_fault("silent"))
+        start_s = patient_clock().now_s()
+        with pytest.raises(ReplyTimeout, match=bench.port.path):
+            source.set_light(True)
+        assert patient_clock().now_s() - start_s < 3
+
+    @pytest.mark.parametrize("fault", ["silent", "garbled", "foreign"])
+    @pytest.mark.parametrize("command", [1, 2, 3, 4])
+    def test_one_bad_reply_never_leads_to_a_wrong_state(self, bench: SourceBench, fault: str, command: int) -> None:
+        source = bench.open()
+        counted = bench.emulator.faults.commands
+        bench.emulator.faults.add(parse_fault(f"{fault}@{counted + command}x1"))
+        try:
+            source.set_light(True)
+        except DeviceError:
+            return
+        assert bench.true_light()
+
+    def test_another_device_on_the_port_is_named(self, bench: SourceBench) -> None:
+        bench.emulator.faults.add(parse_fault("foreign"))
+        with pytest.raises(DeviceError, match=bench.port.path):
+            bench.open()
+
+    def test_a_port_in_use_by_another_protocol_is_refused(self, bench: SourceBench) -> None:
+        bench.open()
+
+        class Other:
+            def close(self) -> None: ...
+
+        with pytest.raises(PortBusy):
+            bench.lines.take(bench.port.path, Other, lambda _: Other())
