@@ -124,7 +124,7 @@ def _of_capture(path: Path) -> xr.Dataset:
         column = {name: capture.column(name) for name in ("exposure_s", "host_time_s")}
         coords: dict[str, Any] = {
             "state": ("state", capture.done, {"long_name": "number in the plan"}),
-            "channel": ("channel", list(capture.header.channels)),
+            "channel": ("channel", list(capture.channel_names)),
             "y": ("y", np.arange(counts.shape[2]), {"units": "pixel"}),
             "x": ("x", np.arange(counts.shape[3]), {"units": "pixel"}),
             "role": ("state", list(capture.role)),
@@ -135,7 +135,9 @@ def _of_capture(path: Path) -> xr.Dataset:
             coords[f"{axis}_deg"] = ("state", values, {"units": "degree", "long_name": f"{axis}, as read back"})
         attributes = {"units": "count", "long_name": "counts as stored"}
         variables = {"counts": (("state", "channel", "y", "x"), counts, attributes)}
-        return xr.Dataset(variables, coords, _attributes(capture.header, capture.simulated))
+        # What was cut apart here is channels from now on.
+        header = capture.header.model_copy(update={"channels": capture.channel_names, "beams": None})
+        return xr.Dataset(variables, coords, _attributes(header, capture.simulated))
 
 
 def _of_product(path: Path) -> xr.Dataset:

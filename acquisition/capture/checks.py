@@ -86,13 +86,17 @@ def check_table(table: StateTable, rig: RigConfig, instrument: InstrumentModel) 
     """Forbidden poses of every state and step, and whether the states determine a Mueller matrix."""
     poses = [{axis: float(column[k]) for axis, column in table.angles_deg.items()} for k in range(len(table))]
     checks = _free_ways(rig, poses)
-    if instrument.mosaic is None and instrument.axes:
-        light = [k for k, role in enumerate(table.role) if role != "dark"]
-        lacking = [axis for axis in instrument.axes if axis not in table.angles_deg]
-        if lacking:
-            found = f"instrument {instrument.name!r} turns with {', '.join(lacking)}, the plan does not"
-            return [*checks, Check("instrument", False, found)]
-        angles = {axis: table.angles_deg[axis][light] for axis in instrument.axes}
+    lacking = [axis for axis in instrument.axes if axis not in table.angles_deg]
+    if lacking:
+        found = f"instrument {instrument.name!r} turns with {', '.join(lacking)}, the plan does not"
+        return [*checks, Check("instrument", False, found)]
+    if len(instrument.channels) > 1 and instrument.mosaic is None and instrument.beams is None:
+        found = f"{len(instrument.channels)} channels on one camera: the instrument file says by `beams` where they lie"
+        return [*checks, Check("instrument", False, found)]
+    light = [k for k, role in enumerate(table.role) if role != "dark"]
+    angles = {axis: table.angles_deg[axis][light] for axis in instrument.axes}
+    # A mosaic before which nothing turns measures one linear Stokes vector.
+    if angles and (instrument.mosaic is None or any(np.ptp(turned) > 0 for turned in angles.values())):
         w = instrument.rows(angles, changes_at(instrument, angles))
         basis = determined_basis(instrument)
         r, wanted = rank(w), basis.shape[1]

@@ -28,6 +28,7 @@ from processing.instrument.model import InstrumentModel
 from processing.instrument.states import StateTable
 from processing.storage.capture import Capture
 from processing.storage.capture_schema import Status
+from processing.storage.frame_layout import Beams
 from processing.yaml_file import parse_yaml
 
 
@@ -90,6 +91,8 @@ def check_with_devices(job: Job, rig: Rig, folder: Path) -> list[Check]:
     if job.instrument.mosaic is not None:
         checks.append(_check_mosaic(job.instrument, rig))
     rows, columns = frame_shape(rig)
+    if job.instrument.beams is not None:
+        checks.append(_check_beams(job.instrument.beams, rows, columns))
     needed = bytes_needed(len(job.table), 1, (rows, columns))
     try:
         check_space(existing(folder), needed)
@@ -105,6 +108,14 @@ def _check_mosaic(instrument: InstrumentModel, rig: Rig) -> Check:
     except AcquisitionError as error:
         return Check("mosaic", False, str(error))
     return Check("mosaic", True, "from the top left: " + " / ".join(" ".join(line) for line in mosaic))
+
+
+def _check_beams(beams: tuple[str, ...], rows: int, columns: int) -> Check:
+    try:
+        height, width = Beams(beams).shape((rows, columns))
+    except ValueError as error:
+        return Check("beams", False, f"{error}. Change the camera's width")
+    return Check("beams", True, f"from the left: {', '.join(beams)}, {width} x {height} pixels each")
 
 
 def job_of(path: Path, rig: RigConfig | None = None, plan: MeasurementPlan | None = None) -> Job:

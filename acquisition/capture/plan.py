@@ -21,7 +21,8 @@ from processing.instrument.states import (
 from processing.storage.capture_schema import Sample
 from processing.yaml_file import ConfigError, load_yaml, message_of
 
-Mode = Literal["drr", "stokes"]
+#: Name of a mode of the rig file; file names of captures hold it.
+Mode = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
 
 #: The axis that sets Omega, where the rig has one.
 ARM = "arm"
@@ -32,16 +33,20 @@ class _Part(BaseModel):
 
 
 class RotatingRetarders(_Part):
-    """Equal steps of the generator retarder; the analyzer retarder turns `ratio` times as far."""
+    """Equal steps of the generator retarder; the analyzer retarder turns `ratio` times as far.
+
+    `axes` names the generator's axis and the analyzer's.
+    """
 
     kind: Literal["rotating_retarders"] = "rotating_retarders"
     states: int = Field(default=RGB950_STATES, gt=0, le=10_000)
     step_deg: float = Field(default=RGB950_STEP_DEG, allow_inf_nan=False)
     ratio: float = Field(default=RGB950_RATIO, allow_inf_nan=False)
+    axes: tuple[str, str] = ("psg", "psa")
 
     def angles_deg(self) -> dict[str, NDArray[np.float64]]:
         """Target angles of each axis (states,), degrees."""
-        return dict(rotating_retarders(1.0, self.states, self.step_deg, self.ratio).angles_deg)
+        return dict(rotating_retarders(1.0, self.states, self.step_deg, self.ratio, axes=self.axes).angles_deg)
 
 
 class FixedPose(_Part):

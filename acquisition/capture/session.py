@@ -79,9 +79,9 @@ def resume(
     place_sample(job, rig)
     with Capture(partial) as capture:
         done = set(capture.done.tolist())
-        if capture.frame_shape != frame_shape(rig):
+        if capture.stored_shape != frame_shape(rig):
             raise AcquisitionError(
-                f"{partial} has frames of {capture.frame_shape}, the camera gives {frame_shape(rig)}. "
+                f"{partial} has frames of {capture.stored_shape}, the camera gives {frame_shape(rig)}. "
                 "Go on with the camera and the settings that began it."
             )
         job = replace(job, instrument=seen_by_camera(job.instrument, rig.require_camera()))

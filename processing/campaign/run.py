@@ -101,6 +101,7 @@ def find_captures(
         try:
             with Capture(path) as capture:
                 header, simulated, flat = capture.header, capture.simulated, FlatCapture.of(capture)
+                stokes = capture.header.mosaic is not None and not capture.turned_mosaic
         except CaptureError as error:
             left_out.append(f"{path}: {error}")
             continue
@@ -110,7 +111,7 @@ def find_captures(
             left_out.append(f"{path}: no arm angle" if header.omega_deg is None else f"{path}: {header.sample.kind}")
             continue
         kinds[path] = simulated
-        kind = "stokes" if header.mosaic else "mueller"
+        kind = "stokes" if stokes else "mueller"
         found.append((path, kind, float(header.wavelength_nm), float(header.omega_deg)))
     if not found:
         raise ProcessError(f"{folder} holds no capture of an object with an arm angle. {' '.join(left_out[:3])}")

@@ -166,6 +166,7 @@ class InstrumentModel(_Part):
 
     `mosaic`, for a division-of-focal-plane sensor, lays out the channel names over the super-pixel, row by
     row from the top left, e.g. (("90", "45"), ("135", "0")).
+    `beams` names the channels whose images lie side by side on one detector, in equal parts of its columns.
     `calibrate` names values ("element.field") that are only nominal: `diagnose` fits them to captures of known samples.
     An effect of scope "capture" holds for the captures that it names and for no other.
     `systematic` is what `diagnose` leaves uncertain; `process reduce` carries it into its error bars.
@@ -181,6 +182,7 @@ class InstrumentModel(_Part):
     analyzer: tuple[AnyElement, ...]
     channels: tuple[Channel, ...] = (Channel(name="camera"),)
     mosaic: tuple[tuple[str, ...], ...] | None = None
+    beams: tuple[str, ...] | None = None
     calibrate: tuple[str, ...] = ()
     free_source: bool = False
     effects: tuple[AppliedEffect, ...] = ()
@@ -199,6 +201,8 @@ class InstrumentModel(_Part):
             raise ValueError("free_source needs two channels or more: with one, nothing is left over")
         if self.mosaic is not None and sorted(n for row in self.mosaic for n in row) != sorted(channels):
             raise ValueError("the mosaic must name each channel exactly once")
+        if self.beams is not None and (self.mosaic is not None or self.beams != tuple(channels)):
+            raise ValueError("beams must name the channels in their order, and there is no mosaic beside them")
         return self
 
     @classmethod

@@ -62,10 +62,12 @@ class Correction:
         for other, name in ((dark_from, "dark"), *((c, "flat") for c in flat_from)):
             if other is not None:
                 _check_partner(capture, other, name)
-        if bad is not None and bad.shape != capture.frame_shape:
+        if bad is not None and bad.shape != capture.stored_shape:
             raise CaptureError(
-                f"the bad-pixel map is {bad.shape}, the frames of {capture.path} are {capture.frame_shape}."
+                f"the bad-pixel map is {bad.shape}, the frames of {capture.path} are {capture.stored_shape}."
             )
+        if bad is not None and capture.layout is not None:
+            bad = np.any(capture.layout.split(bad), axis=0)
         light = capture.column("exposure_s")[_light(capture)].astype(float)
         black = Black.of(dark_from or capture) or Black.level(capture.header.detector.black_level_counts)
         source = black.in_words(light) + (f" of {dark_from.path.name}" if dark_from else "")

@@ -226,9 +226,9 @@ def reduce_mueller(
     reader = BlockReader(capture, states, correction, counts_correction(changes, model))
     choice = choice or Choice()
     noise = choice.noise or NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
-    if inversion.rank < ELEMENTS and (choice.weighted or (changes is not None and changes.field_retardance_rad)):
+    if inversion.rank < ELEMENTS and (choice.physical or (changes is not None and changes.field_retardance_rad)):
         raise ProcessError(
-            f"{capture.path}: instrument {model.name!r} determines {inversion.rank} of 16 numbers; --weighted and "
+            f"{capture.path}: instrument {model.name!r} determines {inversion.rank} of 16 numbers; --physical and "
             "field_retardance need all of them. Leave them away."
         )
     solver = choice.solver(MuellerSolver(inversion, reader, noise), field_of(capture, model, states, changes))
@@ -298,6 +298,8 @@ def _block(
     if unseen.any():
         found["mueller"][unseen] = np.nan
         found["mueller_errors"][unseen] = np.nan
+        if "mueller_covariance" in found:
+            found["mueller_covariance"][(unseen[:, None] | unseen)[np.tril_indices(ELEMENTS)]] = np.nan
     if systematic is not None:
         found["mueller_systematic"] = systematic.errors(found["mueller"])
     for name, values in found.items():

@@ -48,7 +48,7 @@ class Reduction(FileStep):
     def kind(self) -> str:
         """Of the product: "mueller" or "stokes"."""
         with Capture(self.capture) as capture:
-            return "stokes" if capture.header.mosaic else "mueller"
+            return "stokes" if capture.header.mosaic and not capture.turned_mosaic else "mueller"
 
     @property
     def usual_path(self) -> Path:
@@ -59,14 +59,13 @@ class Reduction(FileStep):
         """Options and contents; the capture's name is among the options, for effects of single captures go by it."""
         with Capture(self.capture) as capture:
             flats = [_flat_file(path, capture) for path in self.flat]
-            mosaic = capture.header.mosaic is not None
-        if mosaic:
+        if self.kind == "stokes":
             self._refuse(
                 ("weighted", "covariance", "physical"), "a mosaic capture; its product holds the covariance of S always"
             )
             options: dict[str, Any] = {"demosaic": self.demosaic or _default_method()}
         else:
-            self._refuse(("demosaic", "analyzers"), "not a mosaic capture")
+            self._refuse(("demosaic", "analyzers"), "reduced super-pixel by super-pixel, or has no mosaic")
             options = {name: getattr(self, name) for name in ("weighted", "covariance", "physical")}
         named = ("capture", "instrument", "camera", "dark", "analyzers")
         files = [(role, getattr(self, role)) for role in named] + [("flat", path) for path in flats]
@@ -80,13 +79,18 @@ class Reduction(FileStep):
 
     def _write(self, out: Path, record: Step, overwrite: bool, progress: Progress | None) -> None:
         flats = [Path(i["path"]) for i in record.inputs if i["role"] == "flat"]
+        mueller = self.kind == "mueller"
         with ExitStack() as stack:
-            capture = stack.enter_context(Capture(self.capture))
-            dark = stack.enter_context(Capture(self.dark)) if self.dark else None
+
+            def opened(path: Path) -> Capture:
+                return stack.enter_context(Capture(path, by_super_pixel=mueller))
+
+            capture = opened(self.capture)
+            dark = opened(self.dark) if self.dark else None
             noise, bad = read_camera(self.camera) if self.camera else (None, None)
-            correction = Correction.of(capture, bad, dark, [stack.enter_context(Capture(path)) for path in flats])
+            correction = Correction.of(capture, bad, dark, [opened(path) for path in flats])
             model = choose_model(capture, self.instrument)
-            if not capture.header.mosaic:
+            if mueller:
                 choice = Choice(self.weighted, self.covariance, self.physical, noise)
                 reduce_mueller(capture, model, out, (record,), correction, choice, overwrite, progress)
                 return

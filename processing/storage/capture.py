@@ -19,6 +19,7 @@ from processing.instrument.model import InstrumentModel
 from processing.storage.capture_door import check_capture
 from processing.storage.capture_schema import SCHEMA_VERSION, CaptureHeader
 from processing.storage.checksums import NONE, row_crc32, state_crc32, summed_values
+from processing.storage.frame_layout import Beams, Cells, FrameLayout
 from processing.storage.h5_door import damage_as, open_h5, text_attribute
 from processing.storage.segments import Segment, decode_lines, segments_of
 from processing.yaml_file import parse_yaml
@@ -36,6 +37,9 @@ class Capture:
     Parameters
     ----------
     verify : False to look at damaged states as well, for `damaged_states`.
+    by_super_pixel : of a polarization mosaic, give each super-pixel as one pixel with four channels.
+
+    Images of several beams on one detector are channels always.
 
     Attributes
     ----------
@@ -44,9 +48,10 @@ class Capture:
     angles_deg : dict of axis name to array (states,), degrees as read back
     """
 
-    def __init__(self, path: Path | str, *, verify: bool = True) -> None:
+    def __init__(self, path: Path | str, *, verify: bool = True, by_super_pixel: bool = False) -> None:
         self.path = Path(path)
         self._verifying = verify
+        self._by_super_pixel = by_super_pixel
         self._h5 = _open(self.path)
         try:
             with damage_as(CaptureError, f"{self.path} is not a whole umov capture"):
@@ -82,6 +87,7 @@ class Capture:
             if group.attrs.get("NX_class") == "NXpositioner"
         }
         self._frames: h5py.Dataset = entry["instrument/detector/data"]
+        self.layout = self._layout()
         self._contradictory: list[int] = []
         self._sums = self._verified_sums(entry) if version > 1 else None
 
@@ -130,6 +136,19 @@ class Capture:
         """A column of the state table (exposure_s, host_time_s, ...) for the states done."""
         return self.planned_column(name)[self.done]
 
+    @property
+    def turned_mosaic(self) -> bool:
+        """Whether a polarization mosaic looks through, or into light of, elements that turn between the states.
+
+        Each super-pixel then determines a part of the Mueller matrix; if nothing turns, one linear Stokes vector.
+        """
+        if self.header.mosaic is None or self.instrument is None:
+            return False
+        light = np.array([role not in ("dark", "flat") for role in self.role], dtype=bool)
+        targets = self.planned_targets_deg()
+        turned = [targets[axis][self.done][light] for axis in self.instrument.axes if axis in targets]
+        return any(np.ptp(angles) > 0 for angles in turned if angles.size)
+
     def seen(self, model: InstrumentModel) -> InstrumentModel:
         """The model with the mosaic as this capture's frames have it: an odd offset of the region shifts it."""
         if model.mosaic is None or self.header.mosaic is None:
@@ -166,15 +185,35 @@ class Capture:
         with self._damage():
             return {name: self._h5[f"entry/instrument/{name}/target_value"][...] for name in self.angles_deg}
 
+    def _layout(self) -> FrameLayout | None:
+        layout: FrameLayout | None = None
+        if self.header.beams:
+            layout = Beams(self.header.beams)
+        elif self._by_super_pixel and self.header.mosaic and self.instrument:
+            layout = Cells(self.header.mosaic, tuple(c.name for c in self.instrument.channels))
+        if layout is not None:
+            layout.shape(self.stored_shape)
+        return layout
+
+    @property
+    def stored_shape(self) -> tuple[int, int]:
+        """(rows, columns) of a frame as the detector gave it."""
+        return int(self._frames.shape[2]), int(self._frames.shape[3])
+
     @property
     def frame_shape(self) -> tuple[int, int]:
-        """(rows, columns) of one frame."""
-        return int(self._frames.shape[2]), int(self._frames.shape[3])
+        """(rows, columns) of the image of one channel."""
+        return self.stored_shape if self.layout is None else self.layout.shape(self.stored_shape)
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the spatially separate channels; one, "mosaic", for a mosaic."""
+        return self.header.channels if self.layout is None else self.layout.channels
 
     @property
     def channels(self) -> int:
         """Number of spatially separate channels (1 for a mosaic)."""
-        return int(self._frames.shape[1])
+        return len(self.channel_names)
 
     def states_with(self, role: str) -> NDArray[np.int64]:
         """Positions, among the states done, of those with the role."""
@@ -182,10 +221,11 @@ class Capture:
 
     def frames(self, state: int, rows: slice = slice(None)) -> NDArray[Any]:
         """Counts (channels, rows, columns) of one state done, as stored."""
+        stored = rows if self.layout is None or rows == slice(None) else self.layout.stored_rows(rows)
         with self._damage():
-            counts = np.asarray(self._frames[int(self.done[state]), :, rows, :])
-        self._verify(state, rows, counts)
-        return counts
+            counts = np.asarray(self._frames[int(self.done[state]), :, stored, :])
+        self._verify(state, stored, counts)
+        return counts if self.layout is None else self.layout.split(counts[0])
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -200,6 +240,10 @@ class Capture:
 
     def read_block(self, states: NDArray[np.int64], rows: slice, out: NDArray[Any]) -> None:
         """Fill `out` (len(states), channels, rows, columns) with counts of states done, as stored."""
+        if self.layout is not None:
+            for k, state in enumerate(states):
+                out[k] = self.frames(int(state), rows)
+            return
         with self._damage():
             for k, state in enumerate(states):
                 self._frames.read_direct(out, np.s_[int(self.done[state]), :, rows, :], np.s_[k])

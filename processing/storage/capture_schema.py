@@ -97,6 +97,8 @@ class CaptureHeader(_Part):
     detector: Detector = Detector()
     channels: tuple[str, ...] = ("camera",)
     mosaic: tuple[tuple[str, ...], ...] | None = None
+    #: Names of the channels whose images lie side by side in each frame.
+    beams: tuple[str, ...] | None = None
     instrument_yaml: str = ""
     plan_yaml: str = ""
     rig_yaml: str = ""

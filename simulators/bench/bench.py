@@ -90,7 +90,7 @@ class SimulatedBench:
         self.seed = seed
         self.effects = tuple(effects)
         self.state_period_s = state_period_s
-        self._scene_key: tuple[float, float] | None = None
+        self._scene_key: tuple[float, float, int] | None = None
         self.put(scene, instrument, wavelength_nm)
 
     def put(self, scene: SceneImage, instrument: InstrumentModel, wavelength_nm: float) -> None:
@@ -102,7 +102,8 @@ class SimulatedBench:
 
     def look(self, omega_deg: float) -> None:
         """Compute the scene for an arm angle ahead of the exposures there."""
-        self._planes(omega_deg)
+        beams = self.instrument.beams
+        self._planes(omega_deg, self.columns // len(beams) if beams else self.columns)
 
     def expose(
         self,
@@ -124,7 +125,8 @@ class SimulatedBench:
 
         Returns
         -------
-        ndarray of uint16, (rows, columns), or (channels, rows, columns) with several channels and no mosaic.
+        ndarray of uint16, (rows, columns), or (channels, rows, columns) with several channels that do not share the
+        detector as a mosaic or as beams side by side.
         """
         expected, shot = self._expected(angles_deg, exposure_s, index, light, omega_deg)
         random = np.random.default_rng([self.seed, index + (1 << 31)])
@@ -158,8 +160,8 @@ class SimulatedBench:
         level = float(light)
         for effect in self.effects:
             level = effect.source(level, shot)
-        mosaic = model.mosaic is not None
-        shape = (self.rows, self.columns) if mosaic or len(model.channels) == 1 else None
+        shared = model.mosaic is not None or model.beams is not None
+        shape = (self.rows, self.columns) if shared or len(model.channels) == 1 else None
         image = np.zeros(shape or (len(model.channels), self.rows, self.columns), dtype=np.float32)
         if light:
             axes = {name: [angles[name]] for name in model.axes} or {"none": [0.0]}
@@ -179,9 +181,11 @@ class SimulatedBench:
         return image, shot
 
     def _render(self, image: Image, weights: NDArray[np.float32], model: InstrumentModel, omega_deg: float) -> None:
-        planes = self._planes(omega_deg)
+        columns = self.columns // len(model.beams) if model.beams else self.columns
+        planes = self._planes(omega_deg, columns)
         if model.mosaic is None:
-            stack = image if image.ndim == 3 else image[np.newaxis]
+            # One camera, or beams side by side on one, are strips of its frame.
+            stack = image if image.ndim == 3 else np.hsplit(image, self.columns // columns)
             for channel, row in zip(stack, weights, strict=True):
                 _add_product(channel, row, planes)
             return
@@ -192,12 +196,12 @@ class SimulatedBench:
                 pixels = (slice(r, None, height), slice(c, None, width))
                 _add_product(image[pixels], weights[names.index(name)], planes[(slice(None), *pixels)])
 
-    def _planes(self, omega_deg: float) -> NDArray[np.float32]:
+    def _planes(self, omega_deg: float, columns: int) -> NDArray[np.float32]:
         """Scene as (16, rows, columns), computed anew when the arm has moved by more than a hundredth of a degree."""
-        key = (round(omega_deg, 2), self.wavelength_nm)
+        key = (round(omega_deg, 2), self.wavelength_nm, columns)
         if key != self._scene_key:
-            mueller = self.scene.mueller_image(key[0], self.wavelength_nm, self.rows, self.columns)
-            flat = np.asarray(mueller, dtype=np.float32).reshape(self.rows, self.columns, 16)
+            mueller = self.scene.mueller_image(key[0], self.wavelength_nm, self.rows, columns)
+            flat = np.asarray(mueller, dtype=np.float32).reshape(self.rows, columns, 16)
             self._scene_planes = np.ascontiguousarray(np.moveaxis(flat, -1, 0))
             self._scene_key = key
         return self._scene_planes

@@ -49,14 +49,16 @@ def noisy(synthetic_capture, configs):
     return make
 
 
+@pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("name", INSTRUMENTS)
-def test_what_is_determined_is_reported_with_its_error_and_the_rest_is_not(name, noisy, tmp_path):
+def test_what_is_determined_is_reported_with_its_error_and_the_rest_is_not(name, weighted, noisy, tmp_path):
     elements, angles = INSTRUMENTS[name]
     path, model, scale = noisy(name, angles)
     seen = determined_elements(determined_basis(model))
     assert names_of(seen) == elements
     with Capture(path) as capture:
-        facts = reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
+        choice = Choice(weighted=weighted, covariance=weighted)
+        facts = reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),), choice=choice)
     assert (facts["rank"], facts["determined"].replace(",", "")) == (seen.sum(), elements)
     assert facts["median_reduced_chi_square"] == pytest.approx(1, abs=0.35)
     image = MuellerImage.load(tmp_path / "m.h5")
@@ -70,10 +72,12 @@ def test_what_is_determined_is_reported_with_its_error_and_the_rest_is_not(name,
     assert pulls.std(axis=1) == pytest.approx(1, abs=5 / np.sqrt(2 * count))
 
 
-def test_saturated_states_are_left_out_there_too(noisy, tmp_path):
+@pytest.mark.parametrize("weighted", [False, True])
+def test_saturated_states_are_left_out_there_too(weighted, noisy, tmp_path):
     path, model, scale = noisy("rotating_retarder_stokes", INSTRUMENTS["rotating_retarder_stokes"][1], top=65535)
     with Capture(path) as capture:
-        reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
+        choice = Choice(weighted=weighted)
+        reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),), choice=choice)
     image = MuellerImage.load(tmp_path / "m.h5")
     assert (image.mask[:3] == Mask.SATURATED).all()
     stokes = image.values[:, 0, :3].reshape(4, -1) / scale
@@ -90,7 +94,7 @@ def test_what_needs_the_whole_matrix_says_so(noisy, tmp_path):
     path, model, _ = noisy("rotating_analyzer", INSTRUMENTS["rotating_analyzer"][1])
     with Capture(path) as capture:
         with pytest.raises(ProcessError, match="3 of 16 numbers"):
-            reduce_mueller(capture, model, tmp_path / "w.h5", (Step("reduce", {}),), choice=Choice(weighted=True))
+            reduce_mueller(capture, model, tmp_path / "p.h5", (Step("reduce", {}),), choice=Choice(physical="nearest"))
         reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
     with pytest.raises(ProductError, match="determines m00, m10, m20, and this needs all 16"):
         xi0_of_mueller(tmp_path / "m.h5", tmp_path / "x.h5", Step("xi0", {}), False, None)

@@ -50,8 +50,11 @@ class WeightedSolver:
         self.noise: NoiseModel = plain.noise
         self.repeats = plain.repeats
         self.covariance, self.likelihood = covariance, likelihood
-        w = plain.inversion.w.astype(np.float32)
-        self._w, self._wt = w, np.ascontiguousarray(w.T)
+        self._w = plain.inversion.w.astype(np.float32)
+        #: A partial polarimeter is solved in coordinates (16, 16) whose first axes are what it determines.
+        self._axes = _axes(plain.inversion.basis)
+        w = self._w if self._axes is None else self._w @ self._axes
+        self._solved_w, self._wt = w, np.ascontiguousarray(w.T)
         self._pairs = np.ascontiguousarray((w[:, PACKED_ROW] * w[:, PACKED_COLUMN]).T)
         self.intensity_floor = plain.intensity_floor
         self._floor = self.intensity_floor.astype(np.float32)[:, None]
@@ -78,18 +81,20 @@ class WeightedSolver:
             self._refit_saturated(raw, signal, found, slice(a, b))
             weight = self._weights(raw, found["mueller"][:, a:b], gain)
             residual = signal.reshape(n, b - a) - self._w @ found["mueller"][:, a:b]
-            normal = self._pairs @ weight
+            normal = self._normal(weight)
             right = self._wt @ (weight * residual)
             step, covariance = np.empty((ELEMENTS, b - a), np.float32), np.empty((PACKED, b - a), np.float32)
             solve_range(normal, right, step, covariance, 0, b - a)
-            residual -= self._w @ step
+            residual -= self._solved_w @ step
             kept = (weight > 0).sum(axis=0)
             chi_square = np.einsum("np,np->p", weight, residual**2)
             squares = np.einsum("np,np->p", weight > 0, residual**2)
+            rank = self.inversion.rank
+            expected = kept - rank + self._add_black(covariance, weight.reshape(-1, channels, b - a), gain)
+            step, covariance = self._in_elements(step, covariance)
             found["mueller"][:, a:b] += step
-            expected = kept - ELEMENTS + self._add_black(covariance, weight.reshape(-1, channels, b - a), gain)
             with np.errstate(divide="ignore", invalid="ignore"):
-                found["reduced_chi_square"][a:b] = np.where(kept > ELEMENTS, chi_square / expected, np.nan)
+                found["reduced_chi_square"][a:b] = np.where(kept > rank, chi_square / expected, np.nan)
                 found["residual_rms"][a:b] = np.sqrt(squares / kept)
             found["mueller_errors"][:, a:b] = np.sqrt(covariance[_DIAGONAL])
             lost = np.isnan(step[0]) & ((found["pixel_mask"][a:b] & np.uint8(Mask.SATURATED)) != 0)
@@ -98,6 +103,24 @@ class WeightedSolver:
                 found["mueller_covariance"][:, a:b] = covariance
             if self.likelihood:
                 found["mueller_physical"][:, a:b] = most_likely(found["mueller"][:, a:b], normal)
+
+    def _normal(self, weight: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Normal matrices (136, pixels); what a partial polarimeter cannot see stands apart."""
+        normal = self._pairs @ weight
+        normal[_DIAGONAL[self.inversion.rank :]] = 1.0
+        return np.asarray(normal)
+
+    def _in_elements(
+        self, solution: NDArray[np.float32], covariance: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Solution (16, pixels) and packed covariance (136, pixels) as elements of M, zero where nothing is seen."""
+        if self._axes is None:
+            return solution, covariance
+        rank = self.inversion.rank
+        seen = self._axes[:, :rank]
+        full = _unpacked(covariance)[:rank, :rank]
+        in_elements = np.einsum("ik,klp,jl->ijp", seen, full, seen, optimize=True)
+        return seen @ solution[:rank], in_elements[PACKED_ROW, PACKED_COLUMN]
 
     def _weights(
         self, raw: NDArray[Any], elements: NDArray[np.float32], gain: NDArray[np.float32] | None
@@ -128,7 +151,8 @@ class WeightedSolver:
         keep = (raw[:, :, some] < level).reshape(n, -1).astype(np.float32)
         right = self._wt @ (keep * signal[:, :, some].reshape(n, -1))
         fit, covariance = np.empty((ELEMENTS, some.size), np.float32), np.empty((PACKED, some.size), np.float32)
-        solve_range(self._pairs @ keep, right, fit, covariance, 0, some.size)
+        solve_range(self._normal(keep), right, fit, covariance, 0, some.size)
+        fit, _ = self._in_elements(fit, covariance)
         found["mueller"][:, pixels.start + some] = np.where(np.isnan(fit), 0.0, fit)
 
     def _add_black(
@@ -141,10 +165,8 @@ class WeightedSolver:
         if not self.plain.black_variance.any():
             return 0.0
         states, channels, pixels = weight.shape
-        w = self._w.reshape(states, channels, ELEMENTS)
-        full = np.empty((ELEMENTS, ELEMENTS, pixels), np.float32)
-        full[PACKED_ROW, PACKED_COLUMN] = covariance
-        full[PACKED_COLUMN, PACKED_ROW] = covariance
+        w = self._solved_w.reshape(states, channels, ELEMENTS)
+        full = _unpacked(covariance)
         left = np.zeros(pixels, np.float32)
         for channel in range(channels):
             scale = 1.0 if gain is None else gain[channel]
@@ -156,3 +178,20 @@ class WeightedSolver:
                 covariance += unit * moved[PACKED_ROW] * moved[PACKED_COLUMN]
                 left += unit * (share.astype(np.float32) @ pushed - np.einsum("ip,ip->p", drive, moved))
         return left
+
+
+def _axes(basis: NDArray[np.float64]) -> NDArray[np.float32] | None:
+    """Orthonormal (16, 16) whose first columns are the basis (16, rank); None where that is everything."""
+    rank = basis.shape[1]
+    if rank == ELEMENTS:
+        return None
+    rest = np.linalg.svd(basis, full_matrices=True)[0][:, rank:]
+    return np.concatenate([basis, rest], axis=1).astype(np.float32)
+
+
+def _unpacked(covariance: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Full symmetric matrices (16, 16, pixels) of packed ones."""
+    full = np.empty((ELEMENTS, ELEMENTS, covariance.shape[1]), np.float32)
+    full[PACKED_ROW, PACKED_COLUMN] = covariance
+    full[PACKED_COLUMN, PACKED_ROW] = covariance
+    return full
