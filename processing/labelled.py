@@ -13,13 +13,10 @@ from processing.errors import ProcessError
 from processing.steps.reduction import Reduction
 from processing.storage.capture import Capture
 from processing.storage.capture_schema import CaptureHeader, create_layout, write_closing
-from processing.storage.product import Product, is_product
+from processing.storage.product import Product, is_product, leading_dimensions
 
 if TYPE_CHECKING:
     import xarray as xr
-
-#: Leading shapes of planes that are matrices or vectors, and what their axes are called.
-LEADING = {(4, 4): ("row", "column"), (4,): ("element",), (3,): ("element",)}
 
 
 def open_dataset(path: Path | str) -> xr.Dataset:
@@ -147,7 +144,7 @@ def _of_product(path: Path) -> xr.Dataset:
         variables: dict[str, Any] = {}
         for name in product.names:
             values = product.get(name)
-            leading = LEADING.get(values.shape[:-2]) or tuple(f"{name}_{k}" for k in range(values.ndim - 2))
+            leading = leading_dimensions(name, values.shape[:-2])
             attributes = {"units": product.units(name), "long_name": product.long_name(name)}
             variables[name] = ((*leading, "y", "x"), values, attributes)
         coords: dict[str, Any] = {

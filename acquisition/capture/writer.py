@@ -140,8 +140,7 @@ class CaptureWriter:
             h5["entry/states/exposure_s"][...] = table.exposure_s
             h5["entry/states/repeats"][...] = table.repeats
             if begin is not None:
-                line = np.frombuffer(encode_line(json_bytes(begin)), np.uint8)
-                h5["entry/segments/json"][: line.size] = line
+                h5["entry/segments/json"][()] = encode_line(json_bytes(begin))
 
         try:
             make_folder(path.parent)

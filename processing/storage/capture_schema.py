@@ -14,6 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from processing.storage.nexus import (
+    PIXEL_AXES,
+    add_group,
+    add_scales,
+    attach,
+    declare,
+    default_plot,
+    describe_light,
+    link_coordinate,
+)
+
 #: 2 added segments and checksums; a file of version 1 is read, but not gone on with.
 SCHEMA_VERSION = 2
 
@@ -42,11 +53,27 @@ STATE_COLUMNS: dict[str, Any] = {
     "monitor": np.float64,
     "camera_temperature_c": np.float64,
 }
+#: Units of the columns; what is not named is a plain number.
+COLUMN_UNITS = {
+    "exposure_s": "s",
+    "host_time_s": "s",
+    "camera_time_ns": "ns",
+    "monitor": "count/s",
+    "camera_temperature_c": "degC",
+}
+#: Units of what is known about the detector.
+DETECTOR_UNITS = {
+    "black_level_counts": "count",
+    "gain_e_per_count": "1/count",
+    "read_noise_e": "",
+    "full_well_e": "",
+    "bits": "",
+}
 #: What a column holds before its state is taken, where it is not NaN or zero.
 EMPTY: dict[str, int] = {"repeats": 1, "crc32": -1}
 
 #: What else stands in /entry/instrument, so that no axis can have the name.
-NOT_AXES = frozenset({"beam", "detector", "omega", "omega_deg", "name"})
+NOT_AXES = frozenset({"beam", "beam_light", "detector", "detector_camera", "omega", "omega_deg", "name"})
 
 
 class _Part(BaseModel):
@@ -137,7 +164,7 @@ def create_layout(
     n, c = len(role), len(header.channels)
     h5.attrs["default"] = "entry"
     h5.attrs["umov_schema"] = SCHEMA_VERSION
-    entry = _group(h5, "entry", "NXentry")
+    entry = add_group(h5, "entry", "NXentry")
     entry.attrs["default"] = "data"
     entry.attrs["simulated"] = header.simulated
     entry.attrs.create("status", b"running", dtype=STATUS_TYPE)
@@ -145,36 +172,25 @@ def create_layout(
         entry[key] = getattr(header, key)
     entry["start_time"] = start_time
     entry.attrs["header_json"] = header.model_dump_json()
+    declare(entry)
+    # In the entry, where every group below finds them; the plot has them under the same names.
+    add_scales(entry, {"state": n, "channel": c, **dict(zip(PIXEL_AXES, frame_shape, strict=True))})
 
-    instrument = _group(entry, "instrument", "NXinstrument")
-    beam = _group(instrument, "beam", "NXbeam")
-    _quantity(beam, "incident_wavelength", header.wavelength_nm, "nm")
+    instrument = describe_light(entry, header.wavelength_nm, header.sample.name or header.sample.kind)
     if header.omega_deg is not None:
         _quantity(instrument, "omega_deg", header.omega_deg, "degree")
     for axis, target in target_deg.items():
-        positioner = _group(instrument, axis, "NXpositioner")
-        positioner["name"] = axis
-        _column(positioner, "value", n, np.float64, np.nan).attrs["units"] = "degree"
-        _column(positioner, "raw_value", n, np.float64, np.nan).attrs["units"] = "count"
-        positioner.create_dataset("target_value", data=np.asarray(target, dtype=np.float64)).attrs["units"] = "degree"
-    detector = _group(instrument, "detector", "NXdetector")
-    frames = _allocated(detector, "data", (n, c, *frame_shape), dtype, chunks=(1, 1, *frame_shape))
-    frames.attrs["long_name"] = "counts (state, channel, row, column)"
-    _allocated(detector, "row_crc32", (n, c, frame_shape[0]), np.uint32, chunks=None)
-    detector["channels"] = [name.encode() for name in header.channels]
-    for key in ("black_level_counts", "gain_e_per_count", "read_noise_e", "full_well_e", "bits"):
-        value = getattr(header.detector, key)
-        if value is not None:
-            detector[key] = value
+        _positioner(entry, axis, np.asarray(target, dtype=np.float64))
+    _detector(entry, header, (n, c, *frame_shape), dtype)
 
-    sample = _group(entry, "sample", "NXsample")
-    sample["name"] = header.sample.name or header.sample.kind
-
-    states = _group(entry, "states", "NXcollection")
+    states = add_group(entry, "states", "NXcollection")
     states["role"] = [r.encode() for r in role]
+    attach(states["role"], entry, ["state"])
     for name, kind in STATE_COLUMNS.items():
         empty = np.nan if np.issubdtype(kind, np.floating) else EMPTY.get(name, 0)
-        _column(states, name, n, kind, empty)
+        column = _column(states, name, n, kind, empty)
+        column.attrs["units"] = COLUMN_UNITS.get(name, "")
+        attach(column, entry, ["state"])
 
     for name, kind, text in (
         ("plan", "yaml", header.plan_yaml),
@@ -182,16 +198,67 @@ def create_layout(
         ("instrument_model", "yaml", header.instrument_yaml),
         ("camera_nodes", "json", json.dumps(header.camera_nodes)),
     ):
-        note = _group(entry, name, "NXnote")
+        note = add_group(entry, name, "NXnote")
         note["type"] = f"application/{kind}"
-        note["data"] = text
-    data = _group(entry, "data", "NXdata")
-    data.attrs["signal"] = "data"
-    data["data"] = h5py.SoftLink("/entry/instrument/detector/data")
+        # As bytes, which is what a note holds for NeXus.
+        raw = text.encode()
+        note.create_dataset("data", data=raw, dtype=h5py.string_dtype("utf-8", max(len(raw), 1)))
+    _plot(entry, header.title, tuple(target_deg))
     # Written later, in space that exists already: a line for the begin and the end of each segment of the run, and at
-    # sealing end time, ledger, statistics and messages.
+    # sealing end time, ledger, statistics and messages. A text of fixed length: readers show what stands in it.
     for name, size in (("segments", SEGMENTS_BYTES), ("closing", CLOSING_BYTES)):
-        _column(_group(entry, name, "NXcollection"), "json", size, np.uint8, 0)
+        group = add_group(entry, name, "NXcollection")
+        _allocated(group, "json", (), h5py.string_dtype("utf-8", size), chunks=None)[()] = b""
+
+
+def _positioner(entry: h5py.Group, axis: str, target_deg: NDArray[np.float64]) -> None:
+    """An axis: where it was to be and where it was, in each state."""
+    positioner = add_group(entry["instrument"], axis, "NXpositioner")
+    positioner["name"] = axis
+    _column(positioner, "value", len(target_deg), np.float64, np.nan)
+    _column(positioner, "raw_value", len(target_deg), np.float64, np.nan)
+    positioner.create_dataset("target_value", data=target_deg)
+    for name, units in (("value", "degree"), ("raw_value", "count"), ("target_value", "degree")):
+        positioner[name].attrs["units"] = units
+        attach(positioner[name], entry, ["state"])
+    positioner["value"].attrs["long_name"] = f"{axis}, as read back"
+
+
+def _detector(entry: h5py.Group, header: CaptureHeader, shape: tuple[int, ...], dtype: Any) -> None:
+    """The frames (state, channel, row, column), with the checksums of their rows, and what is known of the noise."""
+    detector = entry["instrument/detector"]
+    frames = _allocated(detector, "data", shape, dtype, chunks=(1, 1, *shape[2:]))
+    frames.attrs.update({"long_name": "counts (state, channel, row, column)", "units": "count"})
+    sums = _allocated(detector, "row_crc32", shape[:3], np.uint32, chunks=None)
+    sums.attrs["units"] = ""
+    for dataset in (frames, sums):
+        attach(dataset, entry, ["state", "channel", *PIXEL_AXES])
+    detector["channels"] = [name.encode() for name in header.channels]
+    attach(detector["channels"], entry, ["channel"])
+    for key, units in DETECTOR_UNITS.items():
+        value = getattr(header.detector, key)
+        if value is not None:
+            detector[key] = value
+            detector[key].attrs["units"] = units
+
+
+def _plot(entry: h5py.Group, title: str, axes: tuple[str, ...]) -> None:
+    """The default plot: the frames over state, channel and pixel, with the angles as further coordinates."""
+    data = add_group(entry, "data", "NXdata")
+    dimensions = ("state", "channel", *PIXEL_AXES)
+    for name in dimensions:
+        data[name] = entry[name]
+    data["data"] = h5py.SoftLink("/entry/instrument/detector/data")
+    default_plot(data, "data", dimensions, title)
+    further = {f"{axis}_deg": f"/entry/instrument/{axis}/value" for axis in axes}
+    further |= {name: f"/entry/states/{name}" for name in ("role", "exposure_s", "host_time_s", "done")}
+    for name, target in further.items():
+        link_coordinate(data, name, target, dimensions.index("state"))
+    link_coordinate(data, "channel_name", "/entry/instrument/detector/channels", dimensions.index("channel"))
+    # Of the CF conventions: which variables are coordinates although no dimension has their name.
+    data["data"].attrs.update(
+        {"target": "/entry/instrument/detector/data", "coordinates": " ".join([*further, "channel_name"])}
+    )
 
 
 def write_closing(h5: h5py.File, status: Status, closing: Mapping[str, Any]) -> None:
@@ -201,10 +268,7 @@ def write_closing(h5: h5py.File, status: Status, closing: Mapping[str, Any]) -> 
     lists, and says so under `left_out`: a capture is sealed whatever happened in it.
     """
     box = h5["entry/closing/json"]
-    raw = fitted_json(closing, room=box.shape[0])
-    padded = np.zeros(box.shape, dtype=np.uint8)
-    padded[: len(raw)] = np.frombuffer(raw, dtype=np.uint8)
-    box[...] = padded
+    box[()] = fitted_json(closing, room=box.dtype.itemsize)
     write_status(h5, status)
 
 
@@ -234,12 +298,6 @@ def json_bytes(value: Any) -> bytes:
     return json.dumps(value, ensure_ascii=False, default=str).encode(errors="backslashreplace")
 
 
-def _group(parent: h5py.Group, name: str, nx_class: str) -> h5py.Group:
-    group = parent.create_group(name)
-    group.attrs["NX_class"] = nx_class
-    return group
-
-
 def _quantity(parent: h5py.Group, name: str, value: float, units: str) -> None:
     parent[name] = float(value)
     parent[name].attrs["units"] = units
@@ -260,6 +318,6 @@ def _allocated(
     create.set_fill_time(h5py.h5d.FILL_TIME_NEVER if chunks else h5py.h5d.FILL_TIME_IFSET)
     if chunks:
         create.set_chunk(chunks)
-    space = h5py.h5s.create_simple(shape)
+    space = h5py.h5s.create_simple(shape) if shape else h5py.h5s.create(h5py.h5s.SCALAR)
     kind = h5py.h5t.py_create(np.dtype(dtype), logical=True)
     return h5py.Dataset(h5py.h5d.create(parent.id, name.encode(), kind, space, dcpl=create))

@@ -23,6 +23,7 @@ from processing.storage.capture_schema import CaptureHeader, Detector, Sample, c
 from processing.storage.checksums import row_crc32, write_checksums
 from processing.storage.frame_files import check_stack, open_stack, read_picture
 from processing.storage.h5_door import read_npy
+from processing.storage.nexus import attach
 from processing.storage.state_csv import ImportFailed, StatesFile, read_states
 
 #: Called with (states done, states in all).
@@ -127,6 +128,8 @@ def _write(
         table["host_time_s"][...] = states.time_s
     if states.sigma is not None:
         table["sigma"] = states.sigma
+        table["sigma"].attrs["units"] = "count"
+        attach(table["sigma"], h5["entry"], ["state"])
     table["done"][...] = 1
     write_checksums(h5["entry"], row_sums)
     write_closing(h5, "complete", {"imported": now})

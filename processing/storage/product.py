@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from processing.errors import ProcessError
 from processing.storage.capture_schema import CaptureHeader
 from processing.storage.h5_door import damage_as, mark_of, open_h5, require_dataset, text_attribute
+from processing.storage.nexus import PIXEL_AXES, add_group, add_scales, attach, declare, default_plot, describe_light
 from processing.storage.provenance import Step as Step
 from processing.storage.provenance import file_identity as file_identity
 from processing.storage.provenance import jsonable, read_steps, sign, write_steps
@@ -110,23 +111,40 @@ class ProductWriter:
     ) -> None:
         try:
             self._h5 = h5py.File(self._partial, "w")
-            entry = self._h5.create_group("entry")
-            entry.attrs.update({"NX_class": "NXentry", "default": "data"})
+            entry = add_group(self._h5, "entry", "NXentry")
+            entry.attrs["default"] = "data"
             self._h5.attrs.update({"default": "entry", "umov_product": PRODUCT_VERSION, "signature": self._signature})
             entry.attrs.update({"kind": kind, "simulated": header.simulated, "header_json": header.model_dump_json()})
             entry.attrs["facts_json"] = "{}"
             entry["title"] = header.title
             entry["rows_done"] = 0
-            data = entry.create_group("data")
-            data.attrs.update({"NX_class": "NXdata", "signal": next(iter(planes))})
-            for name, plane in planes.items():
-                dataset = _early(data, name, (*plane.leading, *shape), plane.dtype)
-                dataset.attrs.update({"units": plane.units, "long_name": plane.long_name})
+            entry["rows_done"].attrs["units"] = ""
+            declare(entry)
+            describe_light(entry, header.wavelength_nm, header.sample.name or header.sample.kind)
+            self._create_planes(entry, header.title, shape, planes)
             write_steps(entry, steps)
             sign(self._h5, steps)
             self._h5.flush()
         except OSError as error:
             raise ProductError(f"{self._partial} cannot be written ({error}). Free space, or give --out.") from error
+
+    def _create_planes(
+        self, entry: h5py.Group, title: str, shape: tuple[int, int], planes: Mapping[str, Plane]
+    ) -> None:
+        data = add_group(entry, "data", "NXdata")
+        dimensions = {name: (*leading_dimensions(name, plane.leading), *PIXEL_AXES) for name, plane in planes.items()}
+        sizes = {
+            dimension: size
+            for name, plane in planes.items()
+            for dimension, size in zip(dimensions[name], (*plane.leading, *shape), strict=True)
+        }
+        add_scales(data, sizes)
+        for name, plane in planes.items():
+            dataset = _early(data, name, (*plane.leading, *shape), plane.dtype)
+            dataset.attrs.update({"units": plane.units, "long_name": plane.long_name})
+            attach(dataset, data, dimensions[name])
+        signal = next(iter(planes))
+        default_plot(data, signal, dimensions[signal], title)
 
     def write(self, rows: slice, **blocks: NDArray[Any]) -> None:
         """Store the blocks (leading..., rows, columns) of some datasets, and remember that the rows are done."""
@@ -210,7 +228,7 @@ class Product:
         self.facts: dict[str, Any] = dict(json.loads(text_attribute(entry, "facts_json")))
         self.steps = read_steps(entry)
         data = entry["data"]
-        self.names: tuple[str, ...] = tuple(data)
+        self.names: tuple[str, ...] = tuple(name for name in data if not _is_beside(name, data[name]))
         rows, columns = data[text_attribute(data, "signal")].shape[-2:]
         self.shape: tuple[int, int] = (int(rows), int(columns))
         for name in self.names:
@@ -260,6 +278,18 @@ class Product:
 
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, tb: TracebackType | None) -> None:
         self.close()
+
+
+def _is_beside(name: str, dataset: h5py.Dataset) -> bool:
+    """Whether a dataset of the plot is a coordinate or its title, and no plane."""
+    return name == "title" or dataset.is_scale
+
+
+def leading_dimensions(name: str, leading: tuple[int, ...]) -> tuple[str, ...]:
+    """Names of the dimensions of a plane before (y, x): row and column of a matrix, else NAME_0, NAME_1, ..."""
+    if leading == (4, 4):
+        return ("row", "column")
+    return tuple(f"{name.removesuffix('_errors')}_{k}" for k in range(len(leading)))
 
 
 def refuse_existing(path: Path, overwrite: bool) -> None:

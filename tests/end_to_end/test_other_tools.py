@@ -1,0 +1,119 @@
+"""Captures and products open in tools that nobody here wrote: named dimensions, units, the default plot of NeXus."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+
+from acquisition.capture.state_file import StateFile
+from processing.labelled import open_dataset
+from processing.steps.reduction import Reduction
+from processing.storage.capture import Capture
+from processing.storage.images import MuellerImage
+
+DOCS = Path(__file__).parents[2] / "docs"
+STATES, SHAPE = 24, (6, 8)
+
+
+@pytest.fixture
+def capture(synthetic_capture, configs) -> Path:
+    psg = np.arange(STATES) * 7.5  # over one half turn, not commensurate with the analyzer
+    text = (configs / "instruments" / "drr_5to1.yaml").read_text()
+    frames = np.random.default_rng(3).integers(400, 3000, (STATES, 1, *SHAPE), dtype=np.uint16)
+    detector = {"gain_e_per_count": 2.5, "read_noise_e": 4.0, "bits": 12}
+    angles = {"psg": psg, "psa": psg * 4.91, "arm": np.full(STATES, 35.0)}
+    return synthetic_capture(frames, angles, instrument_yaml=text, detector=detector)
+
+
+@pytest.fixture
+def product(capture) -> Path:
+    return Reduction(capture).make(capture.with_suffix(".mueller.h5"))
+
+
+def test_the_lines_in_the_docs_open_both_with_xarray(capture, product, monkeypatch):
+    code = re.search(r"```python\n(.*?)```", (DOCS / "other-tools.md").read_text(), re.DOTALL)
+    monkeypatch.chdir(capture.parent)
+    names: dict = {}
+    exec(code[1], names)
+    frames, image = names["frames"], names["image"]
+    with frames, image:
+        assert frames["data"].dims == ("state", "channel", "y", "x")
+        ours = open_dataset(capture)
+        np.testing.assert_array_equal(frames["data"], ours["counts"])
+        for name in ("psg_deg", "psa_deg", "arm_deg", "exposure_s"):
+            assert name in frames["data"].coords
+            np.testing.assert_array_equal(frames[name], ours[name])
+        assert image["mueller"].dims == open_dataset(product)["mueller"].dims == ("row", "column", "y", "x")
+        np.testing.assert_array_equal(image["mueller_errors"], MuellerImage.load(product).errors)
+        assert not [name for name in (*frames.dims, *image.dims) if name.startswith("phony")]
+
+
+def test_a_whole_capture_is_a_tree_for_xarray(capture):
+    with xr.open_datatree(capture, engine="h5netcdf") as tree:
+        assert tree["entry/states/exposure_s"].dims == tree["entry/instrument/psg/value"].dims == ("state",)
+        assert tree["entry/instrument/detector/row_crc32"].dims == ("state", "channel", "y")
+
+
+def test_the_default_plot_has_its_axes_and_coordinates(capture, product):
+    for path in (capture, product):
+        with h5py.File(path) as h5:
+            entry = h5[h5.attrs["default"]]
+            data = entry[entry.attrs["default"]]
+            assert data.attrs["NX_class"] == "NXdata"
+            signal = data[data.attrs["signal"]]
+            axes = list(data.attrs["axes"])
+            assert tuple(len(data[name]) for name in axes) == signal.shape
+            for name in (key.removesuffix("_indices") for key in data.attrs if key.endswith("_indices")):
+                assert len(data[name]) == signal.shape[data.attrs[f"{name}_indices"]]
+
+
+def test_every_number_has_units_and_every_error_its_value(capture, product):
+    for path in (capture, product):
+        missing, errors = [], []
+
+        def look(name: str, node: object, missing: list = missing, errors: list = errors) -> None:
+            if isinstance(node, h5py.Dataset):
+                if node.dtype.kind in "uif" and "units" not in node.attrs and not name.endswith("sequence_index"):
+                    missing.append(name)
+                if name.endswith("_errors"):
+                    errors.append(node.shape == node.parent[node.name.removesuffix("_errors")].shape)
+
+        with h5py.File(path) as h5:
+            h5.visititems(look)
+        assert missing == []
+        assert all(errors)
+
+
+def test_what_the_nexus_definition_requires_is_there(capture, product):
+    for path in (capture, product):
+        with h5py.File(path) as h5:
+            entry = h5["entry"]
+            assert entry["definition"].asstr()[()] == "NXoptical_spectroscopy"
+            assert {"version", "URL"} <= set(entry["definition"].attrs)
+            assert entry["experiment_type"].attrs["custom"]
+            assert entry["instrument/beam_light/parameter_reliability"].asstr()[()] == "nominal"
+            assert entry["instrument/detector_camera/detector_channel_type"].asstr()[()] == "multichannel"
+            assert entry["sample/name"].asstr()[()]
+
+
+def test_a_file_with_the_older_layout_is_read_and_written_in_its_place(capture):
+    """Before named dimensions the journal and the closing record were arrays of bytes."""
+    with h5py.File(capture, "r+") as h5:
+        for name, size in (("segments", 4096), ("closing", 2048)):
+            del h5[f"entry/{name}/json"]
+            h5[f"entry/{name}"].create_dataset("json", data=np.zeros(size, np.uint8))
+        for name in ("definition", "state", "channel", "y", "x", "data"):
+            del h5[f"entry/{name}"]
+        h5["entry"].attrs["status_at"] = 0
+    file = StateFile(capture)
+    file.add_segment_record({"event": "begin"})
+    file.write_closing({"end_time": "now"})
+    file.close()
+    with Capture(capture) as there:
+        assert there.closing == {"end_time": "now"}
+        assert len(there.frames(3)[0]) == SHAPE[0]
