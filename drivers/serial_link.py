@@ -75,6 +75,8 @@ class SerialLink:
         Takes one frame off the buffer.
     xonxoff, rtscts : bool
         Flow control.
+    two_stop_bits : bool
+        Two stop bits in place of one.
     transcript : Transcript, optional
         Where to log the wire.
     clock : Clock
@@ -96,6 +98,7 @@ class SerialLink:
         *,
         xonxoff: bool = False,
         rtscts: bool = False,
+        two_stop_bits: bool = False,
         transcript: Transcript | None = None,
         clock: Clock = REAL,
         held_by: str | None = None,
@@ -108,7 +111,7 @@ class SerialLink:
         self._framer = framer
         self._buffer = bytearray()
         self._transcript = transcript
-        self._serial: Any = _open_port(port, baudrate, xonxoff, rtscts, held_by)
+        self._serial: Any = _open_port(port, baudrate, held_by, xonxoff, rtscts, two_stop_bits)
         self.purge(0.0)
 
     def write(self, data: bytes) -> None:
@@ -174,7 +177,7 @@ class SerialLink:
             ) from error
 
 
-def _open_port(port: str, baudrate: int, xonxoff: bool, rtscts: bool, held_by: str | None) -> Any:
+def _open_port(port: str, baudrate: int, held_by: str | None, xonxoff: bool, rtscts: bool, two_stop_bits: bool) -> Any:
     asked = f"open port {port}"
     if "://" not in port:
         if not Path(port).exists():
@@ -186,7 +189,14 @@ def _open_port(port: str, baudrate: int, xonxoff: bool, rtscts: bool, held_by: s
     try:
         options: dict[str, Any] = {} if "://" in port else {"exclusive": True}
         return serial.serial_for_url(
-            port, baudrate=baudrate, timeout=READ_SLICE_S, write_timeout=2.0, xonxoff=xonxoff, rtscts=rtscts, **options
+            port,
+            baudrate=baudrate,
+            stopbits=serial.STOPBITS_TWO if two_stop_bits else serial.STOPBITS_ONE,
+            timeout=READ_SLICE_S,
+            write_timeout=2.0,
+            xonxoff=xonxoff,
+            rtscts=rtscts,
+            **options,
         )
     except (serial.SerialException, OSError, ValueError) as error:
         number = getattr(error, "errno", None)

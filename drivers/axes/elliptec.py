@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import re
+from collections import Counter
 from functools import partial
 from typing import Literal
 
@@ -71,6 +72,7 @@ class ElliptecLine:
         self.reply_s = reply_s
         # Last message of each module that nobody had asked for: the end of its move.
         self.ended: dict[str, tuple[str, str]] = {}
+        self._unanswered_stops: Counter[str] = Counter()
         self._last_sent_s = -float("inf")
 
     def close(self) -> None:
@@ -90,14 +92,27 @@ class ElliptecLine:
             self.ended.pop(address, None)
             self.send(address, command)
 
+    def stop(self, address: str) -> None:
+        """Write a stop; takes no lock. Its answer, a status, is neither the end of a move nor that of a question."""
+        self._unanswered_stops[address] += 1
+        self.send(address, "st")
+
     def drain(self) -> None:
         """Sort what has arrived without waiting."""
         with self.link.lock:
             while (frame := self.link.read_frame(0.0)) is not None:
                 self._note(*_parse(frame))
 
+    def _answers_a_stop(self, address: str, letters: str) -> bool:
+        answers = letters == "GS" and self._unanswered_stops[address] > 0
+        if answers:
+            self._unanswered_stops[address] -= 1
+        return answers
+
     def _note(self, address: str, letters: str, data: str) -> None:
         """Keep what a module says unasked: the end of its move, or an error that ended it."""
+        if self._answers_a_stop(address, letters):
+            return
         if (letters == "PO" and len(data) == 8) or (
             letters == "GS" and len(data) == 2 and int(data, 16) not in (0, BUSY)
         ):
@@ -121,6 +136,8 @@ class ElliptecLine:
                 deadline_s = self.link.clock.now_s() + self.reply_s
                 while (frame := self.link.read_frame(deadline_s)) is not None:
                     sender, said, data = _parse(frame)
+                    if self._answers_a_stop(sender, said):
+                        continue
                     if (sender, said) == (address, letters) and len(data) >= digits:
                         return data
                     if (sender, said) == (address, "GS") and len(data) == 2 and int(data, 16) != 0:
@@ -130,6 +147,7 @@ class ElliptecLine:
                     self._note(sender, said, data)
                     seen.append(frame)
                 self.link.purge()
+                self._unanswered_stops.clear()
         if seen:
             raise ReplyError(asked, f"no valid reply, but {seen[:3]}", "Check cable, and that addresses differ")
         raise ReplyTimeout(asked, f"nothing within {self.reply_s} s", "Check power, cable and address")
@@ -240,7 +258,7 @@ class ElliptecAxis(SessionReferenceAxis):
 
     def _do_stop(self) -> None:
         log.warning("axis %s: an Elliptec module runs a started move to its end, it cannot be stopped", self.name)
-        self._line.send(self._address, "st")
+        self._line.stop(self._address)
 
     def _do_check_fault(self) -> None:
         if self._status:

@@ -86,7 +86,7 @@ class GCS2Axis(MotionAxis):
     """One axis of a controller."""
 
     def __init__(self, name: str, config: Config, line: GCS2Line, lines: LineRegistry) -> None:
-        super().__init__(name, config)
+        super().__init__(name, config, lines.clock)
         self.config: Config = config
         self._line, self._lines = line, lines
         self._answer = re.compile(rf"{config.axis}=([+-]?\d+\.?\d*(?:[eE][+-]?\d+)?)")

@@ -114,7 +114,7 @@ class XPSAxis(MotionAxis):
     def __init__(
         self, name: str, config: Config, line: XPSLine, lines: LineRegistry, moving: SerialLink, stopping: SerialLink
     ) -> None:
-        super().__init__(name, config)
+        super().__init__(name, config, lines.clock)
         self.config: Config = config
         self._line, self._lines, self._moving, self._stopping = line, lines, moving, stopping
         self._homing = False

@@ -121,3 +121,16 @@ class AxisFaults(ServedAxis):
             with pytest.raises(NotHomedError):
                 axis.start_move(40.0)
             assert bench.emulator.true_deg(0) == pytest.approx(30.0, abs=0.05)
+
+    def test_the_answer_to_a_stop_is_not_taken_for_that_of_the_next_question(self, kind: str) -> None:
+        with served(kind) as bench:
+            axis = bench.open()
+            axis.start_move(30.0).wait()
+            # Of the stop alone: the questions behind it are answered first.
+            bench.emulator.faults.add(Fault("late", commands=1, amount=0.1))
+            axis.stop()
+            assert not axis.is_moving()
+            assert axis.is_homed()
+            axis.check_fault()
+            assert axis.read_position().deg == pytest.approx(30.0, abs=0.05)
+            assert axis.start_move(31.0).wait().deg == pytest.approx(31.0, abs=0.05)

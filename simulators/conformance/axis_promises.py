@@ -129,3 +129,17 @@ class AxisPromises(ServedAxis):
             stopper.join()
             # The axis is usable afterwards.
             assert axis.start_move(1.0).wait().deg == pytest.approx(1.0, abs=0.05)
+
+    def test_a_stop_in_mid_move_does_not_hide_that_the_axis_moves(self, kind: str) -> None:
+        with served(kind, speed=1.0) as bench:
+            axis = bench.open()
+            axis.start_move(120.0)
+            axis.stop()
+            while axis.is_moving():
+                time.sleep(0.002)
+            assert not bench.emulator.axes[0].is_moving()
+            axis.check_fault()
+
+    def test_deadlines_are_counted_by_the_clock_of_the_lines(self, kind: str) -> None:
+        with served(kind) as bench:
+            assert bench.open().clock is bench.lines.clock

@@ -63,9 +63,13 @@ class EmulatedAxis:
         self.is_moving()
         return self._motion.position(self.clock.now_s()) - self._origin_deg
 
+    def mechanical_deg(self) -> float:
+        """Angle of the shaft now, counted from the home switch."""
+        return self._motion.position(self.clock.now_s())
+
     def true_deg(self) -> float:
         """True angle of the optic now, which no reply on the wire tells."""
-        mechanical_deg = self._motion.position(self.clock.now_s())
+        mechanical_deg = self.mechanical_deg()
         on_shaft_deg = mechanical_deg if self.true_angle is None else self.true_angle(mechanical_deg)
         return on_shaft_deg + self.slip_deg
 

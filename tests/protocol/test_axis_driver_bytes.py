@@ -307,6 +307,41 @@ def test_elliptec_end_message_just_before_the_status_still_proves_the_homing() -
         assert axis.home().wait().counts == 0
 
 
+def elliptec_after(*pairs: tuple[bytes, bytes]) -> list[tuple[bytes, bytes]]:
+    """The exchanges of opening a module, then these."""
+    opening = (b"0in", b"0IN0E1140050920201501016800023000\r\n"), (b"0gv", b"0GV64\r\n")
+    return [*[pair for pair in opening for _ in range(2)], *pairs]
+
+
+def test_the_status_that_answers_a_stop_of_an_elliptec_is_no_answer_to_a_question() -> None:
+    pairs = elliptec_after(
+        # Busy: a module takes no stop on its way. The answer comes when the move is over and another question is asked.
+        (b"0st", b""),
+        (b"0gp", b"0GS09\r\n0PO00000000\r\n"),
+        (b"0gp", b"0PO00000000\r\n"),
+        # "Not supported", from a module that knows no stop, is no fault of its last move.
+        (b"0st", b"0GS03\r\n"),
+        (b"0gs", b"0GS00\r\n"),
+        (b"0st", b""),
+        (b"0gs", b"0GS00\r\n0GS09\r\n"),
+        # It may never come.
+        (b"0st", b""),
+        (b"0gs", b"0GS09\r\n"),
+        (b"0gs", b"0GS09\r\n"),
+    )
+    with scripted(*pairs) as path, LineRegistry(clock=patient_clock()) as lines:
+        axis = elliptec.open("psg", elliptec.Config(port=path, address="0", reply_s=0.2), lines)
+        axis.stop()
+        assert axis.read_position().counts == 0
+        axis.stop()
+        assert not axis.is_moving()
+        axis.check_fault()
+        axis.stop()
+        assert axis.is_moving()
+        axis.stop()
+        assert axis.is_moving()
+
+
 def test_zaber_replies_without_checksum_count_where_the_device_says_that_it_sends_none() -> None:
     with scripted(
         (b"/" + summed("0 0 01 get system.serial") + b"\n", b"@01 0 01 OK IDLE -- 4711\r\n"),

@@ -259,6 +259,7 @@ QUESTIONS = {
     "smc100": b"1TS\r\n",
     "esp301": b"VE?\r",
     "gcs2": b"*IDN?\n",
+    "standa": b"gser",
     "apt-k10cr1": bytes.fromhex("110401005001"),
     "apt-kdc101": bytes.fromhex("900401005001"),
     "apt-kbd101": bytes.fromhex("900401005001"),

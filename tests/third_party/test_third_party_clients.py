@@ -1,8 +1,10 @@
 """Clients that nobody here wrote must be able to drive the emulators; what had to be mended is in docs."""
 
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import ModuleType
 from unittest.mock import MagicMock
 
 import pytest
@@ -199,3 +201,34 @@ def test_pymeasure_esp300() -> None:
             assert "POSITIVE SOFTWARE LIMIT" in str(controller.errors[0])
         finally:
             adapter.close()
+
+
+def test_libximc(monkeypatch: pytest.MonkeyPatch) -> None:
+    # It asks for a module of Windows, whatever the system.
+    monkeypatch.setitem(sys.modules, "winreg", ModuleType("winreg"))
+    import libximc.highlevel as ximc
+
+    with served("standa") as (emulator, path):
+        stage = ximc.Axis(f"xi-com://{path}")
+        stage.open_device()
+        try:
+            assert stage.get_serial_number() == 27_182
+            assert not stage.get_status().Flags & ximc.StateFlags.STATE_IS_HOMED
+            stage.command_homezero()
+            assert stage.get_status().Flags & ximc.StateFlags.STATE_IS_HOMED
+            assert emulator.true_deg(0) == pytest.approx(0.0, abs=1e-9)
+            stage.command_move(-1234, -56)
+            stage.command_wait_for_stop(10)
+            position = stage.get_position()
+            assert (position.Position, position.uPosition) == (-1234, -56)
+            assert emulator.true_deg(0) == pytest.approx(-(1234 + 56 / 256) / 100, abs=1e-9)
+            settings = stage.get_move_settings()
+            settings.Speed = 500
+            stage.set_move_settings(settings)
+            stage.command_movr(100_000, 0)
+            wait_until("motion", lambda: emulator.true_deg(0) > -12.0)
+            stage.command_sstp()
+            stage.command_wait_for_stop(10)
+            assert emulator.true_deg(0) < 500.0
+        finally:
+            stage.close_device()
