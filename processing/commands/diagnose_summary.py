@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from processing.diagnosis.search.result import Correction, Diagnosis, FoundEffect
+from processing.diagnosis.search.result import CaptureReport, Correction, Diagnosis, FoundEffect, Unexplained
 
 
 def show(d: Diagnosis) -> None:
@@ -21,35 +21,40 @@ def show(d: Diagnosis) -> None:
     if d.noise_floor_percent is not None:
         typer.echo(f"  noise floor   {d.noise_floor_percent:8.4f} %")
     typer.echo(f"  held out: {before.held_out}")
-    for c in d.captures:
-        if len(d.wavelengths_nm) > 1 and c.rms_before_percent is not None:
-            typer.echo(
-                f"  {c.wavelength_nm:g} nm: {c.rms_before_percent:.4f} % -> {c.rms_after_percent:.4f} %, {c.name}"
-            )
-        if c.cut_off:
-            states = f"state{'s' if len(c.cut_off) > 1 else ''} {', '.join(str(k) for k in c.cut_off)}"
-            typer.echo(f"  left out: {states} of {c.name}, cut off at zero counts; raise the black level")
-        if c.dark_fraction > 0:
-            typer.echo(f"  left out as too dark, with their rim: {c.dark_fraction:.1%} of the pixels of {c.name}")
-        if c.closure_before_percent is not None and c.closure_after_percent is not None:
-            typer.echo(f"  closure of {c.name}: {c.closure_before_percent:.3f} % -> {c.closure_after_percent:.3f} %")
+    for capture in d.captures:
+        _show_capture(capture, several=len(d.wavelengths_nm) > 1)
     for effect in d.effects:
         _show_effect(effect)
     if d.correction is not None:
         _show_correction(d.correction)
     if d.unexplained is not None:
-        typer.echo("  unexplained structure is left:")
-        for line in d.unexplained.description:
-            typer.echo(f"    {line}")
-        if d.unexplained.empirical is not None:
-            e = d.unexplained.empirical
-            typer.echo(
-                f"    empirical {e.kind} would leave {e.rms_percent_in_sample:.4f} % (in sample, names no cause)"
-            )
-            typer.echo(f"    would also fit: {', '.join(e.would_also_fit)}")
+        _show_unexplained(d.unexplained)
     if d.unobservable:
         typer.echo(f"  cannot be seen with these captures: {', '.join(d.unobservable)}")
     typer.echo(f"  recommendation: {d.recommendation}")
+
+
+def _show_capture(c: CaptureReport, several: bool) -> None:
+    """What was left out of a capture; its own residual where there are several wavelengths."""
+    if several and c.rms_before_percent is not None:
+        typer.echo(f"  {c.wavelength_nm:g} nm: {c.rms_before_percent:.4f} % -> {c.rms_after_percent:.4f} %, {c.name}")
+    if c.cut_off:
+        states = f"state{'s' if len(c.cut_off) > 1 else ''} {', '.join(str(k) for k in c.cut_off)}"
+        typer.echo(f"  left out: {states} of {c.name}, cut off at zero counts; raise the black level")
+    if c.dark_fraction > 0:
+        typer.echo(f"  left out as too dark, with their rim: {c.dark_fraction:.1%} of the pixels of {c.name}")
+    if c.closure_before_percent is not None and c.closure_after_percent is not None:
+        typer.echo(f"  closure of {c.name}: {c.closure_before_percent:.3f} % -> {c.closure_after_percent:.3f} %")
+
+
+def _show_unexplained(unexplained: Unexplained) -> None:
+    typer.echo("  unexplained structure is left:")
+    for line in unexplained.description:
+        typer.echo(f"    {line}")
+    if unexplained.empirical is not None:
+        e = unexplained.empirical
+        typer.echo(f"    empirical {e.kind} would leave {e.rms_percent_in_sample:.4f} % (in sample, names no cause)")
+        typer.echo(f"    would also fit: {', '.join(e.would_also_fit)}")
 
 
 def _show_effect(effect: FoundEffect) -> None:

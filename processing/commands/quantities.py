@@ -50,10 +50,10 @@ def quantities_command(
 
 def _pair(text: str) -> tuple[str, tuple[NamedStokes, NamedStokes]]:
     from processing.errors import ProcessError
-    from processing.polarization.quantities import STATES
+    from processing.polarization.quantities import POLARIZATIONS
 
     names = [part.strip() for part in text.split(",")]
-    if len(names) != 2 or not set(names) <= set(STATES):
-        raise ProcessError(f"--pair {text!r}: give GENERATOR,ANALYZER, each one of: {', '.join(STATES)}")
+    if len(names) != 2 or not set(names) <= set(POLARIZATIONS):
+        raise ProcessError(f"--pair {text!r}: give GENERATOR,ANALYZER, each one of: {', '.join(POLARIZATIONS)}")
     generator, analyzer = (cast("NamedStokes", name) for name in names)
     return f"{generator}_to_{analyzer}", (generator, analyzer)

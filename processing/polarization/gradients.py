@@ -179,14 +179,14 @@ def differential_quantities(m: RealArray) -> dict[str, Derived]:
     }
 
 
-def pairs(m: RealArray, states: Mapping[str, tuple[NamedStokes, NamedStokes]]) -> dict[str, Derived]:
+def pairs(m: RealArray, named: Mapping[str, tuple[NamedStokes, NamedStokes]]) -> dict[str, Derived]:
     """Light between generator and analyzer over m00, for named pairs; linear in M apart from m00."""
     m = np.asarray(m, dtype=float)
     m00 = m[..., 0, 0]
     found = {}
-    for name, (generator, analyzer) in states.items():
+    for name, (generator, analyzer) in named.items():
         value = quantities.between(m, generator, analyzer) / m00
-        pair = 0.5 * np.outer(quantities.STATES[analyzer], quantities.STATES[generator]).reshape(16)
+        pair = 0.5 * np.outer(quantities.POLARIZATIONS[analyzer], quantities.POLARIZATIONS[generator]).reshape(16)
         gradient = np.repeat((1 / m00)[..., None], 16, axis=-1) * pair
         gradient[..., 0] -= value / m00
         found[name] = Derived(value, gradient)

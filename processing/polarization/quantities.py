@@ -15,8 +15,8 @@ from processing.arrays import RealArray
 
 NamedStokes = Literal["horizontal", "vertical", "45", "135", "right", "left", "unpolarized"]
 
-#: Stokes vectors of named states, unit intensity.
-STATES: dict[str, NDArray[np.float64]] = {
+#: Stokes vectors by name of the polarization, unit intensity.
+POLARIZATIONS: dict[str, NDArray[np.float64]] = {
     "unpolarized": np.array([1.0, 0, 0, 0]),
     "horizontal": np.array([1.0, 1, 0, 0]),
     "vertical": np.array([1.0, -1, 0, 0]),
@@ -101,9 +101,9 @@ def orientation(vector: RealArray) -> RealArray:
 
 
 def retardance_vector(retarder: RealArray) -> RealArray:
-    """Retardance vector (..., 3) of rotations MR (..., 4, 4): length in [0, pi], direction the fast state.
+    """Retardance vector (..., 3) of rotations MR (..., 4, 4): length in [0, pi], direction the fast eigenpolarization.
 
-    Components: horizontal, 45 degrees, right circular (Lu and Chipman, Eqs. 16-17). At pi the fast and the slow state
+    Components: horizontal, 45 degrees, right circular (Lu and Chipman, Eqs. 16-17). At pi the fast and the slow one
     cannot be told apart; the vector is then one of the two.
     """
     r = np.asarray(retarder)[..., 1:, 1:]
@@ -134,12 +134,12 @@ def _near_half_turn(r: RealArray, twice_sine: RealArray, angle: RealArray) -> Re
 
 
 def between(m: RealArray, generator: NamedStokes | ArrayLike, analyzer: NamedStokes | ArrayLike) -> RealArray:
-    """Fraction of the light, generated in one state, that a polarizer for the other state passes after the sample.
+    """Fraction of the light, generated with one polarization, that a polarizer for another one passes after the sample.
 
     Parameters
     ----------
     m : (..., 4, 4)
-    generator, analyzer : a state's name (`STATES`) or a Stokes vector (4,); divided by its S0. The analyzer carries
+    generator, analyzer : a name (`POLARIZATIONS`) or a Stokes vector (4,); divided by its S0. The analyzer carries
         the factor 1/2 of an ideal polarizer, so an unpolarized beam through air gives 1/2.
 
     Returns
@@ -150,12 +150,13 @@ def between(m: RealArray, generator: NamedStokes | ArrayLike, analyzer: NamedSto
     return np.asarray(0.5 * np.einsum("i,...ij,j->...", a, np.asarray(m), g))
 
 
-def _stokes(state: NamedStokes | ArrayLike, what: str) -> NDArray[np.float64]:
-    if isinstance(state, str):
-        if state not in STATES:
-            raise ValueError(f"{what} {state!r} is no state; known: {', '.join(STATES)}, or four Stokes parameters")
-        return STATES[state]
-    s = np.asarray(state, dtype=float)
+def _stokes(light: NamedStokes | ArrayLike, what: str) -> NDArray[np.float64]:
+    if isinstance(light, str):
+        if light not in POLARIZATIONS:
+            known = ", ".join(POLARIZATIONS)
+            raise ValueError(f"{what} {light!r} is no polarization; known: {known}, or four Stokes parameters")
+        return POLARIZATIONS[light]
+    s = np.asarray(light, dtype=float)
     if s.shape != (4,) or not s[0] > 0 or not np.linalg.norm(s[1:]) <= s[0] * (1 + 1e-9):
         raise ValueError(f"{what} must be a Stokes vector (4,) with S0 > 0 and degree of polarization <= 1; got {s}")
     return np.asarray(s / s[0])

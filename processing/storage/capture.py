@@ -20,7 +20,7 @@ from processing.storage.capture_door import check_capture
 from processing.storage.capture_schema import SCHEMA_VERSION, CaptureHeader
 from processing.storage.checksums import NONE, row_crc32, state_crc32, summed_values
 from processing.storage.frame_layout import Beams, Cells, FrameLayout
-from processing.storage.h5_door import damage_as, open_h5, text_attribute
+from processing.storage.h5_door import closed_if_damaged, damage_as, open_h5, text_attribute
 from processing.storage.segments import Segment, decode_lines, segments_of
 from processing.yaml_file import parse_yaml
 
@@ -53,12 +53,8 @@ class Capture:
         self._verifying = verify
         self._by_super_pixel = by_super_pixel
         self._h5 = _open(self.path)
-        try:
-            with damage_as(CaptureError, f"{self.path} is not a whole umov capture"):
-                self._read()
-        except CaptureError:
-            self._h5.close()
-            raise
+        with closed_if_damaged(self._h5, CaptureError, f"{self.path} is not a whole umov capture"):
+            self._read()
 
     def _read(self) -> None:
         if "umov_schema" not in self._h5.attrs:

@@ -57,6 +57,17 @@ def damage_as(error: type[ProcessError], what: str) -> Iterator[None]:
         raise error(f"{what} ({one_line(why)})") from why
 
 
+@contextmanager
+def closed_if_damaged(h5: h5py.File, error: type[ProcessError], what: str) -> Iterator[None]:
+    """The same while a file is read for the first time; it does not stay open then."""
+    try:
+        with damage_as(error, what):
+            yield
+    except error:
+        h5.close()
+        raise
+
+
 def require_dataset(parent: h5py.Group, name: str, shape: Sequence[int | None], kinds: str) -> h5py.Dataset:
     """A dataset of a group, looked at but not read.
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from processing.errors import ProcessError
 from processing.storage.capture_schema import CaptureHeader
-from processing.storage.h5_door import damage_as, mark_of, open_h5, require_dataset, text_attribute
+from processing.storage.h5_door import closed_if_damaged, damage_as, mark_of, open_h5, require_dataset, text_attribute
 from processing.storage.nexus import PIXEL_AXES, add_group, add_scales, attach, declare, default_plot, describe_light
 from processing.storage.provenance import Step as Step
 from processing.storage.provenance import file_identity as file_identity
@@ -204,12 +204,8 @@ class Product:
         if not self.path.exists():
             raise ProductError(f"{self.path}: no such file. `process reduce` prints the name of what it writes.")
         self._h5 = open_h5(self.path, ProductError)
-        try:
-            with damage_as(ProductError, f"{self.path} is damaged, or not a whole product"):
-                self._read()
-        except ProductError:
-            self._h5.close()
-            raise
+        with closed_if_damaged(self._h5, ProductError, f"{self.path} is damaged, or not a whole product"):
+            self._read()
 
     def _read(self) -> None:
         if "umov_product" not in self._h5.attrs:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import selectors
 import socket
-import threading
-from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
 from simulators.clock import BEAT_S, patient_clock
 from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort, SerialEmulator
+from simulators.serial.served_port import ServedPort
 
 
 class NetworkEmulator(Protocol):
@@ -22,55 +20,16 @@ class NetworkEmulator(Protocol):
         """Begin a conversation."""
 
 
-class TcpPort:
-    """A TCP port on 127.0.0.1 served by one emulator in a thread.
-
-    Attributes
-    ----------
-    path : str
-        ``socket://127.0.0.1:PORT``, for the client.
-    """
+class TcpPort(ServedPort):
+    """A TCP port on 127.0.0.1 served by one emulator; `path` is ``socket://127.0.0.1:PORT``."""
 
     def __init__(self, emulator: NetworkEmulator) -> None:
         self.emulator = emulator
         self._listener = socket.create_server(("127.0.0.1", 0))
-        self.path = f"socket://127.0.0.1:{self._listener.getsockname()[1]}"
-        self._wake_read, self._wake_write = os.pipe()
-        self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._serve, name=f"emulator {self.path}", daemon=True)
-        self._thread.start()
+        super().__init__(f"socket://127.0.0.1:{self._listener.getsockname()[1]}")
 
-    def is_serving(self) -> bool:
-        """True until it is closed or the emulator fails."""
-        return self._thread.is_alive()
-
-    def close(self) -> None:
-        """Stop serving and close the port.
-
-        Raises
-        ------
-        RuntimeError
-            The emulator itself failed while it served.
-        """
-        if self._thread.is_alive():
-            os.write(self._wake_write, b"x")
-            self._thread.join()
+    def _release(self) -> None:
         self._listener.close()
-        for descriptor in (self._wake_read, self._wake_write):
-            if descriptor >= 0:
-                os.close(descriptor)
-        self._wake_read = self._wake_write = -1
-        error, self._error = self._error, None
-        if error is not None:
-            raise RuntimeError(f"the emulator on {self.path} failed") from error
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _serve(self) -> None:
         talks: dict[socket.socket, SerialEmulator] = {}
@@ -90,8 +49,6 @@ class TcpPort:
                         # A client that has gone is noticed when it is read from.
                         with contextlib.suppress(ConnectionError):
                             connection.sendall(talk.take_output())
-        except BaseException as error:  # noqa: BLE001 - raised again by close()
-            self._error = error
         finally:
             for connection in talks:
                 connection.close()

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from processing.polarization import mueller, quantities, triply_degenerate
 from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
-from processing.polarization.quantities import PAPER_PAIRS, STATES, between
+from processing.polarization.quantities import PAPER_PAIRS, POLARIZATIONS, between
 
 Array = NDArray[np.float64]
 
@@ -107,10 +107,11 @@ def test_light_between_two_polarizers() -> None:
     assert between(mueller.IDEAL_DEPOLARIZER, "left", "right") == 0.5
     m = random_mueller(1, 0)[0]
     for generator, analyzer in PAPER_PAIRS.values():
-        by_polarizer = (0.5 * np.outer(STATES[analyzer], STATES[analyzer]) @ m @ STATES[generator])[0]
+        light, passed = POLARIZATIONS[generator], POLARIZATIONS[analyzer]
+        by_polarizer = (0.5 * np.outer(passed, passed) @ m @ light)[0]
         np.testing.assert_allclose(between(m, generator, analyzer), by_polarizer)
     np.testing.assert_allclose(between(m, [2, 1, 0, 0], "45"), between(m, [1, 0.5, 0, 0], [3, 0, 3, 0]))
-    with pytest.raises(ValueError, match="generator 'up' is no state; known: unpolarized, horizontal"):
+    with pytest.raises(ValueError, match="generator 'up' is no polarization; known: unpolarized, horizontal"):
         between(m, "up", "left")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="degree of polarization"):
         between(m, [1, 1, 1, 0], "left")
@@ -132,8 +133,8 @@ def test_physical_matrices_stay_in_their_ranges(seed: int, spread: float) -> Non
         assert (quantities.magnitude(vector) <= 1 + 1e-12).all()
     missed = quantities.td_missed(xi)
     assert ((missed >= 0) & (missed <= 2 / 3 * (1 - xi[:, 0]) + 1e-12)).all()
-    for generator in STATES:
-        for analyzer in STATES:
+    for generator in POLARIZATIONS:
+        for analyzer in POLARIZATIONS:
             fraction = between(m, generator, analyzer) / m[:, 0, 0]  # type: ignore[arg-type]
             assert ((fraction >= -1e-12) & (fraction <= 2 + 1e-12)).all()
 

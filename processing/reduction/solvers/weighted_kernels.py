@@ -78,6 +78,19 @@ def _invert(a):  # type: ignore[no-untyped-def]
 
 
 @_jit
+def _take_tile(normal, a, first, count):  # type: ignore[no-untyped-def]
+    """Copy the normal matrices of `count` pixels into a tile; the rest of it holds a matrix that is not singular."""
+    for p in range(PACKED):
+        for t in range(count):
+            a[p, t] = normal[p, first + t]
+        for t in range(count, TILE):
+            a[p, t] = 1.0
+    for i in range(16):
+        for t in range(count, TILE):
+            a[_at(i, i), t] = 100.0
+
+
+@_jit
 def solve_range(normal, right, solution, covariance, start, stop):  # type: ignore[no-untyped-def]
     """Solve normal . solution = right for pixels start..stop; covariance = inverse of normal, packed.
 
@@ -89,14 +102,7 @@ def solve_range(normal, right, solution, covariance, start, stop):  # type: igno
     for first in range(start, stop, TILE):
         count = min(TILE, stop - first)
         bad[:] = False
-        for p in range(PACKED):
-            for t in range(count):
-                a[p, t] = normal[p, first + t]
-            for t in range(count, TILE):
-                a[p, t] = 1.0
-        for i in range(16):
-            for t in range(count, TILE):
-                a[_at(i, i), t] = 100.0
+        _take_tile(normal, a, first, count)
         _cholesky(a, bad)
         _invert(a)
         for i in range(16):
