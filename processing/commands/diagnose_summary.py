@@ -43,6 +43,8 @@ def _show_capture(c: CaptureReport, several: bool) -> None:
         typer.echo(f"  left out: {states} of {c.name}, cut off at zero counts; raise the black level")
     if c.dark_fraction > 0:
         typer.echo(f"  left out as too dark, with their rim: {c.dark_fraction:.1%} of the pixels of {c.name}")
+    if c.steep_fraction > 0:
+        typer.echo(f"  left out at sharp edges: {c.steep_fraction:.1%} of the pixels of {c.name}")
     if c.closure_before_percent is not None and c.closure_after_percent is not None:
         typer.echo(f"  closure of {c.name}: {c.closure_before_percent:.3f} % -> {c.closure_after_percent:.3f} %")
 

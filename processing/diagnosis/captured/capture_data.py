@@ -34,6 +34,7 @@ class CaptureData:
         That averages the noise of neighbours, and adds no information.
     usable : (rows, columns) True where every state has a number and the pixel is not dark.
     dark_fraction : part of the pixels that are too dark, or too close to dark ones, to be used.
+    steep_fraction : part of the pixels that are left out because they lie at sharp edges.
     cut_off : numbers of states that do not count because their counts are cut off at zero.
     binned : side of the squares over which pixels were averaged.
     pitch : pixels of the sensor from one pixel here to the next.
@@ -56,6 +57,7 @@ class CaptureData:
     binned: int = 1
     pitch: int = 1
     dark_fraction: float = 0.0
+    steep_fraction: float = 0.0
     cut_off: tuple[int, ...] = ()
     noise_estimated: bool = False
     true_variance: NDArray[np.float32] | None = None

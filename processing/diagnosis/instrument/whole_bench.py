@@ -9,13 +9,15 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.instrument.moments import MARGIN
-from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.noise_of_light import scatter_prefers
+from processing.diagnosis.instrument.problem import EXACT, InstrumentProblem
 from processing.diagnosis.instrument.starts import first_values
+from processing.diagnosis.instrument.undone import exactly_undone
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.fit import Fit, HeldOut, held_out, minimize, prior, score
 from processing.diagnosis.search.posterior import Posterior, Say, posterior, quadratic, resampled
-from processing.diagnosis.search.rules import DECISIVE, LIKELY, SHARES, TAKES_PART
+from processing.diagnosis.search.rules import DECISIVE, LIKELY, REFUTED, SHARES, TAKES_PART
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import FieldEffect, ImageShift, PointwiseEffect, Switch, ValuePerState
 
@@ -75,6 +77,11 @@ class WholeBench:
         plain = [c for c in self.pool if self._offered(c)]
         fixed = [*self.base.candidates, *self._clipped()]
         found = self._posterior([*fixed, *plain], fixed)
+        refuted = self._refuted_by_noise(found)
+        if refuted:
+            self.say(f"the noise speaks against {', '.join(c.label for c in refuted)}")
+            rest = [c for c in found.space.candidates if c not in refuted]
+            found = self._posterior(rest, fixed, found)
         fields = [c for c in self.pool if isinstance(c.effect, FieldEffect)]
         if fields and not self.whole.holds_out_states:
             found = self._with_fields(found, fixed, fields)
@@ -85,6 +92,18 @@ class WholeBench:
                 self.problem.adopt_noise(*solved)
             found = self._posterior(list(found.space.candidates), fixed, found)
         return found
+
+    def _refuted_by_noise(self, found: Posterior) -> list[Candidate]:
+        """Corrections of the counts whose light would scatter otherwise than the counts do."""
+        space, values = applied(found, self.base)
+        if not self.whole.noise_known or any(c.noise_estimated for c in self.whole.captures):
+            return []
+        far = {
+            c: v
+            for c, v in exactly_undone(space, values, pointwise=True).items()
+            if np.any(np.abs(v) > EXACT * c.typical)
+        }
+        return [c for c, v in far.items() if scatter_prefers(self.whole, space, values, {c: v}, {}) < -REFUTED]
 
     def _unknowns(self, k: int) -> int:
         return int(np.linalg.matrix_rank(self.whole.columns(k, self.whole.changes(k, Space(()), np.zeros(0)))))
@@ -135,11 +154,10 @@ class WholeBench:
         """The posterior with values that vary over the image, if they promise something beside all others."""
         space, values = applied(found, self.base)
         unit = found.samples.best.unit
-        gains = {}
-        for candidate in fields:
-            both = Space((*space.candidates, candidate))
-            sums = self.whole.sums(both, np.append(values, np.zeros(candidate.size)))
-            gains[candidate] = score(sums, space.size, both.slices[-1], prior(both))[0] / unit
+        both = Space((*space.candidates, *fields))
+        sums = self.whole.sums(both, np.append(values, np.zeros(both.size - space.size)))
+        parts = dict(zip(both.candidates, both.slices, strict=True))
+        gains = {c: score(sums, space.size, parts[c], prior(both))[0] / unit for c in fields}
         best = max(gains, key=lambda c: gains[c])
         if gains[best] < DECISIVE:
             return found

@@ -110,6 +110,7 @@ class CaptureReport(_Part):
     binned: int
     clipped_fraction: float
     dark_fraction: float = 0.0
+    steep_fraction: float = 0.0
     cut_off: tuple[int, ...] = ()
     tests_before: dict[str, float]
     tests_after: dict[str, float]

@@ -24,6 +24,9 @@ SLACK = 2.0
 #: Least residual, relative to the signal, that is taken as noise where the noise is not known: no bench repeats better.
 LEAST_NOISE = 1e-4
 
+#: Log odds of the scatter of the counts against the noise that a correction of them tells, from which on it is dropped.
+REFUTED = 12.0
+
 # ---- search --------------------------------------------------------------------------------------------------------
 #: Times that the problem is linearized anew about its solution.
 ROUNDS = 4

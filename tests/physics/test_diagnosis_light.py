@@ -1,0 +1,62 @@
+"""What light an image is made of: photons that scatter, and edges that move."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.captured.steep_pixels import without_steep_pixels
+from processing.diagnosis.instrument.noise_of_light import scatter_prefers
+from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.search.rules import REFUTED
+from processing.diagnosis.search.space import Space
+from processing.instrument.model import InstrumentModel
+from processing.storage.capture import Capture
+from processing.storage.capture_schema import Sample
+from simulators.blind.suite import state_angles
+from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
+
+SIDE = 24
+
+
+def captured(folder, configs, bench):
+    """An air capture as `diagnose` reads it."""
+    random = np.random.default_rng(4)
+    angles, file = state_angles(40, False, False), configs / "instruments/rgb950.yaml"
+    counts = digitize(bench, expose(bench, Scene(random, np.eye(4)), angles), random)
+    write_capture(folder / "air.h5", bench, counts, angles, Sample(kind="air"), file.read_text())
+    model = InstrumentModel.load(file).at(662)
+    with Capture(folder / "air.h5") as capture:
+        return model, read_capture(capture, model)
+
+
+@pytest.mark.parametrize("leaks", [True, False])
+def test_light_that_leaks_scatters_and_an_offset_does_not(configs, tmp_path, leaks):
+    bench = Bench(rows=SIDE, columns=SIDE, electrons=600.0)
+    if leaks:
+        bench.extinction_a = 0.1
+    else:
+        bench.stored.append(lambda counts: counts + 80)
+    model, data = captured(tmp_path, configs, bench)
+    problem = InstrumentProblem(model, [data], folds=1)
+    offset, leak = (next(c for c in problem.pool() if c.kind == kind) for kind in ("detector_offset", "psa_extinction"))
+    # Either describes the counts: what is left is noise. The scatter knows which it is.
+    there, value = (leak, np.array([0.1])) if leaks else (offset, np.array([80.0]))
+    gain = scatter_prefers(problem, Space((there,)), value, {offset: np.array([80.0])}, {})
+    assert gain < -REFUTED if leaks else gain > REFUTED
+
+
+def test_pixels_at_an_edge_are_left_out_and_those_of_a_slope_are_not(configs, tmp_path):
+    _, data = captured(tmp_path, configs, Bench(rows=SIDE, columns=SIDE))
+    across = np.broadcast_to(np.linspace(0.3, 0.6, SIDE), (SIDE, SIDE))
+    sloping = replace(data, signal=np.broadcast_to(across, data.signal.shape).astype(np.float32))
+    assert without_steep_pixels(sloping).usable.sum() == sloping.usable.sum()
+    edge = np.where(np.arange(SIDE) < 8, 0.1, across)
+    cut = without_steep_pixels(replace(data, signal=np.broadcast_to(edge, data.signal.shape).astype(np.float32)))
+    assert not cut.usable[:, 7:9].any()
+    assert cut.usable[:, 11:].all()
+    assert cut.steep_fraction == pytest.approx(2 / SIDE)
+    # All edges: there is nothing else to look at.
+    stripes = np.broadcast_to(0.2 + 0.4 * (np.arange(SIDE) // 2 % 2), data.signal.shape).astype(np.float32)
+    assert without_steep_pixels(replace(data, signal=stripes)).usable.all()
