@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("drivers", "processing", "simulators", "acquisition")
+PACKAGES = ("drivers", "processing", "simulators", "acquisition", "viewer")
 
 
 def imports(root: Path) -> dict[str, set[str]]:

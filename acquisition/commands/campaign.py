@@ -23,6 +23,7 @@ from acquisition.rig.config import load_rig
 from acquisition.rig.rig import Rig
 from acquisition.screen.observer import Observer
 from acquisition.screen.progress import ConsoleProgress
+from acquisition.screen.run_file import RunFile
 from acquisition.stop_request import StopRequest
 
 
@@ -49,8 +50,9 @@ def run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Obs
     held.begin_with(identity)
     try:
         operator = Operator(console.print, stop, options.yes, rig_config.simulated)
-        with live_page(options.live, rig_config, stop, console) as page:
-            watchers = [ConsoleProgress(console), *page, *observers]
+        told = RunFile(folder, rig_config.simulated)
+        with live_page(options.live, rig_config, stop, console) as page, told:
+            watchers = [ConsoleProgress(console), told, *page, *observers]
             done = CampaignRun(campaign, rig_config, held, operator, stop, watchers, options.home).run(jobs)
         complete = sum(entry.get("status") == "complete" for entry in held.index.values())
     finally:

@@ -26,6 +26,7 @@ from acquisition.rig.guarded import guarded
 from acquisition.rig.rig import Rig
 from acquisition.screen.observer import Observer
 from acquisition.screen.progress import ConsoleProgress
+from acquisition.screen.run_file import RunFile
 from acquisition.stop_request import StopRequest
 from processing.storage.capture import Capture
 from processing.storage.capture_schema import Sample
@@ -73,8 +74,9 @@ def run(options: Options, stop: StopRequest) -> int:
         if stop.requested:
             return INTERRUPTED
         take = session.resume if resuming else session.take
-        with guarded(job.rig, path.parent), live_page(options.live, job.rig, stop, console) as page:
-            result = take(job, rig, path, stop, [ConsoleProgress(console), *page], home=options.home)
+        told = RunFile(path.parent, job.rig.simulated)
+        with guarded(job.rig, path.parent), live_page(options.live, job.rig, stop, console) as page, told:
+            result = take(job, rig, path, stop, [ConsoleProgress(console), told, *page], home=options.home)
     summarize(job, result)
     return INTERRUPTED if result.status == "aborted" else 0
 

@@ -1,0 +1,137 @@
+"""What a run says of itself to other programs of this machine: one small file beside its captures, while it runs.
+
+Who looks from elsewhere sees where the run is, and may send its process what Ctrl-C sends. A thread of its own writes
+the file a few times a second: a slow or full disc keeps nobody from measuring.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import threading
+import time
+from collections import deque
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from acquisition.screen.observer import Mosaic, Observer, StateReport
+from processing.doors import read_json
+from processing.errors import ProcessError
+from processing.instrument.states import StateTable
+
+#: Seconds between two versions of the file.
+EVERY_S = 0.3
+#: Messages that are kept, and characters of each.
+MESSAGES, LONGEST = 50, 300
+PATTERN = ".run-*.json"
+
+
+class RunFile(Observer):
+    """Keeps `.run-PID.json` in the folder of the captures up to date; a context manager."""
+
+    def __init__(self, folder: Path, simulated: bool) -> None:
+        self._path = folder / f".run-{os.getpid()}.json"
+        self._messages: deque[str] = deque(maxlen=MESSAGES)
+        self._facts: dict[str, Any] = {
+            "pid": os.getpid(),
+            "begun_ticks": begun_ticks(os.getpid()),
+            "simulated": simulated,
+            "title": "",
+            "activity": "starting",
+            "done": 0,
+            "pending": 0,
+        }
+        self._changed = threading.Event()
+        self._ended = threading.Event()
+        self._start_s = time.monotonic()
+        self._writing = threading.Thread(target=self._keep, name="run file", daemon=True)
+
+    def __enter__(self) -> Self:
+        for old in self._path.parent.glob(PATTERN):
+            # Left behind by a run that was killed.
+            if _read(old) is None:
+                with contextlib.suppress(OSError):
+                    old.unlink()
+        self._writing.start()
+        self._show()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ended.set()
+        self._changed.set()
+        self._writing.join(timeout=1)
+        with contextlib.suppress(OSError):
+            self._path.unlink(missing_ok=True)
+
+    def campaign_progress(self, number: int, total: int, name: str) -> None:
+        self._show(campaign_done=number, campaign_total=total, capture=name)
+
+    def run_started(self, title: str, table: StateTable, pending: int, mosaic: Mosaic | None) -> None:
+        self._start_s = time.monotonic()
+        self._show(title=title, done=0, pending=pending, left_s=None)
+
+    def activity(self, text: str) -> None:
+        self._show(activity=text[:LONGEST])
+
+    def state_done(self, report: StateReport) -> None:
+        done, pending = self._facts["done"] + 1, self._facts["pending"]
+        self._show(
+            done=done,
+            activity=f"state {report.state} ({report.role})",
+            left_s=round((time.monotonic() - self._start_s) / done * (pending - done), 1),
+            axes_deg={name: position.deg for name, position in report.positions.items()},
+            exposure_s=report.exposure_s,
+            saturated=report.saturated_fraction,
+        )
+
+    def warning(self, text: str) -> None:
+        self._messages.appendleft(f"{time.strftime('%H:%M:%S')} {text[:LONGEST]}")
+        self._show()
+
+    def run_ended(self, status: str, details: dict[str, Any]) -> None:
+        self._show(activity=status)
+
+    def _show(self, **changes: Any) -> None:
+        # One new value, never a change of the old one: the thread reads without a lock.
+        self._facts = self._facts | changes | {"messages": list(self._messages)}
+        self._changed.set()
+
+    def _keep(self) -> None:
+        new = self._path.with_suffix(".new")
+        while not self._ended.is_set():
+            self._changed.wait()
+            self._changed.clear()
+            with contextlib.suppress(OSError):
+                new.write_text(json.dumps(self._facts), encoding="utf-8")
+                os.replace(new, self._path)
+            self._ended.wait(EVERY_S)
+
+
+def begun_ticks(pid: int) -> int | None:
+    """When a process began, in the kernel's ticks: with its number it names it for good. None if it has ended."""
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8")
+    except OSError:
+        return None
+    # The second field is its name in brackets, which may hold anything.
+    fields = stat.rpartition(")")[2].split()
+    return None if fields[0] == "Z" else int(fields[19])
+
+
+def running_in(folder: Path) -> dict[str, Any] | None:
+    """What the program that takes captures in a folder says; None where none does."""
+    return next((facts for path in sorted(folder.glob(PATTERN)) if (facts := _read(path)) is not None), None)
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    """A run file whose process still runs."""
+    with contextlib.suppress(ProcessError):
+        facts = read_json(path)
+        if isinstance(facts, dict) and isinstance(pid := facts.get("pid"), int):
+            ticks = begun_ticks(pid)
+            return facts if ticks is not None and ticks == facts.get("begun_ticks") else None
+    return None

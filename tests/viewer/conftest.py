@@ -1,0 +1,60 @@
+"""Fixtures of the room: a folder with captures, and the application in front of it."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+
+from processing.instrument.model import InstrumentModel
+from viewer.application import application
+
+TOKEN = "the-token"
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Path:
+    """An empty folder for the application to show."""
+    folder = tmp_path / "lab"
+    folder.mkdir()
+    return folder
+
+
+@pytest.fixture
+def client(lab: Path) -> TestClient:
+    """A browser on this machine that was given the address."""
+    return TestClient(application(lab, TOKEN), base_url=f"http://127.0.0.1:8000/{TOKEN}", raise_server_exceptions=False)
+
+
+@pytest.fixture
+def drr_capture(lab: Path, configs: Path, synthetic_capture: Callable[..., Path]) -> Callable[..., Path]:
+    """Writes a capture of a dual rotating retarder polarimeter into the folder; returns its path.
+
+    The scene is a known Mueller matrix with some noise of its own in every pixel; keywords go to the header.
+    """
+    text = (configs / "instruments" / "rgb950.yaml").read_text()
+    model = InstrumentModel.load(configs / "instruments" / "rgb950.yaml").at(662)
+
+    def make(
+        name: str = "one.h5", mueller: np.ndarray | None = None, shape: tuple[int, int] = (12, 16), **more
+    ) -> Path:
+        states = np.arange(40)
+        angles = {"psg": 9.0 * states, "psa": 9.0 * 4.91 * states}
+        w = model.rows(angles, None).reshape(40, 16)
+        m = np.diag([1.0, 0.5, 0.4, 0.3]) if mueller is None else mueller
+        rng = np.random.default_rng(1)
+        signal = (w @ m.reshape(16))[:, None, None] * 1000 * np.ones(shape)
+        frames = np.concatenate([np.full((4, *shape), 64.0), 64 + signal + rng.normal(0, 3, signal.shape)])
+        angles = {name: np.concatenate([np.zeros(4), column]) for name, column in angles.items()}
+        detector = {"black_level_counts": 64.0, "gain_e_per_count": 2.6, "read_noise_e": 2.3, "bits": 12}
+        header = {"instrument_yaml": text, "mode": "drr", "wavelength_nm": 662.0, "detector": detector} | more
+        return synthetic_capture(
+            np.round(frames[:, None]).astype(np.uint16),
+            angles,
+            name=f"lab/{name}",
+            role=("dark",) * 4 + ("sample",) * 40,
+            **header,
+        )
+
+    return make

@@ -1,0 +1,126 @@
+"""What the application says of captures: lists, frames, histograms and the intensities of a pixel."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from processing.steps.reduction import Reduction
+from processing.storage.product import Product
+
+
+def plane(answer):
+    told = json.loads(answer.headers["x-plane"])
+    return np.frombuffer(answer.content, "<f4").reshape(-1, told["rows"], told["columns"]), told
+
+
+def test_the_first_page_lists_what_is_there_and_names_what_is_broken(lab, client, drr_capture):
+    drr_capture("one.h5", title="a red sphere", omega_deg=35.0)
+    (lab / "deep").mkdir()
+    (lab / "deep" / "broken.h5").write_bytes(b"no HDF5 at all")
+    page = client.get("/").text
+    assert "one.h5" in page
+    assert "44 of 44" in page
+    assert "SIMULATED" in page
+    assert re.search(r"deep/broken.h5.*cannot be opened as HDF5.*unreadable", page, re.S)
+
+
+def test_search_finds_by_what_a_capture_is(client, drr_capture):
+    drr_capture("one.h5", sample={"name": "leaf"}, omega_deg=35.0)
+    drr_capture("two.h5", sample={"name": "mirror"}, omega_deg=35.0)
+    page = client.get("/", params={"q": "LEAF omega 35 662"}).text
+    assert "one.h5" in page
+    assert "two.h5" not in page
+
+
+def test_text_of_a_header_is_never_a_page_s_own(client, drr_capture):
+    drr_capture("one.h5", title="<script>alert(1)</script>", sample={"name": "</script><b>x"})
+    for address, query in (("/", {}), ("/capture", {"file": "one.h5"})):
+        page = client.get(address, params=query).text
+        assert "<script>alert" not in page
+        assert "</script><b>x" not in page
+
+
+def test_a_changed_file_is_read_again(client, drr_capture):
+    drr_capture("one.h5", title="before")
+    assert "before" in client.get("/capture", params={"file": "one.h5"}).text
+    drr_capture("one.h5", title="afterwards", shape=(12, 18))
+    assert "afterwards" in client.get("/capture", params={"file": "one.h5"}).text
+
+
+def test_a_frame_is_the_counts_of_the_file(client, drr_capture):
+    drr_capture("one.h5")
+    (counts, red), told = plane(client.get("/frame", params={"file": "one.h5", "state": 0}))
+    assert counts.shape == (12, 16)
+    assert np.all(counts == 64)
+    assert not red.any()
+    assert told["step"] == 1
+
+
+def test_a_reduced_frame_keeps_the_mean_and_every_saturated_pixel(lab, client, synthetic_capture):
+    frames = np.full((1, 1, 100, 130), 1000, np.uint16)
+    frames[0, 0, 57, 101] = 4095
+    frames[0, 0, ::2] += 2
+    synthetic_capture(frames, {}, name="lab/one.h5", detector={"bits": 12})
+    (counts, red), told = plane(client.get("/frame", params={"file": "one.h5", "state": 0, "most": 16}))
+    step = told["step"]
+    assert max(counts.shape) <= 16
+    assert np.median(counts) == pytest.approx(1001, abs=0.2)
+    assert np.argwhere(red).tolist() == [[57 // step, 101 // step]]
+    part, told = plane(
+        client.get("/frame", params={"file": "one.h5", "x0": 100, "x1": 110, "y0": 50, "y1": 60, "most": 16})
+    )
+    assert (told["x0"], told["y0"], told["step"]) == (100, 50, 1)
+    assert np.argwhere(part[1]).tolist() == [[7, 1]]
+
+
+def test_the_histogram_counts_every_pixel_once(client, drr_capture):
+    drr_capture("one.h5")
+    told = client.get("/histogram", params={"file": "one.h5", "state": 10}).json()
+    assert sum(told["pixels"]) == 12 * 16
+    widths = np.diff(told["edges"])
+    assert np.all(widths == widths[0])
+    assert widths[0] == round(widths[0])
+
+
+@pytest.mark.parametrize("asked", [{"state": 44}, {"state": "x"}, {"channel": 1}, {"x0": "nan"}, {"state": -45}])
+def test_what_is_not_there_is_refused_in_words(client, drr_capture, asked):
+    drr_capture("one.h5")
+    answer = client.get("/frame", params={"file": "one.h5", **asked})
+    assert answer.status_code == 422
+    assert "Traceback" not in answer.text
+
+
+def test_a_pixel_is_reduced_as_its_product_is(lab, client, drr_capture):
+    path = drr_capture("one.h5")
+    product = Reduction(path).make()
+    pixel = {"file": "one.h5", "x0": 5, "y0": 7}
+    found = client.get("/curve", params=pixel).json()
+    matrix = client.get("/matrix", params=pixel).json()["matrix"]
+    with Product(product) as there:
+        m = there.get("mueller")[:, :, 7, 5].astype(float)
+        error = there.get("mueller_errors")[0, 0, 7, 5]
+    np.testing.assert_allclose(matrix["mueller"], m / m[0, 0], atol=1e-5)
+    assert matrix["m00_error"] == pytest.approx(error, rel=1e-4)
+    residual = np.array(found["fit"]["residual"])
+    assert found["fit"]["states"] == list(range(4, 44))
+    assert np.sqrt(np.mean(residual**2)) < 1.5
+    assert np.ptp(found["fit"]["signal"]) > 200
+
+
+def test_a_region_is_the_mean_of_its_pixels_with_a_smaller_error(client, drr_capture):
+    drr_capture("one.h5")
+    pixel = client.get("/matrix", params={"file": "one.h5", "x0": 5, "y0": 7}).json()["matrix"]
+    region = client.get("/matrix", params={"file": "one.h5", "x0": 0, "y0": 0, "x1": 16, "y1": 12}).json()["matrix"]
+    assert region["m00_error"] == pytest.approx(pixel["m00_error"] / np.sqrt(192), rel=0.05)
+    np.testing.assert_allclose(region["mueller"], np.diag([1, 0.5, 0.4, 0.3]), atol=0.004)
+    xi = region["quantities"]["coherency_eigenvalues"]["value"]
+    assert sum(xi) == pytest.approx(1)
+    assert xi[0] == pytest.approx(0.55, abs=0.005)
+
+
+def test_a_probe_outside_the_image_is_refused(client, drr_capture):
+    drr_capture("one.h5")
+    for asked in ({"x0": 16, "y0": 0}, {"x0": 5, "y0": 3, "x1": 5, "y1": 9}, {"x0": 1}, {"x0": 0, "y0": -1}):
+        assert client.get("/curve", params={"file": "one.h5", **asked}).status_code == 422

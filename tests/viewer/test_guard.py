@@ -1,0 +1,62 @@
+"""Only a browser on this machine that was given the whole address is answered, and no page of another site."""
+
+import pytest
+from starlette.testclient import TestClient
+
+from viewer.application import application
+
+TOKEN = "the-token"
+ADDRESSES = ("/", "/style.css", "/static/plots.js", "/capture?file=one.h5", "/frame?file=one.h5", "/events?folder=.")
+
+
+def browser(lab, **more):
+    return TestClient(application(lab, TOKEN), base_url="http://127.0.0.1:8000", raise_server_exceptions=False, **more)
+
+
+@pytest.mark.parametrize("address", ADDRESSES)
+@pytest.mark.parametrize("token", ["", "/wrong", f"/{TOKEN}x", f"/x/{TOKEN}"])
+def test_without_the_token_nothing_is_answered(lab, address, token):
+    answer = browser(lab).get(token + address)
+    assert answer.status_code == 403
+    assert TOKEN not in answer.text
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example:8000", "localhost.evil:8000", ""])
+def test_a_name_of_another_site_is_refused(lab, host):
+    assert browser(lab).get(f"/{TOKEN}/", headers={"host": host}).status_code == 403
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:8000", "localhost:9000", "localhost"])
+def test_this_machine_is_let_in_also_through_a_tunnel(lab, host):
+    assert browser(lab).get(f"/{TOKEN}/", headers={"host": host}).status_code == 200
+
+
+@pytest.mark.parametrize("origin", [None, "http://evil.example", "http://127.0.0.1:9999", "null"])
+def test_no_other_page_changes_anything(lab, origin):
+    headers = {} if origin is None else {"origin": origin}
+    assert browser(lab).post(f"/{TOKEN}/stop", headers=headers).status_code == 403
+
+
+def test_our_own_page_may_ask_and_is_told_what_is_wrong(lab):
+    (lab / "night").mkdir()
+    headers = {"origin": "http://127.0.0.1:8000"}
+    answer = browser(lab).post(f"/{TOKEN}/stop", headers=headers, json={"folder": "night"})
+    assert (answer.status_code, answer.text) == (422, "nothing runs in this folder any more")
+
+
+def test_pages_take_nothing_from_elsewhere_and_tell_nobody_where_they_are(lab):
+    headers = browser(lab).get(f"/{TOKEN}/").headers
+    assert "default-src 'none'" in headers["content-security-policy"]
+    assert "unsafe-inline" not in headers["content-security-policy"].split("script-src")[1].split(";")[0]
+    assert headers["referrer-policy"] == "no-referrer"
+    assert headers["cache-control"] == "no-store"
+
+
+@pytest.mark.parametrize("name", ["../secret.h5", "/etc/passwd", "link.h5", "nothing.h5", "one.h5\0"])
+def test_nothing_outside_the_folder_is_read(lab, name):
+    (lab.parent / "secret.h5").write_bytes(b"secret")
+    (lab / "link.h5").symlink_to(lab.parent / "secret.h5")
+    for what in ("capture", "frame", "histogram", "curve"):
+        answer = browser(lab).get(f"/{TOKEN}/{what}", params={"file": name})
+        assert answer.status_code == 404
+        assert "HDF5" not in answer.text

@@ -1,0 +1,67 @@
+"""The application: which address is answered by what."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import plotly
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, Response
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from processing.errors import ProcessError
+from viewer import browsing, following, frames, probes
+from viewer.guard import Guard
+from viewer.library import Library, NotHere
+from viewer.pages import Pages, pages_of, whole_style
+
+STATIC = Path(__file__).parent / "static"
+#: The plotting library as its Python package carries it.
+PLOTLY = Path(plotly.__file__).parent / "package_data" / "plotly.min.js"
+
+
+def application(folder: Path, token: str) -> Starlette:
+    """The application for one folder; every address begins with the token."""
+    routes = [
+        Route("/", browsing.browse),
+        Route("/campaign", browsing.campaign),
+        Route("/events", following.events),
+        Route("/stop", following.stop, methods=["POST"]),
+        Route("/capture", frames.capture),
+        Route("/states", frames.states),
+        Route("/frame", frames.frame),
+        Route("/histogram", frames.histogram),
+        Route("/curve", probes.curve_of),
+        Route("/matrix", probes.matrix_of),
+        Route("/style.css", _style),
+        Route(f"/plotly-{plotly.__version__}.js", _plotly),
+        Mount("/static", StaticFiles(directory=STATIC)),
+    ]
+    app = Starlette(
+        routes=[Mount(f"/{token}", routes=routes)],
+        middleware=[Middleware(Guard, token=token)],
+        exception_handlers={ProcessError: _refused},
+    )
+    library = Library(folder)
+    app.state.pages = Pages(library, f"/{token}", f"/{token}/plotly-{plotly.__version__}.js")
+
+    return app
+
+
+async def _style(request: Request) -> Response:
+    return Response(whole_style(), media_type="text/css")
+
+
+async def _plotly(request: Request) -> Response:
+    # Its address changes with its version.
+    return FileResponse(PLOTLY, headers={"Cache-Control": "private, max-age=31536000, immutable"})
+
+
+async def _refused(request: Request, error: Exception) -> Response:
+    code = 404 if isinstance(error, NotHere) else 422
+    if "text/html" in request.headers.get("accept", ""):
+        return pages_of(request).draw("refused.html", code=code, text=str(error))
+    return Response(str(error), code, media_type="text/plain")

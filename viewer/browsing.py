@@ -1,0 +1,72 @@
+"""The first page, and the page of a campaign."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import HTMLResponse
+
+from acquisition.screen.run_file import running_in
+from viewer.campaigns import STATUS, CampaignView, read_campaign
+from viewer.library import Entry, NotHere, made_from
+from viewer.pages import Pages, pages_of
+
+#: Files on one page of a list; more are found by searching.
+MOST = 300
+
+
+async def browse(request: Request) -> HTMLResponse:
+    """Campaigns, captures and products of the folder; `q` searches."""
+    return await run_in_threadpool(_browse, pages_of(request), request.query_params.get("q", ""))
+
+
+def _browse(pages: Pages, query: str) -> HTMLResponse:
+    library = pages.library
+    entries = library.entries()
+    words = query.lower().split()
+    found = [e for e in entries if all(word in e.words for word in words)]
+    views = [view for f in library.campaigns() if (view := read_campaign(f, library)) is not None]
+    campaigns = [(v, running_in(library.root / v.name)) for v in views if all(w in v.name.lower() for w in words)]
+    return pages.draw(
+        "browse.html",
+        simulated=_all_simulated(found),
+        query=query,
+        campaigns=campaigns,
+        statuses=STATUS,
+        captures=[e for e in found if e.kind in ("capture", "unreadable")][:MOST],
+        products=[(e, made_from(e, entries, library.root)) for e in found if e.kind not in ("capture", "unreadable")][
+            :MOST
+        ],
+        found=len(found),
+        total=len(entries),
+        shown_at=pages.shown_at,
+    )
+
+
+def _all_simulated(entries: list[Entry]) -> bool:
+    readable = [e for e in entries if e.kind != "unreadable"]
+    return bool(readable) and all(e.simulated for e in readable)
+
+
+async def campaign(request: Request) -> HTMLResponse:
+    """One campaign: grid, timeline, log, and what its run does now."""
+    pages = pages_of(request)
+    view = await run_in_threadpool(_campaign, pages, pages.library.path(request.query_params.get("folder", "")))
+    return pages.draw(
+        "campaign.html",
+        simulated=view.simulated,
+        view=view,
+        statuses=STATUS,
+        bars=[asdict(bar) for bar in view.bars],
+    )
+
+
+def _campaign(pages: Pages, folder: Path) -> CampaignView:
+    run = running_in(folder)
+    view = read_campaign(folder, pages.library, None if run is None else run.get("capture"))
+    if view is None:
+        raise NotHere(f"{pages.library.name(folder)}: no campaign was begun in this folder")
+    return view

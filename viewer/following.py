@@ -1,0 +1,84 @@
+"""A run as it goes on: a stream of events for the page, and the stop button."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import JSONResponse, StreamingResponse
+
+from acquisition.capture.writer import PARTIAL
+from acquisition.screen.run_file import running_in
+from processing.errors import ProcessError
+from processing.storage.capture import Capture
+from viewer.campaigns import read_campaign, seconds_left
+from viewer.lamp import lamp
+from viewer.library import Library
+from viewer.pages import fields_of, file_of, pages_of
+
+#: Seconds between two looks at a run.
+EVERY_S = 0.5
+#: A line now and then, so that a page that has gone is noticed.
+ALIVE_EVERY = 20
+
+
+async def events(request: Request) -> StreamingResponse:
+    """Server-sent events: what the run in a folder does, whenever that has changed."""
+    folder, library = file_of(request, "folder"), pages_of(request).library
+    return StreamingResponse(_changes(request, folder, library), media_type="text/event-stream")
+
+
+async def _changes(request: Request, folder: Path, library: Library) -> AsyncIterator[str]:
+    last, looks = "", 0
+    while not await request.is_disconnected():
+        try:
+            text = json.dumps(await run_in_threadpool(seen, folder, library))
+        except ProcessError as error:
+            text = json.dumps({"running": False, "error": str(error)})
+        if text != last:
+            yield f"data: {text}\n\n"
+            last = text
+        elif looks % ALIVE_EVERY == 0:
+            yield ": still here\n\n"
+        looks += 1
+        await asyncio.sleep(EVERY_S)
+
+
+def seen(folder: Path, library: Library) -> dict[str, Any]:
+    """What a page shows of a running campaign, or that none runs."""
+    run = running_in(folder)
+    view = read_campaign(folder, library, None if run is None else run.get("capture"))
+    found: dict[str, Any] = {"running": run is not None}
+    if view is not None:
+        found |= {"complete": view.complete, "cells": {cell.name: cell.status for cell in view.cells}}
+        if run is not None:
+            found["night_s"] = seconds_left(view, run.get("left_s"))
+    if run is None:
+        return found
+    found |= {key: run.get(key) for key in ("title", "activity", "done", "pending", "left_s", "messages", "capture")}
+    found |= {"number": run.get("campaign_done", 0) + 1, "total": run.get("campaign_total", 1)}
+    # What turns on and on is told within one turn.
+    found["axes_deg"] = {name: degrees % 360 for name, degrees in (run.get("axes_deg") or {}).items()}
+    partial = folder / f"{run.get('capture')}{PARTIAL}"
+    if partial.exists():
+        with Capture(partial) as capture:
+            found |= {"file": library.name(partial), "states": len(capture.done), "lamp": lamp(capture)}
+    return found
+
+
+async def stop(request: Request) -> JSONResponse:
+    """Send the process of the run what Ctrl-C sends. Raises ProcessError where none runs."""
+    asked = await fields_of(request)
+    folder = pages_of(request).library.path(asked.get("folder", ""))
+    run = running_in(folder)
+    if run is None:
+        raise ProcessError("nothing runs in this folder any more")
+    os.kill(int(run["pid"]), signal.SIGINT)
+    return JSONResponse({"stopping": True})

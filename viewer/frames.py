@@ -1,0 +1,166 @@
+"""A capture: its frames as pictures, their histograms, and the table of its states."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, JSONResponse, Response
+
+from processing.errors import ProcessError
+from processing.reduction.counts_to_signal import saturation
+from processing.storage.capture import Capture
+from viewer.library import Entry, made_into
+from viewer.pages import Pages, file_of, pages_of
+from viewer.planes import Window, sent
+
+#: Most bars of a histogram.
+BARS = 256
+
+
+async def capture(request: Request) -> HTMLResponse:
+    """The page of a capture."""
+    return await run_in_threadpool(_capture, pages_of(request), file_of(request))
+
+
+def _capture(pages: Pages, path: Path) -> HTMLResponse:
+    library = pages.library
+    entry = library.entry(library.name(path))
+    with Capture(path) as opened:
+        header, closing = opened.header, opened.closing
+        facts = [
+            ("sample", f"{header.sample.name or header.sample.kind} ({header.sample.kind})"),
+            ("mode", header.mode),
+            ("wavelength", f"{header.wavelength_nm:g} nm"),
+            ("Omega", "not stated" if header.omega_deg is None else f"{header.omega_deg:g} degrees"),
+            ("states", f"{len(opened.done)} of {opened.planned_states}, {opened.status}"),
+            ("frame", f"{opened.frame_shape[1]} x {opened.frame_shape[0]}, {opened.channels} channel(s)"),
+            ("begun", opened.start_time),
+            ("checksums", "every state is held against them" if opened.checked else "none in the file"),
+        ]
+        if segments := len(opened.segments) - 1:
+            facts.append(("interrupted", f"{segments} times, and gone on with"))
+        notes = [
+            (name, text)
+            for name, text in (
+                ("plan", header.plan_yaml),
+                ("rig", header.rig_yaml),
+                ("instrument model", header.instrument_yaml),
+            )
+            if text.strip()
+        ]
+        states = states_of(opened)
+        warnings = [str(message) for message in closing.get("messages", [])]
+    entries = library.entries()
+    return pages.draw(
+        "capture.html",
+        simulated=entry.simulated,
+        entry=entry,
+        facts=facts,
+        notes=notes,
+        warnings=warnings,
+        states=states,
+        made=[(e, pages.shown_at(e)) for e in made_into(entry, entries, library.root)],
+        others=others(entry, entries),
+        writing=entry.status == "running",
+    )
+
+
+def others(entry: Entry, entries: list[Entry]) -> list[Entry]:
+    """Files of the same kind and mode, to compare with."""
+    mode = None if entry.header is None else entry.header.mode
+    alike = [e for e in entries if e.kind == entry.kind and e is not entry]
+    return [e for e in alike if e.header is not None and e.header.mode == mode]
+
+
+def states_of(opened: Capture) -> dict[str, Any]:
+    """What a page has to know of the states done: roles, angles, exposures, limits of the scale."""
+    detector = opened.header.detector
+    top = saturation(opened)
+    return {
+        "number": [int(k) for k in opened.done],
+        "role": list(opened.role),
+        "angles_deg": {name: _plain(values) for name, values in opened.angles_deg.items()},
+        "exposure_s": _plain(opened.column("exposure_s")),
+        "saturated_fraction": _plain(opened.column("saturated_fraction")),
+        "channels": list(opened.header.channels),
+        "shape": list(opened.frame_shape),
+        "black": detector.black_level_counts,
+        "saturation": top,
+    }
+
+
+def _plain(values: Any) -> list[float | None]:
+    return [round(float(v), 6) if np.isfinite(v) else None for v in values]
+
+
+async def states(request: Request) -> JSONResponse:
+    """The states done by now, for a capture that is being written."""
+
+    def read() -> dict[str, Any]:
+        with Capture(file_of(request)) as opened:
+            return states_of(opened) | {"status": opened.status, "planned": opened.planned_states}
+
+    return JSONResponse(await run_in_threadpool(read))
+
+
+async def frame(request: Request) -> Response:
+    """Part of a frame: two pictures, mean counts and where a pixel is saturated (1, else 0)."""
+    return await run_in_threadpool(_frame, file_of(request), request.query_params)
+
+
+def _frame(path: Path, query: Any) -> Response:
+    with Capture(path) as opened:
+        state, channel = chosen(opened, query)
+        window = Window.asked(query, opened.frame_shape)
+        counts = opened.frames(state, window.rows)[channel]
+        top = saturation(opened)
+    mean = window.mean(counts)
+    red = np.zeros_like(mean) if top is None else window.largest(counts) >= top
+    return sent(window, np.stack([mean, red.astype(np.float32)]), state=state)
+
+
+def chosen(opened: Capture, query: Any) -> tuple[int, int]:
+    """State (among those done; -1 is the last) and channel that a request asks for. Raises ProcessError."""
+    done = len(opened.done)
+    try:
+        state, channel = int(query.get("state", 0)), int(query.get("channel", 0))
+    except ValueError as error:
+        raise ProcessError(f"state and channel must be whole numbers ({error})") from error
+    state += done if state < 0 else 0
+    if not 0 <= state < done or not 0 <= channel < opened.channels:
+        raise ProcessError(f"{opened.path.name} has {done} states done and {opened.channels} channel(s)")
+    return state, channel
+
+
+async def histogram(request: Request) -> JSONResponse:
+    """Pixels of a frame by their counts: edges of the bars, pixels in each, and where the range ends."""
+    return JSONResponse(await run_in_threadpool(_histogram, file_of(request), request.query_params))
+
+
+def _histogram(path: Path, query: Any) -> dict[str, Any]:
+    with Capture(path) as opened:
+        state, channel = chosen(opened, query)
+        counts = opened.frames(state)[channel]
+        top, black = saturation(opened), opened.header.detector.black_level_counts
+    finite = counts[np.isfinite(counts)] if counts.dtype.kind == "f" else counts
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+    if counts.dtype.kind in "ui":
+        # Whole counts: bars of a whole number of counts each, or some would hold one value more than their neighbours.
+        wide = max(1, -(-int(high - low + 1) // BARS))
+        edges = np.arange(int(low), int(high) + wide + 1, wide, dtype=float) - 0.5
+    else:
+        edges = np.linspace(low, high if high > low else low + 1, BARS + 1)
+    pixels, _ = np.histogram(finite, edges)
+    saturated = 0 if top is None else int(np.count_nonzero(counts >= top))
+    return {
+        "edges": edges.tolist(),
+        "pixels": pixels.tolist(),
+        "black": black,
+        "saturation": top,
+        "saturated": saturated,
+        "of": int(counts.size),
+    }

@@ -1,0 +1,82 @@
+"""The light of the lamp through a capture, told from what polarization does to the mean of a frame.
+
+The mean of a frame, dark subtracted, is linear in the mean Mueller matrix of the scene: sixteen numbers explain it in
+every state, and what is left over, in parts of the fit, is the lamp. States that repeat the first pose see the same
+polarization, and tell the lamp without any model.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.errors import ProcessError
+from processing.reduction.effects_of_capture import capture_changes
+from processing.reduction.mueller import angles_of
+from processing.storage.capture import Capture
+
+#: States more than unknowns before a fit tells anything.
+SPARE = 4
+
+
+def lamp(capture: Capture) -> dict[str, Any]:
+    """Light of each light state over what it should be: states, ratio, and how it was told."""
+    light = np.flatnonzero([role != "dark" for role in capture.role])
+    if not light.size:
+        return {"states": [], "ratio": [], "told": "no light state is done yet"}
+    signal = _dark_corrected(capture, light)
+    try:
+        fitted = _fitted(capture, light, signal)
+    except ProcessError as error:
+        return {"states": [], "ratio": [], "told": str(error)}
+    if fitted is not None:
+        told = "dark-corrected mean of each state over what polarization makes of it"
+        return _told(capture, light, signal / fitted, told)
+    same = _repeats(capture, light)
+    if same.sum() > 1:
+        told = f"dark-corrected mean of the {int(same.sum())} states that repeat the pose of the first one"
+        return _told(capture, light[same], signal[same] / signal[same][0], told)
+    told = "told once enough states are done to tell the lamp from polarization"
+    return {"states": [], "ratio": [], "told": told}
+
+
+def _told(capture: Capture, states: NDArray[np.int64], ratio: NDArray[np.float64], told: str) -> dict[str, Any]:
+    keep = np.isfinite(ratio)
+    return {"states": capture.done[states][keep].tolist(), "ratio": ratio[keep].tolist(), "told": told}
+
+
+def _dark_corrected(capture: Capture, light: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Counts a second above the dark states of the same exposure, else above the declared black level."""
+    monitor, exposure_s = capture.column("monitor").astype(float), capture.column("exposure_s").astype(float)
+    signal = monitor[light].copy()
+    dark = capture.states_with("dark")
+    for k, state in enumerate(light):
+        alike = dark[np.isclose(exposure_s[dark], exposure_s[state])]
+        if alike.size:
+            signal[k] -= monitor[alike].mean()
+    return signal
+
+
+def _repeats(capture: Capture, light: NDArray[np.int64]) -> NDArray[np.bool_]:
+    targets = capture.planned_targets_deg()
+    exposure_s = capture.column("exposure_s")[light]
+    same = np.isclose(exposure_s, exposure_s[0])
+    for column in targets.values():
+        turned = np.abs(column[capture.done[light]] - column[capture.done[light[0]]]) % 360
+        same &= np.minimum(turned, 360 - turned) < 0.01
+    return np.asarray(same)
+
+
+def _fitted(capture: Capture, light: NDArray[np.int64], signal: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    model = capture.instrument
+    if model is None or capture.header.mosaic is not None or capture.channels > 1:
+        return None
+    changes = capture_changes(capture, model, light)
+    w = model.rows(angles_of(capture, model, light), changes).reshape(len(light), 16)
+    known = np.isfinite(signal)
+    if known.sum() < np.linalg.matrix_rank(w[known], rtol=1e-6) + SPARE:
+        return None
+    m, *_ = np.linalg.lstsq(w[known], signal[known], rcond=1e-8)
+    return np.asarray(w @ m)

@@ -1,0 +1,231 @@
+"""What lies in the folder: captures, products, tables and campaigns, and what was made from what."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from acquisition.campaign.identity import IDENTITY
+from acquisition.capture.writer import PARTIAL
+from processing.errors import ProcessError
+from processing.reflectance.tables import ScatteringTable, is_table, table_steps
+from processing.storage.capture import Capture
+from processing.storage.capture_schema import CaptureHeader
+from processing.storage.product import Product, is_product
+from processing.storage.provenance import MADE_OF, Step, made_of
+
+#: Part of the pixels of a state beyond which its saturation is pointed out.
+SATURATED = 0.001
+#: Where the application keeps its own files; a hidden folder is never looked into.
+OWN = ".umov-view"
+
+
+class NotHere(ProcessError):
+    """A name that leads to nothing in the folder."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One file, as far as a list tells.
+
+    Attributes
+    ----------
+    name : path from the folder on, with forward slashes.
+    kind : "capture", "table", the kind of a product, or "unreadable".
+    status : of a capture; "complete" for what has none.
+    flags : what somebody should look at, in words.
+    inputs : identities of the files that it was made from, as the provenance keeps them.
+    content : what the file is known by in the provenance of others: `made_of` of a product.
+    """
+
+    name: str
+    kind: str
+    changed_s: float
+    size: int
+    header: CaptureHeader | None = None
+    simulated: bool = False
+    status: str = "complete"
+    states: tuple[int, int] | None = None
+    begun: str = ""
+    flags: tuple[str, ...] = ()
+    inputs: tuple[dict[str, Any], ...] = ()
+    content: str | None = None
+    step: str = ""
+
+    @property
+    def title(self) -> str:
+        """What the header calls it, or the file's name."""
+        return self.header.title if self.header is not None else Path(self.name).name
+
+    @property
+    def words(self) -> str:
+        """What a search looks through, in small letters."""
+        parts = [self.name, self.kind, self.status, self.step, *self.flags]
+        if self.header is not None:
+            header = self.header
+            omega = "" if header.omega_deg is None else f"omega {header.omega_deg:g}"
+            parts += [header.title, header.mode, header.sample.name, f"{header.wavelength_nm:g} nm", omega]
+        return " ".join(parts).lower()
+
+
+@dataclass
+class Library:
+    """A folder; every file is opened once and again when it has changed."""
+
+    root: Path
+    _known: dict[Path, tuple[tuple[int, int], Entry]] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def __post_init__(self) -> None:
+        self.root = self.root.resolve()
+
+    def path(self, name: str) -> Path:
+        """The file or folder of that name. Raises NotHere for what is not there, or not inside the folder."""
+        if "\0" in name:
+            raise NotHere("a name with a zero byte leads nowhere")
+        path = (self.root / name).resolve()
+        if not path.is_relative_to(self.root) or not path.exists():
+            raise NotHere(f"{name}: there is no such file in {self.root}")
+        return path
+
+    def name(self, path: Path) -> str:
+        """Name of a file inside the folder."""
+        return path.resolve().relative_to(self.root).as_posix()
+
+    def inside(self, path: Path) -> bool:
+        """Whether a file lies in the folder."""
+        return path.resolve().is_relative_to(self.root)
+
+    def entries(self) -> list[Entry]:
+        """Every HDF5 file, newest first."""
+        with self._lock:
+            found = [self._entry(path) for path in self._files()]
+        return sorted((e for e in found if e is not None), key=lambda e: (-e.changed_s, e.name))
+
+    def entry(self, name: str) -> Entry:
+        """One file. Raises NotHere."""
+        with self._lock:
+            found = self._entry(self.path(name))
+        if found is None:
+            raise NotHere(f"{name}: there is no such file in {self.root}")
+        return found
+
+    def campaigns(self) -> list[Path]:
+        """Folders that campaigns were taken into, the one last written to first."""
+        found = [Path(folder) for folder, _, files in self._walk() if IDENTITY in files]
+        return sorted(found, key=lambda folder: -_changed_s(folder))
+
+    def yaml_files(self, kind: str) -> list[Path]:
+        """Configuration files that say they are of this kind."""
+        mark = f"kind: {kind}"
+        found = []
+        for folder, _, files in self._walk():
+            for name in sorted(files):
+                path = Path(folder) / name
+                if path.suffix == ".yaml" and path.stat().st_size < 1 << 20 and mark in _lines(path):
+                    found.append(path)
+        return found
+
+    def _walk(self) -> Iterator[tuple[str, list[str], list[str]]]:
+        for folder, folders, files in os.walk(self.root):
+            folders[:] = sorted(f for f in folders if not f.startswith("."))
+            yield folder, folders, files
+
+    def _files(self) -> Iterator[Path]:
+        for folder, _, files in self._walk():
+            for name in files:
+                if name.endswith((".h5", f".h5{PARTIAL}")):
+                    yield Path(folder) / name
+
+    def _entry(self, path: Path) -> Entry | None:
+        try:
+            stat = path.stat()
+        except OSError:
+            return None
+        seen = (stat.st_mtime_ns, stat.st_size)
+        if path in self._known and self._known[path][0] == seen:
+            return self._known[path][1]
+        common: dict[str, Any] = {"name": self.name(path), "changed_s": stat.st_mtime, "size": stat.st_size}
+        try:
+            entry = _read(path, common)
+        except ProcessError as error:
+            entry = Entry(**common, kind="unreadable", status="failed", flags=(str(error),))
+        self._known[path] = (seen, entry)
+        return entry
+
+
+def _read(path: Path, common: dict[str, Any]) -> Entry:
+    if is_product(path):
+        return _product(path, common)
+    if is_table(path):
+        table = ScatteringTable.load(path)
+        inputs, step = _origin(tuple(table_steps(path)))
+        return Entry(**common, kind="table", simulated=table.simulated, inputs=inputs, step=step, content=made_of(path))
+    with Capture(path) as capture:
+        flags = [str(message) for message in capture.closing.get("messages", [])]
+        saturated = capture.column("saturated_fraction")
+        if (worst := max(saturated, default=0.0)) > SATURATED:
+            flags.append(f"up to {100 * worst:.2f} % of the pixels of a state are saturated")
+        return Entry(
+            **common,
+            kind="capture",
+            header=capture.header,
+            simulated=capture.simulated,
+            status=capture.status,
+            states=(len(capture.done), capture.planned_states),
+            begun=capture.start_time,
+            flags=tuple(flags),
+        )
+
+
+def _product(path: Path, common: dict[str, Any]) -> Entry:
+    with Product(path) as product:
+        inputs, step = _origin(product.steps)
+        return Entry(
+            **common,
+            kind=product.kind,
+            header=product.header,
+            simulated=product.simulated,
+            begun=product.steps[-1].date if product.steps else "",
+            flags=tuple(str(warning) for warning in product.facts.get("warnings", [])),
+            inputs=inputs,
+            step=step,
+            content=made_of(path),
+        )
+
+
+def _origin(steps: tuple[Step, ...]) -> tuple[tuple[dict[str, Any], ...], str]:
+    return (steps[-1].inputs, steps[-1].name) if steps else ((), "")
+
+
+def made_from(entry: Entry, entries: list[Entry], root: Path) -> list[tuple[str, str, Entry | None]]:
+    """Inputs of a file: role, path, and the file in the folder that it is, by content or else by path."""
+    by_content = {e.content: e for e in entries if e.content is not None}
+    by_path = {str(root / e.name): e for e in entries}
+
+    def found(identity: dict[str, Any]) -> tuple[str, str, Entry | None]:
+        path = str(identity.get("path", ""))
+        source = by_content.get(str(identity.get(MADE_OF))) or by_path.get(path)
+        return str(identity.get("role", "")), path, source
+
+    return [found(identity) for identity in entry.inputs]
+
+
+def made_into(entry: Entry, entries: list[Entry], root: Path) -> list[Entry]:
+    """Files of the folder that were made from this one."""
+    return [e for e in entries if any(source is entry for _, _, source in made_from(e, entries, root))]
+
+
+def _changed_s(folder: Path) -> float:
+    return max((path.stat().st_mtime for path in folder.iterdir() if path.is_file()), default=0.0)
+
+
+def _lines(path: Path) -> set[str]:
+    try:
+        return {line.strip() for line in path.read_text(encoding="utf-8").splitlines()}
+    except (OSError, UnicodeDecodeError):
+        return set()

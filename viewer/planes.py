@@ -1,0 +1,105 @@
+"""Reduced reads: any part of a frame or of a map, with no more pixels than a screen shows."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from starlette.responses import Response
+
+from processing.errors import ProcessError
+
+#: Most pixels along a side of what is sent at once.
+MOST = 1024
+
+
+@dataclass(frozen=True)
+class Window:
+    """Part of an image: rows and columns from the first to the one after the last, and the step between those shown.
+
+    Attributes
+    ----------
+    step : 1 where every pixel is shown.
+    """
+
+    rows: slice
+    columns: slice
+    step: int
+
+    @classmethod
+    def asked(cls, query: Any, shape: tuple[int, int], most: int = MOST) -> Window:
+        """The part that a request asks for with x0, x1, y0, y1 and most; default: all of it.
+
+        Raises
+        ------
+        ProcessError : they are no numbers.
+        """
+        try:
+            y0, y1 = (float(query.get(name, default)) for name, default in (("y0", 0), ("y1", shape[0])))
+            x0, x1 = (float(query.get(name, default)) for name, default in (("x0", 0), ("x1", shape[1])))
+            most = min(max(int(query.get("most", most)), 16), MOST)
+            rows, columns = _inside(y0, y1, shape[0]), _inside(x0, x1, shape[1])
+        except (ValueError, OverflowError) as error:
+            raise ProcessError(f"x0, x1, y0, y1 and most must be numbers ({error})") from error
+        step = max(1, -(-max(rows.stop - rows.start, columns.stop - columns.start) // most))
+        return cls(rows, columns, step)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns) of what is sent."""
+        return (
+            -(-(self.rows.stop - self.rows.start) // self.step),
+            -(-(self.columns.stop - self.columns.start) // self.step),
+        )
+
+    def every(self, image: NDArray[Any]) -> NDArray[Any]:
+        """Every step-th pixel of an image (..., rows of the window, all columns)."""
+        return image[..., :: self.step, self.columns][..., :: self.step]
+
+    def mean(self, image: NDArray[Any]) -> NDArray[np.float32]:
+        """Means of blocks of step x step pixels of an image (rows of the window, all columns)."""
+        part = np.ascontiguousarray(image[:, self.columns], dtype=np.float32)
+        if self.step == 1:
+            return part
+        return np.asarray(cv2.blur(part, (self.step, self.step), anchor=(0, 0))[:: self.step, :: self.step])
+
+    def largest(self, image: NDArray[Any]) -> NDArray[Any]:
+        """The largest of each block of step x step pixels: a single saturated pixel shows however far one is away."""
+        part = np.ascontiguousarray(image[:, self.columns])
+        if self.step == 1:
+            return part
+        block = np.ones((self.step, self.step), np.uint8)
+        return np.asarray(cv2.dilate(part, block, anchor=(0, 0))[:: self.step, :: self.step])
+
+
+def _inside(first: float, last: float, length: int) -> slice:
+    start = min(max(math.floor(first), 0), length - 1)
+    return slice(start, min(max(math.ceil(last), start + 1), length))
+
+
+def sent(window: Window, image: NDArray[Any], **facts: Any) -> Response:
+    """A picture as numbers: 4-byte floats row by row, the rest as JSON in a header."""
+    told = {
+        "x0": window.columns.start,
+        "y0": window.rows.start,
+        "step": window.step,
+        "rows": image.shape[-2],
+        "columns": image.shape[-1],
+        **facts,
+    }
+    body = np.ascontiguousarray(image, dtype="<f4").tobytes()
+    return Response(body, media_type="application/octet-stream", headers={"X-Plane": json.dumps(told)})
+
+
+def limits(values: NDArray[Any], percent: float = 99.5) -> tuple[float, float]:
+    """What a scale shows: from 100 - percent to percent of the finite values; 0 to 1 where there are none."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return 0.0, 1.0
+    low, high = np.percentile(finite, [100 - percent, percent])
+    return float(low), float(high)

@@ -1,0 +1,131 @@
+"""Answers to what a page asks of a pixel or a region."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import JSONResponse
+
+from processing.errors import ProcessError
+from processing.storage.capture import Capture
+from processing.storage.images import MuellerImage
+from processing.storage.product import Product
+from viewer.frames import chosen
+from viewer.library import Library
+from viewer.pages import file_of, pages_of
+from viewer.probing import PixelReducer, Region, curve, finite, mask_words, matrix, raw_curve
+
+
+async def curve_of(request: Request) -> JSONResponse:
+    """Intensities of a pixel or a region of a capture, with the fitted curve where there can be one."""
+    return JSONResponse(await run_in_threadpool(_curve_of, file_of(request), request.query_params))
+
+
+def _curve_of(path: Path, query: Any) -> dict[str, Any]:
+    with Capture(path) as capture:
+        region = Region.asked(query, capture.frame_shape)
+        found = raw_curve(capture, region, chosen(capture, {"channel": query.get("channel", 0)})[1])
+        channels, running = capture.channels, capture.status == "running"
+    if running:
+        return found | {"told": "The capture is being taken; the fit comes when it is complete."}
+    return found | _fit(path, region, channels, None)
+
+
+async def matrix_of(request: Request) -> JSONResponse:
+    """Mueller matrix of a pixel or a region of a capture, and what it decomposes into."""
+    return JSONResponse(await run_in_threadpool(_matrix_of, file_of(request), request.query_params))
+
+
+def _matrix_of(path: Path, query: Any) -> dict[str, Any]:
+    with Capture(path) as capture:
+        region = Region.asked(query, capture.frame_shape)
+        if capture.status == "running":
+            raise ProcessError("the capture is being taken")
+    return {"where": str(region), "matrix": matrix(reducer_of(path, None).image(region)[0])}
+
+
+def _fit(path: Path, region: Region, channels: int, instrument: Path | None) -> dict[str, Any]:
+    try:
+        reducer = reducer_of(path, instrument)
+        fit = curve(reducer, *reducer.image(region), channels)
+    except ProcessError as error:
+        return {"told": f"No fit: {error}"}
+    return {"fit": fit, "told": fit["told"]}
+
+
+def reducer_of(path: Path, instrument: Path | None) -> PixelReducer:
+    """What reduces single pixels of a capture, kept while its files stay as they are."""
+    changed = [p.stat().st_mtime_ns for p in (path, instrument) if p is not None]
+    return _kept(path, instrument, tuple(changed))
+
+
+@lru_cache(maxsize=4)
+def _kept(path: Path, instrument: Path | None, changed: tuple[int, ...]) -> PixelReducer:
+    return PixelReducer(path, instrument)
+
+
+async def of_product(request: Request) -> JSONResponse:
+    """What a product says of a pixel or a region, and the intensities behind it where the capture is at hand."""
+    library = pages_of(request).library
+    return JSONResponse(await run_in_threadpool(_of_product, file_of(request), request.query_params, library))
+
+
+def _of_product(path: Path, query: Any, library: Library) -> dict[str, Any]:
+    with Product(path) as product:
+        region = Region.asked(query, product.shape)
+        found: dict[str, Any] = {"where": str(region), "planes": _planes(product, region), "told": ""}
+        if "pixel_mask" in product.names:
+            bits = product.get("pixel_mask", region.rows)[:, region.columns]
+            found["mask"] = mask_words(int(bits.max())) if bits.any() else "valid"
+        if product.kind == "mueller" and region.pixels == 1:
+            image = MuellerImage.of(product, region.rows)
+            found["matrix"] = matrix(image.at(np.array([region.columns.start])))
+        source = capture_of(product, library)
+    if source is None:
+        return found | {"told": "The capture behind this product is not in the folder."}
+    path, instrument = source
+    with Capture(path) as capture:
+        channels = capture.channels
+        found |= raw_curve(capture, region, 0)
+    found |= _fit(path, region, channels, instrument)
+    if "matrix" not in found and "fit" in found:
+        found["matrix"] = matrix(reducer_of(path, instrument).image(region)[0])
+    return found
+
+
+def _planes(product: Product, region: Region) -> list[dict[str, Any]]:
+    told = []
+    for name in product.names:
+        if name.endswith("_errors") or name == "mueller" or name.endswith("covariance"):
+            continue
+        values = product.get(name, region.rows)[..., region.columns]
+        if values.size // region.pixels > 4:
+            continue
+        flat = values.reshape(-1, region.pixels).astype(float)
+        errors = f"{name}_errors"
+        entry = {"name": name, "units": product.units(name), "about": product.long_name(name)}
+        with np.errstate(invalid="ignore"):
+            entry["value"] = finite(flat.mean(axis=1))
+            if errors in product.names:
+                each = product.get(errors, region.rows)[..., region.columns].reshape(-1, region.pixels).astype(float)
+                entry["error"] = finite(np.sqrt(np.square(each).sum(axis=1)) / region.pixels)
+        told.append(entry)
+    return told
+
+
+def capture_of(product: Product, library: Library) -> tuple[Path, Path | None] | None:
+    """The capture that a product was reduced from, and the instrument file; None where it is not in the folder."""
+    reductions = [step for step in product.steps if step.name == "reduce"]
+    if not reductions:
+        return None
+    inputs = {str(i.get("role")): Path(str(i.get("path"))) for i in reductions[0].inputs}
+    path = inputs.get("capture")
+    instrument = inputs.get("instrument")
+    if path is None or not path.exists() or not library.inside(path):
+        return None
+    return path, instrument if instrument is not None and instrument.exists() else None

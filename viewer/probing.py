@@ -1,0 +1,224 @@
+"""A pixel or a region looked at closely: intensities with the fitted curve, Mueller matrix, what it decomposes into."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.errors import ProcessError
+from processing.instrument.determined import determined_basis
+from processing.instrument.model import InstrumentModel
+from processing.maps.quantities import quantities_block
+from processing.reduction.counts_to_signal import BlockReader, Correction, saturation
+from processing.reduction.cut_off import without_cut_off
+from processing.reduction.effects_of_capture import capture_changes, counts_correction
+from processing.reduction.mueller import Choice, choose_model, field_of, measurement_matrix, sample_states
+from processing.reduction.noise import NoiseModel
+from processing.reduction.solvers.inversion import ELEMENTS, Inversion
+from processing.reduction.solvers.plain import MuellerSolver
+from processing.storage.capture import Capture
+from processing.storage.images import MuellerImage
+from processing.storage.pixel_mask import Mask
+
+#: Most intensities that a region may have, states x pixels.
+MOST = 1 << 26
+
+
+@dataclass(frozen=True)
+class Region:
+    """Rows and columns of an image; one of each is a pixel."""
+
+    rows: slice
+    columns: slice
+
+    @classmethod
+    def asked(cls, query: Any, shape: tuple[int, int]) -> Region:
+        """The region of a request, inside the image. Raises ProcessError where its numbers are none."""
+        try:
+            x0, y0 = int(query["x0"]), int(query["y0"])
+            x1, y1 = int(query.get("x1", x0 + 1)), int(query.get("y1", y0 + 1))
+        except (KeyError, ValueError) as error:
+            raise ProcessError("a probe needs x0 and y0, and x1 and y1 for a region, in pixels") from error
+        if not (0 <= x0 < x1 <= shape[1] and 0 <= y0 < y1 <= shape[0]):
+            raise ProcessError(f"columns {x0} to {x1}, rows {y0} to {y1} do not lie in {shape[1]} x {shape[0]} pixels")
+        return cls(slice(y0, y1), slice(x0, x1))
+
+    @property
+    def pixels(self) -> int:
+        """How many."""
+        return int((self.rows.stop - self.rows.start) * (self.columns.stop - self.columns.start))
+
+    def __str__(self) -> str:
+        if self.pixels == 1:
+            return f"column {self.columns.start}, row {self.rows.start}"
+        return (
+            f"columns {self.columns.start} to {self.columns.stop - 1}, rows {self.rows.start} to {self.rows.stop - 1} "
+            f"({self.pixels} pixels)"
+        )
+
+
+def raw_curve(capture: Capture, region: Region, channel: int) -> dict[str, Any]:
+    """Counts of every state done, mean over the region, as stored: nothing but the file is needed."""
+    if region.pixels * len(capture.done) > MOST:
+        raise ProcessError(f"{region} x {len(capture.done)} states are more than are read at once; draw a smaller one")
+    counts = [capture.frames(k, region.rows)[channel][:, region.columns] for k in range(len(capture.done))]
+    top = saturation(capture)
+    return {
+        "where": str(region),
+        "state": capture.done.tolist(),
+        "role": list(capture.role),
+        "counts": [float(c.mean()) for c in counts],
+        "spread": [float(c.std()) for c in counts] if region.pixels > 1 else None,
+        "saturated": [bool(top is not None and c.max() >= top) for c in counts],
+    }
+
+
+class PixelReducer:
+    """Reduces single pixels and regions of a Mueller capture as `process reduce` does; opened once, asked often.
+
+    Parameters
+    ----------
+    instrument : file to use instead of the model in the capture.
+    """
+
+    def __init__(self, path: Path, instrument: Path | None = None) -> None:
+        self._path = path
+        with Capture(path) as capture:
+            if capture.header.mosaic is not None:
+                raise ProcessError("a mosaic capture has no fitted curve of one pixel; its Stokes image is the product")
+            self.model: InstrumentModel = choose_model(capture, instrument)
+            self.states, _ = without_cut_off(capture, sample_states(capture))
+            self._changes = capture_changes(capture, self.model, self.states)
+            self._w = measurement_matrix(capture, self.model, self.states, self._changes)
+            self._inversion = Inversion.of(self._w.reshape(-1, 16), f"{path}: ", determined_basis(self.model))
+            self._correction = Correction.of(capture)
+            self._noise = NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
+            self._field = field_of(capture, self.model, self.states, self._changes)
+
+    def image(self, region: Region) -> tuple[MuellerImage, NDArray[np.float64]]:
+        """The region as an image of one pixel, the mean of those that can be used, and its intensities (N,), counts.
+
+        Raises
+        ------
+        ProcessError : none of its pixels can be used, or it is too large.
+        """
+        if region.pixels * self._w.size // 16 > MOST:
+            raise ProcessError(f"{region} is more than is reduced at once; draw a smaller one")
+        with Capture(self._path) as capture:
+            reader = BlockReader(capture, self.states, self._correction, counts_correction(self._changes, self.model))
+            solver = Choice(noise=self._noise).solver(MuellerSolver(self._inversion, reader, self._noise), self._field)
+            frames = reader.read(region.rows)
+            found = solver.solve(frames)
+            signal = np.empty(frames.shape, np.float32)
+            reader.signal(frames, slice(None), signal)
+            shape = (region.rows.stop - region.rows.start, capture.frame_shape[1])
+            header, simulated, shape_of_image = capture.header, capture.simulated, capture.frame_shape
+
+        def part(values: NDArray[Any]) -> NDArray[Any]:
+            return values.reshape(*values.shape[:-1], *shape)[..., region.columns]
+
+        mask = part(found["pixel_mask"])
+        good = mask & np.uint8(Mask.NOT_FINITE | Mask.BAD | Mask.NOT_DETERMINED) == 0
+        count = int(good.sum())
+        if not count:
+            raise ProcessError(f"{region}: no pixel can be used ({mask_words(int(mask.max()))})")
+        mueller, errors = part(found["mueller"])[..., good], part(found["mueller_errors"])[..., good]
+        intensities = part(signal.reshape(len(self._w.reshape(-1, 16)), -1))[:, good].mean(axis=1, dtype=float)
+        m = mueller.reshape(16, -1).mean(axis=1, dtype=float)
+        w = self._matrix(region, shape_of_image)
+        nothing, noise = np.full(len(w), np.nan), self._noise
+        total = np.sqrt(np.square(errors.astype(float)).sum(axis=-1)) / count
+        image = MuellerImage(
+            values=m.reshape(4, 4, 1, 1).astype(np.float32),
+            errors=total.reshape(4, 4, 1, 1).astype(np.float32),
+            mask=np.zeros((1, 1), np.uint8),
+            residual_rms=np.array([[np.sqrt(np.mean((intensities - w @ m) ** 2))]], np.float32),
+            w=w,
+            noise_slope=nothing if noise is None else noise.slope / solver.repeats / count,
+            noise_floor=nothing if noise is None else solver.intensity_floor / count,
+            header=header,
+            steps=(),
+            simulated=simulated,
+            facts={"weighted": False, "rank": self._inversion.rank, "pixels": count},
+        )
+        return image, intensities
+
+    def _matrix(self, region: Region, shape: tuple[int, int]) -> NDArray[np.float64]:
+        """W (N, 16) in the middle of the region."""
+        if self._field is None:
+            return self._w.reshape(-1, 16)
+        middle = [(part.start + part.stop - 1) / 2 for part in (region.columns, region.rows)]
+        x, y = (np.array([2 * at / max(size - 1, 1) - 1]) for at, size in zip(middle, shape[::-1], strict=True))
+        return self._field.matrix(self._field.extra(x, y)[:, 0])
+
+    def told(self) -> str:
+        """How it is reduced, in a few words."""
+        effects = f", {len(self.model.effects)} effect(s)" if self.model.effects else ""
+        return f"{self.model.name}{effects}; black: {self._correction.source}"
+
+
+def curve(
+    reducer: PixelReducer, image: MuellerImage, intensities: NDArray[np.float64], channels: int
+) -> dict[str, Any]:
+    """Signal of each sample state with the fitted one, and the residual in units of the noise."""
+    fitted = image.w @ image.values.reshape(16).astype(float)
+    noise = np.sqrt(image.intensity_variance.reshape(-1).astype(float))
+    residual = (intensities - fitted) / noise
+    free = max(len(fitted) - int(image.facts["rank"]), 1)
+    return {
+        "states": np.repeat(reducer.states, channels).tolist(),
+        "signal": intensities.tolist(),
+        "fitted": fitted.tolist(),
+        "noise": finite(noise),
+        "residual": finite(residual),
+        "chi_square": finite(np.sum(residual**2) / free),
+        "noise_known": bool(np.isfinite(image.noise_slope).all()),
+        "told": reducer.told(),
+    }
+
+
+def matrix(image: MuellerImage) -> dict[str, Any]:
+    """Mueller matrix over m00 with its standard errors, and what it decomposes into."""
+    m, errors = image.values.reshape(4, 4).astype(float), image.errors.reshape(4, 4).astype(float)
+    derived = quantities_block(image, (), {}) if int(image.facts.get("rank", 16)) == ELEMENTS else {}
+    named = {name: values.reshape(-1).astype(float) for name, values in derived.items()}
+    with np.errstate(divide="ignore", invalid="ignore"):
+        normalized = m / m[0, 0]
+        # First order, with the covariance of an element and m00.
+        over = np.empty((4, 4))
+        for i in range(4):
+            for j in range(4):
+                gradient = np.zeros((1, 1, 16))
+                gradient[..., 4 * i + j] += 1 / m[0, 0]
+                gradient[..., 0] -= m[i, j] / m[0, 0] ** 2
+                over[i, j] = math.sqrt(max(float(image.variance_of(gradient).reshape(-1)[0]), 0.0))
+    quantities = {
+        name: {"value": finite(values), "error": finite(named[f"{name}_errors"])}
+        for name, values in named.items()
+        if f"{name}_errors" in named and values.size <= 4
+    }
+    return {
+        "mueller": finite(normalized),
+        "mueller_errors": finite(over),
+        "m00": finite(m[0, 0]),
+        "m00_error": finite(errors[0, 0]),
+        "quantities": quantities,
+    }
+
+
+def mask_words(bits: int) -> str:
+    """What the bits of a mask say."""
+    return ", ".join(bit.name.lower().replace("_", " ") for bit in Mask if bits & bit and bit.name) or "no reason given"
+
+
+def finite(values: Any) -> Any:
+    """Plain numbers for JSON; None for what is not finite."""
+    array = np.asarray(values, dtype=float)
+    if array.ndim == 0:
+        return float(array) if np.isfinite(array) else None
+    return [finite(v) for v in array]

@@ -1,0 +1,97 @@
+// The page of a campaign: its timeline, and what a run does while it runs.
+
+import { ImageView, place, readPlane } from "./images.js";
+import { accent, at, byId, draw, duration, embedded, narrow, post, quiet, say, statusColour } from "./plots.js";
+
+const run = byId("run"), folder = run.dataset.folder;
+let view = null, shown = {};
+
+function timeline() {
+  if (!byId("bars")) return;
+  const bars = embedded("bars"), names = [...new Set(bars.map(bar => bar.name))];
+  const now = new Date().toISOString();
+  const local = text => { const d = new Date(text); return new Date(d - d.getTimezoneOffset() * 60000).toISOString().slice(0, 23); };
+  draw(byId("timeline"), () => bars.map(bar => ({
+    type: "scatter", mode: "lines", x: [local(bar.start), local(bar.end ?? now)], y: [bar.name, bar.name], line: { color: statusColour(bar.status), width: 11 },
+    hovertemplate: `${bar.name}<br>%{x|%H:%M:%S}: ${bar.status}<extra></extra>`,
+  })), () => ({
+    height: Math.max(170, 60 + 20 * names.length), xaxis: { type: "date" },
+    yaxis: { autorange: "reversed", type: "category", categoryarray: names, showticklabels: !narrow() }, margin: { l: 10, t: 4 },
+  }));
+}
+
+function facts(table, pairs) {
+  table.replaceChildren(...pairs.map(([name, value]) => {
+    const line = document.createElement("tr"), head = document.createElement("th"), cell = document.createElement("td");
+    head.textContent = name;
+    cell.textContent = value;
+    line.append(head, cell);
+    return line;
+  }));
+}
+
+function drawLamp(lamp) {
+  byId("lampwords").textContent = lamp.told;
+  draw(byId("lamp"), () => [{ x: lamp.states, y: lamp.ratio.map(v => 100 * (v - 1)), mode: "markers+lines", line: { width: 1, color: accent() }, marker: { size: 4 },
+    hovertemplate: "state %{x}: %{y:+.2f} %<extra></extra>" }],
+    () => ({ xaxis: { title: { text: "state" } }, yaxis: { title: { text: "lamp / %" }, zerolinecolor: quiet() }, margin: { t: 4 } }));
+}
+
+async function lastFrame(now) {
+  if (!now.file || !now.states || (shown.file === now.file && shown.states === now.states)) return;
+  shown = now;
+  if (!view) {
+    const states = await (await fetch(at("states", { file: now.file }))).json();
+    view = new ImageView(byId("frame"), {
+      shape: states.shape,
+      read: (window, signal) => readPlane("frame", { file: shown.file, state: -1, ...window }, signal),
+      traces: plane => [
+        { type: "heatmap", z: plane.planes[0], ...place(plane), zmin: states.black, zmax: states.saturation ?? undefined, colorscale: [[0, "#000"], [1, "#fff"]],
+          hovertemplate: "%{z:.0f} counts<extra></extra>", colorbar: { title: { text: "counts", side: "right" }, thickness: 10, outlinewidth: 0 } },
+        { type: "heatmap", z: plane.planes[1].map(row => Array.from(row, v => v ? 1 : null)), ...place(plane), hoverinfo: "skip", showscale: false, colorscale: [[0, "#e3122d"], [1, "#e3122d"]] },
+      ],
+    });
+  }
+  // A capture that was just sealed has lost its partial name: the next event brings the new one.
+  await view.refresh().catch(() => { shown = {}; });
+}
+
+function show(now) {
+  const was = !run.hidden;
+  run.hidden = !now.running;
+  if (was && !now.running) return location.reload();
+  if (!now.running) return undefined;
+  byId("title").textContent = now.title || now.activity;
+  byId("captures").textContent = `${now.number} of ${now.total}`;
+  byId("states").textContent = `${now.done} of ${now.pending}`;
+  byId("left").textContent = duration(now.left_s);
+  byId("night").textContent = duration(now.night_s);
+  byId("progress").max = now.pending || 1;
+  byId("progress").value = now.done;
+  byId("activity").textContent = now.activity;
+  facts(byId("axes"), Object.entries(now.axes_deg).map(([name, value]) => [name, `${value.toFixed(3)}°`]));
+  if (now.lamp) drawLamp(now.lamp);
+  byId("messages").replaceChildren(...(now.messages.length ? now.messages : ["none"]).map(text => {
+    const line = document.createElement("div");
+    line.textContent = text;
+    return line;
+  }));
+  return lastFrame(now);
+}
+
+byId("stop").addEventListener("click", async event => {
+  event.target.disabled = true;
+  event.target.textContent = "Stopping after this state ...";
+  try { await post("stop", { folder }); } catch (error) {
+    event.target.disabled = false;
+    event.target.textContent = "Stop after this state";
+    say(byId("messages"), error);
+  }
+});
+
+addEventListener("load", () => {
+  timeline();
+  const events = new EventSource(at("events", { folder }));
+  events.onmessage = event => show(JSON.parse(event.data));
+  document.body.dataset.ready = "yes";
+});

@@ -1,0 +1,123 @@
+// The page of a capture: frames with a slider, histogram, and the intensities of a pixel.
+
+import { ImageView, place, readPlane } from "./images.js";
+import { accent, bad, byId, draw, embedded, getJson, ink, narrow, say } from "./plots.js";
+import { drawCurve, showProbe } from "./probe.js";
+
+const file = byId("look").dataset.file;
+const slider = byId("state"), channel = byId("channel"), problem = byId("problem");
+let states = embedded("states"), timer = null;
+
+channel.hidden = states.channels.length < 2;
+channel.replaceChildren(...states.channels.map((name, k) => new Option(name, k)));
+
+const view = new ImageView(byId("frame"), {
+  shape: states.shape,
+  read: (window, signal) => readPlane("frame", { file, state: slider.value, channel: channel.value || 0, ...window }, signal),
+  traces: plane => [
+    { type: "heatmap", z: plane.planes[0], ...place(plane), colorscale: "Greys", reversescale: false, zmin: states.black,
+      zmax: states.saturation ?? undefined, hovertemplate: "column %{x}, row %{y}<br>%{z:.1f} counts<extra></extra>",
+      colorscale: [[0, "#000"], [1, "#fff"]], colorbar: { title: { text: "counts", side: "right" }, thickness: 12, outlinewidth: 0, len: 0.9 } },
+    { type: "heatmap", z: plane.planes[1].map(row => Array.from(row, v => v ? 1 : null)), ...place(plane), hoverinfo: "skip",
+      showscale: false, zmin: 0, zmax: 1, colorscale: [[0, "#e3122d"], [1, "#e3122d"]] },
+  ],
+  chosen: region => probe(region),
+});
+
+const run = action => action().then(() => problem.replaceChildren(), error => say(problem, error));
+
+async function probe(region) {
+  await run(async () => {
+    const found = await getJson("curve", { file, ...region, channel: channel.value || 0 });
+    byId("pixel").textContent = found.where;
+    byId("fit").textContent = found.told;
+    drawCurve(byId("curve"), found, Number(slider.value));
+    history.replaceState(null, "", `#x=${region.x0}&y=${region.y0}`);
+    byId("probe").hidden = !found.fit;
+    if (found.fit) showProbe(byId("probe"), { ...found, ...await getJson("matrix", { file, ...region }) });
+  });
+}
+
+async function drawHistogram() {
+  const h = await getJson("histogram", { file, state: slider.value, channel: channel.value || 0 });
+  const middle = h.pixels.map((_, k) => (h.edges[k] + h.edges[k + 1]) / 2);
+  const wide = h.edges[1] - h.edges[0];
+  const lines = [[h.black, ink(), "black"], ...(h.saturation ? [[h.saturation, bad(), "saturated"]] : [])];
+  draw(byId("histogram"), () => [{
+    type: "bar", x: middle, y: h.pixels, width: wide, marker: { line: { width: 0 }, color: middle.map(v => h.saturation && v >= h.saturation - wide / 2 ? "#e3122d" : accent()) },
+    hovertemplate: `%{x:.0f} counts: %{y} pixels<extra></extra>`,
+  }], () => ({
+    bargap: 0, xaxis: { title: { text: "counts" }, range: [Math.min(h.black, h.edges[0]) - 2, Math.max(h.edges.at(-1), h.saturation ?? 0) * 1.02] },
+    yaxis: { title: { text: "pixels" }, type: "log", exponentformat: "power", dtick: 1 },
+    shapes: lines.map(([x, color]) => ({ type: "line", x0: x, x1: x, yref: "paper", y0: 0, y1: 1, line: { color, width: 1, dash: "dot" } })),
+    annotations: lines.map(([x, color, text]) => ({ x, y: 1, yref: "paper", text, showarrow: false, font: { color }, xanchor: x > h.edges.at(-1) / 2 ? "right" : "left", yanchor: "top" })),
+    margin: { t: 6 },
+  }));
+  byId("saturation").textContent = h.saturation === null ? "Where this detector saturates is not known."
+    : `${h.saturated} of ${h.of} pixels saturated (${(100 * h.saturated / h.of).toPrecision(2)} %).`;
+}
+
+function told(k) {
+  const angles = Object.entries(states.angles_deg).map(([name, values]) => `${name} ${values[k] === null ? "?" : (((values[k] % 360) + 360) % 360).toFixed(2)}°`);
+  byId("which").textContent = `state ${states.number[k]}, ${states.role[k]}${narrow() ? "" : `, ${angles.join(", ")}, ${states.exposure_s[k] ?? "?"} s`}`;
+}
+
+async function show() {
+  const k = Number(slider.value);
+  if (!states.number.length) { byId("which").textContent = "no state is done yet"; return; }
+  told(k);
+  slider.setAttribute("aria-valuetext", byId("which").textContent);
+  await run(() => Promise.all([view.refresh(), drawHistogram()]));
+}
+
+function play(on) {
+  clearTimeout(timer);
+  timer = null;
+  byId("play").setAttribute("aria-pressed", on);
+  byId("play").textContent = on ? "Pause" : "Play";
+  const next = async () => {
+    slider.value = (Number(slider.value) + 1) % states.number.length;
+    told(Number(slider.value));
+    await run(() => view.refresh());
+    if (timer !== null) timer = setTimeout(next, 80);
+  };
+  if (on) timer = setTimeout(next, 0); else show();
+}
+
+const step = by => { slider.value = Number(slider.value) + by; show(); };
+slider.max = Math.max(states.number.length - 1, 0);
+slider.value = Math.max(states.role.findIndex(role => role !== "dark"), 0);
+slider.addEventListener("input", show);
+channel.addEventListener("change", show);
+byId("play").addEventListener("click", () => play(timer === null));
+byId("region").addEventListener("click", event => {
+  const on = event.target.getAttribute("aria-pressed") !== "true";
+  event.target.setAttribute("aria-pressed", on);
+  Plotly.relayout(view.node, { dragmode: on ? "select" : "zoom" });
+});
+document.addEventListener("keydown", event => {
+  if (/^(input|select|textarea)$/i.test(event.target.tagName) && event.target.type !== "range") return;
+  if (event.key === ",") step(-1);
+  else if (event.key === ".") step(1);
+  else if (event.key === " " && !/^(button|summary|a)$/i.test(event.target.tagName)) { play(timer === null); event.preventDefault(); }
+  else if (document.activeElement === view.node) view.key(event);
+});
+
+async function follow() {
+  const now = await getJson("states", { file });
+  const atEnd = Number(slider.value) === states.number.length - 1 || !states.number.length;
+  states = now;
+  slider.max = Math.max(states.number.length - 1, 0);
+  if (atEnd) { slider.value = slider.max; await show(); }
+  byId("status").textContent = `${now.status}, ${now.number.length} of ${now.planned}`;
+  if (now.status === "running") setTimeout(follow, 1000);
+}
+
+addEventListener("load", async () => {
+  await show();
+  const wanted = new URLSearchParams(location.hash.slice(1));
+  const x = Number(wanted.get("x")), y = Number(wanted.get("y"));
+  if (wanted.has("x")) view.choose({ x0: x, y0: y });
+  if (byId("look").dataset.writing) run(follow);
+  document.body.dataset.ready = "yes";
+});

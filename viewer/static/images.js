@@ -1,0 +1,127 @@
+// Pictures of numbers: read from the server in the resolution that the screen shows, and again for what is zoomed into.
+
+import { at, draw } from "./plots.js";
+
+/** Read a picture; its planes as arrays of rows, with where its pixels lie in the image. */
+export async function readPlane(what, query, signal) {
+  const answer = await fetch(at(what, query), { signal });
+  if (!answer.ok) throw new Error(await answer.text());
+  const told = JSON.parse(answer.headers.get("X-Plane"));
+  const values = new Float32Array(await answer.arrayBuffer());
+  const size = told.rows * told.columns;
+  const planes = [];
+  for (let k = 0; k < values.length / size; k++) {
+    const rows = [];
+    for (let r = 0; r < told.rows; r++) rows.push(values.subarray(k * size + r * told.columns, k * size + (r + 1) * told.columns));
+    planes.push(rows);
+  }
+  return { ...told, planes };
+}
+
+/** Where a picture's pixels lie, as a heat map wants it: centres, in pixels of the image. */
+export const place = plane => ({
+  x0: plane.x0 + (plane.step - 1) / 2, dx: plane.step, y0: plane.y0 + (plane.step - 1) / 2, dy: plane.step,
+});
+
+/**
+ * An image with pan, zoom and a chosen pixel or region; what is zoomed into is read again in full resolution.
+ *
+ * read(query, signal): reads the window that `query` names; traces(plane): heat maps of it; more(): further layout.
+ * chosen({x0, x1, y0, y1}): told of a click on a pixel, or of a region drawn with the select tool.
+ */
+export class ImageView {
+  constructor(node, { read, traces, shape, more = () => ({}), chosen }) {
+    Object.assign(this, { node, read, traces, shape, more, chosen, plane: null, region: null });
+    node.dataset.wheel = "yes";
+  }
+
+  window() {
+    const [x0, x1] = this.node.layout?.xaxis?.range || [-0.5, this.shape[1] - 0.5];
+    const [a, b] = this.node.layout?.yaxis?.range || [this.shape[0] - 0.5, -0.5];
+    const inside = (v, top) => Math.min(Math.max(v, 0), top);
+    return {
+      x0: inside(Math.floor(x0 + 0.5), this.shape[1] - 1), x1: inside(Math.ceil(x1 + 0.5), this.shape[1]),
+      y0: inside(Math.floor(Math.min(a, b) + 0.5), this.shape[0] - 1), y1: inside(Math.ceil(Math.max(a, b) + 0.5), this.shape[0]),
+      most: Math.min(1024, Math.ceil(this.node.clientWidth * Math.min(devicePixelRatio, 2)) || 600),
+    };
+  }
+
+  /** Read what is seen now and show it; a later call ends an earlier one. */
+  async refresh() {
+    this.reading?.abort();
+    this.reading = new AbortController();
+    try {
+      const plane = await this.read(this.window(), this.reading.signal);
+      this.plane = plane;
+      await this.show();
+    } catch (error) {
+      if (error.name !== "AbortError") throw error;
+    }
+  }
+
+  async show() {
+    if (!this.plane) return;
+    const first = !this.node.layout;
+    await draw(this.node, () => this.traces(this.plane), () => this.frame());
+    if (first) this.listen();
+  }
+
+  frame() {
+    const more = this.more();
+    return {
+      dragmode: this.node.layout?.dragmode || "zoom", margin: { l: 44, r: 8, t: 8, b: 36 },
+      ...more,
+      xaxis: { range: [-0.5, this.shape[1] - 0.5], constrain: "domain", title: { text: "column / pixels" }, showgrid: false, zeroline: false, ...more.xaxis },
+      yaxis: { range: [this.shape[0] - 0.5, -0.5], scaleanchor: "x", constrain: "domain", title: { text: "row / pixels" }, showgrid: false, zeroline: false, ...more.yaxis },
+      shapes: [...this.marks(), ...(more.shapes || [])],
+    };
+  }
+
+  marks() {
+    if (!this.region) return [];
+    const { x0, x1, y0, y1 } = this.region;
+    const line = { color: "#ff2d95", width: 2 };
+    return [{ type: "rect", x0: x0 - 0.5, x1: x1 - 0.5, y0: y0 - 0.5, y1: y1 - 0.5, line }];
+  }
+
+  listen() {
+    let pause;
+    this.node.on("plotly_relayout", change => {
+      if (!Object.keys(change).some(key => /axis/.test(key))) return;
+      clearTimeout(pause);
+      pause = setTimeout(() => this.refresh(), 120);
+    });
+    this.node.on("plotly_click", event => {
+      const point = event.points[0];
+      this.choose({ x0: Math.round(point.x), y0: Math.round(point.y) });
+    });
+    this.node.on("plotly_selected", event => {
+      if (!event?.range) return;
+      const [x0, x1] = event.range.x.map(Number).sort((a, b) => a - b);
+      const [y0, y1] = event.range.y.map(Number).sort((a, b) => a - b);
+      this.choose({ x0: Math.ceil(x0), x1: Math.floor(x1) + 1, y0: Math.ceil(y0), y1: Math.floor(y1) + 1 });
+    });
+  }
+
+  /** Mark a pixel or a region and tell of it. */
+  choose({ x0, y0, x1 = x0 + 1, y1 = y0 + 1 }, told = true) {
+    const inside = (v, low, high) => Math.min(Math.max(v, low), high);
+    x0 = inside(x0, 0, this.shape[1] - 1); x1 = inside(x1, x0 + 1, this.shape[1]);
+    y0 = inside(y0, 0, this.shape[0] - 1); y1 = inside(y1, y0 + 1, this.shape[0]);
+    this.region = { x0, x1, y0, y1 };
+    if (this.node.layout) Plotly.relayout(this.node, { shapes: this.frame().shapes });
+    if (told) this.chosen?.(this.region);
+  }
+
+  /** Arrow keys move the chosen pixel; with Shift by ten. */
+  key(event) {
+    const step = event.shiftKey ? 10 : 1;
+    const moves = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -step], ArrowDown: [0, step] };
+    if (!(event.key in moves)) return false;
+    const [dx, dy] = moves[event.key];
+    const { x0, y0 } = this.region || { x0: this.shape[1] >> 1, y0: this.shape[0] >> 1 };
+    this.choose({ x0: x0 + dx, y0: y0 + dy });
+    event.preventDefault();
+    return true;
+  }
+}

@@ -1,0 +1,81 @@
+// What the plots of all pages share: colours of the page, scales as in print, and pictures read from the server.
+
+export const root = document.documentElement.dataset.root;
+export const at = (what, query = {}) => {
+  const given = Object.entries(query).filter(([, value]) => value !== null && value !== undefined);
+  return `${root}/${what}?${new URLSearchParams(given)}`;
+};
+export const byId = id => document.getElementById(id);
+export const embedded = id => JSON.parse(byId(id).textContent);
+
+export async function getJson(what, query) {
+  const answer = await fetch(at(what, query));
+  if (!answer.ok) throw new Error(await answer.text());
+  return answer.json();
+}
+
+export async function post(what, fields) {
+  const answer = await fetch(`${root}/${what}`, { method: "POST", body: JSON.stringify(fields) });
+  if (!answer.ok) throw new Error(await answer.text());
+  return answer.json();
+}
+
+export function say(where, error) {
+  const line = document.createElement("p");
+  line.className = "error";
+  line.setAttribute("role", "alert");
+  line.textContent = error.message || String(error);
+  where.replaceChildren(line);
+}
+
+const colour = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+const dark = matchMedia("(prefers-color-scheme: dark)");
+export const narrow = () => innerWidth < 640;
+
+export function layout(more = {}) {
+  const ink = colour("--ink"), line = colour("--line");
+  const axis = { gridcolor: line, zerolinecolor: line, linecolor: line, automargin: true, ticks: "outside", tickcolor: line };
+  const { xaxis, yaxis, margin, ...rest } = more;
+  return {
+    paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+    font: { color: ink, family: "system-ui, DejaVu Sans, sans-serif", size: 12 },
+    margin: { l: 52, r: 12, t: 10, b: 40, ...margin }, showlegend: false, hovermode: "closest", uirevision: "kept",
+    legend: { orientation: "h", y: 1.12, x: 0 },
+    xaxis: { ...axis, ...xaxis }, yaxis: { ...axis, ...yaxis }, ...rest,
+  };
+}
+
+export const settings = {
+  responsive: true, displaylogo: false, scrollZoom: false,
+  modeBarButtonsToRemove: ["lasso2d", "select2d", "autoScale2d"],
+};
+
+const drawn = new Map();
+/** Draw a plot; it is drawn again with the colours of the page when those change. */
+export function draw(node, traces, more) {
+  drawn.set(node, [traces, more]);
+  return Plotly.react(node, traces(), layout(more()), node.dataset.wheel ? { ...settings, scrollZoom: true } : settings);
+}
+dark.addEventListener("change", () => drawn.forEach(([traces, more], node) => {
+  const kept = ["xaxis", "yaxis"].map(name => node.layout?.[name]?.range);
+  const fresh = more();
+  fresh.xaxis = { ...fresh.xaxis, range: kept[0] };
+  fresh.yaxis = { ...fresh.yaxis, range: kept[1] };
+  Plotly.react(node, traces(), layout(fresh), settings);
+}));
+
+export const ink = () => colour("--ink");
+export const accent = () => colour("--accent");
+export const bad = () => colour("--bad");
+export const warn = () => colour("--warn");
+export const quiet = () => colour("--quiet");
+export const statusColour = status => ({
+  done: "#2e7d4f", flagged: "#e0a030", partial: "#e0a030", failed: "#b3261e", running: accent(),
+})[status] || quiet();
+
+export function duration(seconds) {
+  if (seconds === null || seconds === undefined) return "not known yet";
+  if (seconds < 90) return `${Math.round(seconds)} s`;
+  if (seconds < 5400) return `${Math.round(seconds / 60)} min`;
+  return `${Math.floor(seconds / 3600)} h ${Math.round(seconds % 3600 / 60)} min`;
+}
