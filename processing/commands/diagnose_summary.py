@@ -23,6 +23,8 @@ def show(d: Diagnosis) -> None:
     typer.echo(f"  held out: {before.held_out}")
     for capture in d.captures:
         _show_capture(capture, several=len(d.wavelengths_nm) > 1)
+    for left_out in d.left_out:
+        typer.echo(f"  left out of {left_out.capture}: {left_out.told}")
     for effect in d.effects:
         _show_effect(effect)
     if d.correction is not None:

@@ -37,6 +37,10 @@ def reduce_command(
         list[Path] | None,
         typer.Option(help="Capture of the flat field to divide by, several times for a mean; or a campaign's folder."),
     ] = None,
+    leave_out: Annotated[
+        Path | None,
+        typer.Option(help="Leave out what `diagnose --json` found to be no measurement: states, hits, bad pixels."),
+    ] = None,
     demosaic: Annotated[str | None, typer.Option(help="Mosaic method; default: the best of docs/mosaic.md.")] = None,
     analyzers: Annotated[
         Path | None, typer.Option(help="Mosaic: analysis vectors of the pixels, from `process calibrate-mosaic`.")
@@ -51,7 +55,17 @@ def reduce_command(
     from processing.steps.reduction import Reduction
 
     step = Reduction(
-        capture, instrument, weighted, covariance, physical, camera, dark, tuple(flat or ()), demosaic, analyzers
+        capture,
+        instrument,
+        weighted,
+        covariance,
+        physical,
+        camera,
+        dark,
+        tuple(flat or ()),
+        leave_out,
+        demosaic,
+        analyzers,
     )
     with progress_bar("reducing", "rows" if step.kind == "mueller" else "states") as tick:
         product = step.make(out, overwrite, tick)

@@ -129,7 +129,9 @@ class BlockReader:
         states: NDArray[np.int64],
         correction: Correction,
         counts: CountsCorrection | None = None,
+        struck: NDArray[np.int64] | None = None,
     ) -> None:
+        """`struck` (H, 4): state among `states`, channel, row and column of intensities that are left out."""
         self.capture, self.states, self.correction, self.counts = capture, states, correction, counts
         self.repeats = capture.column("repeats")[states].astype(float)
         exposure = capture.column("exposure_s")[states].astype(float)
@@ -144,6 +146,8 @@ class BlockReader:
         self._black = np.zeros((1, 1, 1), np.float32)
         self._gain: NDArray[np.float32] | None = None
         self._bad: NDArray[np.bool_] | None = None
+        self._all_struck = np.zeros((0, 4), dtype=np.int64) if struck is None else struck
+        self._struck: NDArray[np.bool_] | None = None
 
     def read(self, rows: slice) -> NDArray[np.generic]:
         """Counts (states, channels, pixels) of a row block as stored; the memory is used again by the next call."""
@@ -166,7 +170,23 @@ class BlockReader:
         self._black = np.ascontiguousarray(black, dtype=np.float32)
         self._gain = None if flat is None else 1.0 / flat.response[:, rows].reshape(channels, -1)
         self._bad = None if bad is None else bad[rows].reshape(-1)
+        self._struck = self._struck_in(rows, shape)
         return block.reshape(len(self.states), channels, -1)
+
+    def _struck_in(self, rows: slice, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
+        """(states, channels, pixels) of a row block; None for none."""
+        mine = self._all_struck[(self._all_struck[:, 2] >= rows.start) & (self._all_struck[:, 2] < rows.stop)]
+        if not len(mine):
+            return None
+        out = np.zeros(shape, dtype=bool)
+        out[mine[:, 0], mine[:, 1], mine[:, 2] - rows.start, mine[:, 3]] = True
+        return out.reshape(*shape[:2], -1)
+
+    def sound(self, raw: NDArray[np.generic], pixels: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which intensities (states, channels, pixels) of the block count: neither saturated nor struck."""
+        level = self.correction.saturation
+        out = np.ones(raw.shape, dtype=bool) if level is None else np.less(raw, level)
+        return out if self._struck is None else out & ~self._struck[:, :, pixels]
 
     def _read_moved(self, rows: slice, block: NDArray[np.generic], shift_px: NDArray[np.float64], pitch: int) -> None:
         """Fill `block` with counts of images moved back; beyond an edge of the frame slopes go on.
@@ -193,6 +213,8 @@ class BlockReader:
         level = self.correction.saturation
         if level is not None:
             flags[raw.max(axis=(0, 1)) >= level] |= np.uint8(Mask.SATURATED)
+        if self._struck is not None:
+            flags[self._struck[:, :, start:stop].any(axis=(0, 1))] |= np.uint8(Mask.STRUCK)
         if raw.dtype.kind == "f":
             flags[~np.isfinite(raw).all(axis=(0, 1))] |= np.uint8(Mask.NOT_FINITE)
         if self._bad is not None:

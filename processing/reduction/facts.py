@@ -36,7 +36,7 @@ def mueller_facts(
     CaptureError : not one pixel could be reduced.
     """
     mask, warnings = product.get("pixel_mask"), list(correction.warnings)
-    good = (mask & ~np.uint8(Mask.SATURATED)) == 0
+    good = (mask & ~np.uint8(Mask.PARTLY)) == 0
     counts = {flag.name.lower(): int(np.sum((mask & np.uint8(flag)) != 0)) for flag in Mask if flag.name}
     if not good.any():
         raise CaptureError(f"no pixel could be reduced: {in_words(counts)} of {mask.size} pixels. Nothing was written.")

@@ -29,6 +29,7 @@ from processing.reduction.effects_of_capture import (
     with_extra,
 )
 from processing.reduction.facts import mueller_facts
+from processing.reduction.left_out import LeftOut
 from processing.reduction.noise import NoiseModel
 from processing.reduction.solvers.field import Field, FieldSolver
 from processing.reduction.solvers.inversion import ELEMENTS, Inversion
@@ -202,6 +203,7 @@ def reduce_mueller(
     steps: tuple[Step, ...],
     correction: Correction | None = None,
     choice: Choice | None = None,
+    left_out: LeftOut | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -212,18 +214,25 @@ def reduce_mueller(
     model : resolved at the capture's wavelength.
     correction : black, flat and masks; default: what the capture itself offers.
     choice : weighting, covariance, physical estimate, noise; default: plain.
+    left_out : states and intensities that are no measurement of the sample; its bad pixels belong into `correction`.
 
     Raises
     ------
     NotDetermined : W has a lower rank than states of this instrument can have.
     CaptureError : angles or frames are missing or not finite.
     """
-    states, cut_off = without_cut_off(capture, sample_states(capture))
+    left_out = left_out or LeftOut()
+    every = sample_states(capture)
+    if not set(left_out.states) | set(left_out.hits[:, 0].tolist()) <= set(range(len(every))):
+        raise CaptureError(f"{capture.path} has {len(every)} states; some that are to be left out are not among them.")
+    states, cut_off = without_cut_off(capture, np.delete(every, left_out.states))
+    cut_off = [*left_out.warnings, *cut_off]
     changes = capture_changes(capture, model, states)
     w = measurement_matrix(capture, model, states, changes)
     inversion = Inversion.of(w.reshape(-1, 16), f"{capture.path}: ", determined_basis(model))
     correction = correction or Correction.of(capture)
-    reader = BlockReader(capture, states, correction, counts_correction(changes, model))
+    struck = _among(left_out.hits, every, states)
+    reader = BlockReader(capture, states, correction, counts_correction(changes, model), struck)
     choice = choice or Choice()
     noise = choice.noise or NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
     if inversion.rank < ELEMENTS and (choice.physical or (changes is not None and changes.field_retardance_rad)):
@@ -261,6 +270,13 @@ def reduce_mueller(
             facts["physical_estimate"] = f"{choice.physical}, as mueller_physical beside the plain one"
         product.seal(facts)
     return facts
+
+
+def _among(hits: NDArray[np.int64], every: NDArray[np.int64], states: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Hits (H, 4) with their state's number among `states` in place of that among `every`; of those that are there."""
+    out = hits[np.isin(every[hits[:, 0]], states)]
+    out[:, 0] = np.searchsorted(states, every[out[:, 0]])
+    return out
 
 
 def _store_noise(product: ProductWriter, noise: NoiseModel | None, solver: Solver) -> None:

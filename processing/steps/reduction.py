@@ -11,6 +11,7 @@ from processing.calibration.photon_transfer import read_camera
 from processing.errors import ProcessError
 from processing.reduction.counts_to_signal import Correction
 from processing.reduction.flat import flat_captures, nearest_flat
+from processing.reduction.left_out import LeftOut
 from processing.reduction.mueller import Choice, choose_model, reduce_mueller
 from processing.steps.file_step import FileStep, Found, Progress
 from processing.storage.capture import Capture
@@ -30,6 +31,7 @@ class Reduction(FileStep):
     camera : noise and bad pixels, a product of `process camera`.
     dark : other capture whose dark states are subtracted.
     flat : captures of the flat field, or folders of which the one that belongs to the capture is taken.
+    leave_out : result of `diagnose --json`: states, struck intensities and bad pixels that it names are left out.
     demosaic, analyzers : method (None: the default) and analysis vectors of the pixels; for a mosaic capture.
     """
 
@@ -41,6 +43,7 @@ class Reduction(FileStep):
     camera: Path | None = None
     dark: Path | None = None
     flat: tuple[Path, ...] = ()
+    leave_out: Path | None = None
     demosaic: str | None = None
     analyzers: Path | None = None
 
@@ -63,17 +66,18 @@ class Reduction(FileStep):
             self._refuse(
                 ("weighted", "covariance", "physical"), "a mosaic capture; its product holds the covariance of S always"
             )
+            self._refuse(("leave_out",), "a mosaic capture; bad pixels come from --camera, and states are images each")
             options: dict[str, Any] = {"demosaic": self.demosaic or _default_method()}
         else:
             self._refuse(("demosaic", "analyzers"), "reduced super-pixel by super-pixel, or has no mosaic")
             options = {name: getattr(self, name) for name in ("weighted", "covariance", "physical")}
-        named = ("capture", "instrument", "camera", "dark", "analyzers")
+        named = ("capture", "instrument", "camera", "dark", "leave_out", "analyzers")
         files = [(role, getattr(self, role)) for role in named] + [("flat", path) for path in flats]
         inputs = tuple(file_identity(path, role) for role, path in files if path is not None)
         return Step("reduce", {"capture": self.capture.name} | options, inputs)
 
     def _refuse(self, options: tuple[str, ...], why: str) -> None:
-        given = [f"--{name}" for name in options if getattr(self, name)]
+        given = [f"--{name.replace('_', '-')}" for name in options if getattr(self, name)]
         if given:
             raise ProcessError(f"{' '.join(given)}: {self.capture} is {why}.")
 
@@ -88,11 +92,14 @@ class Reduction(FileStep):
             capture = opened(self.capture)
             dark = opened(self.dark) if self.dark else None
             noise, bad = read_camera(self.camera) if self.camera else (None, None)
+            left_out = LeftOut.read(self.leave_out, capture) if self.leave_out else LeftOut()
+            if left_out.bad is not None:
+                bad = left_out.bad if bad is None else bad | left_out.bad
             correction = Correction.of(capture, bad, dark, [opened(path) for path in flats])
             model = choose_model(capture, self.instrument)
             if mueller:
                 choice = Choice(self.weighted, self.covariance, self.physical, noise)
-                reduce_mueller(capture, model, out, (record,), correction, choice, overwrite, progress)
+                reduce_mueller(capture, model, out, (record,), correction, choice, left_out, overwrite, progress)
                 return
             # Imported here: OpenCV is not needed for a Mueller capture.
             from processing.reduction.mosaic.pixel_response import read_response

@@ -12,6 +12,8 @@ class Mask(IntFlag):
     NOT_FINITE = 2  # some state has no number there
     BAD = 4  # listed as a bad pixel
     NOT_DETERMINED = 8  # too few states are left
+    STRUCK = 16  # some state was struck there (cosmic ray) and was left out
+    PARTLY = SATURATED | STRUCK  # solved from the states that are left
 
     @classmethod
     def meaning(cls) -> str:

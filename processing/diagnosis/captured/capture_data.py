@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,24 @@ from numpy.typing import NDArray
 from processing.arrays import Array
 from processing.instrument.changes import Conditions
 from processing.reduction.move_image import shifted_back
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """What is no measurement of the sample, and is left out.
+
+    Attributes
+    ----------
+    frames : state to the rms by which it differs from what the others predict, relative to the signal.
+    hits : (H, 4) state, channel, row and column of single intensities; pixels : (B, 2) row and column of bad pixels.
+    """
+
+    frames: dict[int, float] = field(default_factory=dict)
+    hits: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 4), dtype=np.int64))
+    pixels: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+
+    def __bool__(self) -> bool:
+        return bool(self.frames) or len(self.hits) > 0 or len(self.pixels) > 0
 
 
 @dataclass(frozen=True)
@@ -36,6 +54,7 @@ class CaptureData:
     dark_fraction : part of the pixels that are too dark, or too close to dark ones, to be used.
     steep_fraction : part of the pixels that are left out because they lie at sharp edges.
     cut_off : numbers of states that do not count because their counts are cut off at zero.
+    left_out : frames, hits and pixels that are no measurement of the sample.
     binned : side of the squares over which pixels were averaged.
     pitch : pixels of the sensor from one pixel here to the next.
     """
@@ -62,6 +81,7 @@ class CaptureData:
     noise_estimated: bool = False
     true_variance: NDArray[np.float32] | None = None
     moved_px: Array | None = None
+    left_out: LeftOut = field(default_factory=LeftOut)
 
     @property
     def values_per_pixel(self) -> int:
@@ -77,7 +97,7 @@ class CaptureData:
     def row_counts(self) -> NDArray[np.bool_]:
         """(values_per_pixel,) whether a row of W counts."""
         counts = np.ones(self.conditions.states, dtype=bool)
-        counts[list(self.cut_off)] = False
+        counts[[*self.cut_off, *self.left_out.frames]] = False
         return np.repeat(counts, self.signal.shape[1])
 
     @property

@@ -20,6 +20,7 @@ from processing.diagnosis.instrument.telling import (
     error,
     floor,
     missing,
+    not_measured,
     ranking,
     told_effects,
     told_switches,
@@ -119,6 +120,7 @@ def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
         simulated=any(c.simulated for c in problem.captures),
         correction=correction_told,
         wiring=None if wiring is None else wiring.told,
+        left_out=not_measured(problem),
     )
     return Judged(diagnosis, kept, before, after if refused is None else before)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.captured.screening import screened
 from processing.diagnosis.instrument.judge import Judged, diagnose
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.posterior import Say
@@ -34,6 +35,6 @@ def diagnose_captures(
         say(f"reading {path.name}")
         with Capture(path) as capture:
             models.append(model.nominal_at(capture.header.wavelength_nm))
-            data.append(read_capture(capture, models[-1]))
+            data.append(screened(read_capture(capture, models[-1]), models[-1], say))
     problem = InstrumentProblem(models, data)
     return diagnose(problem, say), problem

@@ -14,7 +14,15 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause
 from processing.diagnosis.search.fit import HeldOut
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.result import CaptureReport, Check, Correction, Error, FoundEffect, Ranked
+from processing.diagnosis.search.result import (
+    CaptureReport,
+    Check,
+    Correction,
+    Error,
+    FoundEffect,
+    NotMeasured,
+    Ranked,
+)
 from processing.diagnosis.search.rules import DECISIVE, NOMINAL_TAU
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import (
@@ -246,3 +254,22 @@ def capture_report(
         closure_before_percent=closure(problem, k, solved.base, solved.before_fit.values),
         closure_after_percent=closure(problem, k, solved.space, solved.fit.values),
     )
+
+
+def not_measured(problem: InstrumentProblem) -> tuple[NotMeasured, ...]:
+    """Frames, hits and pixels that were left out, as the frames are stored."""
+    told = []
+    for data in problem.captures:
+        out, pitch = data.left_out, data.pitch
+        if out:
+            told.append(
+                NotMeasured(
+                    capture=data.name,
+                    states=tuple(out.frames),
+                    misfits_percent=tuple(100 * m for m in out.frames.values()),
+                    hits=tuple((n, c, y * pitch, x * pitch) for n, c, y, x in out.hits.tolist()),
+                    pixels=tuple((y * pitch, x * pitch) for y, x in out.pixels.tolist()),
+                    pitch=pitch,
+                )
+            )
+    return tuple(told)

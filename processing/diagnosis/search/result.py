@@ -121,6 +121,39 @@ class CaptureReport(_Part):
     closure_after_percent: float | None = None
 
 
+class NotMeasured(_Part):
+    """What of a capture is no measurement of the sample, and was left out.
+
+    Attributes
+    ----------
+    states : numbers among the states of the sample; misfits_percent : by how much each differs from what the others
+        predict, rms, relative to the signal.
+    hits : state, channel, row and column of single intensities that were struck (cosmic rays, bit errors).
+    pixels : row and column of bad pixels. All are of the frames as stored, each the first of `pitch` x `pitch` pixels.
+    """
+
+    capture: str
+    states: tuple[int, ...] = ()
+    misfits_percent: tuple[float, ...] = ()
+    hits: tuple[tuple[int, int, int, int], ...] = ()
+    pixels: tuple[tuple[int, int], ...] = ()
+    pitch: int = 1
+
+    @property
+    def told(self) -> str:
+        """In words."""
+        parts = []
+        if self.states:
+            misfits = ", ".join(f"{k} ({m:.0f} % off)" for k, m in zip(self.states, self.misfits_percent, strict=True))
+            parts.append(f"state{'s' if len(self.states) > 1 else ''} {misfits}, which the others do not predict")
+        if self.hits:
+            struck = len({h[2:] for h in self.hits})
+            parts.append(f"{len(self.hits)} hits (as of cosmic rays) in {struck} pixels")
+        if self.pixels:
+            parts.append(f"{len(self.pixels)} bad pixel{'s' if len(self.pixels) > 1 else ''}")
+        return "; ".join(parts)
+
+
 class Diagnosis(_Part):
     """Result of `diagnose`."""
 
@@ -140,6 +173,7 @@ class Diagnosis(_Part):
     simulated: bool
     correction: Correction | None = None
     wiring: str | None = None
+    left_out: tuple[NotMeasured, ...] = ()
 
     def applied(self) -> tuple[AppliedEffect, ...]:
         """The effects as an instrument file stores them; none where the correction does not hold."""

@@ -36,7 +36,8 @@ class FieldSolver:
     """Least squares with W of each pixel's place; the same interface as MuellerSolver.
 
     Values and residual are those of the place. Standard errors are those of the image's centre: they change with the
-    place far less than the values do. Saturated intensities are not left out; their pixels are not determined.
+    place far less than the values do. Saturated and struck intensities are not left out; their pixels are not
+    determined.
 
     Parameters
     ----------
@@ -72,8 +73,8 @@ class FieldSolver:
         found = self.plain.estimate(frames)
         rows = frames.shape[2] // self.reader.capture.frame_shape[1]
         for_ranges(rows, lambda a, b: self._range(frames, a, b, found), align=1, smallest=16)
-        saturated = (found["pixel_mask"] & np.uint8(Mask.SATURATED)) != 0
-        found["pixel_mask"][saturated] |= np.uint8(Mask.NOT_DETERMINED)
+        partly = (found["pixel_mask"] & np.uint8(Mask.PARTLY)) != 0
+        found["pixel_mask"][partly] |= np.uint8(Mask.NOT_DETERMINED)
         return found
 
     def _range(self, frames: NDArray[Any], start: int, stop: int, found: dict[str, NDArray[Any]]) -> None:

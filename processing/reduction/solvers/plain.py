@@ -13,7 +13,7 @@ from processing.reduction.noise import NoiseModel
 from processing.reduction.solvers.inversion import TILE, Inversion
 from processing.storage.pixel_mask import Mask
 
-#: Saturated pixels solved at a time, each with its own matrix.
+#: Pixels of which some intensities are left out, solved at a time, each with its own matrix.
 REPAIR_BATCH = 4096
 #: A pixel's remaining states must leave W a condition number below this.
 WORST_CONDITION = 1e3
@@ -51,13 +51,13 @@ class MuellerSolver:
     def solve(self, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
         """Mueller elements, errors, residual and mask of frames (N, channels, pixels) that the reader just read."""
         found = self.estimate(frames)
-        repair = np.flatnonzero(found["pixel_mask"] & np.uint8(Mask.SATURATED))
+        repair = np.flatnonzero(found["pixel_mask"] & np.uint8(Mask.PARTLY))
         if repair.size:
-            solve_without_saturated(self, frames, repair, found)
+            solve_with_the_sound(self, frames, repair, found)
         return found
 
     def estimate(self, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """As `solve`, with saturated intensities taken as they are (but flagged)."""
+        """As `solve`, with saturated and struck intensities taken as they are (but flagged)."""
         pixels = frames.shape[2]
         out: dict[str, NDArray[Any]] = {
             "mueller": np.empty((16, pixels), np.float32),
@@ -110,14 +110,13 @@ class MuellerSolver:
         return np.asarray(np.maximum(noise.slope * shot + dark, LEAST * dark))
 
 
-def solve_without_saturated(
+def solve_with_the_sound(
     solver: MuellerSolver, frames: NDArray[Any], pixels: NDArray[np.int64], found: dict[str, NDArray[Any]]
 ) -> None:
-    """Solve saturated pixels again, each from the intensities that are not saturated; results go into `found`.
+    """Solve pixels again, each from its intensities that are neither saturated nor struck; results go into `found`.
 
     A pixel whose remaining states are too few is flagged Mask.NOT_DETERMINED.
     """
-    level = solver.reader.correction.saturation
     basis = solver.inversion.basis
     w = solver.inversion.w @ basis
     n, rank = w.shape
@@ -125,7 +124,7 @@ def solve_without_saturated(
         raw = frames[:, :, part]
         signal = np.empty(raw.shape, np.float32)
         gain = solver.reader.signal(raw, part, signal)
-        keep = (raw < level).reshape(n, -1).T.astype(float)
+        keep = solver.reader.sound(raw, part).reshape(n, -1).T.astype(float)
         normal = np.einsum("pn,ni,nj->pij", keep, w, w, optimize=True)
         eigenvalues = np.linalg.eigvalsh(normal)
         ill = eigenvalues[:, 0] < WORST_CONDITION**-2 * eigenvalues[:, -1]

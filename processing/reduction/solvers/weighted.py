@@ -79,7 +79,7 @@ class WeightedSolver:
             signal = np.empty(raw.shape, np.float32)
             gain = self.reader.signal(raw, slice(a, b), signal)
             self._refit_saturated(raw, signal, found, slice(a, b))
-            weight = self._weights(raw, found["mueller"][:, a:b], gain)
+            weight = self._weights(raw, slice(a, b), found["mueller"][:, a:b], gain)
             residual = signal.reshape(n, b - a) - self._w @ found["mueller"][:, a:b]
             normal = self._normal(weight)
             right = self._wt @ (weight * residual)
@@ -97,7 +97,7 @@ class WeightedSolver:
                 found["reduced_chi_square"][a:b] = np.where(kept > rank, chi_square / expected, np.nan)
                 found["residual_rms"][a:b] = np.sqrt(squares / kept)
             found["mueller_errors"][:, a:b] = np.sqrt(covariance[_DIAGONAL])
-            lost = np.isnan(step[0]) & ((found["pixel_mask"][a:b] & np.uint8(Mask.SATURATED)) != 0)
+            lost = np.isnan(step[0]) & ((found["pixel_mask"][a:b] & np.uint8(Mask.PARTLY)) != 0)
             found["pixel_mask"][a:b][lost] |= np.uint8(Mask.NOT_DETERMINED)
             if self.covariance:
                 found["mueller_covariance"][:, a:b] = covariance
@@ -123,9 +123,9 @@ class WeightedSolver:
         return seen @ solution[:rank], in_elements[PACKED_ROW, PACKED_COLUMN]
 
     def _weights(
-        self, raw: NDArray[Any], elements: NDArray[np.float32], gain: NDArray[np.float32] | None
+        self, raw: NDArray[Any], pixels: slice, elements: NDArray[np.float32], gain: NDArray[np.float32] | None
     ) -> NDArray[np.float32]:
-        """1 / variance (N, pixels); 0 for saturated intensities."""
+        """1 / variance (N, pixels); 0 for saturated and struck intensities."""
         fitted = self._w @ elements
         if gain is None:
             variance = np.maximum(self._slope * fitted + self._floor, LEAST * self._floor)
@@ -134,21 +134,18 @@ class WeightedSolver:
             floor = self._floor * per_state
             variance = np.maximum(self._slope * fitted + floor, LEAST * floor) * per_state
         weight = 1.0 / variance
-        level = self.reader.correction.saturation
-        if level is not None:
-            weight[raw.reshape(weight.shape) >= level] = 0.0
+        weight[~self.reader.sound(raw, pixels).reshape(weight.shape)] = 0.0
         return np.asarray(weight, dtype=np.float32)
 
     def _refit_saturated(
         self, raw: NDArray[Any], signal: NDArray[np.float32], found: dict[str, NDArray[Any]], pixels: slice
     ) -> None:
         """Put the plain fit without saturated intensities into `found`, for the pixels that have any."""
-        level = self.reader.correction.saturation
-        some = np.flatnonzero(found["pixel_mask"][pixels] & np.uint8(Mask.SATURATED))
-        if level is None or not some.size:
+        some = np.flatnonzero(found["pixel_mask"][pixels] & np.uint8(Mask.PARTLY))
+        if not some.size:
             return
         n = self._w.shape[0]
-        keep = (raw[:, :, some] < level).reshape(n, -1).astype(np.float32)
+        keep = self.reader.sound(raw[:, :, some], pixels.start + some).reshape(n, -1).astype(np.float32)
         right = self._wt @ (keep * signal[:, :, some].reshape(n, -1))
         fit, covariance = np.empty((ELEMENTS, some.size), np.float32), np.empty((PACKED, some.size), np.float32)
         solve_range(self._normal(keep), right, fit, covariance, 0, some.size)

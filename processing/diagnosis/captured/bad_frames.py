@@ -1,0 +1,100 @@
+"""Frames that belong to nothing: a shutter half closed, an axis that stood elsewhere, a frame of another run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.arrays import Array
+from processing.diagnosis.captured.capture_data import CaptureData
+
+#: Rms by which a frame has to differ from what all others predict for it, relative to the signal of all: a source or an
+#: axis that is merely unsteady stays below.
+LEAST_MISFIT = 0.015
+#: Times by which its misfit has to be larger, squared, than the next one that is left without it.
+AGAINST_NEXT = 8.0
+#: Share of what is left over that has to go with the frame.
+OF_ALL = 0.5
+#: Share of the states that may be bad.
+MOST = 0.1
+RANK = 1e-8
+
+
+@dataclass(frozen=True)
+class BadFrame:
+    """A state that belongs to nothing, and the rms of its misfit relative to the signal of all states."""
+
+    state: int
+    misfit: float
+
+
+def bad_frames(data: CaptureData, a: Array) -> tuple[BadFrame, ...]:
+    """States that the others do not predict, against rows a (L, K) of the model.
+
+    Faults of the model make many states misfit, none by itself.
+    """
+    states, channels = data.signal.shape[:2]
+    good = (data.usable & ~data.clipped).reshape(-1)
+    if not good.any():
+        return ()
+    y = data.signal.reshape(data.values_per_pixel, -1)[:, good].astype(np.float64)
+    noise = data.variance().reshape(data.values_per_pixel, -1)[:, good].mean(axis=1)
+    bright = float(np.mean(y**2))
+    moments = _Moments(y @ y.T / y.shape[1] / bright, noise * data.noise_known / bright, a, channels)
+    left = [k for k in range(states) if data.row_counts[k * channels]]
+    found: list[BadFrame] = []
+    before = moments.suspect(left)
+    while before is not None and len(found) < MOST * states:
+        rest = [k for k in left if k != before.state]
+        after = moments.suspect(rest)
+        if after is None or before.misfit < LEAST_MISFIT or before.misfit**2 < AGAINST_NEXT * after.misfit**2:
+            break
+        if moments.left(rest) > (1 - OF_ALL) * moments.left(left):
+            break
+        found.append(before)
+        left, before = rest, after
+    return tuple(found)
+
+
+class _Moments:
+    """Second moments (L, L) of the signal over its mean square, and how a fit to some states leaves them."""
+
+    def __init__(self, products: Array, noise: Array, a: Array, channels: int) -> None:
+        self._products, self._noise, self._a, self._channels = products, noise, a, channels
+
+    def _rows(self, states: Sequence[int]) -> NDArray[np.int64]:
+        return (np.asarray(states)[:, None] * self._channels + np.arange(self._channels)).reshape(-1)
+
+    def _outside(self, rows: NDArray[np.int64]) -> Array:
+        u, size, _ = np.linalg.svd(self._a[rows], full_matrices=False)
+        q = u[:, size > RANK * size[0]]
+        return np.asarray(np.eye(len(rows)) - q @ q.T)
+
+    def left(self, states: Sequence[int]) -> float:
+        """Mean square beyond noise that a fit to some states leaves, summed over the states."""
+        rows = self._rows(states)
+        p = self._outside(rows)
+        beyond = self._products[np.ix_(rows, rows)] - np.diag(self._noise[rows])
+        return max(float(np.sum(p * beyond)), 1e-300)
+
+    def suspect(self, states: Sequence[int]) -> BadFrame | None:
+        """The state that differs most from what the others predict; None where they do not predict any."""
+        rows = self._rows(states)
+        p = self._outside(rows)
+        beyond = p @ (self._products[np.ix_(rows, rows)] - np.diag(self._noise[rows])) @ p
+        c = self._channels
+        worst = None
+        for j, state in enumerate(states):
+            mine = slice(j * c, (j + 1) * c)
+            free = p[mine, mine]
+            # A residual, over what is free of the state, is its difference from the prediction by the others.
+            if np.linalg.cond(free) > 1e4:
+                continue
+            back = np.linalg.inv(free)
+            misfit = float(np.sqrt(max(np.trace(back @ beyond[mine, mine] @ back.T), 0.0) / c))
+            if worst is None or misfit > worst.misfit:
+                worst = BadFrame(state, misfit)
+        return worst

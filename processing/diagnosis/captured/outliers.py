@@ -1,0 +1,140 @@
+"""Hits (cosmic rays, bit errors) and bad pixels: what stands out of its own pixel, or of the pixels around.
+
+The model, and what the residual of the whole image has in common, are taken away first: any fault of the instrument
+that is linear in the light goes with them. A hit is one intensity that is far from what the other states of its pixel
+say; a bad pixel is noisier than its neighbours in all states. At an edge that moves, neighbours and other states are as
+far off, and nothing stands out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from processing.arrays import Array
+from processing.diagnosis.captured.capture_data import CaptureData
+
+#: Robust standard deviations, of its row and of its pixel, from which on an intensity is a hit: the largest of 10^9
+#: normal ones is 6.1.
+HIT = 8.0
+#: States of one pixel that are hits; with more of them it is a bad pixel.
+MOST_STATES = 4
+#: Share of the pixels of a state beyond which what stands out is no hit: the frame itself moved, or belongs to nothing.
+MOST_HITS = 0.02
+#: Variance of a bad pixel over that of the pixels around; standard deviations of that ratio from one.
+BAD, BAD_DEVIATIONS = 4.0, 10.0
+#: Side of the square of pixels around, and the share of them that may be as bad.
+AROUND, ALSO_BAD = 5, 0.2
+#: Below so many pixels, or directions over the states that the model leaves over, nothing can stand out.
+FEWEST_PIXELS, FEWEST_DIRECTIONS = 100, 8
+#: Eigenvalue of the residual, over that of noise, from which on a direction over the states is structure.
+STRUCTURE = 1.5
+#: Robust standard deviations at which a residual is cut off before structure is looked for.
+CUT = 4.0
+NORMAL_MAD = 0.6745
+
+
+@dataclass(frozen=True)
+class Outliers:
+    """What is left out: `hits` (N, channels, rows, columns) single intensities, `bad` (rows, columns) pixels."""
+
+    hits: NDArray[np.bool_]
+    bad: NDArray[np.bool_]
+
+
+def outliers_of(data: CaptureData, a: Array) -> Outliers:
+    """Hits and bad pixels of a capture against rows a (L, K) of its model."""
+    rows = data.values_per_pixel
+    good, keep = data.usable & ~data.clipped, data.row_counts
+    hits, bad = np.zeros((rows, good.size), dtype=bool), np.zeros(good.shape, dtype=bool)
+    u, power, _ = np.linalg.svd(a[keep], full_matrices=True)
+    outside = u[:, int(np.sum(power > 1e-8 * power[0])) :]
+    if good.sum() >= FEWEST_PIXELS and outside.shape[1] >= FEWEST_DIRECTIONS:
+        part = np.ix_(keep, good.reshape(-1))
+        y, variance = data.signal.reshape(rows, -1)[part].astype(np.float64), data.variance().reshape(rows, -1)[part]
+        variance = np.maximum(variance, 0.1 * np.mean(variance, axis=1, keepdims=True))
+        clean = np.ones(y.shape[1], dtype=bool)
+        # Twice: what was struck is no structure of the image.
+        for _ in range(2):
+            rest = _rest(y[:, clean], outside)
+            # In standard deviations as the image itself shows them: what is declared of the noise is not asked.
+            t = (rest @ y) / np.sqrt(np.diag(rest)[:, None] * variance)
+            t /= _scale(t[:, clean])
+            struck, noisy = _hits(t, rest)
+            clean = (np.max(np.abs(t), axis=0) < HIT) & ~struck.any(axis=0)
+            if clean.all() or clean.sum() < FEWEST_PIXELS:
+                break
+        hits[part] = struck
+        map_of = np.full(good.shape, float(np.median(noisy)))
+        map_of[good] = noisy
+        bad = good & _noisier_than_around(map_of, outside.shape[1])
+    return Outliers(hits.reshape(data.signal.shape), bad)
+
+
+def _rest(y: Array, outside: Array) -> Array:
+    """Projection (L, L) on what neither the model reaches nor the residual of all pixels has in common."""
+    r = outside @ (outside.T @ y)
+    scale = _scale(r)
+    inner = outside.T @ np.clip(r, -CUT * scale, CUT * scale)
+    value, vector = np.linalg.eigh(inner @ inner.T)
+    # At least half of the directions are left to tell what noise is.
+    half = len(value) // 2
+    structure = outside @ vector[:, half:][:, value[half:] > STRUCTURE * np.median(value)]
+    return np.asarray(outside @ outside.T - structure @ structure.T)
+
+
+def _scale(r: Array) -> Array:
+    """Robust standard deviation (L, 1) of every row."""
+    return np.asarray(np.maximum(np.median(np.abs(r), axis=1, keepdims=True) / NORMAL_MAD, 1e-12))
+
+
+def _hits(t: Array, rest: Array) -> tuple[NDArray[np.bool_], Array]:
+    """Hits (L, P) of residuals t (L, P) in standard deviations, and the mean square (P,) of what is left beside them.
+
+    A hit shows in all states through the fit: the strongest is left out of the fit, and the next is looked for.
+    """
+    hits = np.zeros(t.shape, dtype=bool)
+    noisy = np.mean(t**2, axis=0)
+    size = np.sqrt(np.diag(rest))
+    for p in np.flatnonzero(np.max(np.abs(t), axis=0) > HIT):
+        r, q = t[:, p] * size, rest.copy()
+        struck: list[int] = []
+        found: tuple[list[int], float] = ([], float(noisy[p]))
+        while len(struck) < MOST_STATES:
+            share = np.maximum(np.diag(q), 1e-6)
+            k = int(np.argmax(np.abs(r) / np.sqrt(share)))
+            far = abs(r[k]) / np.sqrt(share[k])
+            r, q = r - q[:, k] * r[k] / share[k], q - np.outer(q[:, k], q[k]) / share[k]
+            struck.append(k)
+            left = float(np.sum(r**2) / max(np.trace(q), 1.0))
+            if far > HIT * max(np.sqrt(left), 1.0):
+                found = struck.copy(), left
+        hits[found[0], p], noisy[p] = True, found[1]
+    hits[hits.mean(axis=1) > MOST_HITS] = False
+    return hits, noisy
+
+
+def _noisier_than_around(noisy: Array, free: int) -> NDArray[np.bool_]:
+    """Pixels (rows, columns) with far more noise than those around them, and than the image."""
+    around = ndimage.percentile_filter(noisy, 100 * (1 - ALSO_BAD), size=AROUND)
+    least = max(BAD, 1 + BAD_DEVIATIONS * float(np.sqrt(2 / free)))
+    return np.asarray(noisy > least * np.maximum(around, np.median(noisy)))
+
+
+def without(data: CaptureData, found: Outliers) -> CaptureData:
+    """The capture with the pixels of outliers left out, and their counts filled in from the pixels around.
+
+    A pixel is left out whole, since the moments need all its states; what is filled in serves image derivatives.
+    """
+    every = found.hits | found.bad
+    signal = data.signal.copy()
+    box = np.ones((3, 3), dtype=np.float32)
+    for n, c in np.argwhere(every.any(axis=(2, 3))):
+        frame, lost = signal[n, c], every[n, c]
+        weight = ndimage.convolve((~lost).astype(np.float32), box, mode="nearest")
+        mean = ndimage.convolve(np.where(lost, 0, frame), box, mode="nearest") / np.maximum(weight, 1)
+        frame[lost] = np.where(weight > 0, mean, np.median(frame[~lost]))[lost]
+    return replace(data, signal=signal, usable=data.usable & ~every.any(axis=(0, 1)))

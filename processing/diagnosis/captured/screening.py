@@ -1,0 +1,39 @@
+"""Before anything is fitted: what of a capture is no measurement is found, left out, and kept to be told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from processing.arrays import Array
+from processing.diagnosis.captured.bad_frames import bad_frames
+from processing.diagnosis.captured.capture_data import CaptureData, LeftOut
+from processing.diagnosis.captured.outliers import outliers_of, without
+from processing.instrument.applied_effects import changes_of
+from processing.instrument.model import InstrumentModel
+
+
+def screened(data: CaptureData, model: InstrumentModel, say: Callable[[str], None]) -> CaptureData:
+    """The capture without hits, bad pixels and bad frames; `model` is resolved at its wavelength."""
+    a = rows_of(data, model)
+    found = outliers_of(data, a)
+    hits, bad = np.argwhere(found.hits), np.argwhere(found.bad)
+    if len(hits) or len(bad):
+        data = without(data, found)
+        data = replace(data, left_out=LeftOut(hits=hits, pixels=bad))
+        say(f"left out of {data.name}: {len(hits)} hits, {len(bad)} bad pixels")
+    frames = bad_frames(data, a)
+    if frames:
+        misfits = {f.state: f.misfit for f in frames}
+        data = replace(data, left_out=replace(data.left_out, frames=misfits))
+        say(f"left out of {data.name}: state {', '.join(map(str, misfits))}, which belongs to nothing")
+    return data
+
+
+def rows_of(data: CaptureData, model: InstrumentModel) -> Array:
+    """Rows (L, 16) of the measurement matrix, or (L, 1) of the known sample, with the effects that the file has."""
+    changes = changes_of(model, data.conditions, data.name)
+    w = model.rows(data.conditions.angles_deg, changes).reshape(-1, 16) * data.row_exposure[:, None]
+    return w if data.sample is None else (w @ data.sample)[:, None]

@@ -1,0 +1,135 @@
+"""Cosmic rays, bad pixels and bad frames are found before anything is fitted, named, and left out of a reduction."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.captured.screening import screened
+from processing.instrument.model import InstrumentModel
+from processing.reduction.left_out import LeftOut
+from processing.reduction.mueller import reduce_mueller
+from processing.steps.reduction import Reduction
+from processing.storage.capture import Capture
+from processing.storage.capture_schema import Sample
+from processing.storage.images import MuellerImage
+from processing.storage.pixel_mask import Mask
+from simulators.blind.detector_cases import DETECTOR
+from simulators.blind.suite import state_angles
+from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
+
+STATES, SIDE = 46, 40
+
+
+def taken(folder: Path, configs: Path, bench: Bench, seed: int, air: bool) -> Path:
+    random = np.random.default_rng(seed)
+    angles = state_angles(STATES, False, False)
+    light = expose(bench, Scene(random, np.eye(4) if air else None), angles)
+    path = folder / "capture.h5"
+    text = (configs / "instruments/rgb950.yaml").read_text()
+    write_capture(path, bench, digitize(bench, light, random), angles, Sample(kind="air" if air else "unknown"), text)
+    return path
+
+
+def screened_capture(path: Path, configs: Path) -> CaptureData:
+    model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
+    with Capture(path) as capture:
+        return screened(read_capture(capture, model), model, lambda line: None)
+
+
+def small_faults(bench: Bench) -> None:
+    """A bench as it is: nothing quite where it should be, a source that is not quite steady, an image that wanders."""
+    bench.og += np.deg2rad(0.5)
+    bench.da += np.deg2rad(1.0)
+    bench.level.append(lambda k, a: 1 + 0.01 * np.sin(1.7 * k**2))
+    bench.shift.append(lambda k, a: (0.3 * np.cos(a["psa"]), 0.3 * np.sin(a["psa"])))
+
+
+@pytest.mark.parametrize("air", [True, False])
+def test_nothing_is_left_out_of_a_bench_with_faults_of_the_optics(configs, tmp_path, air):
+    bench = Bench(rows=SIDE, columns=SIDE)
+    small_faults(bench)
+    assert not screened_capture(taken(tmp_path, configs, bench, 3, air), configs).left_out
+
+
+@pytest.mark.parametrize("air", [True, False])
+@pytest.mark.parametrize("state", [0, 17])
+def test_a_frame_that_belongs_to_nothing_is_found_among_faults(configs, tmp_path, air, state):
+    bench = Bench(rows=SIDE, columns=SIDE)
+    small_faults(bench)
+    bench.level.append(lambda k, a: 0.75 if k == state else 1.0)
+    found = screened_capture(taken(tmp_path, configs, bench, 3, air), configs)
+    assert list(found.left_out.frames) == [state]
+    assert not found.row_counts[state]
+    assert found.left_out.frames[state] > 0.1
+
+
+def test_cosmic_rays_and_hot_pixels_are_found_and_left_out(configs, tmp_path):
+    bench = Bench(rows=SIDE, columns=SIDE)
+    small_faults(bench)
+    truth = np.zeros((STATES, SIDE, SIDE), dtype=bool)
+
+    def spoil(electrons, random):
+        after = electrons.copy()
+        for frame, struck in zip(after, truth, strict=True):
+            for y, x in random.integers(0, SIDE, (3, 2)):
+                frame[y, x] += random.uniform(2e3, 1e4)
+                struck[y, x] = True
+        after[:, 8, 30] += 4000 * random.uniform(0.5, 1.5, STATES)
+        return after
+
+    bench.noise.append(spoil)
+    found = screened_capture(taken(tmp_path, configs, bench, 5, air=False), configs)
+    assert [8, 30] in found.left_out.pixels.tolist()
+    hits = {(n, y, x) for n, _, y, x in found.left_out.hits.tolist()}
+    true = {(n, y, x) for n, y, x in np.argwhere(truth).tolist() if (y, x) != (8, 30)}
+    bad = {tuple(p) for p in found.left_out.pixels.tolist()}
+    # A pixel that was struck several times may be called bad.
+    assert len([t for t in true if t not in hits and t[1:] not in bad]) <= 0.03 * len(true)
+    assert len(hits - true) <= 0.01 * len(true)
+    assert not found.usable[truth.any(axis=0)][3:].all()
+
+
+def mean_error(image: MuellerImage, good: np.ndarray) -> float:
+    """Largest error of an element of M/m00 of air, mean over the image."""
+    with np.errstate(invalid="ignore"):
+        found = (image.values / image.values[0, 0])[..., good].mean(axis=-1)
+    return float(np.abs(found - np.eye(4)).max())
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_a_reduction_leaves_out_what_a_diagnosis_names(configs, tmp_path, weighted):
+    bench = Bench(rows=SIDE, columns=SIDE)
+    DETECTOR["bad_frame"](bench, np.random.default_rng(2), STATES)
+    path = taken(tmp_path, configs, bench, 5, air=True)
+    result = tmp_path / "result.json"
+    with Capture(path) as capture:
+        name = f"{capture.header.title} ({capture.path.name})"
+    bad = screened_capture(path, configs).left_out.frames
+    entry = {"capture": name, "states": list(bad), "hits": [[3, 0, 11, 12]], "pixels": [[4, 5]]}
+    result.write_text(json.dumps({"left_out": [entry]}))
+    plain = MuellerImage.load(Reduction(path, weighted=weighted).make(tmp_path / "plain.h5"))
+    clean = MuellerImage.load(Reduction(path, weighted=weighted, leave_out=result).make(tmp_path / "clean.h5"))
+    assert clean.w.shape[0] == STATES - 1
+    assert clean.mask[4, 5] == Mask.BAD
+    assert clean.mask[11, 12] == Mask.STRUCK
+    good = clean.mask == 0
+    assert mean_error(clean, good) < 0.1 * mean_error(plain, good)
+
+
+def test_a_struck_intensity_does_not_count(configs, tmp_path):
+    path = taken(tmp_path, configs, Bench(rows=8, columns=8), 5, air=True)
+    hits = np.array([[3, 0, 4, 5]])
+    with Capture(path) as capture:
+        model = capture.instrument
+        reduce_mueller(capture, model, tmp_path / "a.h5", (), left_out=LeftOut(hits=hits))
+    with Capture(path) as capture:
+        frames = np.stack([capture.frames(k)[0, 4, 5] for k in range(STATES)]).astype(float) - 100
+    w = model.rows(state_angles(STATES, False, False))
+    rest = np.delete(np.arange(STATES), 3)
+    expected = np.linalg.lstsq(w.reshape(STATES, 16)[rest], frames[rest], rcond=None)[0]
+    found = MuellerImage.load(tmp_path / "a.h5").values[:, :, 4, 5].reshape(16)
+    assert found == pytest.approx(expected, rel=1e-3, abs=1e-3 * expected[0])
