@@ -11,7 +11,6 @@ from scipy import ndimage
 from processing.calibration.train import known_mueller
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.noise_estimate import estimated_noise
-from processing.diagnosis.captured.steep_pixels import without_steep_pixels
 from processing.instrument.changes import Conditions, elapsed
 from processing.instrument.model import InstrumentModel
 from processing.reduction.counts_to_signal import Correction
@@ -95,7 +94,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     data = _binned(data)
     if not data.noise_known and data.usable.sum() >= FEWEST_PIXELS:
         data = estimated_noise(data)
-    return without_steep_pixels(without_dark_pixels(data)) if data.noise_known else data
+    return without_dark_pixels(data) if data.noise_known else data
 
 
 def without_dark_pixels(data: CaptureData) -> CaptureData:

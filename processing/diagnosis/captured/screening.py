@@ -10,18 +10,22 @@ import numpy as np
 from processing.arrays import Array
 from processing.diagnosis.captured.bad_frames import bad_frames
 from processing.diagnosis.captured.capture_data import CaptureData, LeftOut
+from processing.diagnosis.captured.noise_estimate import estimated_noise
 from processing.diagnosis.captured.outliers import outliers_of, without
+from processing.diagnosis.captured.steep_pixels import without_steep_pixels
 from processing.instrument.applied_effects import changes_of
 from processing.instrument.model import InstrumentModel
 
 
 def screened(data: CaptureData, model: InstrumentModel, say: Callable[[str], None]) -> CaptureData:
-    """The capture without hits, bad pixels and bad frames; `model` is resolved at its wavelength."""
+    """The capture without hits, bad pixels, bad frames and sharp edges; `model` is resolved at its wavelength."""
     a = rows_of(data, model)
     found = outliers_of(data, a)
     hits, bad = np.argwhere(found.hits), np.argwhere(found.bad)
     if len(hits) or len(bad):
         data = without(data, found)
+        # What was struck is no noise either.
+        data = estimated_noise(data) if data.noise_estimated else data
         data = replace(data, left_out=LeftOut(hits=hits, pixels=bad))
         say(f"left out of {data.name}: {len(hits)} hits, {len(bad)} bad pixels")
     frames = bad_frames(data, a)
@@ -29,7 +33,8 @@ def screened(data: CaptureData, model: InstrumentModel, say: Callable[[str], Non
         misfits = {f.state: f.misfit for f in frames}
         data = replace(data, left_out=replace(data.left_out, frames=misfits))
         say(f"left out of {data.name}: state {', '.join(map(str, misfits))}, which belongs to nothing")
-    return data
+    # After the hits, which are steep as well.
+    return without_steep_pixels(data) if data.noise_known else data
 
 
 def rows_of(data: CaptureData, model: InstrumentModel) -> Array:
