@@ -9,7 +9,7 @@ of the counts.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -27,6 +27,7 @@ from processing.diagnosis.instrument.moments import (
     moments_of,
 )
 from processing.diagnosis.instrument.projection import RANK, add_block, noise_information
+from processing.diagnosis.instrument.slopes import Columns, slopes_of_counts, slopes_of_rows
 from processing.diagnosis.instrument.tile_sums import add_tiles, tile_columns
 from processing.diagnosis.instrument.undone import distance, exactly_undone, movable, undone_signal
 from processing.diagnosis.search.candidate import Candidate, nominal_values, pool
@@ -34,21 +35,13 @@ from processing.diagnosis.search.space import Space, Sums
 from processing.instrument.applied_effects import apply_to, changes_of
 from processing.instrument.changes import Changes
 from processing.instrument.effects.base import (
-    CountsEffect,
     FieldEffect,
-    FromAState,
     ImageShift,
     PointwiseEffect,
     SourceEffect,
-    Switch,
-    ValuePerState,
-    turned_by,
 )
 from processing.instrument.model import InstrumentModel
 
-#: Makes A (..., L, K) of the changes of a capture.
-Columns = Callable[[Changes], Array]
-STEP = 1e-4
 #: Distance, in typical sizes, from the point of expansion up to which a correction of counts is exact enough.
 EXACT = 0.3
 #: Element matrices that are kept for use in another evaluation.
@@ -273,7 +266,7 @@ class InstrumentProblem:
             mine, index = space.acting(k, self.wavelengths_nm[k])
             changes = self.changes(k, mine, values[index])
             a = self.columns(k, changes)
-            dc = self._slopes_of_counts(k, mine, values[index], self.coefficients(k, changes))
+            dc = self.slopes_of_counts(k, mine, values[index], self.coefficients(k, changes))
             if np.any(dc[:, -DERIVATIVES:]):
                 out[np.ix_(index, index)] += sum(noise_information(block, a, dc, moments) for block in moments.blocks)
         return out
@@ -285,8 +278,8 @@ class InstrumentProblem:
         a, c = self.columns(k, changes), self.coefficients(k, changes)
         da, dc = np.zeros((0, *a.shape)), None
         if derivatives:
-            da = self._slopes(k, space, values, a, partial(self.columns, k))
-            dc = self._slopes_of_counts(k, space, values, c)
+            da = self.slopes(k, space, values, a, partial(self.columns, k))
+            dc = self.slopes_of_counts(k, space, values, c)
         for block in self.moments[k].blocks:
             if block.clipped and changes.drop_clipped:
                 # What is left of a clipped pixel is its states without any clipping, if they are enough.
@@ -296,97 +289,14 @@ class InstrumentProblem:
             if block.rows.size:
                 add_block(block, a, c, da, dc, self.moments[k], out)
 
-    def mueller_slopes(self, space: Space, values: Array) -> tuple[Array, float]:
-        """How values move the Mueller matrices that the counts give: products (K, K), and the sum of m00 squared.
-
-        The products are those of the derivatives of M, summed over elements and pixels, a common factor of M left out.
-        """
-        other, local = self.near(space, values)
-        if other is not self:
-            return other.mueller_slopes(space, local)
-        products, light = np.zeros((space.size, space.size)), 0.0
-        for k, moments in enumerate(self.moments):
-            mine, index = space.acting(k, self.wavelengths_nm[k])
-            own = values[index]
-            changes = self.changes(k, mine, own)
-            columns = partial(self._all_columns, k)
-            w, c = columns(changes), self.coefficients(k, changes)
-            back = np.linalg.pinv(w * moments.counts[:, None], rcond=RANK)
-            dw, dc = self._slopes(k, mine, own, w, columns), self._slopes_of_counts(k, mine, own, c)
-            scale = 1 / moments.sigma[:, None]
-            for block in moments.blocks[:: self.folds if moments.tiles is None else 1]:
-                m = back @ (np.einsum("fl,flr->lr", c, block.z) * scale)
-                slopes = -np.einsum("el,klm,mr->ker", back, dw, m, optimize=True)
-                for j in np.flatnonzero(np.any(dc, axis=(1, 2))):
-                    slopes[j] += back @ (np.einsum("fl,flr->lr", dc[j], block.z) * scale)
-                bright = float(m[0] @ m[0])
-                slopes -= (slopes[:, 0] @ m[0] / max(bright, 1e-300))[:, None, None] * m
-                flat = slopes.reshape(mine.size, -1)
-                products[np.ix_(index, index)] += flat @ flat.T
-                light += bright
-        return products, light
-
-    def _all_columns(self, k: int, changes: Changes) -> Array:
-        """Rows (L, 16) of the measurement matrix in units of their noise, whatever the sample."""
-        data = self.captures[k]
-        w = self.models[k].rows(data.conditions.angles_deg, changes).reshape(-1, 16) * data.row_exposure[:, None]
-        return np.asarray(w / self.moments[k].sigma[:, None])
-
-    def _slopes(self, k: int, space: Space, values: Array, a: Array, columns: Columns) -> Array:
-        """Derivatives (values, ..., L, K) of a (..., L, K), which `columns` makes of the changes."""
-        da = np.zeros((space.size, *a.shape))
+    def slopes(self, k: int, space: Space, values: Array, a: Array, columns: Columns) -> Array:
+        """Derivatives (values, ..., L, K) of the rows a (..., L, K) of a capture, which `columns` makes of changes."""
         conditions = self.captures[k].conditions
-        channels = len(conditions.channels)
-        whole: dict[str, Array] = {}
-        for candidate, part in self._fitted(space):
-            if isinstance(candidate.effect, CountsEffect):
-                continue
-            if isinstance(candidate.effect, ValuePerState):
-                # Parameter n acts on state n alone: one step of all of them together gives every derivative.
-                moved = values.copy()
-                step = STEP * candidate.typical
-                moved[part] += step
-                slope = (columns(self.changes(k, space, moved)) - a) / step.repeat(channels)[:, None]
-                for n in range(candidate.size):
-                    rows = slice(n * channels, (n + 1) * channels)
-                    da[part.start + n, ..., rows, :] = slope[..., rows, :]
-                continue
-            if isinstance(candidate.effect, FromAState) and not values[part].any():
-                # The same step of the same axis from another state on: one evaluation serves all of them.
-                axis = candidate.effect.axis(candidate.place)
-                first = candidate.effect.first_state(candidate.place)
-                if axis not in whole:
-                    turned = self.changes(k, space, values)
-                    turned.turn_axis(axis, np.full(conditions.states, STEP), turned_by(self.models[k], axis))
-                    whole[axis] = (columns(turned) - a) / STEP
-                da[part.start, ..., first * channels :, :] = whole[axis][..., first * channels :, :]
-                continue
-            for j, (moved, step_j) in enumerate(self._stepped(candidate, part, values)):
-                da[part.start + j] = (columns(self.changes(k, space, moved)) - a) / step_j
-        return da
+        return slopes_of_rows(partial(self.changes, k, space), self.models[k], conditions, space, values, a, columns)
 
-    def _slopes_of_counts(self, k: int, space: Space, values: Array, c: Array) -> Array:
-        """Derivatives (values, F, L) of the coefficients c (F, L)."""
-        dc = np.zeros((space.size, *c.shape))
-        for candidate, part in self._fitted(space):
-            if isinstance(candidate.effect, CountsEffect):
-                for j, (moved, step) in enumerate(self._stepped(candidate, part, values)):
-                    dc[part.start + j] = (self.coefficients(k, self.changes(k, space, moved)) - c) / step
-        return dc
-
-    @staticmethod
-    def _fitted(space: Space) -> list[tuple[Candidate, slice]]:
-        """Candidates that have values to fit."""
-        pairs = zip(space.candidates, space.slices, strict=True)
-        return [(c, part) for c, part in pairs if not isinstance(c.effect, Switch)]
-
-    @staticmethod
-    def _stepped(candidate: Candidate, part: slice, values: Array) -> Iterator[tuple[Array, float]]:
-        """All values with one of a candidate's after the other moved by a small step, and the step."""
-        for j, step in enumerate(STEP * candidate.typical):
-            moved = values.copy()
-            moved[part.start + j] += step
-            yield moved, step
+    def slopes_of_counts(self, k: int, space: Space, values: Array, c: Array) -> Array:
+        """Derivatives (values, F, L) of the coefficients c (F, L) of the corrected counts of a capture."""
+        return slopes_of_counts(partial(self.changes, k, space), partial(self.coefficients, k), space, values, c)
 
     def _tile_sums(self, k: int, space: Space, values: Array, changes: Changes, out: Sums, derivatives: bool) -> None:
         """The same with another A in every tile of the image."""
@@ -397,8 +307,8 @@ class InstrumentProblem:
         a, c = columns(changes), self.coefficients(k, changes)
         da, dc = np.zeros((0, *a.shape)), np.zeros((0, *c.shape))
         if derivatives:
-            da = self._slopes(k, space, values, a, columns)
-            dc = self._slopes_of_counts(k, space, values, c)
+            da = self.slopes(k, space, values, a, columns)
+            dc = self.slopes_of_counts(k, space, values, c)
         add_tiles(data, moments, moments.tiles, a, c, da, dc, out)
         if moments.clipped is not None and not changes.drop_clipped:
             add_tiles(data, moments, moments.clipped, a, c, da, dc, out)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from processing.arrays import Array
+from processing.diagnosis.instrument.mueller_slopes import mueller_slopes
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.stored import parameters_of, scope_of
 from processing.diagnosis.search.posterior import Posterior
@@ -32,7 +33,7 @@ def systematic_error(problem: InstrumentProblem, found: Posterior) -> Systematic
     if not space.size:
         return None
     index = np.concatenate([np.r_[found.space.slices[k]] for k in chosen])
-    products, light = problem.mueller_slopes(space, found.values[index])
+    products, light = mueller_slopes(problem, space, found.values[index])
     covariance = (found.covariance + _unseen(found))[np.ix_(index, index)]
     value, vector = np.linalg.eigh(covariance)
     root = vector * np.sqrt(np.maximum(value, 0.0))

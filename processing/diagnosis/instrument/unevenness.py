@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.instrument.problem import STEP, InstrumentProblem
+from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import RANK
+from processing.diagnosis.instrument.slopes import STEP
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import field_terms

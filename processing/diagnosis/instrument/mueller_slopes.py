@@ -1,0 +1,49 @@
+"""How the values of the candidates move the Mueller matrices that the counts give."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from processing.arrays import Array
+from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.projection import RANK
+from processing.diagnosis.search.space import Space
+from processing.instrument.changes import Changes
+
+
+def mueller_slopes(problem: InstrumentProblem, space: Space, values: Array) -> tuple[Array, float]:
+    """Products (K, K) of the derivatives of M, and the sum of m00 squared, over all pixels.
+
+    The products are summed over elements and pixels, a common factor of M left out.
+    """
+    problem, values = problem.near(space, values)
+    products, light = np.zeros((space.size, space.size)), 0.0
+    for k, moments in enumerate(problem.moments):
+        mine, index = space.acting(k, problem.wavelengths_nm[k])
+        own = values[index]
+        changes = problem.changes(k, mine, own)
+        columns = partial(_all_columns, problem, k)
+        w, c = columns(changes), problem.coefficients(k, changes)
+        back = np.linalg.pinv(w * moments.counts[:, None], rcond=RANK)
+        dw, dc = problem.slopes(k, mine, own, w, columns), problem.slopes_of_counts(k, mine, own, c)
+        scale = 1 / moments.sigma[:, None]
+        for block in moments.blocks[:: problem.folds if moments.tiles is None else 1]:
+            m = back @ (np.einsum("fl,flr->lr", c, block.z) * scale)
+            slopes = -np.einsum("el,klm,mr->ker", back, dw, m, optimize=True)
+            for j in np.flatnonzero(np.any(dc, axis=(1, 2))):
+                slopes[j] += back @ (np.einsum("fl,flr->lr", dc[j], block.z) * scale)
+            bright = float(m[0] @ m[0])
+            slopes -= (slopes[:, 0] @ m[0] / max(bright, 1e-300))[:, None, None] * m
+            flat = slopes.reshape(mine.size, -1)
+            products[np.ix_(index, index)] += flat @ flat.T
+            light += bright
+    return products, light
+
+
+def _all_columns(problem: InstrumentProblem, k: int, changes: Changes) -> Array:
+    """Rows (L, 16) of the measurement matrix in units of their noise, whatever the sample."""
+    data = problem.captures[k]
+    w = problem.models[k].rows(data.conditions.angles_deg, changes).reshape(-1, 16) * data.row_exposure[:, None]
+    return np.asarray(w / problem.moments[k].sigma[:, None])

@@ -1,0 +1,88 @@
+"""Derivatives by the values of the candidates: of the rows of a capture, and of the coefficients of its counts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from processing.arrays import Array
+from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.space import Space
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import CountsEffect, FromAState, Switch, ValuePerState, turned_by
+from processing.instrument.model import InstrumentModel
+
+#: Makes A (..., L, K) of the changes of a capture.
+Columns = Callable[[Changes], Array]
+#: Makes the changes of a capture of the values (K,) of a space.
+ChangesOf = Callable[[Array], Changes]
+#: Step of a derivative, in typical sizes.
+STEP = 1e-4
+
+
+def slopes_of_rows(
+    changes_of: ChangesOf,
+    model: InstrumentModel,
+    conditions: Conditions,
+    space: Space,
+    values: Array,
+    a: Array,
+    columns: Columns,
+) -> Array:
+    """Derivatives (values, ..., L, K) of a (..., L, K), which `columns` makes of the changes."""
+    da = np.zeros((space.size, *a.shape))
+    channels = len(conditions.channels)
+    whole: dict[str, Array] = {}
+    for candidate, part in _fitted(space):
+        if isinstance(candidate.effect, CountsEffect):
+            continue
+        if isinstance(candidate.effect, ValuePerState):
+            # Parameter n acts on state n alone: one step of all of them together gives every derivative.
+            moved = values.copy()
+            step = STEP * candidate.typical
+            moved[part] += step
+            slope = (columns(changes_of(moved)) - a) / step.repeat(channels)[:, None]
+            for n in range(candidate.size):
+                rows = slice(n * channels, (n + 1) * channels)
+                da[part.start + n, ..., rows, :] = slope[..., rows, :]
+            continue
+        if isinstance(candidate.effect, FromAState) and not values[part].any():
+            # The same step of the same axis from another state on: one evaluation serves all of them.
+            axis = candidate.effect.axis(candidate.place)
+            first = candidate.effect.first_state(candidate.place)
+            if axis not in whole:
+                turned = changes_of(values)
+                turned.turn_axis(axis, np.full(conditions.states, STEP), turned_by(model, axis))
+                whole[axis] = (columns(turned) - a) / STEP
+            da[part.start, ..., first * channels :, :] = whole[axis][..., first * channels :, :]
+            continue
+        for j, (moved, step_j) in enumerate(_stepped(candidate, part, values)):
+            da[part.start + j] = (columns(changes_of(moved)) - a) / step_j
+    return da
+
+
+def slopes_of_counts(
+    changes_of: ChangesOf, coefficients: Callable[[Changes], Array], space: Space, values: Array, c: Array
+) -> Array:
+    """Derivatives (values, F, L) of the coefficients c (F, L) of the corrected counts."""
+    dc = np.zeros((space.size, *c.shape))
+    for candidate, part in _fitted(space):
+        if isinstance(candidate.effect, CountsEffect):
+            for j, (moved, step) in enumerate(_stepped(candidate, part, values)):
+                dc[part.start + j] = (coefficients(changes_of(moved)) - c) / step
+    return dc
+
+
+def _fitted(space: Space) -> list[tuple[Candidate, slice]]:
+    """Candidates that have values to fit."""
+    pairs = zip(space.candidates, space.slices, strict=True)
+    return [(c, part) for c, part in pairs if not isinstance(c.effect, Switch)]
+
+
+def _stepped(candidate: Candidate, part: slice, values: Array) -> Iterator[tuple[Array, float]]:
+    """All values with one of a candidate's after the other moved by a small step, and the step."""
+    for j, step in enumerate(STEP * candidate.typical):
+        moved = values.copy()
+        moved[part.start + j] += step
+        yield moved, step
