@@ -24,6 +24,9 @@ WIDE = (-1000.0, 1000.0)
 FAST = 200.0
 
 
+Served = contextlib.AbstractContextManager["Bench"]
+
+
 class ServedAxis:
     """What every conformance class of an axis needs: the name under which its emulator is served.
 
@@ -39,6 +42,10 @@ class ServedAxis:
     def kind(self) -> str:
         """The emulator's name; a class for several kinds overrides this by a fixture with parameters."""
         return self.emulator
+
+    def served(self, kind: str, homed: bool = True, speed: float = FAST, **options: object) -> Served:
+        """The emulator, served; overridden where the axis has no wire."""
+        return served(kind, homed, speed, **options)
 
 
 @dataclass

@@ -16,7 +16,7 @@ from drivers.errors import (
     WrongDevice,
 )
 from simulators.clock import patient_clock
-from simulators.conformance.axis_bench import ServedAxis, served
+from simulators.conformance.axis_bench import ServedAxis
 from simulators.serial.reply_faults import Fault
 
 
@@ -24,7 +24,7 @@ class AxisFaults(ServedAxis):
     """Tests of an axis on an emulator that is stuck, slow, silent, disturbed, reset or another one."""
 
     def test_another_device_than_the_rig_file_names_is_refused(self, kind: str) -> None:
-        with served(kind) as bench:
+        with self.served(kind) as bench:
             field = type(bench.configs[0]).identified_by
             is_text = "str" in str(type(bench.configs[0]).model_fields[field].annotation)
             with pytest.raises(WrongDevice, match="rig file"):
@@ -33,7 +33,7 @@ class AxisFaults(ServedAxis):
             bench.open()
 
     def test_a_port_that_vanishes_and_one_that_is_not_there(self, kind: str) -> None:
-        with served(kind) as bench:
+        with self.served(kind) as bench:
             axis = bench.open()
             with pytest.raises(PortNotFound, match="no such port"):
                 bench.open(port="/dev/ttyUSB_none")
@@ -44,7 +44,7 @@ class AxisFaults(ServedAxis):
             axis.close()
 
     def test_a_stuck_axis_fails_in_bounded_time_and_is_named(self, kind: str) -> None:
-        with served(kind) as bench:
+        with self.served(kind) as bench:
             axis = bench.open(margin_s=0.1, stall_s=0.1)
             axis.start_move(10.0).wait()
             bench.emulator.faults.add(Fault("stuck"))
@@ -59,7 +59,7 @@ class AxisFaults(ServedAxis):
                 motion.wait()
 
     def test_a_slow_axis_fails_at_the_deadline(self, kind: str) -> None:
-        with served(kind) as bench:
+        with self.served(kind) as bench:
             axis = bench.open(margin_s=0.05, stall_s=5.0)
             bench.emulator.faults.add(Fault("slow", amount=1e-5))
             motion = axis.start_move(20.0)
@@ -67,7 +67,7 @@ class AxisFaults(ServedAxis):
                 motion.wait()
 
     def test_a_silent_device_fails_with_the_reason(self, kind: str) -> None:
-        with served(kind, speed=2.0) as bench:
+        with self.served(kind, speed=2.0) as bench:
             axis = bench.open(reply_s=0.15)
             motion = axis.start_move(90.0)
             bench.emulator.faults.add(Fault("silent"))
@@ -85,7 +85,7 @@ class AxisFaults(ServedAxis):
     def test_a_passing_fault_never_gives_a_wrong_position(self, kind: str, fault: str) -> None:
         """One spoiled reply, at every place of the exchange: the move ends right, or with an error."""
         right = 0
-        with served(kind) as bench:
+        with self.served(kind) as bench:
             axis = bench.open(reply_s=0.1)
             for place in range(1, 13) if fault == "garbled" else (1, 4, 7, 10):
                 bench.emulator.faults.add(Fault(fault, from_command=place, commands=1, amount=0.13))  # type: ignore[arg-type]
@@ -106,14 +106,14 @@ class AxisFaults(ServedAxis):
 
     @pytest.mark.parametrize("fault", ["garbled", "foreign"])
     def test_a_lasting_fault_ends_in_an_error(self, kind: str, fault: str) -> None:
-        with served(kind) as bench:
+        with self.served(kind) as bench:
             axis = bench.open(reply_s=0.1)
             bench.emulator.faults.add(Fault(fault))  # type: ignore[arg-type]
             with pytest.raises((ReplyError, ReplyTimeout, MotionFailed)):
                 axis.start_move(33.0).wait()
 
     def test_a_reset_in_mid_run_is_noticed(self, kind: str) -> None:
-        with served(kind) as bench:
+        with self.served(kind) as bench:
             axis = bench.open()
             axis.start_move(30.0).wait()
             bench.emulator.faults.add(Fault("not_homed"))
@@ -123,7 +123,7 @@ class AxisFaults(ServedAxis):
             assert bench.emulator.true_deg(0) == pytest.approx(30.0, abs=0.05)
 
     def test_the_answer_to_a_stop_is_not_taken_for_that_of_the_next_question(self, kind: str) -> None:
-        with served(kind) as bench:
+        with self.served(kind) as bench:
             axis = bench.open()
             axis.start_move(30.0).wait()
             # Of the stop alone: the questions behind it are answered first.

@@ -13,7 +13,7 @@ from drivers.errors import PortBusy
 from drivers.registry import open_axis
 from drivers.serial_link import LineRegistry
 from simulators.clock import patient_clock
-from simulators.conformance.axis_bench import ServedAxis, served
+from simulators.conformance.axis_bench import ServedAxis
 from simulators.conformance.axis_noise import DriverNoise
 
 
@@ -21,7 +21,7 @@ class SharedLineConformance(ServedAxis):
     """Of a controller or a chain with several axes on one line."""
 
     def test_two_axes_on_one_line_move_at_once(self, kind: str) -> None:
-        with served(kind, speed=2.0, axes=2) as bench:
+        with self.served(kind, speed=2.0, axes=2) as bench:
             first, second = bench.open(0), bench.open(1)
             motions = [first.start_move(150.0), second.start_move(-150.0)]
             assert first.is_moving()
@@ -42,7 +42,7 @@ class SerialPortConformance(DriverNoise):
     """Of a controller behind a serial port: one program has it at a time, and its line may be disturbed."""
 
     def test_a_port_that_another_program_holds_is_refused_by_name(self, kind: str) -> None:
-        with served(kind) as bench:
+        with self.served(kind) as bench:
             holder = (
                 "import os, sys; f = os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY); print('open', flush=True); input()"
             )

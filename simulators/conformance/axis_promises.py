@@ -10,14 +10,14 @@ import time
 import pytest
 
 from drivers.errors import CommandRejected, LimitError, MotionStopped, NotHomedError
-from simulators.conformance.axis_bench import ServedAxis, served
+from simulators.conformance.axis_bench import ServedAxis
 
 
 class AxisPromises(ServedAxis):
     """Tests of an axis that works, on its emulator."""
 
     def test_opening_moves_nothing_and_tells_that_it_is_not_homed(self, kind: str) -> None:
-        with served(kind, homed=False) as bench:
+        with self.served(kind, homed=False) as bench:
             before = [axis.true_deg() for axis in bench.emulator.axes]
             axis = bench.open()
             assert not axis.may_move_on_connect
@@ -30,7 +30,7 @@ class AxisPromises(ServedAxis):
             assert all(axis.end_s() <= bench.emulator.clock.now_s() for axis in bench.emulator.axes)
 
     def test_identity_is_read_from_the_device(self, kind: str) -> None:
-        with served(kind) as bench:
+        with self.served(kind) as bench:
             identity = bench.open().describe()
             assert identity.kind == bench.configs[0].kind  # type: ignore[attr-defined]
             assert identity.port == bench.port.path
@@ -39,7 +39,7 @@ class AxisPromises(ServedAxis):
             assert identity.firmware
 
     def test_homing_gives_a_reference_and_can_be_repeated(self, kind: str) -> None:
-        with served(kind, homed=False) as bench:
+        with self.served(kind, homed=False) as bench:
             axis = bench.open()
             for _ in range(2):
                 position = axis.home().wait()
@@ -50,7 +50,7 @@ class AxisPromises(ServedAxis):
             axis.close()
 
     def test_moves_are_read_back_in_degrees_and_counts(self, kind: str) -> None:
-        with served(kind) as bench:
+        with self.served(kind) as bench:
             axis = bench.open()
             for target_deg in (9.0, -44.19, 372.5, 900.25, -0.01, 0.0):
                 position = axis.start_move(target_deg).wait()
@@ -62,7 +62,7 @@ class AxisPromises(ServedAxis):
 
     @pytest.mark.parametrize(("zero_deg", "direction"), [(12.5, 1), (-3.25, -1)])
     def test_one_zero_and_one_direction(self, kind: str, zero_deg: float, direction: int) -> None:
-        with served(kind) as bench:
+        with self.served(kind) as bench:
             axis = bench.open(zero_deg=zero_deg, direction=direction, limits_deg=(-400.0, 500.0))
             assert axis.limits.min_deg == -400.0
             assert axis.limits.max_deg == 500.0
@@ -71,7 +71,7 @@ class AxisPromises(ServedAxis):
             assert bench.emulator.true_deg(0) == pytest.approx(direction * 40.0 + zero_deg, abs=0.05)
 
     def test_targets_outside_the_limits_are_refused_without_a_byte(self, kind: str) -> None:
-        with served(kind) as bench:
+        with self.served(kind) as bench:
             axis = bench.open(limits_deg=(-10.0, 20.0))
             before = bench.emulator.faults.commands
             for target_deg in (20.5, -10.5, 1e9, math.nan, math.inf, -math.inf):
@@ -84,7 +84,7 @@ class AxisPromises(ServedAxis):
             assert axis.start_move(20.0).wait().deg == pytest.approx(20.0, abs=0.05)
 
     def test_limits_of_the_controller_count_as_well(self, kind: str) -> None:
-        with served(kind, limits_deg=(0.0, 90.0)) as bench:
+        with self.served(kind, limits_deg=(0.0, 90.0)) as bench:
             axis = bench.open(zero_deg=10.0, direction=-1)
             if not bench.emulator.tells_limits:
                 assert (axis.limits.min_deg, axis.limits.max_deg) == (None, None)
@@ -95,7 +95,7 @@ class AxisPromises(ServedAxis):
                 axis.start_move(10.1)
 
     def test_two_moves_at_once_on_one_axis_are_refused(self, kind: str) -> None:
-        with served(kind, speed=3.0) as bench:
+        with self.served(kind, speed=3.0) as bench:
             axis = bench.open()
             motion = axis.start_move(60.0)
             assert not motion.done()
@@ -104,7 +104,7 @@ class AxisPromises(ServedAxis):
             assert motion.wait().deg == pytest.approx(60.0, abs=0.05)
 
     def test_stop_from_another_thread(self, kind: str, caplog: pytest.LogCaptureFixture) -> None:
-        with served(kind, speed=1.0) as bench:
+        with self.served(kind, speed=1.0) as bench:
             axis = bench.open()
             # So far that nobody arrives before the stop, however late the thread gets to run.
             far_deg = 900.0 if axis.can_stop_a_move else 120.0
@@ -131,7 +131,7 @@ class AxisPromises(ServedAxis):
             assert axis.start_move(1.0).wait().deg == pytest.approx(1.0, abs=0.05)
 
     def test_a_stop_in_mid_move_does_not_hide_that_the_axis_moves(self, kind: str) -> None:
-        with served(kind, speed=1.0) as bench:
+        with self.served(kind, speed=1.0) as bench:
             axis = bench.open()
             axis.start_move(120.0)
             axis.stop()
@@ -141,5 +141,5 @@ class AxisPromises(ServedAxis):
             axis.check_fault()
 
     def test_deadlines_are_counted_by_the_clock_of_the_lines(self, kind: str) -> None:
-        with served(kind) as bench:
+        with self.served(kind) as bench:
             assert bench.open().clock is bench.lines.clock
