@@ -3,9 +3,10 @@
 Facts: Newport's own Python library, as newportxps and pyepics carry it (calls, ``code,values,EndOfAPI``), EPICS' and
 BLISS' drivers (status codes; a move or homing holds up its connection until it ends, so every axis has a second one
 for them, and a third for stops: nobody waits for their answers, which must not be taken for another question's).
-A group is homed after GroupInitialize and GroupHomeSearch; GroupKill ends a homing.
-Unverified on hardware: everything; that no Login is asked; the text behind an error code. The unit must be degrees,
-which is not asked. The position compare output is not used.
+A group is homed after GroupInitialize and GroupHomeSearch; GroupKill ends a homing. Position compare: the same library
+and Newport's note "High speed position compare output".
+Unverified on hardware: everything; that no Login is asked; the text behind an error code; in which states position
+compare is refused. The unit must be degrees, which is not asked.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from drivers.clock import Clock
-from drivers.errors import CommandRejected, NotHomedError, ReplyError, ReplyTimeout, WrongDevice
+from drivers.errors import CommandRejected, LimitError, NotHomedError, ReplyError, ReplyTimeout, WrongDevice
 from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
 from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed
 from drivers.unmarked_replies import ask
@@ -34,6 +35,8 @@ NO_LIMIT_DEG = 1e6
 # GroupInitialize starts the motor's control loop; a refusal of a move comes at once.
 INITIALIZE_S = 20.0
 REFUSAL_S = 0.1
+# Of a step, so that 0.1 + 0.2 is three of them.
+STEPS_ROUNDING = 1e-6
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _ERROR = r"-\d+,.*"
 
@@ -157,6 +160,59 @@ class XPSAxis(MotionAxis):
 
     def _status(self) -> int:
         return int(self._line.ask(f"GroupStatusGet({self.config.group},int *)", r"\d{1,3}"))
+
+    def output_pulses(self, first_deg: float, last_deg: float, step_deg: float) -> None:
+        """Put out a pulse at every step between two angles, whenever the axis passes one, until `output_no_pulses`.
+
+        This is the controller's position compare output (connector PCO): it triggers a camera in mid-move. Captures do
+        not use it, since their axes stand still while a frame is exposed.
+
+        Parameters
+        ----------
+        first_deg, last_deg : float
+            User angles of the outermost pulses.
+        step_deg : float
+            Distance of two pulses; first and last are whole steps apart.
+
+        Raises
+        ------
+        LimitError
+            An end outside the limits of the axis, or not whole steps between them.
+        CommandRejected, NotHomedError, ReplyError
+            The controller refuses, or reads back something else.
+        """
+        for end_deg in (first_deg, last_deg):
+            self.check(end_deg)
+        steps = (last_deg - first_deg) / step_deg if step_deg > 0 else 0.0
+        if steps < 1 or abs(steps - round(steps)) > STEPS_ROUNDING:
+            raise LimitError(
+                f"axis {self.name}, pulses from {first_deg:g} to {last_deg:g} deg",
+                f"steps of {step_deg:g} deg do not fit",
+                "Choose ends that are whole steps apart, the lower one first",
+            )
+        low_deg, high_deg = sorted(self._to_device_deg(end_deg) for end_deg in (first_deg, last_deg))
+        wanted = (low_deg, high_deg, step_deg)
+        self._line.command(
+            f"PositionerPositionCompareSet({self._positioner},{','.join(f'{value:.6f}' for value in wanted)})"
+        )
+        # The encoder's resolution rounds them.
+        back, _ = self._read_compare()
+        if any(abs(got - value) > self.config.tolerance_deg for got, value in zip(back, wanted, strict=True)):
+            raise ReplyError(f"axis {self.name}, pulses {wanted}", f"it reads back {back}", "Choose another step")
+        self._line.command(f"PositionerPositionCompareEnable({self._positioner})")
+
+    def output_no_pulses(self) -> None:
+        """Switch the position compare output off; raises as the controller refuses."""
+        self._line.command(f"PositionerPositionCompareDisable({self._positioner})")
+
+    def puts_out_pulses(self) -> bool:
+        """True while the position compare output is on."""
+        return self._read_compare()[1]
+
+    def _read_compare(self) -> tuple[tuple[float, ...], bool]:
+        call = f"PositionerPositionCompareGet({self._positioner},double *,double *,double *,bool *)"
+        *ends, on = self._line.ask(call, ",".join([_NUMBER] * 3 + ["[01]"])).split(",")
+        return tuple(float(value) for value in ends), on == "1"
 
     def _do_read_counts(self) -> float:
         return self._ask("GroupPositionCurrentGet", 1)[0]

@@ -5,9 +5,10 @@ A move or a homing holds up its own connection until it ends; other connections 
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from drivers.axes.xps import Config
 from simulators.clock import Clock
@@ -29,6 +30,30 @@ class Failed(Exception):
 
 
 @dataclass
+class PositionCompare:
+    """A pulse at each of the angles low, low + step, ... high that the axis passes; `pulses_deg` has those so far."""
+
+    low_deg: float = 0.0
+    high_deg: float = 0.0
+    step_deg: float = 0.0
+    on: bool = False
+    pulses_deg: list[float] = field(default_factory=list)
+    _seen_deg: float = math.nan
+
+    def look(self, here_deg: float) -> None:
+        """Note what was passed since the last look; the axis turned one way only in between."""
+        there_deg, self._seen_deg = self._seen_deg, here_deg
+        if not self.on or math.isnan(there_deg):
+            return
+        count = round((self.high_deg - self.low_deg) / self.step_deg) + 1
+        passed = [self.low_deg + k * self.step_deg for k in range(count)]
+        low, high = sorted((there_deg, here_deg))
+        # What was on the mark at the last look has given its pulse.
+        passed = [deg for deg in passed if low <= deg <= high and deg != there_deg]
+        self.pulses_deg += passed if here_deg >= there_deg else passed[::-1]
+
+
+@dataclass
 class Group:
     """A group with one positioner, `name`.Pos."""
 
@@ -38,6 +63,7 @@ class Group:
     enabled: bool = True
     came_by: int = 11
     aborted: bool = False
+    compare: PositionCompare = field(default_factory=PositionCompare)
 
     def status(self) -> int:
         """Status code of GroupStatusGet."""
@@ -123,6 +149,10 @@ class XPSConversation(Emulator):
             "GroupKill": self._kill,
             "GroupMotionEnable": lambda group, _: self._enable(group, True),
             "GroupMotionDisable": lambda group, _: self._enable(group, False),
+            "PositionerPositionCompareSet": self._set_compare,
+            "PositionerPositionCompareGet": lambda group, _: _compare(group.compare),
+            "PositionerPositionCompareEnable": lambda group, _: self._switch_compare(group, True),
+            "PositionerPositionCompareDisable": lambda group, _: self._switch_compare(group, False),
         }
         if name not in functions:
             raise Failed(UNKNOWN)
@@ -174,7 +204,28 @@ class XPSConversation(Emulator):
         group.enabled, group.came_by = on, 10
         return ""
 
+    def _set_compare(self, group: Group, words: list[str]) -> str:
+        try:
+            low_deg, high_deg, step_deg = (float(word) for word in words)
+        except ValueError:
+            raise Failed(WRONG_FORMAT) from None
+        if group.compare.on or not 10 <= group.status() <= 18:
+            raise Failed(NOT_ALLOWED)
+        if not (step_deg > 0 and low_deg < high_deg and group.axis.within(low_deg) and group.axis.within(high_deg)):
+            raise Failed(OUT_OF_RANGE)
+        group.compare = PositionCompare(low_deg, high_deg, step_deg)
+        return ""
+
+    def _switch_compare(self, group: Group, on: bool) -> str:
+        if on and group.compare.step_deg == 0:
+            raise Failed(NOT_ALLOWED)
+        group.compare.look(group.axis.position_deg())
+        group.compare.on = on
+        return ""
+
     def _do_advance(self) -> None:
+        for each in self._controller.groups.values():
+            each.compare.look(each.axis.position_deg())
         group = self._waits_for
         if group is not None and not group.axis.is_moving():
             self._waits_for = None
@@ -192,6 +243,10 @@ def _limits(axis: EmulatedAxis) -> str:
     low = -1e7 if axis.min_deg is None else axis.min_deg
     high = 1e7 if axis.max_deg is None else axis.max_deg
     return f"{low:g},{high:g}"
+
+
+def _compare(compare: PositionCompare) -> str:
+    return f"{compare.low_deg:.9g},{compare.high_deg:.9g},{compare.step_deg:.9g},{int(compare.on)}"
 
 
 def make(options: ServeOptions) -> XPSEmulator:

@@ -9,12 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.apt_frames import apt_framer
-from drivers.axes import apt, elliptec, esp301, gcs2, smc100, xps, zaber
+from drivers.axes import apt, elliptec, esp301, gcs2, smc100, zaber
 from drivers.errors import CommandRejected, NotHomedError, ReplyError
 from drivers.serial_link import LONGEST_FRAME, LineRegistry, line_framer
-from simulators.clock import Clock, ManualClock, patient_clock
+from simulators.clock import Clock, patient_clock
 from simulators.controllers import esp301 as esp301_emulator
-from simulators.controllers import xps as xps_emulator
 from simulators.controllers import zaber as zaber_emulator
 from simulators.serial.pty_port import PtyPort
 from simulators.serial.serve_options import ServeOptions
@@ -395,38 +394,3 @@ def test_errors_of_one_esp301_axis_are_kept_while_another_is_asked() -> None:
         with pytest.raises(CommandRejected, match="error 204: hardware limit"):
             second.check_fault()
         second.check_fault()
-
-
-def test_xps_bytes() -> None:
-    emulator = xps_emulator.make(ServeOptions(clock=Clock(instant=True)))
-    talk, motion = emulator.connect(), emulator.connect()
-    for line, sent, came in (
-        (talk, b"FirmwareVersionGet(char *)", b"0,XPS-C8 Firmware V2.6.x,EndOfAPI"),
-        (talk, b"GroupStatusGet(Group1,int *)", b"0,0,EndOfAPI"),
-        (talk, b"GroupHomeSearch(Group1)", b"-22,GroupHomeSearch(Group1),EndOfAPI"),
-        (talk, b"GroupInitialize(Group1)", b"0,,EndOfAPI"),
-        (talk, b"GroupStatusGet(Group1,int *)", b"0,42,EndOfAPI"),
-        (motion, b"GroupHomeSearch(Group1)", b"0,,EndOfAPI"),
-        (talk, b"GroupStatusGet(Group1,int *)", b"0,11,EndOfAPI"),
-        (motion, b"GroupMoveAbsolute(Group1.Pos,-12.500000)", b"0,,EndOfAPI"),
-        (talk, b"GroupPositionCurrentGet(Group1.Pos,double *)", b"0,-12.5,EndOfAPI"),
-        (motion, b"GroupMoveAbsolute(Group1.Pos,999)", b"-17,GroupMoveAbsolute(Group1.Pos,999),EndOfAPI"),
-        (talk, b"GroupStatusGet(Group7,int *)", b"-19,GroupStatusGet(Group7,int *),EndOfAPI"),
-    ):
-        line.receive(sent)
-        assert line.take_output() == came
-    buffer = bytearray(b"0,12,EndOfAPI0,1.5,EndO")
-    assert (xps.framer(buffer), xps.framer(buffer), bytes(buffer)) == (b"0,12", None, b"0,1.5,EndO")
-
-
-def test_a_move_of_an_xps_holds_up_its_own_connection_alone() -> None:
-    clock = ManualClock()
-    emulator = xps_emulator.make(ServeOptions(clock=clock, homed=True))
-    talk, motion = emulator.connect(), emulator.connect()
-    motion.receive(b"GroupMoveAbsolute(Group1.Pos,90)GroupStatusGet(Group1,int *)")
-    talk.receive(b"GroupStatusGet(Group1,int *)")
-    assert (motion.take_output(), talk.take_output()) == (b"", b"0,44,EndOfAPI")
-    talk.receive(b"GroupMoveAbort(Group1)")
-    clock.sleep_s(60.0)
-    assert talk.take_output() == b"0,,EndOfAPI"
-    assert motion.take_output() == b"-27,,EndOfAPI0,12,EndOfAPI"

@@ -1,0 +1,70 @@
+"""Newport XPS: what is said on each of its connections, and the position compare output."""
+
+import pytest
+
+from drivers.axes import xps
+from drivers.errors import LimitError
+from drivers.serial_link import LineRegistry
+from simulators.clock import Clock, ManualClock, patient_clock
+from simulators.controllers import xps as xps_emulator
+from simulators.serial.serve_options import ServeOptions
+from simulators.serial.tcp_port import port_for
+
+
+def test_xps_bytes() -> None:
+    emulator = xps_emulator.make(ServeOptions(clock=Clock(instant=True)))
+    talk, motion = emulator.connect(), emulator.connect()
+    for line, sent, came in (
+        (talk, b"FirmwareVersionGet(char *)", b"0,XPS-C8 Firmware V2.6.x,EndOfAPI"),
+        (talk, b"GroupStatusGet(Group1,int *)", b"0,0,EndOfAPI"),
+        (talk, b"GroupHomeSearch(Group1)", b"-22,GroupHomeSearch(Group1),EndOfAPI"),
+        (talk, b"GroupInitialize(Group1)", b"0,,EndOfAPI"),
+        (talk, b"GroupStatusGet(Group1,int *)", b"0,42,EndOfAPI"),
+        (motion, b"GroupHomeSearch(Group1)", b"0,,EndOfAPI"),
+        (talk, b"GroupStatusGet(Group1,int *)", b"0,11,EndOfAPI"),
+        (motion, b"GroupMoveAbsolute(Group1.Pos,-12.500000)", b"0,,EndOfAPI"),
+        (talk, b"GroupPositionCurrentGet(Group1.Pos,double *)", b"0,-12.5,EndOfAPI"),
+        (motion, b"GroupMoveAbsolute(Group1.Pos,999)", b"-17,GroupMoveAbsolute(Group1.Pos,999),EndOfAPI"),
+        (talk, b"GroupStatusGet(Group7,int *)", b"-19,GroupStatusGet(Group7,int *),EndOfAPI"),
+    ):
+        line.receive(sent)
+        assert line.take_output() == came
+    buffer = bytearray(b"0,12,EndOfAPI0,1.5,EndO")
+    assert (xps.framer(buffer), xps.framer(buffer), bytes(buffer)) == (b"0,12", None, b"0,1.5,EndO")
+
+
+def test_a_move_of_an_xps_holds_up_its_own_connection_alone() -> None:
+    clock = ManualClock()
+    emulator = xps_emulator.make(ServeOptions(clock=clock, homed=True))
+    talk, motion = emulator.connect(), emulator.connect()
+    motion.receive(b"GroupMoveAbsolute(Group1.Pos,90)GroupStatusGet(Group1,int *)")
+    talk.receive(b"GroupStatusGet(Group1,int *)")
+    assert (motion.take_output(), talk.take_output()) == (b"", b"0,44,EndOfAPI")
+    talk.receive(b"GroupMoveAbort(Group1)")
+    clock.sleep_s(60.0)
+    assert talk.take_output() == b"0,,EndOfAPI"
+    assert motion.take_output() == b"-27,,EndOfAPI0,12,EndOfAPI"
+
+
+def test_an_xps_puts_out_a_pulse_at_every_step_that_it_passes() -> None:
+    emulator = xps_emulator.make(ServeOptions(clock=Clock(100.0, base=patient_clock()), homed=True))
+    with port_for(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
+        config = xps.Config(port=port.path, group="Group1", direction=-1, zero_deg=5.0, poll_s=0.002)
+        axis = xps.open("arm", config, lines)
+        axis.start_move(0.0).wait()
+        axis.output_pulses(10.0, 10.3, 0.1)
+        assert axis.puts_out_pulses()
+        axis.start_move(20.0).wait()
+        axis.start_move(10.15).wait()
+        axis.output_no_pulses()
+        axis.start_move(0.0).wait()
+        assert not axis.puts_out_pulses()
+        # The controller counts the other way round: 10 deg is -5 there.
+        pulses_deg = emulator.groups["Group1"].compare.pulses_deg
+        assert pulses_deg == pytest.approx([-5.0, -5.1, -5.2, -5.3, -5.3, -5.2])
+        for ends in ((10.0, 9.0), (10.0, 10.25), (10.0, 400.0)):
+            with pytest.raises(LimitError):
+                axis.output_pulses(*ends, 0.1)
+    talk = xps_emulator.make(ServeOptions(clock=Clock(instant=True))).connect()
+    talk.receive(b"PositionerPositionCompareSet(Group1.Pos,0,10,0.5)")
+    assert talk.take_output() == b"-22,PositionerPositionCompareSet(Group1.Pos,0,10,0.5),EndOfAPI"
