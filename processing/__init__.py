@@ -2,11 +2,12 @@
 
 The names below are the public interface; each is imported when it is first used.
 
+    from glob import glob
     from processing import reduce_to_dataset
 
-    image = reduce_to_dataset("captures/NAME.h5")
+    image = reduce_to_dataset(max(glob("captures/*omega35.h5")))
     m = image.mueller / image.mueller.sel(row=0, column=0)
-    print(m.isel(y=30, x=30).values, image.mueller_errors.isel(y=30, x=30).values)
+    print(m.median(["y", "x"]).values, image.mueller_errors.median(["y", "x"]).values)
 """
 
 from __future__ import annotations

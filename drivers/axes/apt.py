@@ -145,7 +145,7 @@ class APTAxis(MotionAxis):
         self.acceleration_deg_s2 = acceleration / self._scale.acceleration
         self._home_speed_deg_s = self._read_home_parameters()[2] / self._scale.velocity or self.speed_deg_s
         self._identity = AxisIdentity(
-            kind="apt",
+            kind=config.kind,
             model=model,
             serial_number=str(serial_number),
             firmware=".".join(str(part) for part in reversed(info[14:17])),

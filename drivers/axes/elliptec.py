@@ -185,7 +185,7 @@ class ElliptecAxis(SessionReferenceAxis):
         self.speed_deg_s = FULL_SPEED_DEG_S * max(velocity, 1) / 100
         self.acceleration_deg_s2 = ACCELERATION_DEG_S2
         self._identity = AxisIdentity(
-            kind="elliptec",
+            kind=config.kind,
             model=_ROTARY.get(module, f"ELL{module}"),
             serial_number=info[2:10],
             firmware=info[14:16],

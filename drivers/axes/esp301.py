@@ -133,7 +133,7 @@ class ESP301Axis(SessionReferenceAxis):
         self._device_max_deg = self._limit("SR?")
         model, _, serial_number = stage.partition(",")
         self._identity = AxisIdentity(
-            kind="esp301",
+            kind=config.kind,
             model=f"{version.split()[0]} stage {model.strip()}",
             serial_number=serial_number.strip(),
             firmware=" ".join(version.split()[1:]),

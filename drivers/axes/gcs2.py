@@ -101,7 +101,7 @@ class GCS2Axis(MotionAxis):
             raise ReplyError(f"{asked}, speed", f"{self.speed_deg_s}, {self.acceleration_deg_s2}", "Set VEL and ACC")
         self._device_min_deg, self._device_max_deg = self._limit("TMN?"), self._limit("TMX?")
         self._identity = AxisIdentity(
-            kind="gcs2",
+            kind=config.kind,
             model=model,
             serial_number=serial_number,
             firmware=firmware,

@@ -177,7 +177,7 @@ class SMC100Axis(MotionAxis):
         model, _, firmware = version.rpartition(" ")
         self._model_is_known = any(known in version.upper() for known in _KNOWN)
         self._identity = AxisIdentity(
-            kind="smc100",
+            kind=config.kind,
             model=f"{model or version} stage {stage or 'not told'}",
             serial_number="not told by the protocol",
             firmware=firmware,

@@ -134,7 +134,7 @@ class XPSAxis(MotionAxis):
         limits = agreed(lambda: self._ask("PositionerUserTravelLimitsGet", 2))
         self._device_min_deg, self._device_max_deg = (None if abs(end) >= NO_LIMIT_DEG else end for end in limits)
         self._identity = AxisIdentity(
-            kind="xps",
+            kind=config.kind,
             model=firmware.partition(" ")[0],
             serial_number="not told by the protocol",
             firmware=firmware,

@@ -229,7 +229,7 @@ class ZaberAxis(MotionAxis):
         self._device_min_deg = self._limit("limit.min")
         self._device_max_deg = self._limit("limit.max")
         self._identity = AxisIdentity(
-            kind="zaber",
+            kind=config.kind,
             model=f"device id {self._ask('get deviceid', axis=0).data}",
             serial_number=serial_number,
             firmware=self._ask("get version", axis=0).data,

@@ -117,7 +117,7 @@ class LedDriver(LightSource):
     def describe(self) -> dict[str, str]:
         """Kind, model, serial number, firmware and port."""
         return {
-            "kind": "dc2200",
+            "kind": self.config.kind,
             "model": self._model.strip(),
             "serial_number": self._serial_number.strip(),
             "firmware": self._firmware.strip(),

@@ -152,7 +152,7 @@ class LedDriver(LightSource):
         """Kind, model, serial number, firmware, port, and the LEDs by channel with their nominal wavelengths."""
         leds = ", ".join(f"{channel + 1}: {nm:g} nm" for channel, nm in self._nominal_nm.items())
         return {
-            "kind": "dc4100",
+            "kind": self.config.kind,
             "model": self._model,
             "serial_number": self._serial_number,
             "firmware": self._firmware,

@@ -112,7 +112,7 @@ class FilterWheel(LightSource):
     def describe(self) -> dict[str, str]:
         """Kind, model, port, and the filters by position."""
         filters = ", ".join(f"{position}: {nm:g} nm" for nm, position in self.config.positions.items())
-        found = {"kind": "fw102c", "model": self._model, "port": self.config.port, "filters": filters}
+        found = {"kind": self.config.kind, "model": self._model, "port": self.config.port, "filters": filters}
         if self._shutter is not None:
             found["shutter"] = self._shutter.describe()["model"]
         return found

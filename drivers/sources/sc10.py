@@ -74,7 +74,7 @@ class Shutter(LightSource):
 
     def describe(self) -> dict[str, str]:
         """Kind, model and port."""
-        return {"kind": "sc10", "model": self._model, "port": self.config.port}
+        return {"kind": self.config.kind, "model": self._model, "port": self.config.port}
 
     def close(self) -> None:
         """Give the port back."""

@@ -69,6 +69,6 @@ def test_the_docstrings_run_as_they_stand(small_rig, tmp_path, monkeypatch, caps
         lines = (package.__doc__ or "").splitlines()
         blocks[package.__name__] = "\n".join(line[4:] for line in lines if line.startswith("    ") or not line.strip())
     exec(compile(blocks["acquisition"], "acquisition", "exec"), {})
-    taken = capsys.readouterr().out.strip()
-    exec(compile(blocks["processing"].replace("captures/NAME.h5", taken), "processing", "exec"), {})
+    capsys.readouterr()
+    exec(compile(blocks["processing"], "processing", "exec"), {})
     assert "[[" in capsys.readouterr().out

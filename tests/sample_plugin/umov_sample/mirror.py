@@ -5,8 +5,9 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel
 
-from processing.arrays import Array
+from processing.arrays import Array, ComplexArray
 from processing.geometry.frames import ScatteringGeometry
+from processing.reflectance.base import normalized_mueller
 
 
 class Model(BaseModel):
@@ -16,7 +17,10 @@ class Model(BaseModel):
     name: str
     wavelengths_nm: tuple[float, ...] = ()
 
+    def jones(self, geometry: ScatteringGeometry, wavelength_nm: float) -> ComplexArray:
+        """Jones matrices (..., 2, 2)."""
+        return np.broadcast_to(np.diag([1.0 + 0j, -1]), (*np.shape(geometry.normal)[:-1], 2, 2))
+
     def mueller_jones(self, geometry: ScatteringGeometry, wavelength_nm: float) -> Array:
         """Mueller matrices (..., 4, 4)."""
-        shape = np.shape(geometry.normal)[:-1]
-        return np.broadcast_to(np.diag([1.0, 1, -1, -1]), (*shape, 4, 4))
+        return normalized_mueller(self.jones(geometry, wavelength_nm))

@@ -1,0 +1,221 @@
+"""Every code block of README and docs: what is shown runs, or says why it does not run here.
+
+A block is a fence with a language. `bash` and `python` run as they stand, page by page, in a folder that looks like the
+checkout; a capture of the tutorial lies in `captures/` where a page takes none of itself. `console` has a title that
+says what it needs (minutes, hardware, files of yours): its commands, options and scripts must exist. `yaml` has a
+title that says what it is: `NAME.yaml` is written for the commands that follow, a part of a file is put into that file.
+"""
+
+import glob
+import os
+import re
+import shlex
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from markdown_it import MarkdownIt
+from ruamel.yaml import YAML
+
+from acquisition.campaign.plan import Campaign
+from acquisition.commands.application import app as acquire_app
+from acquisition.commands.application import main as acquire
+from acquisition.rig.config import load_rig
+from processing.commands.application import app as process_app
+from processing.commands.application import main as process
+from processing.commands.diagnose import app as diagnose_app
+from processing.commands.diagnose import main as diagnose
+from processing.geometry.viewing import ViewingGeometry
+from simulators.cli import app as simulate_app
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+RUNS = {"acquire": acquire, "process": process, "diagnose": diagnose}
+APPS = {"acquire": acquire_app, "process": process_app, "diagnose": diagnose_app, "simulate": simulate_app}
+FIRST_CAPTURE = ["./lab", "acquire", "--omega", "35"]
+LANGUAGES = {"bash", "python", "console", "yaml", "text"}
+
+
+@dataclass(frozen=True)
+class Block:
+    """One code block: where it begins, its language, its title and its lines."""
+
+    page: Path
+    line: int
+    language: str
+    title: str
+    text: str
+
+    def commands(self) -> list[list[str]]:
+        """Words of each command line, without comments; a backslash joins lines."""
+        lines = self.text.replace("\\\n", " ").splitlines()
+        return [words for line in lines if (words := shlex.split(line, comments=True))]
+
+
+def shown(block: Block) -> list[list[str]]:
+    """Commands of a block that runs."""
+    return block.commands() if block.language == "bash" else []
+
+
+def blocks_of(page: Path) -> list[Block]:
+    """Code blocks of a page; one that is made by indentation has no language."""
+    found = []
+    for token in MarkdownIt().parse(page.read_text(encoding="utf-8")):
+        if token.type in ("fence", "code_block"):
+            language, _, rest = token.info.partition(" ")
+            title = re.search(r'title="([^"]+)"', rest)
+            line = token.map[0] + 1 if token.map else 0
+            found.append(Block(page, line, language, title[1] if title else "", token.content))
+    return found
+
+
+BLOCKS = [block for page in PAGES for block in blocks_of(page)]
+WITH_CODE = [page for page in PAGES if any(b.page == page and b.language in ("bash", "python") for b in BLOCKS)]
+
+
+def test_every_block_says_what_it_is() -> None:
+    wrong = [
+        f"{b.page.name}:{b.line}: {b.language or 'indented, without a language'}"
+        for b in BLOCKS
+        if b.language not in LANGUAGES or (b.language in ("console", "yaml") and not b.title)
+    ]
+    assert wrong == []
+
+
+def test_most_blocks_run() -> None:
+    counted = Counter(b.language for b in BLOCKS)
+    assert counted["bash"] + counted["python"] + counted["yaml"] > counted["console"], counted
+
+
+@pytest.fixture(scope="session")
+def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with the files that pages name; the simulated rig has fewer pixels and a faster clock."""
+    folder = tmp_path_factory.mktemp("checkout")
+    for name in ("configs", "examples", "benchmarks"):
+        target = folder / name
+        for path in (ROOT / name).rglob("*"):
+            if path.is_file() and "__pycache__" not in path.parts:
+                copy = target / path.relative_to(ROOT / name)
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                copy.write_bytes(path.read_bytes())
+    rig = folder / "configs/rigs/simulated.yaml"
+    text = rig.read_text()
+    smaller = {"clock_speed: 10": "clock_speed: 50", "rows: 600": "rows: 160", "columns: 600": "columns: 160"}
+    for old, new in smaller.items():
+        assert old in text
+        text = text.replace(old, new)
+    rig.write_text(text)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def first_capture(checkout: Path) -> Path:
+    """The capture of the tutorial's first command."""
+    with pytest.raises(SystemExit) as end:
+        acquire(
+            ["--omega", "35", "--rig", str(checkout / "configs/rigs/simulated.yaml"), "--out", str(checkout / "one")]
+        )
+    assert not end.value.code
+    (capture,) = (checkout / "one").glob("*omega35.h5")
+    return capture
+
+
+@pytest.fixture
+def desk(checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where a page's commands run: links to the files of the checkout, nothing else."""
+    for name in ("configs", "examples", "benchmarks"):
+        (tmp_path / name).symlink_to(checkout / name)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    monkeypatch.setattr("acquisition.commands.defaults.DEFAULT_RIG", checkout / "configs/rigs/simulated.yaml")
+    return tmp_path
+
+
+def run(words: list[str]) -> None:
+    """Run a line of a shell block in this process, patterns of file names filled in as a shell does."""
+    assert words[0] == "./lab", f"{shlex.join(words)}: shown commands begin with ./lab"
+    arguments = [name for word in words[2:] for name in (sorted(glob.glob(word)) if "*" in word else [word])]
+    with pytest.raises(SystemExit) as end:
+        RUNS[words[1]](arguments)
+    assert not end.value.code, f"{shlex.join(words)} ended with {end.value.code}"
+
+
+@pytest.mark.parametrize("page", WITH_CODE, ids=lambda page: page.stem)
+def test_commands_and_python_run_as_they_stand(page: Path, desk: Path, request: pytest.FixtureRequest) -> None:
+    blocks = [b for b in BLOCKS if b.page == page]
+    if not any(words[:4] == FIRST_CAPTURE and "--mode" not in words for b in blocks for words in shown(b)):
+        (desk / "captures").mkdir()
+        capture = request.getfixturevalue("first_capture")
+        os.link(capture, desk / "captures" / capture.name)
+    scope: dict[str, object] = {}
+    for block in blocks:
+        if block.language == "yaml" and block.title.endswith(".yaml"):
+            (desk / block.title).write_text(block.text)
+        elif block.language == "bash":
+            for words in shown(block):
+                run(words)
+        elif block.language == "python":
+            exec(compile(block.text, f"{page.name}:{block.line}", "exec"), scope)
+
+
+@pytest.mark.parametrize(
+    "block", [b for b in BLOCKS if b.language == "console"], ids=lambda b: f"{b.page.stem}-{b.line}"
+)
+def test_what_is_not_run_here_exists(block: Block) -> None:
+    for words in block.commands():
+        for word in words:
+            if word.startswith(("benchmarks/", "examples/", "tests/", "configs/")):
+                assert (ROOT / word).exists(), word
+        if words[0] == "./lab" and words[1] in APPS:
+            require_options(words[1], words[2:])
+
+
+def require_options(name: str, words: list[str]) -> None:
+    """Assert that a command takes the options it is shown with; nothing is run."""
+    command: Any = typer.main.get_command(APPS[name])
+    if hasattr(command, "commands") and not words[0].startswith("-"):
+        assert words[0] in command.commands, f"{name} has no command {words[0]!r}"
+        command = command.commands[words[0]]
+    known = {option for parameter in command.params for option in parameter.opts}
+    assert {word for word in words if word.startswith("--")} <= known
+
+
+@pytest.mark.parametrize("block", [b for b in BLOCKS if b.language == "yaml"], ids=lambda b: f"{b.page.stem}-{b.line}")
+def test_yaml_is_valid_where_it_belongs(block: Block, tmp_path: Path) -> None:
+    if block.title.endswith(".yaml"):
+        assert block.title in "".join(b.text for b in BLOCKS if b.page == block.page and b.language == "bash")
+        return
+    files = {
+        "in a rig file": (ROOT / "configs/rigs/simulated.yaml", load_rig),
+        "in a campaign file": (ROOT / "configs/campaigns/red_sphere.yaml", Campaign.load),
+        "a geometry file": (None, ViewingGeometry.load),
+    }
+    base, load = files[block.title]
+    yaml = YAML()
+    part = yaml.load(block.text)
+    if base is None:
+        path = tmp_path / "whole.yaml"
+    else:
+        # Beside the file, for its relative paths.
+        path = tmp_path / base.parent.name / base.name
+        for folder in ("instruments", "scenes", "plans"):
+            (tmp_path / folder).symlink_to(ROOT / "configs" / folder)
+        path.parent.mkdir()
+        whole = yaml.load(base)
+        merge(whole, part)
+        part = whole
+    with path.open("w") as file:
+        yaml.dump(part, file)
+    load(path)
+
+
+def merge(whole: dict, part: dict) -> None:
+    """Put a part of a file into it; sections are merged, lists and values replaced."""
+    for key, value in part.items():
+        if isinstance(value, dict) and isinstance(whole.get(key), dict):
+            merge(whole[key], value)
+        else:
+            whole[key] = value
