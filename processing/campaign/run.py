@@ -75,6 +75,8 @@ class CampaignResult:
     left_out: tuple[str, ...] = ()
     flats: dict[str, str] = field(default_factory=dict)
     tables: dict[tuple[str, float], Path] = field(default_factory=dict)
+    #: Geometry of each kind of capture: the file's, or the one found in the images.
+    views: dict[str, ViewingGeometry] = field(default_factory=dict)
 
     def average(self, wavelength_nm: float, quantity: str) -> float:
         """Mean over the arm angles of a quantity of `Row`; NaN without any."""
@@ -140,6 +142,7 @@ class Campaign:
     material : file of the reflectance model.
     register : take centre and scale of the sphere from the images instead of from the geometry file.
     border_px : pixels nearer than this to the outline do not count.
+    instrument : file of the Mueller polarimeter to use instead of the model in the captures.
     """
 
     folder: Path
@@ -149,6 +152,7 @@ class Campaign:
     stokes_geometry: Path | None = None
     register: bool = False
     border_px: int = BORDER_PX
+    instrument: Path | None = None
 
     def run(self, pool: Executor, progress: Progress | None = None) -> CampaignResult:
         """Work on the captures in `pool` and compare.
@@ -174,12 +178,19 @@ class Campaign:
         tables = _merged_tables(measures, self.out)
         rows = tuple(_rows(measures, tables, views))
         names = {path.name: flat.name for path, flat in flats.items()}
-        return CampaignResult(rows, simulated, tuple(left_out), names, tables)
+        return CampaignResult(rows, simulated, tuple(left_out), names, tables, views)
 
     def _task(self, capture: Path, kind: str, flat: Path | None) -> CaptureTask:
         geometry = self.geometry if kind == "mueller" else self.stokes_geometry or self.geometry
         return CaptureTask(
-            str(capture), kind, str(self.out), str(geometry), str(self.material), self.border_px, flat=str(flat or "")
+            str(capture),
+            kind,
+            str(self.out),
+            str(geometry),
+            str(self.material),
+            self.border_px,
+            flat=str(flat or ""),
+            instrument=str(self.instrument or "") if kind == "mueller" else "",
         )
 
 

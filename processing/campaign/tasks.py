@@ -52,6 +52,8 @@ class CaptureTask:
     view_json: str = ""
     #: Capture of the flat field; empty: none.
     flat: str = ""
+    #: Instrument file instead of the model in the capture; empty: that model.
+    instrument: str = ""
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,8 @@ def task_view(task: CaptureTask) -> ViewingGeometry:
 def reduced_product(task: CaptureTask) -> Path:
     """The product of a capture in the task's folder, found or made."""
     path = Path(task.capture)
-    reduction = Reduction(path, flat=(Path(task.flat),) if task.flat else ())
+    instrument = Path(task.instrument) if task.instrument else None
+    reduction = Reduction(path, instrument, flat=(Path(task.flat),) if task.flat else ())
     return reduction.found_or_made(Path(task.out) / f"{path.stem}.{task.kind}.h5").path
 
 

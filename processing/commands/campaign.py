@@ -23,6 +23,9 @@ def campaign_command(
     geometry: Annotated[Path, typer.Option(help="Geometry file: camera, source, shape.")],
     material: Annotated[Path, typer.Option(help="Material file: the dominant process.")],
     stokes_geometry: Annotated[Path | None, typer.Option(help="Geometry of the Stokes camera, if another.")] = None,
+    instrument: Annotated[
+        Path | None, typer.Option(help="Instrument file of the Mueller captures instead of the one in them.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: FOLDER/campaign.")] = None,
     registered: Annotated[bool, typer.Option("--register", help="Find the sphere in the images.")] = False,
     border: Annotated[int, typer.Option(min=0, help="Pixels along the outline that do not count.")] = 4,
@@ -41,7 +44,7 @@ def campaign_command(
     if not folder.is_dir():
         raise ProcessError(f"{folder}: no such folder. Give the folder that holds the captures.")
     target = out or folder / "campaign"
-    step = Campaign(folder, target, geometry, material, stokes_geometry, registered, border)
+    step = Campaign(folder, target, geometry, material, stokes_geometry, registered, border, instrument)
     with executor(workers, scheduler) as pool, progress_bar("campaign", "captures") as tick:
         result = step.run(pool, tick)
     write_csv(result, target / "campaign.csv")

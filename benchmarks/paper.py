@@ -1,0 +1,72 @@
+"""The paper in one command: simulate, acquire on emulators, process, and write one page beside the paper's numbers.
+
+    ./lab paper [--work DIR] [--out paper.html]
+
+Jarecki and Kupinski, "Efficient Modeling of Depolarizing Mueller BRDFs": a red sphere at 15 arm angles and two
+wavelengths, with a Mueller polarimeter and a linear Stokes camera, and a body at one angle; then an undeclared fault
+of the bench. What was taken already in the work folder is not taken again. `--quick` does the same at one wavelength
+and one angle on a small camera.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from concurrent.futures import Executor, ThreadPoolExecutor
+from pathlib import Path
+
+# Before numpy: workers share the cores, threads of BLAS would fight for them.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from paper_study.acquire import QUICK, Size, parts, take_captures
+from paper_study.page import write_page
+from paper_study.process import study_body, study_fault, study_sphere
+
+from processing.campaign.executors import executor
+
+
+def run(work: Path, out: Path, size: Size, pool: Executor) -> None:
+    """Take what is missing, process it and write the page; products of an earlier run are found again."""
+    seconds: dict[str, float] = {}
+    begin = time.perf_counter()
+
+    def say(text: str) -> None:
+        print(f"{time.perf_counter() - begin:6.0f} s  {text}", flush=True)
+
+    def taken(number: int) -> Path:
+        started = time.perf_counter()
+        part = parts(size)[number]
+        say(f"acquire: {part.name}")
+        folder = take_captures(work, size, part)
+        seconds[f"captures of {part.name}"] = time.perf_counter() - started
+        return folder
+
+    # One camera is emulated at a time; what is taken is worked on while the next part is taken.
+    with ThreadPoolExecutor(1) as bench:
+        folders = [bench.submit(taken, number) for number in range(3)]
+        sphere = study_sphere(folders[0].result(), work / "results/sphere", pool, say)
+        body = study_body(folders[1].result())
+        fault = study_fault(folders[2].result(), work / "results/fault", sphere, pool, say)
+    say("page")
+    seconds["in all"] = time.perf_counter() - begin
+    write_page(out, size, sphere, body, fault, seconds)
+    say(str(out))
+
+
+def main() -> None:
+    """Entry point of `./lab paper`."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--work", type=Path, help="folder for captures and products; default: one that is deleted")
+    parser.add_argument("--out", type=Path, default=Path("paper.html"), help="the page")
+    parser.add_argument("--workers", type=int, default=2, help="processes that work on captures")
+    parser.add_argument("--quick", action="store_true", help="one wavelength, one angle, a small camera")
+    given = parser.parse_args()
+    out = given.out.resolve()
+    with tempfile.TemporaryDirectory() as temporary, executor(1 if given.quick else given.workers) as pool:
+        run((given.work or Path(temporary)).resolve(), out, QUICK if given.quick else Size(), pool)
+
+
+if __name__ == "__main__":
+    main()
