@@ -189,6 +189,25 @@ def test_a_maker_s_polarization_camera_takes_a_capture_with_its_node_map(
     assert_horizontal(path)
 
 
+def test_all_states_at_omega_35_on_the_node_map_of_the_paper_s_camera(
+    acquire: Acquire, small_rig: Rig, tmp_path: Path
+) -> None:
+    settings = {"pixel_format": "Mono12p", "width": 40, "height": 32}
+    rig = small_rig(top={"camera": CAMERA | {"settings": settings}}, camera="lucid_tri050s_p")
+    out = tmp_path / "captures"
+    code, _, err = acquire("--omega", 35, "--rig", rig, "--out", out)
+    assert code == 0, err
+    (path,) = out.glob("*.h5")
+    with Capture(path) as capture:
+        assert capture.status == "complete"
+        assert [capture.states_with(role).size for role in ("dark", "sample")] == [4, 40]
+        assert np.all(capture.column("camera_temperature_c") == 38.5)
+        assert capture.camera_nodes["PixelFormat"] == "Mono12p"
+        assert capture.closing["stream"]["stale_discarded"] == 0
+        # An arming time of 20 ms: a trigger that came before would have been ignored, and its frame missed.
+        assert capture.closing["stream"]["retakes"] == 0
+
+
 def test_a_colour_polarization_camera_is_reduced_colour_by_colour(
     acquire: Acquire, small_rig: Rig, short_plan: Callable[[str], Path], tmp_path: Path
 ) -> None:
