@@ -24,7 +24,7 @@ from typing import Any
 
 from acquisition.rig.config import RigConfig
 from acquisition.rig.stop_axes import stop_axes
-from drivers.errors import DeviceError, PortBusy
+from drivers.errors import DeviceError
 from drivers.registry import open_source
 from drivers.serial_link import LineRegistry
 from processing.yaml_file import parse_yaml
@@ -36,8 +36,10 @@ SILENT_S = 10.0
 LOOK_S = 0.05
 #: A look that came later than this was held up itself, as then was `acquire`: no more of it counts as silence.
 LATE_S = 0.2
-#: Longest wait for the ports of a process that was killed.
-LET_GO_S = 1.0
+#: Tries to shut the light before somebody is called, and in all: one that dies holds its ports a moment longer, on a
+#: machine with no time to spare for seconds, and a lamp that burns on is worth every further try.
+CALL_S = 2.0
+TRY_S = 60.0
 #: How often the log says that all is well.
 HEARTBEAT_S = 60.0
 #: Words that `acquire` sends instead of a beat.
@@ -77,6 +79,8 @@ class Guard:
 
     def __init__(self, config: RigConfig, pid: int, journal: Journal, alert: tuple[str, ...]) -> None:
         self.config, self.pid, self.journal, self.alert = config, pid, journal, alert
+        # Nobody waits for them; they are kept because a handle that is dropped complains.
+        self.alerts: list[subprocess.Popen[bytes]] = []
 
     def watch(self, beats: int) -> bool:
         """Listen until `acquire` ends; True if it ended in order, and False once everything was shut in its place.
@@ -124,7 +128,7 @@ class Guard:
     def _shut_light(self) -> str:
         if self.config.source is None:
             return "this rig has no source to shut"
-        end_s = time.monotonic() + LET_GO_S
+        begin_s, called = time.monotonic(), False
         while True:
             try:
                 with LineRegistry() as lines:
@@ -132,10 +136,13 @@ class Guard:
                 self.journal.note("light shut")
                 return "light shut"
             except DeviceError as error:
-                # One that dies holds its ports a moment longer.
-                if not isinstance(error, PortBusy) or time.monotonic() > end_s:
+                tried_s = time.monotonic() - begin_s
+                if tried_s > TRY_S:
                     self.journal.note("LIGHT NOT SHUT", error=str(error))
                     return "LIGHT NOT SHUT"
+                if tried_s > CALL_S and not called:
+                    called = True
+                    self._call(f"The light could not be shut yet: {error}. The guard tries on")
             time.sleep(LOOK_S)
 
     def _stop_axes(self) -> str:
@@ -152,7 +159,9 @@ class Guard:
         if not self.alert:
             return
         try:
-            subprocess.Popen([*self.alert, message], stdin=subprocess.DEVNULL, start_new_session=True)
+            self.alerts.append(
+                subprocess.Popen([*self.alert, message], stdin=subprocess.DEVNULL, start_new_session=True)
+            )
             self.journal.note("alert", message=message)
         except OSError as error:
             self.journal.note("ALERT FAILED", error=str(error), message=message)

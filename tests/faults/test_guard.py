@@ -6,9 +6,12 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from acquisition.rig.config import load_rig
+from acquisition.rig.guard import Guard, Journal
 from simulators.rig.served_rig import serve
 
 
@@ -83,3 +86,21 @@ def test_a_guard_tells_of_a_failure_and_rests(tmp_path, served):
     assert [json.loads(line)["event"] for line in log.read_text().splitlines()] == [
         "guard watches", "alert", "guard rests",
     ]  # fmt: skip
+
+
+def test_the_light_is_shut_however_late_its_port_is_free(served):
+    """What dies slowly holds the port for longer than anybody should wait before calling for help."""
+    simulation, rig, told = served
+    config = load_rig(rig)
+    with open(config.source.port, "rb") as port:
+        holder = subprocess.Popen(["sleep", "600"], stdin=port)
+    guard = Guard(config, holder.pid, Journal(None), config.alert)
+    with ThreadPoolExecutor(1) as beside:
+        light = beside.submit(guard._shut_light)
+        _until(lambda: told.exists() and "could not be shut yet" in told.read_text())
+        assert not light.done()
+        holder.kill()
+        holder.wait()
+        assert light.result() == "light shut"
+    assert [alert.wait() for alert in guard.alerts] == [0]
+    assert not _lit(simulation)
