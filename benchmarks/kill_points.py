@@ -27,7 +27,10 @@ import h5py
 import numpy as np
 from ruamel.yaml import YAML
 
-import processing.reflectance.material_fit  # noqa: F401 - imported once here, not anew in each child
+# Imported once here, not anew in each child:
+import acquisition.commands.campaign
+import acquisition.screen.quicklook  # noqa: F401
+import processing.reflectance.material_fit  # noqa: F401
 from acquisition.commands.application import main as acquire
 from acquisition.commands.custody import verify
 from processing.storage.capture import Capture, CaptureError
