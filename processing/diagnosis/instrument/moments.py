@@ -41,8 +41,9 @@ FOLDS_OF_TILES = 2
 FOLDS_OF_STATES = 5
 #: Pixels that are taken together.
 CHUNK = 8192
-#: Tiles along each side of the image, for effects and structure that vary over it.
-TILES = 16
+#: Tiles along each side of the image, for effects and structure that vary over it; of a small image, so many that each
+#: has four pixels a side.
+TILES, FEWEST_TILES, TILE_PX = 16, 8, 4
 #: Captures with more rows, or fewer pixels, than these hold out states, others hold out tiles of the image.
 MOST_ROWS_FOR_TILES = 100
 FEWEST_PIXELS_FOR_TILES = 64
@@ -231,7 +232,8 @@ def inside(height: int, width: int) -> NDArray[np.bool_]:
 
 
 def _grid(height: int, width: int) -> tuple[NDArray[np.int64], Array, Array]:
-    side = min(TILES, height, width)
+    small = min(height, width)
+    side = min(TILES, max(small // TILE_PX, FEWEST_TILES), small)
     r = (np.arange(height) * side) // height
     c = (np.arange(width) * side) // width
     index = r[:, None] * side + c[None, :]

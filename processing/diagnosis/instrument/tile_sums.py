@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
 
 import numpy as np
@@ -111,23 +111,40 @@ class _Tiled:
         noise = self._mean @ self._b.transpose(0, 2, 1)
         slope = np.einsum("ktli,tli->kt", da, (noise - self.ry) @ self._back)
         pull = -np.einsum("ktli,tli->kt", da, noise @ self._back)
-        counted = {int(j): self._onto(dc[j]) for j in np.flatnonzero(np.any(dc, axis=(1, 2)))}
-        for j, db in counted.items():
-            slope[j] += np.sum(db * (self._rz - self._mean), axis=(1, 2))
-            pull[j] += np.sum(db * self._mean, axis=(1, 2))
+        counted = {int(j): self._parts(dc[j]) for j in np.flatnonzero(np.any(dc, axis=(1, 2)))}
+        for j, parts in counted.items():
+            for f, db in parts.items():
+                here = self._rows_of(f)
+                slope[j] += np.sum(db * (self._rz - self._mean)[:, :, here], axis=(1, 2))
+                pull[j] += np.sum(db * self._mean[:, :, here], axis=(1, 2))
         gradient = np.stack([slope[:, mine].sum(axis=1) for mine in folds])
         stretch = np.stack([pull[:, mine].sum(axis=1) for mine in folds])
         ds = da @ (self._back.transpose(0, 2, 1) @ self._yy @ self._back)
         curvature = np.stack([_flat(ds[:, mine]) @ _flat(da[:, mine]).T for mine in folds])
-        for j, db in counted.items():
-            es = self.outside @ db @ self._s
-            across = np.einsum("ktli,tli->kt", da, es @ self._b.transpose(0, 2, 1) @ self._back)
+        onto_unknowns = self._b.transpose(0, 2, 1) @ self._back
+        for j, parts in counted.items():
+            es = np.sum([(self.outside @ db) @ self._s[:, self._rows_of(f)] for f, db in parts.items()], axis=0)
+            across = np.einsum("ktli,tli->kt", da, es @ onto_unknowns)
+            both = {i: self._along(es, other) for i, other in counted.items()}
             for f, mine in enumerate(folds):
                 curvature[f, j] -= across[:, mine].sum(axis=1)
                 curvature[f, :, j] -= across[:, mine].sum(axis=1)
-                for i, other in counted.items():
-                    curvature[f, i, j] += np.sum(es[mine] * other[mine])
+                for i, each in both.items():
+                    curvature[f, i, j] += each[mine].sum()
         return gradient, stretch, curvature
+
+    def _rows_of(self, feature: int) -> slice:
+        """Where the rows of one feature stand among those of all."""
+        rows = self.outside.shape[1]
+        return slice(feature * rows, (feature + 1) * rows)
+
+    def _parts(self, dc: Array) -> dict[int, Array]:
+        """Matrices (T, L, L) that take each feature to the rows, of coefficients dc (F, L) that are not all zero."""
+        return {int(f): dc[f][:, None] * self._takes[:, :, f] for f in np.flatnonzero(np.any(dc, axis=1))}
+
+    def _along(self, es: Array, parts: Mapping[int, Array]) -> Array:
+        """Sum (T,) of the products of es (T, L, F L) with the parts of another derivative."""
+        return np.asarray(sum(np.einsum("tlk,tlk->t", es[:, :, self._rows_of(f)], db) for f, db in parts.items()))
 
 
 def _flat(x: Array) -> Array:

@@ -29,7 +29,7 @@ REFUTED = 12.0
 
 # ---- search --------------------------------------------------------------------------------------------------------
 #: Times that the problem is linearized anew about its solution.
-ROUNDS = 4
+ROUNDS = 7
 #: A move, in standard deviations of the posterior, below which no new linearization is needed.
 SETTLED = 0.3
 #: Sets that are visited in the last round, and in those before.
