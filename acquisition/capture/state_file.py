@@ -107,6 +107,8 @@ class StateFile:
             self._status_at = int(entry.attrs[STATUS_AT])
             self._closing = _Place(entry["closing/json"], whole=True)
             data = detector["data"]
+            if data.compression is not None:
+                raise ValueError("its frames are compressed and stay as they are")
             self.frame_shape: tuple[int, int] = data.shape[2:]
             self._frames = [
                 [data.id.get_chunk_info_by_coord((k, c, 0, 0)).byte_offset for c in range(data.shape[1])]

@@ -12,6 +12,8 @@ from acquisition.commands.doctor import Finding
 from acquisition.errors import AcquisitionError
 from processing.errors import ProcessError
 from processing.storage.capture import Capture, CaptureError
+from processing.storage.h5_door import mark_of
+from processing.storage.packed_capture import pack_capture
 from processing.yaml_file import load_yaml
 
 
@@ -102,6 +104,20 @@ def repair(folder: Path) -> Iterator[Finding]:
     finally:
         if held is not None:
             held.close()
+
+
+def compressed(folder: Path) -> Iterator[Finding]:
+    """Compress each complete capture of a folder; what is not complete, and what is damaged, stays as it is."""
+    for path in sorted(folder.glob("*.h5")):
+        if mark_of(path, "umov_schema") is None:
+            continue
+        try:
+            sizes = pack_capture(path)
+        except CaptureError as error:
+            yield Finding(path.name, None, str(error))
+            continue
+        found = "compressed already" if sizes is None else f"{sizes[0] / 1e6:.1f} MB, now {sizes[1] / 1e6:.1f} MB"
+        yield Finding(path.name, True, found)
 
 
 def _mended(path: Path) -> Finding:

@@ -19,6 +19,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands."""
     app.command()(verify)
     app.command()(repair)
+    app.command()(compress)
 
 
 def verify(folder: Folder) -> None:
@@ -33,6 +34,16 @@ def repair(folder: Folder) -> None:
     from acquisition.commands.custody import repair as mend
 
     _show(mend(folder))
+
+
+def compress(folder: Folder) -> None:
+    """Write each complete capture of a folder anew, compressed without loss, once its copy was read back.
+
+    Products that were made from them before are made anew when they are asked for: the files have other bytes.
+    """
+    from acquisition.commands.custody import compressed
+
+    _show(compressed(folder))
 
 
 def _show(findings: Iterable[Finding]) -> None:

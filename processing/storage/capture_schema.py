@@ -6,7 +6,8 @@ Both writers use it: `acquisition` state by state from the bench, `process impor
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Annotated, Any, Literal, Self
 
 import h5py
@@ -149,6 +150,7 @@ def create_layout(
     frame_shape: tuple[int, int],
     dtype: Any,
     start_time: str,
+    frames: Callable[[h5py.Group, str, tuple[int, ...], Any], h5py.Dataset] | None = None,
 ) -> None:
     """Create every group and dataset of a capture, fixed shape, uncompressed, space allocated early.
 
@@ -160,6 +162,7 @@ def create_layout(
     frame_shape : (rows, columns) of one frame of one channel.
     dtype : of the frames; uint16 from a camera, floating for imported fluxes.
     start_time : ISO 8601.
+    frames : makes the dataset of the frames, where it is not to be as said.
     """
     n, c = len(role), len(header.channels)
     h5.attrs["default"] = "entry"
@@ -181,7 +184,8 @@ def create_layout(
         _quantity(instrument, "omega_deg", header.omega_deg, "degree")
     for axis, target in target_deg.items():
         _positioner(entry, axis, np.asarray(target, dtype=np.float64))
-    _detector(entry, header, (n, c, *frame_shape), dtype)
+    create = frames or partial(_allocated, chunks=(1, 1, *frame_shape))
+    _detector(entry, header, create(entry["instrument/detector"], "data", (n, c, *frame_shape), dtype))
 
     states = add_group(entry, "states", "NXcollection")
     states["role"] = [r.encode() for r in role]
@@ -224,12 +228,11 @@ def _positioner(entry: h5py.Group, axis: str, target_deg: NDArray[np.float64]) -
     positioner["value"].attrs["long_name"] = f"{axis}, as read back"
 
 
-def _detector(entry: h5py.Group, header: CaptureHeader, shape: tuple[int, ...], dtype: Any) -> None:
+def _detector(entry: h5py.Group, header: CaptureHeader, frames: h5py.Dataset) -> None:
     """The frames (state, channel, row, column), with the checksums of their rows, and what is known of the noise."""
-    detector = entry["instrument/detector"]
-    frames = _allocated(detector, "data", shape, dtype, chunks=(1, 1, *shape[2:]))
+    detector = frames.parent
     frames.attrs.update({"long_name": "counts (state, channel, row, column)", "units": "count"})
-    sums = _allocated(detector, "row_crc32", shape[:3], np.uint32, chunks=None)
+    sums = _allocated(detector, "row_crc32", frames.shape[:3], np.uint32, chunks=None)
     sums.attrs["units"] = ""
     for dataset in (frames, sums):
         attach(dataset, entry, ["state", "channel", *PIXEL_AXES])

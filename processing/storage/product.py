@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -22,11 +23,16 @@ from processing.errors import ProcessError
 from processing.storage.capture_schema import CaptureHeader
 from processing.storage.h5_door import closed_if_damaged, damage_as, mark_of, open_h5, require_dataset, text_attribute
 from processing.storage.nexus import PIXEL_AXES, add_group, add_scales, attach, declare, default_plot, describe_light
+from processing.storage.packed import create_packed, pack, shrinks_to
 from processing.storage.provenance import Step as Step
 from processing.storage.provenance import file_identity as file_identity
 from processing.storage.provenance import jsonable, read_steps, sign, write_steps
 
 PRODUCT_VERSION = 1
+#: Environment variable that switches compression of products off where it is 0.
+COMPRESS_VARIABLE = "UMOV_COMPRESS"
+#: Part of a product that compression has to save to be worth a second writing.
+WORTH_SAVING = 0.2
 
 #: A pixel has light where its intensity is this many standard errors above zero; figures and summaries count those.
 LIT_ERRORS = 10.0
@@ -79,13 +85,14 @@ class ProductWriter:
         self.path = path
         refuse_existing(path, overwrite)
         self._partial = path.with_name(path.name + ".partial")
+        self._kind, self._header, self._shape, self._planes, self._steps = kind, header, shape, planes, tuple(steps)
         #: Equal in two runs exactly if they would write the same values.
         self._signature = json.dumps(
             [kind, header.model_dump_json(), shape, sorted(planes), [s.made_of for s in steps]]
         )
         self.rows_done = 0
         if not self._reopen():
-            self._create(kind, header, shape, planes, steps)
+            self._create()
 
     def _reopen(self) -> bool:
         if not self._partial.exists():
@@ -101,50 +108,44 @@ class ProductWriter:
         self.rows_done = int(h5["entry/rows_done"][()])
         return True
 
-    def _create(
-        self,
-        kind: str,
-        header: CaptureHeader,
-        shape: tuple[int, int],
-        planes: Mapping[str, Plane],
-        steps: Sequence[Step],
-    ) -> None:
+    def _create(self) -> None:
         try:
             self._h5 = h5py.File(self._partial, "w")
-            entry = add_group(self._h5, "entry", "NXentry")
-            entry.attrs["default"] = "data"
-            self._h5.attrs.update({"default": "entry", "umov_product": PRODUCT_VERSION, "signature": self._signature})
-            entry.attrs.update({"kind": kind, "simulated": header.simulated, "header_json": header.model_dump_json()})
-            entry.attrs["facts_json"] = "{}"
-            entry["title"] = header.title
-            entry["rows_done"] = 0
-            entry["rows_done"].attrs["units"] = ""
-            declare(entry)
-            describe_light(entry, header.wavelength_nm, header.sample.name or header.sample.kind)
-            self._create_planes(entry, header.title, shape, planes)
-            write_steps(entry, steps)
-            sign(self._h5, steps)
+            self._lay_out(self._h5, _early)
             self._h5.flush()
         except OSError as error:
             raise ProductError(f"{self._partial} cannot be written ({error}). Free space, or give --out.") from error
 
-    def _create_planes(
-        self, entry: h5py.Group, title: str, shape: tuple[int, int], planes: Mapping[str, Plane]
-    ) -> None:
+    def _lay_out(self, h5: h5py.File, create: Callable[..., h5py.Dataset]) -> None:
+        """All groups and datasets, without values; `create` makes a plane (parent, name, shape, type)."""
+        header = self._header
+        entry = add_group(h5, "entry", "NXentry")
+        entry.attrs["default"] = "data"
+        h5.attrs.update({"default": "entry", "umov_product": PRODUCT_VERSION, "signature": self._signature})
+        entry.attrs.update({"kind": self._kind, "simulated": header.simulated, "header_json": header.model_dump_json()})
+        entry.attrs["facts_json"] = "{}"
+        entry["title"] = header.title
+        entry["rows_done"] = 0
+        entry["rows_done"].attrs["units"] = ""
+        declare(entry)
+        describe_light(entry, header.wavelength_nm, header.sample.name or header.sample.kind)
+        self._lay_out_planes(entry, create)
+        write_steps(entry, self._steps)
+        sign(h5, self._steps)
+
+    def _lay_out_planes(self, entry: h5py.Group, create: Callable[..., h5py.Dataset]) -> None:
         data = add_group(entry, "data", "NXdata")
-        dimensions = {name: (*leading_dimensions(name, plane.leading), *PIXEL_AXES) for name, plane in planes.items()}
-        sizes = {
-            dimension: size
-            for name, plane in planes.items()
-            for dimension, size in zip(dimensions[name], (*plane.leading, *shape), strict=True)
+        shapes = {name: (*plane.leading, *self._shape) for name, plane in self._planes.items()}
+        dimensions = {
+            name: (*leading_dimensions(name, plane.leading), *PIXEL_AXES) for name, plane in self._planes.items()
         }
-        add_scales(data, sizes)
-        for name, plane in planes.items():
-            dataset = _early(data, name, (*plane.leading, *shape), plane.dtype)
+        add_scales(data, {d: size for name in shapes for d, size in zip(dimensions[name], shapes[name], strict=True)})
+        for name, plane in self._planes.items():
+            dataset = create(data, name, shapes[name], plane.dtype)
             dataset.attrs.update({"units": plane.units, "long_name": plane.long_name})
             attach(dataset, data, dimensions[name])
-        signal = next(iter(planes))
-        default_plot(data, signal, dimensions[signal], title)
+        signal = next(iter(self._planes))
+        default_plot(data, signal, dimensions[signal], self._header.title)
 
     def write(self, rows: slice, **blocks: NDArray[Any]) -> None:
         """Store the blocks (leading..., rows, columns) of some datasets, and remember that the rows are done."""
@@ -169,11 +170,45 @@ class ProductWriter:
         group.create_dataset(name, data=values).attrs.update({"units": units, "long_name": long_name})
 
     def seal(self, facts: Mapping[str, Any]) -> Path:
-        """Add the facts (JSON-able: numbers, warnings), close, and give the file its name."""
+        """Add the facts (JSON-able: numbers, warnings), compress where it pays, close, and give the file its name."""
         self._h5["entry"].attrs["facts_json"] = json.dumps(dict(facts), default=jsonable)
+        packed = self._packed()
         self._h5.close()
-        os.replace(self._partial, self.path)
+        os.replace(packed or self._partial, self.path)
+        if packed is not None:
+            self._partial.unlink()
         return self.path
+
+    def _packed(self) -> Path | None:
+        """A copy of the file, whose values are all there, with those planes compressed that it makes much smaller.
+
+        None where that is switched off, saves too little, or the disc has no room for both files.
+        """
+        size = self._partial.stat().st_size
+        if os.environ.get(COMPRESS_VARIABLE) == "0" or shutil.disk_usage(self._partial.parent).free < size:
+            return None
+        whole = self._h5["entry"]
+        saved = {
+            name: plane.nbytes - shrinks_to(plane) for name, plane in whole["data"].items() if name in self._planes
+        }
+        if sum(saved.values()) < WORTH_SAVING * size:
+            return None
+        path = self._partial.with_name(self._partial.name + ".packed")
+        with h5py.File(path, "w") as h5:
+            self._lay_out(
+                h5, lambda data, name, *of: create_packed(data, name, *of) if saved[name] else _early(data, name, *of)
+            )
+            entry = h5["entry"]
+            for name, saving in saved.items():
+                if saving:
+                    pack(whole["data"][name], entry["data"][name])
+                else:
+                    entry["data"][name][...] = whole["data"][name][...]
+            if "reduction" in whole:
+                whole.copy("reduction", entry)
+            entry["rows_done"][...] = whole["rows_done"][()]
+            entry.attrs["facts_json"] = whole.attrs["facts_json"]
+        return path
 
     def close(self) -> None:
         """Close without sealing; the partial file can be resumed."""

@@ -14,7 +14,9 @@ from acquisition.capture.state_file import StateFile
 from processing.labelled import open_dataset
 from processing.steps.reduction import Reduction
 from processing.storage.capture import Capture
+from processing.storage.capture_schema import CaptureHeader
 from processing.storage.images import MuellerImage
+from processing.storage.product import Plane, Product, ProductWriter
 
 DOCS = Path(__file__).parents[2] / "docs"
 STATES, SHAPE = 24, (6, 8)
@@ -117,3 +119,34 @@ def test_a_file_with_the_older_layout_is_read_and_written_in_its_place(capture):
     with Capture(capture) as there:
         assert there.closing == {"end_time": "now"}
         assert len(there.frames(3)[0]) == SHAPE[0]
+
+
+def test_compressed_planes_are_plain_deflate_and_read_the_same(tmp_path):
+    """What h5py and MATLAB know without plug-ins; a plane of noise stays as it is, and so does a whole file of it."""
+    rng = np.random.default_rng(5)
+    planes = {
+        "valid": Plane((), "", "mostly the same", np.uint8),
+        "noise": Plane((2,), "", "incompressible", np.float32),
+        "spread": Plane((3,), "", "zero but for some", np.float32),
+    }
+    shape = (301, 501)
+    values = {
+        "valid": (rng.random(shape) < 0.99).astype(np.uint8),
+        "noise": rng.normal(size=(2, *shape)).astype(np.float32),
+        "spread": np.where(rng.random((3, *shape)) < 0.1, 1.5, np.nan).astype(np.float32),
+    }
+    path = tmp_path / "p.h5"
+    header = CaptureHeader(title="t", simulated=True, mode="drr", wavelength_nm=600)
+    with ProductWriter(path, "xi0", header, shape, planes, ()) as writer:
+        writer.write(slice(0, shape[0]), **values)
+        writer.seal({"rank": 16})
+    with h5py.File(path) as h5:
+        filters = {name: h5[f"entry/data/{name}"].compression for name in planes}
+        assert filters == {"valid": "gzip", "noise": None, "spread": "gzip"}
+        for name in planes:
+            np.testing.assert_array_equal(h5[f"entry/data/{name}"][...], values[name])
+    assert path.stat().st_size < 0.7 * sum(array.nbytes for array in values.values())
+    with Product(path) as product:
+        assert product.facts == {"rank": 16}
+        np.testing.assert_array_equal(product.get("spread", slice(100, 111)), values["spread"][:, 100:111])
+    assert list(tmp_path.iterdir()) == [path]

@@ -1,0 +1,93 @@
+"""What lossless compression saves and costs: size, seconds of processor time to write and to read, for each file.
+
+    python benchmarks/packed_files.py CAPTURE_OR_PRODUCT.h5 ...
+
+Every plane (of a capture, the frames) is copied plain, as products are written, and by the compressors that other
+programs would have to know. A warm file: from a disc, what is half as large comes twice as fast.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from processing.storage.packed import WORTH, create_packed, pack, shrinks_to
+from processing.storage.product import is_product
+
+ROUNDS = 3
+
+
+def planes(h5: h5py.File) -> list[h5py.Dataset]:
+    """What takes the room in a file."""
+    if is_product(Path(h5.filename)):
+        return [node for node in h5["entry/data"].values() if node.ndim > 1]
+    return [h5["entry/instrument/detector/data"]]
+
+
+def ways() -> dict[str, Callable[[h5py.File, h5py.Dataset], None]]:
+    """How a plane is written, by name."""
+
+    def plain(out: h5py.File, plane: h5py.Dataset) -> None:
+        out.create_dataset("plane", data=plane[...])
+
+    def ours(out: h5py.File, plane: h5py.Dataset) -> None:
+        if shrinks_to(plane) * WORTH > plane.nbytes:
+            plain(out, plane)
+        else:
+            pack(plane, create_packed(out, "plane", plane.shape, plane.dtype))
+
+    def all_packed(out: h5py.File, plane: h5py.Dataset) -> None:
+        pack(plane, create_packed(out, "plane", plane.shape, plane.dtype))
+
+    def hdf5(compression: str) -> Callable[[h5py.File, h5py.Dataset], None]:
+        def write(out: h5py.File, plane: h5py.Dataset) -> None:
+            create_packed(out, "like", plane.shape, plane.dtype)
+            chunks = out["like"].chunks
+            level = 1 if compression == "gzip" else None
+            out.create_dataset(
+                "plane", data=plane[...], chunks=chunks, compression=compression, compression_opts=level, shuffle=True
+            )
+
+        return write
+
+    found = {"plain": plain, "ours": ours, "every plane packed": all_packed, "HDF5's deflate": hdf5("gzip")}
+    return found | {"LZF (h5py alone)": hdf5("lzf")}
+
+
+def measure(write: Callable[[h5py.File, h5py.Dataset], None], plane: h5py.Dataset, path: Path) -> np.ndarray:
+    """Bytes, seconds to write, seconds to read; the shortest of some rounds."""
+    rounds = []
+    for _ in range(ROUNDS):
+        start_s = time.process_time()
+        with h5py.File(path, "w") as out:
+            write(out, plane)
+        wrote_s = time.process_time() - start_s
+        with h5py.File(path) as out:
+            start_s = time.process_time()
+            same = np.array_equal(out["plane"][...], plane[...], equal_nan=plane.dtype.kind == "f")
+            read_s = time.process_time() - start_s
+            assert same, "not lossless"
+            rounds.append((out["plane"].id.get_storage_size(), wrote_s, read_s))
+    return np.min(rounds, axis=0)
+
+
+def main() -> None:
+    """Print a line for each file and way."""
+    for path in map(Path, sys.argv[1:]):
+        with h5py.File(path) as h5, tempfile.TemporaryDirectory() as folder:
+            there = planes(h5)
+            size = sum(plane.nbytes for plane in there)
+            print(f"{path.name}: {size / 1e6:.0f} MB")
+            for name, write in ways().items():
+                stored, wrote_s, read_s = sum(measure(write, plane, Path(folder) / "copy.h5") for plane in there)
+                print(f"  {name:22s} {stored / 1e6:6.1f} MB  write {wrote_s:5.2f} s  read and compare {read_s:5.2f} s")
+
+
+if __name__ == "__main__":
+    main()
