@@ -127,6 +127,40 @@ def _tree(text: str, source: str) -> CommentedMap:
     return tree
 
 
+def named_files(path: Path) -> Iterator[tuple[str, Path]]:
+    """The files that a YAML file names by values that are paths from its folder, and those that they name in turn.
+
+    Parameters
+    ----------
+    path : a YAML file; any other names nothing.
+
+    Yields
+    ------
+    name : str
+        Keys on the way, with dots.
+    file : Path
+        Each file once.
+
+    Raises
+    ------
+    ConfigError
+    """
+    return _named_files(path, (), {path.resolve()})
+
+
+def _named_files(path: Path, before: tuple[Any, ...], seen: set[Path]) -> Iterator[tuple[str, Path]]:
+    if path.suffix not in (".yaml", ".yml") or not path.is_file():
+        return
+    for where, value in _scalars(_tree(path.read_text(encoding="utf-8"), str(path))):
+        # No file system has longer names.
+        if not isinstance(value, str) or len(value) > 255 or not (file := path.parent / value).is_file():
+            continue
+        if file.resolve() not in seen:
+            seen.add(file.resolve())
+            yield ".".join(str(part) for part in (*before, *where)), file
+            yield from _named_files(file, (*before, *where), seen)
+
+
 def dump_yaml(value: BaseModel) -> str:
     """YAML text of a model; `parse_yaml` of it gives an equal model."""
     from io import StringIO

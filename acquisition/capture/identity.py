@@ -23,7 +23,7 @@ from drivers.camera import CameraSettings
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture import Capture
 from processing.storage.segments import Identity
-from processing.yaml_file import parse_yaml
+from processing.yaml_file import named_files, parse_yaml
 
 #: Keys of a rig file that tell where something is or who hears of it, not what it is.
 PLACES = ("port", "device", "wire_log", "alert", "held_by")
@@ -71,11 +71,20 @@ def rig_content(config: RigConfig, mode: str) -> Any:
 
 
 def files_of(config: RigConfig, mode: str) -> dict[str, str]:
-    """Digest of the content of each file that a rig file names, but for the instrument, which is compared in words."""
+    """Digest of the content of each file that a rig file names, and of those that they name in turn.
+
+    Not of the instrument, which is compared in words.
+    """
     tree = config.model_dump(mode="python", exclude_none=True)
     tree.pop("modes")
     tree.pop("wire_log", None)
-    return {key: hashlib.sha256(path.read_bytes()).hexdigest() for key, path in _paths(tree, "") if path.is_file()}
+    found: dict[str, str] = {}
+    for key, path in _paths(tree, ""):
+        named = ((f"{key}.{name}", file) for name, file in named_files(path))
+        for name, file in ((key, path), *named):
+            if file.is_file():
+                found[name] = hashlib.sha256(file.read_bytes()).hexdigest()
+    return found
 
 
 def _optics(instrument: InstrumentModel) -> Any:

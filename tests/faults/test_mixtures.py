@@ -93,11 +93,13 @@ def test_where_a_device_is_plugged_in_may_differ(partial, quick_rig):
 
 def test_an_edited_instrument_or_scene_is_refused(run_with, configs, tmp_path):
     folder = shutil.copytree(configs, tmp_path / "configs")
-    model, scene = folder / "instruments" / "rgb950.yaml", folder / "scenes" / "red_flat.yaml"
+    model, scene = folder / "instruments" / "rgb950.yaml", folder / "scenes" / "red_sphere.yaml"
+    material = folder / "materials" / "red_print.yaml"
     modes = {"drr": {"instrument": str(model)}}
     _, path = run_with(broken_at(4), plan=SHORT, top={"modes": modes}, samples={"red_sphere": str(scene)})
     job_of(path)
-    for file, words in ((model, "instrument."), (scene, "content of the file.simulator.samples.red_sphere")):
+    named = "content of the file.simulator.samples.red_sphere"
+    for file, words in ((model, "instrument."), (scene, named), (material, f"{named}.material")):
         text = file.read_text()
         file.write_text(text.replace("13.41", "14.41") + "\n# edited\n")
         with pytest.raises(Differs) as refused:
