@@ -13,7 +13,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from processing.errors import ProcessError
-from viewer import browsing, following, frames, probes
+from viewer import browsing, comparing, following, frames, probes, products
 from viewer.guard import Guard
 from viewer.library import Library, NotHere
 from viewer.pages import Pages, pages_of, whole_style
@@ -34,6 +34,12 @@ def application(folder: Path, token: str) -> Starlette:
         Route("/states", frames.states),
         Route("/frame", frames.frame),
         Route("/histogram", frames.histogram),
+        Route("/product", products.product),
+        Route("/plane", products.plane),
+        Route("/mueller", products.mueller),
+        Route("/probe", probes.of_product),
+        Route("/compare", comparing.compare),
+        Route("/difference", comparing.difference),
         Route("/curve", probes.curve_of),
         Route("/matrix", probes.matrix_of),
         Route("/style.css", _style),

@@ -36,16 +36,16 @@ def drr_capture(lab: Path, configs: Path, synthetic_capture: Callable[..., Path]
     text = (configs / "instruments" / "rgb950.yaml").read_text()
     model = InstrumentModel.load(configs / "instruments" / "rgb950.yaml").at(662)
 
-    def make(
-        name: str = "one.h5", mueller: np.ndarray | None = None, shape: tuple[int, int] = (12, 16), **more
-    ) -> Path:
+    def make(name="one.h5", mueller=None, shape=(12, 16), seed_of_noise=1, **more) -> Path:
         states = np.arange(40)
         angles = {"psg": 9.0 * states, "psa": 9.0 * 4.91 * states}
         w = model.rows(angles, None).reshape(40, 16)
         m = np.diag([1.0, 0.5, 0.4, 0.3]) if mueller is None else mueller
-        rng = np.random.default_rng(1)
+        rng = np.random.default_rng(seed_of_noise)
         signal = (w @ m.reshape(16))[:, None, None] * 1000 * np.ones(shape)
-        frames = np.concatenate([np.full((4, *shape), 64.0), 64 + signal + rng.normal(0, 3, signal.shape)])
+        # As the detector below has it: shot noise and read noise.
+        noise = rng.normal(size=signal.shape) * np.sqrt(signal / 2.6 + (2.3 / 2.6) ** 2)
+        frames = np.concatenate([np.full((4, *shape), 64.0), 64 + signal + noise])
         angles = {name: np.concatenate([np.zeros(4), column]) for name, column in angles.items()}
         detector = {"black_level_counts": 64.0, "gain_e_per_count": 2.6, "read_noise_e": 2.3, "bits": 12}
         header = {"instrument_yaml": text, "mode": "drr", "wavelength_nm": 662.0, "detector": detector} | more

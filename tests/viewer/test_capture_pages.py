@@ -114,10 +114,10 @@ def test_a_region_is_the_mean_of_its_pixels_with_a_smaller_error(client, drr_cap
     pixel = client.get("/matrix", params={"file": "one.h5", "x0": 5, "y0": 7}).json()["matrix"]
     region = client.get("/matrix", params={"file": "one.h5", "x0": 0, "y0": 0, "x1": 16, "y1": 12}).json()["matrix"]
     assert region["m00_error"] == pytest.approx(pixel["m00_error"] / np.sqrt(192), rel=0.05)
-    np.testing.assert_allclose(region["mueller"], np.diag([1, 0.5, 0.4, 0.3]), atol=0.004)
+    np.testing.assert_allclose(region["mueller"], np.diag([1, 0.5, 0.4, 0.3]), atol=0.01)
     xi = region["quantities"]["coherency_eigenvalues"]["value"]
     assert sum(xi) == pytest.approx(1)
-    assert xi[0] == pytest.approx(0.55, abs=0.005)
+    assert xi[0] == pytest.approx(0.55, abs=0.01)
 
 
 def test_a_probe_outside_the_image_is_refused(client, drr_capture):

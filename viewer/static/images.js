@@ -31,7 +31,7 @@ export const place = plane => ({
  */
 export class ImageView {
   constructor(node, { read, traces, shape, more = () => ({}), chosen }) {
-    Object.assign(this, { node, read, traces, shape, more, chosen, plane: null, region: null });
+    Object.assign(this, { node, read, traces, shape, more, chosen, plane: null, region: null, axes: [["x", "y"]] });
     node.dataset.wheel = "yes";
   }
 
@@ -81,7 +81,7 @@ export class ImageView {
     if (!this.region) return [];
     const { x0, x1, y0, y1 } = this.region;
     const line = { color: "#ff2d95", width: 2 };
-    return [{ type: "rect", x0: x0 - 0.5, x1: x1 - 0.5, y0: y0 - 0.5, y1: y1 - 0.5, line }];
+    return this.axes.map(([xref, yref]) => ({ type: "rect", xref, yref, x0: x0 - 0.5, x1: x1 - 0.5, y0: y0 - 0.5, y1: y1 - 0.5, line }));
   }
 
   listen() {

@@ -1,0 +1,75 @@
+"""Which colours a quantity is drawn in, on paper and on a screen: readable without red-green vision.
+
+Signed quantities diverge about zero, red for positive and blue for negative everywhere; orientations run in a circle;
+light is grey; standard errors have colours of their own, so that nobody takes one for the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+SIGNED = "RdBu_r"
+CYCLIC = "twilight"
+LIGHT = "gray"
+ERROR = "magma"
+PLAIN = "viridis"
+ALL = (SIGNED, CYCLIC, LIGHT, ERROR, PLAIN)
+
+#: Parts of names that tell what is drawn how; the first that fits decides.
+_ORIENTATIONS = ("orientation", "aolp", "fast_axis", "axis_or_90")
+_SIGNED = ("deviation", "circular", "vector", "s1", "s2", "mueller", "covariance")
+_FLAGS = ("mask", "valid", "lit", "defined", "negative_determinant", "flip")
+_LIGHT = ("s0", "m00")
+#: Percentile of the values at which a scale ends.
+END_PERCENT = 99.5
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Colours of a map and the values at their ends; what lies beyond an end is clipped."""
+
+    colours: str
+    low: float
+    high: float
+
+
+def colours_of(name: str, units: str) -> str:
+    """Name of the colour map for a quantity of a product."""
+    if name.endswith("_errors"):
+        return ERROR
+    if units == "degree" and any(part in name for part in _ORIENTATIONS):
+        return CYCLIC
+    if any(name.endswith(part) or part in name.split("_") for part in (*_LIGHT, *_FLAGS)):
+        return LIGHT
+    if any(part in name.split("_") for part in _SIGNED):
+        return SIGNED
+    return PLAIN
+
+
+def scale_of(name: str, units: str, values: NDArray[np.floating]) -> Scale:
+    """Colours and limits for a map: a turn for orientations, symmetric about zero for signed quantities."""
+    colours = colours_of(name, units)
+    finite = values[np.isfinite(values)]
+    low, high = np.percentile(finite, [100 - END_PERCENT, END_PERCENT]) if finite.size else (0.0, 1.0)
+    if colours == CYCLIC:
+        return Scale(colours, 0.0, 180.0)
+    if colours == SIGNED:
+        most = max(abs(float(low)), abs(float(high)), 1e-6)
+        return Scale(colours, -most, most)
+    if colours in (LIGHT, ERROR):
+        return Scale(colours, 0.0, max(float(high), 1e-6))
+    return Scale(colours, float(low), max(float(high), float(low) + 1e-6))
+
+
+@cache
+def steps(colours: str, count: int = 33) -> tuple[tuple[float, str], ...]:
+    """A colour map as (0 to 1, "#rrggbb") in equal steps, for a browser."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    drawn = colormaps[colours]
+    return tuple((float(at), to_hex(drawn(at))) for at in np.linspace(0, 1, count))

@@ -1,0 +1,118 @@
+"""Maps of products in the colours of print, and files held against each other."""
+
+import json
+
+import numpy as np
+import pytest
+
+from processing.reports.colours import colours_of, scale_of
+from processing.steps.maps import Quantities
+from processing.steps.reduction import Reduction
+from processing.storage.product import Product
+
+
+def plane(answer):
+    assert answer.status_code == 200, answer.text
+    told = json.loads(answer.headers["x-plane"])
+    return np.frombuffer(answer.content, "<f4").reshape(-1, told["rows"], told["columns"]), told
+
+
+@pytest.fixture
+def products(drr_capture):
+    mueller = Reduction(drr_capture("one.h5")).make()
+    return mueller, Quantities(mueller).make()
+
+
+@pytest.mark.parametrize(
+    ("name", "units", "colours"),
+    [
+        ("mueller", "count", "RdBu_r"),
+        ("eigenvalue_deviation", "", "RdBu_r"),
+        ("polarizance_circular", "", "RdBu_r"),
+        ("polarizance_orientation_deg", "degree", "twilight"),
+        ("retardance_fast_axis_deg", "degree", "twilight"),
+        ("retardance_deg", "degree", "viridis"),
+        ("polarizance_orientation_deg_errors", "degree", "magma"),
+        ("residual_rms", "count", "viridis"),
+        ("s0", "count", "gray"),
+        ("pixel_mask", "", "gray"),
+    ],
+)
+def test_what_a_quantity_is_decides_its_colours(name, units, colours):
+    assert colours_of(name, units) == colours
+
+
+def test_signed_scales_are_symmetric_about_zero_and_a_turn_is_a_turn():
+    values = np.array([-0.1, 0.5, np.nan])
+    signed = scale_of("eigenvalue_deviation", "", values)
+    assert signed.low == -signed.high
+    turn = scale_of("polarizance_orientation_deg", "degree", values)
+    assert (turn.low, turn.high) == (0.0, 180.0)
+    empty = scale_of("residual_rms", "count", np.array([np.nan]))
+    assert empty.low < empty.high
+
+
+def test_sixteen_elements_come_on_one_scale(lab, client, products):
+    elements, told = plane(client.get("/mueller", params={"file": "one.mueller.h5", "normalized": 1}))
+    with Product(products[0]) as there:
+        m = there.get("mueller").reshape(16, 12, 16)
+    np.testing.assert_allclose(elements[1:], m[1:] / m[0], rtol=1e-5)
+    np.testing.assert_allclose(elements[0], m[0])
+    assert told["low"] == -told["high"]
+    assert told["units"] == ""
+    errors, told = plane(client.get("/mueller", params={"file": "one.mueller.h5", "errors": 1}))
+    assert told["colours"] == "magma"
+    assert np.all(errors > 0)
+
+
+def test_a_map_comes_with_its_errors_and_without_what_is_not_valid(client, products):
+    xi, _ = plane(
+        client.get("/plane", params={"file": "one.quantities.h5", "name": "coherency_eigenvalues", "index": 0})
+    )
+    errors, told = plane(
+        client.get("/plane", params={"file": "one.quantities.h5", "name": "coherency_eigenvalues", "errors": 1})
+    )
+    assert np.median(xi) == pytest.approx(0.55, abs=0.01)
+    assert told["colours"] == "magma"
+    assert 0 < np.median(errors) < 0.03
+    page = client.get("/product", params={"file": "one.quantities.h5"}).text
+    assert "one.mueller.h5" in page
+
+
+def test_a_pixel_of_a_product_leads_back_to_its_intensities(client, products):
+    found = client.get("/probe", params={"file": "one.mueller.h5", "x0": 3, "y0": 4}).json()
+    assert found["mask"] == "valid"
+    assert len(found["fit"]["signal"]) == 40
+    assert found["matrix"]["mueller"][1][1] == pytest.approx(0.5, abs=0.2)
+    derived = client.get("/probe", params={"file": "one.quantities.h5", "x0": 3, "y0": 4}).json()
+    named = {plane["name"]: plane for plane in derived["planes"]}
+    assert sum(named["coherency_eigenvalues"]["value"]) == pytest.approx(1, abs=1e-5)
+
+
+def test_what_differs_by_noise_alone_is_one_error_apart(client, drr_capture):
+    drr_capture("one.h5")
+    drr_capture("two.h5", seed_of_noise=2, mueller=np.diag([1.0, 0.6, 0.4, 0.3]))
+    for name in ("one", "two"):
+        assert client.get("/capture", params={"file": f"{name}.h5"}).status_code == 200
+    dark = {"a": "one.h5", "b": "two.h5", "state": 0}
+    (a, b, apart, _), told = plane(client.get("/difference", params=dark))
+    np.testing.assert_allclose(apart, a - b)
+    assert told["rms"] == 0
+
+
+def test_two_products_of_the_same_scene_differ_by_their_errors(client, lab, drr_capture):
+    Reduction(drr_capture("one.h5")).make()
+    Reduction(drr_capture("two.h5", seed_of_noise=2, mueller=np.diag([1.0, 0.6, 0.4, 0.3]))).make()
+    asked = {"a": "one.mueller.h5", "b": "two.mueller.h5", "name": "mueller"}
+    assert client.get("/compare", params=asked).status_code == 200
+    _, same = plane(client.get("/difference", params={**asked, "index": 10}))
+    (_, _, apart, _), other = plane(client.get("/difference", params={**asked, "index": 5}))
+    assert same["rms_over"] == pytest.approx(1, abs=0.2)
+    assert np.median(apart) == pytest.approx(-0.1, abs=0.01)
+    assert other["rms_over"] > 2
+
+
+def test_a_capture_and_a_product_are_not_compared(client, products):
+    answer = client.get("/compare", params={"a": "one.h5", "b": "one.mueller.h5"}, headers={"accept": "text/html"})
+    assert answer.status_code == 422
+    assert "nothing in common" in answer.text

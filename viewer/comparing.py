@@ -1,0 +1,144 @@
+"""Two captures, or two products, side by side: their difference, and the difference over its error."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, Response
+
+from processing.errors import ProcessError
+from processing.reduction.noise import NoiseModel
+from processing.reports.colours import ALL, CYCLIC, LIGHT, SIGNED, Scale, scale_of, steps
+from processing.storage.capture import Capture
+from processing.storage.product import LIT_ERRORS, Product, is_product
+from viewer.frames import chosen
+from viewer.pages import Pages, file_of, pages_of
+from viewer.planes import Window, sent
+from viewer.products import MATRICES, maps_of, read_map, units_words
+
+#: Errors at the ends of the scale of a difference over its error.
+ERRORS_SHOWN = 5.0
+
+#: Values and their standard errors, each (rows, columns).
+Measured = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+
+async def compare(request: Request) -> HTMLResponse:
+    """The page that holds two files against each other."""
+    return await run_in_threadpool(_compare, pages_of(request), file_of(request, "a"), file_of(request, "b"))
+
+
+def _compare(pages: Pages, a: Path, b: Path) -> HTMLResponse:
+    library = pages.library
+    entries = [library.entry(library.name(path)) for path in (a, b)]
+    choices, shape = _choices(a, b)
+    return pages.draw(
+        "compare.html",
+        simulated=any(entry.simulated for entry in entries),
+        mixed=entries[0].simulated != entries[1].simulated,
+        entries=[(entry, pages.shown_at(entry)) for entry in entries],
+        look={"choices": choices, "shape": shape},
+        colours={name: steps(name) for name in ALL},
+    )
+
+
+def _choices(a: Path, b: Path) -> tuple[list[dict[str, Any]], tuple[int, int]]:
+    """What can be compared: states of captures, maps of products. Raises ProcessError where nothing can."""
+    if is_product(a) != is_product(b):
+        raise ProcessError(f"{a.name} and {b.name}: a capture and a product have nothing in common to compare")
+    if not is_product(a):
+        with Capture(a) as one, Capture(b) as other:
+            _same_shape(one.frame_shape, other.frame_shape)
+            count = min(len(one.done), len(other.done))
+            roles = one.role[:count]
+            choices = [{"label": f"state {one.done[k]}, {roles[k]}", "state": k} for k in range(count)]
+            return sorted(choices, key=lambda c: roles[c["state"]] == "dark"), one.frame_shape
+    with Product(a) as first, Product(b) as second:
+        _same_shape(first.shape, second.shape)
+        there = {(m["name"], m["index"]) for m in maps_of(second)}
+        maps = [m for m in maps_of(first) if (m["name"], m["index"]) in there]
+        if first.kind in MATRICES and second.kind in MATRICES:
+            elements = [{"label": f"m{k // 4}{k % 4} over m00", "name": "mueller", "index": k} for k in range(1, 16)]
+            maps = [*elements, {"label": "m00", "name": "mueller", "index": 0}, *maps]
+        return maps, first.shape
+
+
+def _same_shape(a: tuple[int, int], b: tuple[int, int]) -> None:
+    if a != b:
+        raise ProcessError(f"images of {a[1]} x {a[0]} and {b[1]} x {b[0]} pixels cannot be compared pixel by pixel")
+
+
+async def difference(request: Request) -> Response:
+    """Four pictures of one window: a, b, a - b, and that over its standard error."""
+    return await run_in_threadpool(_difference, file_of(request, "a"), file_of(request, "b"), request.query_params)
+
+
+def _difference(a: Path, b: Path, query: Any) -> Response:
+    if is_product(a):
+        with Product(a) as first, Product(b) as second:
+            _same_shape(first.shape, second.shape)
+            window = Window.asked(query, first.shape, most=640)
+            one, other = (_of_product(product, query, window) for product in (first, second))
+            name = str(query.get("name"))
+            units = "" if name == "mueller" else first.units(name)
+            scale = scale_of("m00" if name == "mueller" and query.get("index") == "0" else name, units, one[0])
+    else:
+        with Capture(a) as early, Capture(b) as late:
+            _same_shape(early.frame_shape, late.frame_shape)
+            window = Window.asked(query, early.frame_shape, most=640)
+            one, other = (_of_capture(capture, query, window) for capture in (early, late))
+            units, scale = "counts", Scale(LIGHT, *_ends(one[0]))
+    apart = one[0] - other[0]
+    if scale.colours == CYCLIC:
+        # Orientations are the same after half a turn.
+        apart = (apart + 90) % 180 - 90
+    with np.errstate(divide="ignore", invalid="ignore"):
+        over = apart / np.hypot(one[1], other[1])
+    wide = scale_of("deviation", "", apart)
+    scales = [scale, scale, wide, Scale(SIGNED, -ERRORS_SHOWN, ERRORS_SHOWN)]
+    known = over[np.isfinite(over)]
+    return sent(
+        window,
+        np.stack([one[0], other[0], apart, over]).astype(np.float32),
+        scales=[{"colours": s.colours, "low": s.low, "high": s.high} for s in scales],
+        units=units_words(units),
+        rms=float(np.sqrt(np.nanmean(apart**2))) if np.isfinite(apart).any() else None,
+        rms_over=float(np.sqrt(np.mean(known**2))) if known.size else None,
+    )
+
+
+def _ends(counts: NDArray[np.float32]) -> tuple[float, float]:
+    low, high = float(np.nanmin(counts)), float(np.nanmax(counts))
+    return low, max(high, low + 1)
+
+
+def _of_product(product: Product, query: Any, window: Window) -> Measured:
+    name, index = str(query.get("name")), int(query.get("index", 0))
+    if name == "mueller":
+        elements, errors = (
+            window.every(product.get(dataset, window.rows)).reshape(16, *window.shape).astype(np.float32)
+            for dataset in ("mueller", "mueller_errors")
+        )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            m00 = np.where(elements[0] > LIT_ERRORS * np.nan_to_num(errors[0]), elements[0], np.nan)
+            return (elements[0], errors[0]) if index == 0 else (elements[index] / m00, errors[index] / m00)
+    values = read_map(product, name, index, window)
+    if f"{name}_errors" not in product.names:
+        return values, np.full_like(values, np.nan)
+    return values, read_map(product, f"{name}_errors", index, window)
+
+
+def _of_capture(capture: Capture, query: Any, window: Window) -> Measured:
+    state, channel = chosen(capture, query)
+    counts = window.mean(capture.frames(state, window.rows)[channel])
+    detector = capture.header.detector
+    noise = NoiseModel.of(detector, integer=capture.integer_counts)
+    if noise is None:
+        return counts, np.full_like(counts, np.nan)
+    signal = np.maximum(counts - detector.black_level_counts, 0)
+    return counts, np.sqrt((noise.slope * signal + noise.read + noise.rounding) / window.step**2)

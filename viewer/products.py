@@ -1,0 +1,159 @@
+"""A product: its maps with their standard errors and the valid mask, in the colours of print."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, Response
+
+from processing.errors import ProcessError
+from processing.reports.colours import ALL, LIGHT, SIGNED, Scale, scale_of, steps
+from processing.storage.product import LIT_ERRORS, Product
+from processing.storage.provenance import steps_text
+from viewer.frames import others
+from viewer.library import made_from, made_into
+from viewer.pages import Pages, file_of, pages_of
+from viewer.planes import Window, sent
+
+#: Kinds that hold Mueller matrices.
+MATRICES = ("mueller", "extrapolated")
+
+
+async def product(request: Request) -> HTMLResponse:
+    """The page of a product."""
+    return await run_in_threadpool(_product, pages_of(request), file_of(request))
+
+
+def _product(pages: Pages, path: Path) -> HTMLResponse:
+    library = pages.library
+    entry, entries = library.entry(library.name(path)), library.entries()
+    with Product(path) as opened:
+        maps = maps_of(opened)
+        facts = [(name.replace("_", " "), _shown(v)) for name, v in opened.facts.items() if name != "warnings"]
+        provenance = steps_text(opened.steps)
+        shape, kind = opened.shape, opened.kind
+    return pages.draw(
+        "product.html",
+        simulated=entry.simulated,
+        entry=entry,
+        kind=kind,
+        facts=facts,
+        provenance=provenance,
+        look={"maps": maps, "shape": shape, "matrices": kind in MATRICES},
+        colours={name: steps(name) for name in ALL},
+        sources=[
+            (role, path, e, pages.shown_at(e) if e else None)
+            for role, path, e in made_from(entry, entries, library.root)
+        ],
+        made=[(e, pages.shown_at(e)) for e in made_into(entry, entries, library.root)],
+        others=others(entry, entries),
+    )
+
+
+def _shown(value: Any) -> str:
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
+
+
+def maps_of(opened: Product) -> list[dict[str, Any]]:
+    """What can be looked at: each dataset without its errors, one entry for each number of a vector."""
+    found = []
+    for name in opened.names:
+        if name.endswith("_errors") or name in ("mueller", "mueller_covariance"):
+            continue
+        count = opened.get(name, slice(0, 1)).size // opened.shape[1]
+        common: dict[str, Any] = {"name": name, "about": opened.long_name(name), "units": opened.units(name)}
+        common["errors"] = f"{name}_errors" in opened.names
+        if count <= 16:
+            words = name.replace("_", " ")
+            found += [common | {"index": k, "label": words if count == 1 else f"{words} {k}"} for k in range(count)]
+    return found
+
+
+async def plane(request: Request) -> Response:
+    """Part of one map of a product, or of its standard errors (`errors`); where it is not valid it has no value."""
+    return await run_in_threadpool(_plane, file_of(request), request.query_params)
+
+
+def _plane(path: Path, query: Any) -> Response:
+    with Product(path) as opened:
+        name, index = _named(opened, query)
+        window = Window.asked(query, opened.shape)
+        values = read_map(opened, name, index, window)
+        scale = scale_of(name, opened.units(name), values)
+        return sent(window, values[None], **told(scale, opened.units(name)))
+
+
+def read_map(opened: Product, name: str, index: int, window: Window) -> NDArray[np.float32]:
+    """One map of a product in a window; NaN where no valid mask of the product holds."""
+    planes = opened.get(name, window.rows)
+    values = window.every(planes.reshape(-1, *planes.shape[-2:])[index]).astype(np.float32)
+    if name not in ("lit", "valid", "pixel_mask"):
+        for mask in ("lit", "valid"):
+            if mask in opened.names:
+                values[window.every(opened.get(mask, window.rows)) == 0] = np.nan
+    return np.asarray(values)
+
+
+def _named(opened: Product, query: Any) -> tuple[str, int]:
+    name = str(query.get("name", ""))
+    if query.get("errors") and f"{name}_errors" in opened.names:
+        name = f"{name}_errors"
+    try:
+        index = int(query.get("index", 0))
+        if not 0 <= index < opened.get(name, slice(0, 1)).size // opened.shape[1]:
+            raise ValueError("there is no such element")
+    except ValueError as error:
+        raise ProcessError(f"{name}: {error}") from error
+    return name, index
+
+
+def told(scale: Scale, units: str) -> dict[str, Any]:
+    """A scale and a unit, for the page."""
+    return {"colours": scale.colours, "low": scale.low, "high": scale.high, "units": units_words(units)}
+
+
+async def mueller(request: Request) -> Response:
+    """Sixteen pictures, the elements over m00 or in counts, on one scale; `errors`: their standard errors."""
+    return await run_in_threadpool(_mueller, file_of(request), request.query_params)
+
+
+def _mueller(path: Path, query: Any) -> Response:
+    with Product(path) as opened:
+        opened.require(*MATRICES)
+        window = Window.asked(query, opened.shape, most=320)
+        elements, scale = read_mueller(opened, window, bool(query.get("normalized")), bool(query.get("errors")))
+        light = scale_of("m00", "count", elements[0])
+    facts = told(scale, "" if query.get("normalized") else "counts") | {"light": light.high, "light_colours": LIGHT}
+    return sent(window, elements, **facts)
+
+
+def read_mueller(opened: Product, window: Window, normalized: bool, errors: bool) -> tuple[NDArray[np.float32], Scale]:
+    """Elements (16, rows, columns) in a window and the scale of all but the first; NaN where it is too dark.
+
+    The error of an element over m00 is its own over m00: that of m00 is left out, which is far smaller.
+    """
+    elements = window.every(opened.get("mueller", window.rows)).reshape(16, *window.shape).astype(np.float32)
+    stderr = window.every(opened.get("mueller_errors", window.rows)).reshape(16, *window.shape)
+    m00 = elements[0].copy()
+    with np.errstate(invalid="ignore", divide="ignore"):
+        lit = m00 > LIT_ERRORS * np.nan_to_num(stderr[0])
+        shown = np.asarray(stderr if errors else elements, dtype=np.float32)
+        if normalized:
+            shown = shown / m00
+            shown[0] = stderr[0] / m00 if errors else m00
+    shown[1:, ~lit] = np.nan
+    name = "mueller_errors" if errors else "mueller"
+    scale = scale_of(name, "", shown[1:])
+    if scale.colours == SIGNED and normalized:
+        scale = Scale(SIGNED, max(scale.low, -1.0), min(scale.high, 1.0))
+    return shown, scale
+
+
+def units_words(units: str) -> str:
+    """A unit for the side of a colour bar."""
+    return {"degree": "degrees", "count": "counts", "count2": "counts squared"}.get(units, units)

@@ -1,0 +1,41 @@
+// Two files side by side: four linked maps, read together.
+
+import { ImageView, readPlane } from "./images.js";
+import { mapTraces } from "./maps.js";
+import { byId, embedded, say } from "./plots.js";
+
+const { a, b } = byId("look").dataset, spec = embedded("spec"), choice = byId("choice");
+choice.replaceChildren(...spec.choices.map((c, k) => new Option(c.label, k)));
+const nodes = [0, 1, 2, 3].map(k => byId(`p${k}`));
+
+const views = nodes.map((node, k) => new ImageView(node, {
+  shape: spec.shape,
+  traces: plane => mapTraces({ ...plane, ...plane.scales[k], units: k === 3 ? "standard errors" : plane.units, planes: [plane.planes[k]] }),
+}));
+// One read fills all four; whichever is zoomed takes the others along.
+const read = async (window, signal) => {
+  const { state, name, index } = spec.choices[Number(choice.value)];
+  return readPlane("difference", { a, b, state, name, index, ...window, most: Math.min(window.most, 640) }, signal);
+};
+let reading;
+async function refresh(leader = views[0]) {
+  reading?.abort();
+  reading = new AbortController();
+  try {
+    const plane = await read(leader.window(), reading.signal);
+    const told = v => (v === null ? "not known" : v.toPrecision(3));
+    byId("told").textContent = `rms difference ${told(plane.rms)} ${plane.units}; over its error ${told(plane.rms_over)} (1 is noise alone)`;
+    const ranges = leader.node.layout && [leader.node.layout.xaxis.range, leader.node.layout.yaxis.range];
+    for (const view of views) {
+      view.plane = plane;
+      if (ranges && view !== leader) view.more = () => ({ xaxis: { range: [...ranges[0]] }, yaxis: { range: [...ranges[1]] } });
+      await view.show();
+    }
+    byId("problem").replaceChildren();
+  } catch (error) {
+    if (error.name !== "AbortError") say(byId("problem"), error);
+  }
+}
+views.forEach(view => { view.refresh = () => refresh(view); });
+choice.addEventListener("change", () => refresh());
+addEventListener("load", async () => { await refresh(); document.body.dataset.ready = "yes"; });

@@ -1,0 +1,78 @@
+// The page of a product: its maps, and what it says of a pixel.
+
+import { mapView, matrixView } from "./maps.js";
+import { byId, embedded, getJson, say } from "./plots.js";
+import { drawCurve, showProbe } from "./probe.js";
+
+const file = byId("look").dataset.file, spec = embedded("spec"), problem = byId("problem");
+const map = byId("map"), errors = byId("errors"), normalized = byId("normalized");
+if (spec.matrices) map.append(new Option("Mueller matrix", "mueller"));
+spec.maps.forEach((m, k) => map.append(new Option(m.label, k)));
+const chosenMap = () => (map.value === "mueller" ? null : spec.maps[Number(map.value)]);
+const run = action => action().then(() => problem.replaceChildren(), error => say(problem, error));
+const flag = box => (box.checked ? "1" : null);
+const node = byId("plot");
+let view = null, region = null;
+
+function newView() {
+  Plotly.purge(node);
+  if (chosenMap()) {
+    node.style.height = "34rem";
+    return mapView(node, "plane", () => ({ file, name: chosenMap().name, index: chosenMap().index, errors: flag(errors) }), spec.shape, probe);
+  }
+  const wide = Math.min(node.clientWidth - 64, 1000);
+  node.style.height = `${Math.max(260, Math.min(wide * spec.shape[0] / spec.shape[1], 900))}px`;
+  return matrixView(node, "mueller", () => ({ file, normalized: flag(normalized), errors: flag(errors) }), spec.shape, probe);
+}
+
+async function show(fresh) {
+  const m = chosenMap();
+  normalized.parentElement.hidden = Boolean(m);
+  errors.disabled = Boolean(m) && !m.errors;
+  if (errors.disabled) errors.checked = false;
+  byId("about").textContent = m ? m.about : normalized.checked
+    ? "Elements over m00 on one scale, instrument frames; the first panel is m00 in counts. Grey: too dark." : "Elements in counts on one scale, instrument frames.";
+  if (fresh) { view = newView(); view.region = region; }
+  await run(() => view.refresh());
+}
+
+const number = v => (v === null ? "-" : Math.abs(v) >= 1e4 || (v && Math.abs(v) < 1e-3) ? v.toExponential(3) : v.toFixed(4));
+
+async function probe(chosen) {
+  region = chosen;
+  await run(async () => {
+    const found = await getJson("probe", { file, ...chosen });
+    byId("values").hidden = false;
+    byId("pixel").textContent = found.where + (found.mask ? ` (${found.mask})` : "");
+    byId("fit").textContent = found.told;
+    byId("curve").hidden = !found.counts;
+    if (found.counts) drawCurve(byId("curve"), found);
+    byId("numbers").replaceChildren(...found.planes.map(plane => {
+      const line = document.createElement("tr"), head = document.createElement("th"), cell = document.createElement("td");
+      head.textContent = plane.name.replaceAll("_", " ");
+      head.title = plane.about;
+      cell.textContent = plane.value.map((v, k) => number(v) + (plane.error && plane.error[k] !== null ? ` ± ${number(plane.error[k])}` : "")).join(",  ");
+      line.append(head, cell);
+      return line;
+    }));
+    showProbe(byId("probe"), found);
+    history.replaceState(null, "", `#x=${chosen.x0}&y=${chosen.y0}`);
+  });
+}
+
+map.addEventListener("change", () => show(true));
+errors.addEventListener("change", () => show(false));
+normalized.addEventListener("change", () => show(false));
+byId("region").addEventListener("click", event => {
+  const on = event.target.getAttribute("aria-pressed") !== "true";
+  event.target.setAttribute("aria-pressed", on);
+  Plotly.relayout(node, { dragmode: on ? "select" : "zoom" });
+});
+node.addEventListener("keydown", event => view.key(event));
+
+addEventListener("load", async () => {
+  await show(true);
+  const wanted = new URLSearchParams(location.hash.slice(1));
+  if (wanted.has("x")) view.choose({ x0: Number(wanted.get("x")), y0: Number(wanted.get("y")) });
+  document.body.dataset.ready = "yes";
+});
