@@ -13,7 +13,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from processing.errors import ProcessError
-from viewer import browsing, comparing, following, frames, probes, products
+from viewer import browsing, comparing, following, frames, probes, products, starting, verdicts
 from viewer.guard import Guard
 from viewer.library import Library, NotHere
 from viewer.pages import Pages, pages_of, whole_style
@@ -40,6 +40,15 @@ def application(folder: Path, token: str) -> Starlette:
         Route("/probe", probes.of_product),
         Route("/compare", comparing.compare),
         Route("/difference", comparing.difference),
+        Route("/start", starting.start, methods=["POST"]),
+        Route("/job", starting.job),
+        Route("/job-events", starting.job_events),
+        Route("/stop-job", starting.stop_job, methods=["POST"]),
+        Route("/diagnosis", verdicts.diagnosis),
+        Route("/diagnosis-report", verdicts.report),
+        Route("/residual-map", verdicts.residual_map),
+        Route("/residual-curve", verdicts.residual_curve),
+        Route("/decide", verdicts.decide, methods=["POST"]),
         Route("/curve", probes.curve_of),
         Route("/matrix", probes.matrix_of),
         Route("/style.css", _style),

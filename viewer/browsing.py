@@ -11,8 +11,10 @@ from starlette.responses import HTMLResponse
 
 from acquisition.screen.run_file import running_in
 from viewer.campaigns import STATUS, CampaignView, read_campaign
+from viewer.jobs import Jobs
 from viewer.library import Entry, NotHere, made_from
 from viewer.pages import Pages, pages_of
+from viewer.starting import campaign_files
 
 #: Files on one page of a list; more are found by searching.
 MOST = 300
@@ -25,6 +27,7 @@ async def browse(request: Request) -> HTMLResponse:
 
 def _browse(pages: Pages, query: str) -> HTMLResponse:
     library = pages.library
+    jobs = Jobs(library.root)
     entries = library.entries()
     words = query.lower().split()
     found = [e for e in entries if all(word in e.words for word in words)]
@@ -43,6 +46,8 @@ def _browse(pages: Pages, query: str) -> HTMLResponse:
         found=len(found),
         total=len(entries),
         shown_at=pages.shown_at,
+        files=list(campaign_files(library)),
+        jobs=[(job, jobs.status(job)) for job in jobs.all()[:8]],
     )
 
 

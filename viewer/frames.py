@@ -13,9 +13,11 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 from processing.errors import ProcessError
 from processing.reduction.counts_to_signal import saturation
 from processing.storage.capture import Capture
+from viewer.diagnoses import Diagnoses
 from viewer.library import Entry, made_into
 from viewer.pages import Pages, file_of, pages_of
 from viewer.planes import Window, sent
+from viewer.starting import instrument_files
 
 #: Most bars of a histogram.
 BARS = 256
@@ -66,6 +68,8 @@ def _capture(pages: Pages, path: Path) -> HTMLResponse:
         made=[(e, pages.shown_at(e)) for e in made_into(entry, entries, library.root)],
         others=others(entry, entries),
         writing=entry.status == "running",
+        instruments=list(instrument_files(library)),
+        stories=Diagnoses(library).of_capture(entry.name),
     )
 
 

@@ -23,6 +23,9 @@ def diagnose_command(
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Result as JSON.")] = None,
     report: Annotated[Path | None, typer.Option(help="Report with figures (HTML, one file).")] = None,
+    residuals: Annotated[
+        Path | None, typer.Option(help="Residuals before and after, pixel by pixel (.npz), of an instrument.")
+    ] = None,
     reflectance: Annotated[
         Path | None, typer.Option(help="Material file: the sample is triply degenerate with this dominant process.")
     ] = None,
@@ -32,7 +35,7 @@ def diagnose_command(
     """Trace the residual between intensities and model to the effects that explain it; say so if none does."""
     # The problems are many and small: BLAS threads would only wait for one another.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    for target in (write, json, report):
+    for target in (write, json, report, residuals):
         if target is not None and target.exists():
             from processing.errors import ProcessError
 
@@ -60,6 +63,11 @@ def diagnose_command(
 
         write_report(report, judged, problem)
         typer.echo(str(report))
+    if residuals is not None:
+        from processing.diagnosis.instrument.residual_file import write_residuals
+
+        write_residuals(residuals, judged, problem)
+        typer.echo(str(residuals))
     if write is not None:
         from processing.diagnosis.instrument_file import write_instrument
 

@@ -44,8 +44,12 @@ def _merged(old: Dispersive, entry: EffectParameter, wavelengths_nm: tuple[float
     return {k: v for k, v in kept.items() if all(abs(k - w) >= 0.5 for w in new)} | new
 
 
-def write_instrument(path: Path, model: InstrumentModel, diagnosis: Diagnosis) -> None:
+def write_instrument(path: Path, model: InstrumentModel, diagnosis: Diagnosis, note: str = "") -> None:
     """Write `extended` to a new file.
+
+    Parameters
+    ----------
+    note : why it is believed, for the head of the file.
 
     Raises
     ------
@@ -58,6 +62,8 @@ def write_instrument(path: Path, model: InstrumentModel, diagnosis: Diagnosis) -
     text = dump_yaml(extended(model, diagnosis))
     try:
         with path.open("x", encoding="utf-8") as file:
-            file.write(f"# Written by `diagnose`: {diagnosis.verdict}, see `effects`.\n{text}")
+            file.write(f"# Written by `diagnose`: {diagnosis.verdict}, see `effects`.\n")
+            file.writelines(f"# {line}\n" for line in note.splitlines())
+            file.write(text)
     except FileExistsError as error:
         raise WriteError(f"{path} exists; diagnose never replaces a file. Give another --write.") from error

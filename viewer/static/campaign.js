@@ -1,5 +1,6 @@
 // The page of a campaign: its timeline, and what a run does while it runs.
 
+import "./start.js";
 import { ImageView, place, readPlane } from "./images.js";
 import { accent, at, byId, draw, duration, embedded, narrow, post, quiet, say, statusColour } from "./plots.js";
 
@@ -59,6 +60,7 @@ async function lastFrame(now) {
 function show(now) {
   const was = !run.hidden;
   run.hidden = !now.running;
+  if (byId("resume")) byId("resume").hidden = now.running;
   if (was && !now.running) return location.reload();
   if (!now.running) return undefined;
   byId("title").textContent = now.title || now.activity;

@@ -1,5 +1,6 @@
 // The page of a capture: frames with a slider, histogram, and the intensities of a pixel.
 
+import "./start.js";
 import { ImageView, place, readPlane } from "./images.js";
 import { accent, bad, byId, draw, embedded, getJson, ink, narrow, say } from "./plots.js";
 import { drawCurve, showProbe } from "./probe.js";

@@ -1,5 +1,6 @@
 // The page of a product: its maps, and what it says of a pixel.
 
+import "./start.js";
 import { mapView, matrixView } from "./maps.js";
 import { byId, embedded, getJson, say } from "./plots.js";
 import { drawCurve, showProbe } from "./probe.js";

@@ -1,0 +1,73 @@
+"""Residuals of a diagnosis as a file: what a page or a script draws maps, states and harmonics from."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.diagnosis.instrument.judge import Judged
+from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.errors import ProcessError
+from processing.storage.h5_door import DAMAGE
+
+MOMENTS = ("before", "after")
+
+
+@dataclass(frozen=True)
+class StoredResidual:
+    """What one capture leaves over, before and after the correction.
+
+    Attributes
+    ----------
+    name : of the capture.
+    images : for "before" and "after" (L, rows, columns), in units of the noise of one intensity; NaN where not used.
+    per_state : for each (L,) rms over the pixels.
+    harmonics : for each, axis to amplitudes of the state means.
+    """
+
+    name: str
+    images: dict[str, NDArray[np.float16]]
+    per_state: dict[str, NDArray[np.float64]]
+    harmonics: dict[str, dict[str, list[float]]]
+
+
+def write_residuals(path: Path, judged: Judged, problem: InstrumentProblem) -> None:
+    """Write the residuals of every capture to a new .npz file. Raises ProcessError if it exists."""
+    arrays: dict[str, Any] = {}
+    told = []
+    for k, data in enumerate(problem.captures):
+        harmonics = {}
+        for moment, residual in zip(MOMENTS, (judged.before[k], judged.after[k]), strict=True):
+            # Units of the noise: three digits are more than anybody sees.
+            arrays[f"image_{moment}_{k}"] = np.clip(residual.image, -6e4, 6e4).astype(np.float16)
+            arrays[f"per_state_{moment}_{k}"] = residual.per_state
+            harmonics[moment] = {axis: values.tolist() for axis, values in residual.harmonics.items()}
+        told.append({"name": data.name, "harmonics": harmonics})
+    try:
+        with path.open("xb") as file:
+            np.savez_compressed(file, told=np.array(json.dumps(told)), **arrays)
+    except FileExistsError as error:
+        raise ProcessError(f"{path} exists and is not replaced. Give another --residuals.") from error
+
+
+def read_residuals(path: Path) -> list[StoredResidual]:
+    """Residuals of every capture from such a file. Raises ProcessError."""
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            told = json.loads(str(stored["told"]))
+            return [
+                StoredResidual(
+                    name=str(one["name"]),
+                    images={m: stored[f"image_{m}_{k}"] for m in MOMENTS},
+                    per_state={m: stored[f"per_state_{m}_{k}"] for m in MOMENTS},
+                    harmonics=one["harmonics"],
+                )
+                for k, one in enumerate(told)
+            ]
+    except DAMAGE as error:
+        raise ProcessError(f"{path} is no file of residuals of a diagnosis ({error})") from error

@@ -1,0 +1,148 @@
+"""What the application starts: the commands of the console, each in a process of its own that outlives the page.
+
+Every button runs a command that could be typed as well, and the page shows it. Output and exit code are kept in a
+hidden folder beside the data, so that every tab sees them, and a later start of the application too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import secrets
+import shlex
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from acquisition.screen.run_file import begun_ticks
+from processing.doors import read_json
+from processing.errors import ProcessError
+from viewer.library import OWN, NotHere
+
+#: Modules behind the commands of the console.
+MODULES = {
+    "acquire": "acquisition.commands.application",
+    "process": "processing.commands.application",
+    "diagnose": "processing.commands.diagnose",
+}
+#: Characters of the output that a page shows, from its end.
+SHOWN = 20_000
+
+
+@dataclass(frozen=True)
+class Job:
+    """One command that was started.
+
+    Attributes
+    ----------
+    name : of its folder.
+    command : as it could be typed.
+    about : what it is for: names of files by what they are ("capture", "campaign", "diagnosis").
+    """
+
+    name: str
+    title: str
+    command: tuple[str, ...]
+    about: dict[str, str]
+    begun_s: float
+    pid: int
+    ticks: int | None
+
+    @property
+    def typed(self) -> str:
+        """The command for a console."""
+        return "./lab " + shlex.join(self.command)
+
+
+class Jobs:
+    """The commands started in one folder."""
+
+    def __init__(self, root: Path) -> None:
+        self._folder = root / OWN / "jobs"
+
+    def start(self, title: str, command: Sequence[str], about: dict[str, str], cwd: Path) -> Job:
+        """Start a command of the console.
+
+        Parameters
+        ----------
+        command : first `acquire`, `process` or `diagnose`, then what follows it.
+        """
+        name = f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
+        folder = self._folder / name
+        folder.mkdir(parents=True)
+        environment = {k: v for k, v in os.environ.items() if k != "HDF5_USE_FILE_LOCKING"}
+        # Plain text of any width, as into a file.
+        environment |= {"PYTHONUNBUFFERED": "1", "NO_COLOR": "1", "UMOV_DOOR": os.environ.get("UMOV_DOOR", "./lab")}
+        with (folder / "output.txt").open("wb") as output:
+            process = subprocess.Popen(
+                [sys.executable, "-m", MODULES[command[0]], *command[1:]],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                cwd=cwd,
+                env=environment,
+                # Ctrl-C for the application is not meant for a measurement that it has started.
+                start_new_session=True,
+            )
+        job = Job(name, title, tuple(command), about, time.time(), process.pid, begun_ticks(process.pid))
+        (folder / "job.json").write_text(json.dumps(asdict(job)), encoding="utf-8")
+        threading.Thread(target=self._wait, args=(process, folder), name=f"job {name}", daemon=True).start()
+        return job
+
+    @staticmethod
+    def _wait(process: subprocess.Popen[bytes], folder: Path) -> None:
+        code = process.wait()
+        with contextlib.suppress(OSError):
+            (folder / "code").write_text(str(code), encoding="utf-8")
+
+    def job(self, name: str) -> Job:
+        """A job by its name. Raises NotHere."""
+        path = self._folder / name / "job.json"
+        if "/" in name or "\0" in name or not path.is_file():
+            raise NotHere(f"{name}: nothing of that name was started here")
+        facts = read_json(path)
+        return Job(**{**facts, "command": tuple(facts["command"])})
+
+    def all(self) -> list[Job]:
+        """Every job, the newest first."""
+        names = sorted((path.parent.name for path in self._folder.glob("*/job.json")), reverse=True)
+        return [self.job(name) for name in names]
+
+    def running(self, job: Job) -> bool:
+        """Whether its process is still there."""
+        return job.ticks is not None and begun_ticks(job.pid) == job.ticks
+
+    def code(self, job: Job) -> int | None:
+        """Its exit code; None while it runs, or where the application had ended before it did."""
+        with contextlib.suppress(OSError, ValueError):
+            return int((self._folder / job.name / "code").read_text(encoding="utf-8"))
+        return None
+
+    def status(self, job: Job) -> str:
+        """running, done, stopped, failed or ended, which is: nobody was there to see how."""
+        if self.running(job):
+            return "running"
+        code = self.code(job)
+        if code is None:
+            return "ended"
+        return {0: "done", 130: "stopped"}.get(code, "failed")
+
+    def output(self, job: Job) -> str:
+        """What it has said, the end of it; of a bar that is redrawn the last state."""
+        try:
+            text = (self._folder / job.name / "output.txt").read_text(encoding="utf-8", errors="replace")
+        except OSError:
+            return ""
+        return "\n".join(line.rsplit("\r", 1)[-1] for line in text[-SHOWN:].split("\n"))
+
+    def stop(self, job: Job) -> None:
+        """Send it what Ctrl-C sends. Raises ProcessError if it has ended."""
+        if not self.running(job):
+            raise ProcessError(f"{job.title}: it has ended already")
+        os.kill(job.pid, signal.SIGINT)

@@ -1,0 +1,167 @@
+"""What a page starts: a campaign, a reduction, the maps of a product, a diagnosis; and how far each has come."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, JSONResponse, StreamingResponse
+
+from acquisition import CONFIGS, Campaign
+from acquisition.campaign.identity import read_identity
+from acquisition.campaign.log import PLAN
+from processing.errors import ProcessError
+from viewer.diagnoses import Diagnoses
+from viewer.following import ALIVE_EVERY, EVERY_S
+from viewer.jobs import Job, Jobs
+from viewer.library import Library, NotHere
+from viewer.pages import Pages, fields_of, pages_of
+
+
+def jobs_of(request: Request) -> Jobs:
+    """The commands started in the folder of the application."""
+    return Jobs(pages_of(request).library.root)
+
+
+async def start(request: Request) -> JSONResponse:
+    """Start what the page asks for; answers with the address of the page that follows it."""
+    asked = await fields_of(request)
+    pages = pages_of(request)
+    kind = asked.get("what", "")
+    if kind not in KINDS:
+        raise ProcessError(f"{kind!r} cannot be started; there are {', '.join(KINDS)}")
+    job = await run_in_threadpool(KINDS[kind], pages.library, jobs_of(request), asked)
+    return JSONResponse({"address": pages.address("job", name=job.name)})
+
+
+def _campaign(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
+    file = campaign_files(library).get(asked.get("file", ""))
+    if file is None:
+        raise NotHere(f"{asked.get('file')}: there is no such campaign file")
+    campaign = Campaign.load(file)
+    command = ["acquire", "--campaign", str(file), "--out", str(library.root)]
+    if asked.get("yes"):
+        command.append("--yes")
+    return jobs.start(f"campaign {campaign.name}", command, {"campaign": campaign.name}, library.root)
+
+
+def campaign_files(library: Library) -> dict[str, Path]:
+    """Campaign files that can be started, by the name that a page shows: those of the folder, and the examples."""
+    own = [path for path in library.yaml_files("campaign") if path.name != PLAN]
+    return {library.name(path): path for path in own} | {
+        f"example: {path.stem}": path for path in sorted((CONFIGS / "campaigns").glob("*.yaml"))
+    }
+
+
+def _resume(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
+    folder = library.path(asked.get("folder", ""))
+    identity = read_identity(folder)
+    if identity is None:
+        raise NotHere(f"{asked.get('folder')}: no campaign was begun in this folder")
+    command = ["acquire", "--campaign", str(folder / PLAN), "--rig", str(identity.get("rig_file"))]
+    command += ["--out", str(folder.parent)]
+    return jobs.start(
+        f"campaign {folder.name}, gone on with", command, {"campaign": library.name(folder)}, library.root
+    )
+
+
+def _reduce(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
+    capture = library.path(asked.get("file", ""))
+    command = ["process", "reduce", str(capture)]
+    if instrument := asked.get("instrument"):
+        file = instrument_files(library)[instrument]
+        out = capture.with_name(f"{capture.stem}.{file.stem}.mueller.h5")
+        command += ["--instrument", str(file), "--out", str(out)]
+    return jobs.start(f"reduce {capture.name}", command, {"file": library.name(capture)}, library.root)
+
+
+def _quantities(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
+    product = library.path(asked.get("file", ""))
+    about = {"file": library.name(product)}
+    return jobs.start(f"maps of {product.name}", ["process", "quantities", str(product)], about, library.root)
+
+
+def _diagnose(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
+    captures = [library.path(name) for name in asked.get("files", "").split("\n") if name]
+    chosen = asked.get("instrument", "")
+    instrument = instrument_files(library).get(chosen) if chosen else None
+    name, folder = Diagnoses(library).begin(captures, instrument)
+    command = ["diagnose", *map(str, captures), "--instrument", str(folder / "instrument.yaml")]
+    for option, file in (("--json", "diagnosis.json"), ("--report", "report.html"), ("--residuals", "residuals.npz")):
+        command += [option, str(folder / file)]
+    about = {"diagnosis": name, "file": library.name(captures[0])}
+    return jobs.start(f"diagnose {', '.join(c.name for c in captures)}", command, about, library.root)
+
+
+def instrument_files(library: Library) -> dict[str, Path]:
+    """Instrument files by the name that a page shows: those of the folder, and those that come with the program."""
+    files = {library.name(path): path for path in library.yaml_files("instrument")}
+    return files | {f"example: {path.stem}": path for path in sorted((CONFIGS / "instruments").glob("*.yaml"))}
+
+
+KINDS: dict[str, Callable[[Library, Jobs, dict[str, str]], Job]] = {
+    "campaign": _campaign,
+    "resume": _resume,
+    "reduce": _reduce,
+    "quantities": _quantities,
+    "diagnose": _diagnose,
+}
+
+
+async def job(request: Request) -> HTMLResponse:
+    """The page of a job."""
+    pages, jobs = pages_of(request), jobs_of(request)
+    found = jobs.job(request.query_params.get("name", ""))
+    return pages.draw("job.html", job=found, now=told(pages, jobs, found))
+
+
+def told(pages: Pages, jobs: Jobs, found: Job) -> dict[str, Any]:
+    """What a page shows of a job: status, output, and where what it makes is shown."""
+    status = jobs.status(found)
+    links = []
+    about, library = found.about, pages.library
+    if "campaign" in about and (library.root / about["campaign"] / PLAN).exists():
+        links.append(["The campaign", pages.address("campaign", folder=about["campaign"])])
+    if "diagnosis" in about and status == "done":
+        links.append(["The verdict", pages.address("diagnosis", name=about["diagnosis"])])
+    if "file" in about:
+        entry = library.entry(about["file"])
+        if status == "done" and "diagnosis" not in about:
+            made = [e for e in library.entries() if e.changed_s >= found.begun_s and e.kind != "capture"]
+            links += [[f"{e.kind}: {e.name}", link] for e in made if (link := pages.shown_at(e)) is not None]
+        links.append([entry.name, pages.shown_at(entry) or pages.address("")])
+    return {"status": status, "output": jobs.output(found), "links": links}
+
+
+async def job_events(request: Request) -> StreamingResponse:
+    """Server-sent events: output and status of a job, until it has ended."""
+    pages, jobs = pages_of(request), jobs_of(request)
+    found = jobs.job(request.query_params.get("name", ""))
+    return StreamingResponse(_changes(request, pages, jobs, found), media_type="text/event-stream")
+
+
+async def _changes(request: Request, pages: Pages, jobs: Jobs, found: Job) -> AsyncIterator[str]:
+    last, looks = "", 0
+    while not await request.is_disconnected():
+        now = await run_in_threadpool(told, pages, jobs, found)
+        if (text := json.dumps(now)) != last:
+            yield f"data: {text}\n\n"
+            last = text
+        elif looks % ALIVE_EVERY == 0:
+            yield ": still here\n\n"
+        if now["status"] not in ("running", "ended"):
+            return
+        looks += 1
+        await asyncio.sleep(EVERY_S)
+
+
+async def stop_job(request: Request) -> JSONResponse:
+    """Send a job what Ctrl-C sends."""
+    asked, jobs = await fields_of(request), jobs_of(request)
+    jobs.stop(jobs.job(asked.get("name", "")))
+    return JSONResponse({"stopping": True})

@@ -1,0 +1,126 @@
+"""The page of a diagnosis: its verdict as a story, with linked maps and state plots, and the decision."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response
+
+from processing.diagnosis.instrument.residual_file import MOMENTS, StoredResidual
+from processing.errors import ProcessError
+from processing.reports.colours import ALL, PLAIN, SIGNED, steps
+from viewer.diagnoses import VERDICTS, Diagnoses
+from viewer.pages import fields_of, pages_of
+from viewer.planes import Window, sent
+from viewer.probing import Region, finite
+
+
+def diagnoses_of(request: Request) -> Diagnoses:
+    """The diagnoses of the folder of the application."""
+    return Diagnoses(pages_of(request).library)
+
+
+async def diagnosis(request: Request) -> HTMLResponse:
+    """The page of a diagnosis."""
+    pages, diagnoses = pages_of(request), diagnoses_of(request)
+    name = request.query_params.get("name", "")
+    story = await run_in_threadpool(diagnoses.story, name)
+    residuals = await run_in_threadpool(diagnoses.residuals, name)
+    found = story.diagnosis
+    writes = bool(found.applied() or found.calibrated)
+    return pages.draw(
+        "diagnosis.html",
+        simulated=found.simulated,
+        story=story,
+        found=found,
+        verdict=VERDICTS[found.verdict],
+        writes=writes,
+        proposed=_free_name(pages.library.root, found.instrument),
+        captures=[(capture, pages.address("capture", file=capture)) for capture in story.captures],
+        look={"captures": [_told(residual) for residual in residuals]},
+        colours={name: steps(name) for name in ALL},
+    )
+
+
+def _free_name(folder: Any, instrument: str) -> str:
+    stem = "".join(c if c.isalnum() else "_" for c in instrument).strip("_") or "instrument"
+    number = 2
+    while (folder / f"{stem}_{number}.yaml").exists():
+        number += 1
+    return f"{stem}_{number}.yaml"
+
+
+def _told(residual: StoredResidual) -> dict[str, Any]:
+    rows, columns = residual.images["before"].shape[-2:]
+    loud = [_rms(residual, moment) for moment in MOMENTS]
+    known = np.concatenate([image[np.isfinite(image)] for image in loud])
+    return {
+        "name": residual.name,
+        "shape": [rows, columns],
+        "per_state": {moment: finite(values) for moment, values in residual.per_state.items()},
+        "harmonics": residual.harmonics,
+        # Before and after on one scale, or they could not be compared.
+        "loudest": float(np.percentile(known, 99.5)) if known.size else 1.0,
+    }
+
+
+def _rms(residual: StoredResidual, moment: str) -> Any:
+    return np.sqrt(np.mean(np.square(residual.images[moment].astype(np.float32)), axis=0))
+
+
+async def residual_map(request: Request) -> Response:
+    """Two pictures, before and after: the rms over the states, or one of them (`state`)."""
+    residual = await run_in_threadpool(_chosen, request)
+    query = request.query_params
+    window = Window.asked(query, residual.images["before"].shape[-2:])
+    state = query.get("state")
+    try:
+        shown = [
+            _rms(residual, m) if state is None else residual.images[m][int(state)].astype(np.float32) for m in MOMENTS
+        ]
+    except (ValueError, IndexError) as error:
+        raise ProcessError(f"there is no state {state} in this diagnosis") from error
+    colours = PLAIN if state is None else SIGNED
+    pictures = np.stack([window.every(image[window.rows]) for image in shown])
+    return sent(window, pictures, colours=colours, units="noise of one intensity")
+
+
+async def residual_curve(request: Request) -> JSONResponse:
+    """Residual of each state, before and after, mean over a pixel or a region in units of the noise of that mean."""
+    residual = await run_in_threadpool(_chosen, request)
+    region = Region.asked(request.query_params, residual.images["before"].shape[-2:])
+    told: dict[str, Any] = {"where": str(region)}
+    for moment in MOMENTS:
+        part = residual.images[moment][:, region.rows, region.columns].astype(float).reshape(-1, region.pixels)
+        with np.errstate(invalid="ignore"):
+            used = np.isfinite(part).sum(axis=1)
+            told[moment] = finite(np.nansum(part, axis=1) / np.sqrt(np.where(used > 0, used, np.nan)))
+    return JSONResponse(told)
+
+
+def _chosen(request: Request) -> StoredResidual:
+    residuals = diagnoses_of(request).residuals(request.query_params.get("name", ""))
+    try:
+        return residuals[int(request.query_params.get("capture", 0))]
+    except (ValueError, IndexError) as error:
+        raise ProcessError("this diagnosis has no residuals of such a capture") from error
+
+
+async def decide(request: Request) -> JSONResponse:
+    """Accept the corrected model, which writes a new instrument file, or reject it; both with a note."""
+    asked, diagnoses = await fields_of(request), diagnoses_of(request)
+    name, note = asked.get("name", ""), asked.get("note", "")
+    if asked.get("accept"):
+        path = await run_in_threadpool(diagnoses.accept, name, asked.get("file", ""), note)
+        return JSONResponse({"file": path.name})
+    diagnoses.reject(name, note)
+    return JSONResponse({"file": None})
+
+
+async def report(request: Request) -> Response:
+    """The report of the diagnosis as `diagnose --report` writes it."""
+    path = diagnoses_of(request).folder(request.query_params.get("name", "")) / "report.html"
+    return FileResponse(path, media_type="text/html")
