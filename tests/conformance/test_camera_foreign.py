@@ -1,4 +1,4 @@
-"""A camera that nobody here wrote: Debian's `arv-fake-gv-camera-0.8` (package aravis-tools)."""
+"""Cameras that nobody here wrote: `arv-fake-gv-camera-0.8` of Debian's aravis-tools, and one of Aravis off Ethernet."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from collections.abc import Iterator
 
 import pytest
 
+from drivers.aravis_library import load_aravis
 from drivers.camera import CameraSettings
 from drivers.cameras import aravis
-from drivers.errors import CameraNotFound, FrameLost
+from drivers.errors import CameraNotFound, FrameLost, SettingRefused
 
 PROGRAM = "arv-fake-gv-camera-0.8"
 
@@ -59,3 +60,21 @@ def test_a_camera_that_answers_early_can_be_declared(foreign: None) -> None:
         ids = [frame.frame_id for frame in camera.capture(10)]
         assert ids == list(range(ids[0], ids[0] + 10))
         assert camera.statistics().stale_discarded == 0
+
+
+def test_a_camera_off_ethernet_has_no_packets() -> None:
+    # What can be tried of USB3 Vision without a camera: everything but its transport.
+    library, _ = load_aravis()
+    library.enable_interface("Fake")
+    try:
+        config = aravis.Config(device="Fake_1", answers_early=True, settings=CameraSettings(exposure_s=0.01))
+        with aravis.open("camera", config) as camera:
+            camera.configure(CameraSettings(width=128, height=96))
+            who = camera.describe()
+            assert (who.packet_size, who.packet_delay, who.resend, who.interface_mtu) == (None, None, None, None)
+            assert [frame.pixels.shape for frame in camera.capture(2)] == [(96, 128)] * 2
+            assert camera.statistics().missing_packets == 0
+            with pytest.raises(SettingRefused, match="not on Ethernet"):
+                camera.configure(CameraSettings(packet_size=1500))
+    finally:
+        library.disable_interface("Fake")
