@@ -5,19 +5,22 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy import ndimage
 
 from processing.diagnosis.captured.capture_data import CaptureData
 
-#: Slope of the image, in standard deviations of an intensity for each pixel of way, from which on a pixel is left out.
-#: A frame that moved by a quarter of a pixel, an ordinary support, is moved back to a tenth of that.
-STEEPEST = 6.0
-#: With more than this share of the pixels steep the image is all edges, and they are kept.
-MOST_STEEP = 0.5
+#: Slope of the image, in standard deviations of an intensity for each pixel of way, from which on there is an edge.
+STEEPEST = 15.0
+#: Pixels around an edge that are left out with it: image derivatives are taken over seven, and one that has the edge in it
+#: is not that of the image beside it.
+AROUND = 3
+#: With more than this share of the pixels near an edge the image is all edges, and they are kept.
+MOST_STEEP = 0.75
 
 
 def without_steep_pixels(data: CaptureData) -> CaptureData:
-    """The capture without pixels at sharp edges, root mean square over the frames."""
-    if min(data.signal.shape[2:]) < 3:
+    """The capture without pixels near sharp edges, root mean square over the frames."""
+    if data.conditions.states < 2 or min(data.signal.shape[2:]) < 3:
         return data
     square = np.zeros(data.signal.shape[2:])
     frames = data.signal.reshape(-1, *data.signal.shape[2:])
@@ -26,7 +29,8 @@ def without_steep_pixels(data: CaptureData) -> CaptureData:
     for image, s, f in zip(frames, slope, floor, strict=True):
         down, across = np.gradient(image)
         square += (down**2 + across**2) / (s * np.maximum(image, 0) + f)
-    steep = data.usable & (square > STEEPEST**2 * len(frames))
+    edge = data.usable & (square > STEEPEST**2 * len(frames))
+    steep = data.usable & ndimage.binary_dilation(edge, structure=np.ones((3, 3), dtype=bool), iterations=AROUND)
     if steep.sum() > MOST_STEEP * data.usable.sum():
         return data
     return replace(data, usable=data.usable & ~steep, steep_fraction=float(steep.mean()))
