@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import typer
 
-from processing.diagnosis.search.result import CaptureReport, Correction, Diagnosis, FoundEffect, Unexplained
+from processing.diagnosis.search.result import (
+    CaptureReport,
+    Combination,
+    Correction,
+    Diagnosis,
+    FoundEffect,
+    Unexplained,
+)
 
 
 def show(d: Diagnosis) -> None:
@@ -78,8 +85,18 @@ def _show_correction(correction: Correction) -> None:
     kinds = ", ".join(dict.fromkeys(e.kind for e in correction.effects)) or "nothing"
     fate = f"refused: {correction.refused}" if correction.refused else "holds"
     typer.echo(f"  correction (means over what the data leave open): {kinds}; {fate}")
+    for c in correction.combinations:
+        typer.echo(f"      determined together: {_combination(c)}")
     for check in correction.checks:
         typer.echo(f"      {check.name}: {check.before:.4g} -> {check.after:.4g}")
+
+
+def _combination(c: Combination) -> str:
+    """Sum of values with its error, and by how much each may be off beside it."""
+    terms = " ".join(f"{w:+.3g} {name}" for name, w in c.weights.items()).removeprefix("+1 ").removeprefix("+")
+    unit = "" if c.unit == "1" else f" {c.unit}"
+    alone = ", ".join(f"{v:+.2g}" for v in c.open_by.values())
+    return f"{terms} = {c.value:.4g} +- {c.stderr:.2g}{unit}; each alone may be off, together by {alone}"
 
 
 def _answer(effect: FoundEffect) -> str:

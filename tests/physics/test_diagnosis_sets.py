@@ -5,6 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 
+from processing.diagnosis.instrument.doubts import ONE_PATTERN, patterned_share
 from processing.diagnosis.search.likely_set import likely_set
 from processing.diagnosis.search.rules import TAU
 from processing.diagnosis.search.sampling import sample
@@ -83,3 +84,21 @@ def test_structure_that_no_set_explains_widens_the_errors():
     state = likely_set(Sets(quadratic, groups(*[1] * 6), Noise(known=True, directions=60.0, slack=22.0)))
     assert state.unit == pytest.approx(900, rel=0.4)
     assert not state.tau[1:].any()
+
+
+def test_two_that_say_the_same_share_the_mean():
+    random = np.random.default_rng(17)
+    design = 100 * random.standard_normal((90, 60))
+    design[:, 1] = design[:, 0]
+    sets = Sets(form(design, np.eye(60)[0] + np.eye(60)[5] - np.eye(60)[7]), groups(*[1] * 60), QUIET)
+    found = sample(sets, likely_set(sets), 30)
+    assert found.probability[:2] == pytest.approx(0.5, abs=0.1)
+    assert found.mean[:2] == pytest.approx(0.5, abs=0.1)
+
+
+def test_values_of_a_jump_beside_a_slope_are_not_random():
+    k = np.arange(40)
+    information = np.eye(40) * 1e4
+    assert patterned_share(np.where(k > 15, 0.5, -0.3) - 0.02 * k, information) > ONE_PATTERN
+    assert patterned_share(np.cos(0.7 * k), information) > ONE_PATTERN
+    assert patterned_share(np.random.default_rng(2).standard_normal(40), information) < ONE_PATTERN

@@ -11,8 +11,8 @@ from processing.diagnosis.captured.capture_data import CaptureData
 
 #: Slope of the image, in standard deviations of an intensity for each pixel of way, from which on there is an edge.
 STEEPEST = 15.0
-#: Pixels around an edge that are left out with it: image derivatives are taken over seven, and one that has the edge in it
-#: is not that of the image beside it.
+#: Pixels around an edge that are left out with it: image derivatives are taken over seven, and one that has the edge
+#: in it is not that of the image beside it.
 AROUND = 3
 #: With more than this share of the pixels near an edge the image is all edges, and they are kept.
 MOST_STEEP = 0.75

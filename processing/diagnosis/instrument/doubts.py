@@ -15,8 +15,9 @@ from processing.diagnosis.search.causes import Cause
 from processing.diagnosis.search.posterior import Posterior
 from processing.instrument.effects.base import FieldEffect, GeneralEffect, PointwiseEffect, SourceEffect, ValuePerState
 
-#: Share of the scatter of values that belong to one state each which a single wave may hold, if they are to be random.
-ONE_WAVE = 0.85
+#: Share of the scatter of values that belong to one state each which a single wave, or a jump beside a slope, may hold,
+#: if they are to be random.
+ONE_PATTERN = 0.85
 #: Standard deviations, and share of what it explains, by which the size of an effect of the source may differ over the
 #: image.
 UNEVEN, UNEVEN_SHARE = 6.0, 0.01
@@ -32,25 +33,36 @@ UNKNOWN_NOISE = 25.0
 BOUND = 1e-3
 
 
+#: The one reason that leaves a name likely.
+PART_OF_LEFT = "it may be a part of what is left unexplained"
+
+
 def doubts(
     problem: InstrumentProblem, found: Posterior, solved: Solution, causes: Sequence[Cause], left: float
 ) -> dict[Cause, str]:
     """Reasons by cause; a cause without one may be called by its name. `left` is the chi-square of structure."""
     out: dict[Cause, str] = {}
-    uneven = 0.0
+    uneven, patterned = 0.0, set[int | None]()
     for cause in causes:
         first = cause.candidates[0]
         if _at_bound(cause):
             out[cause] = "a value stands at its bound: the data ask for something else"
         elif isinstance(first.effect, ValuePerState) and not testable(problem, solved, cause, causes):
             out[cause] = "as many values as the data have"
-        elif isinstance(first.effect, ValuePerState) and _waves(found, cause):
-            out[cause] = "its values follow one wave over the states, as a beat or a fringe does, not a random source"
+        elif isinstance(first.effect, ValuePerState) and _one_pattern(found, cause):
+            out[cause] = (
+                "its values follow one wave or jump over the states, as a beat or a fringe does: they are not random"
+            )
+            patterned |= {c.capture for c in cause.candidates if isinstance(c.effect, SourceEffect)}
         elif isinstance(first.effect, SourceEffect) and any(
             _uneven(problem, solved, c, cause) for c in cause.candidates
         ):
             out[cause] = "it differs from part to part of the image, which a source does not"
             uneven = max(uneven, cause.log_odds)
+    for cause in causes:
+        first = cause.candidates[0]
+        if cause not in out and isinstance(first.effect, SourceEffect) and first.capture in patterned:
+            out[cause] = "it may be a part of a source that changes as no effect of the list does"
     for rank, cause in enumerate(causes, 1):
         if problem.noise_known:
             weak = 2 * cause.log_odds * found.samples.best.unit < TIMES * rank**2 * left
@@ -59,7 +71,7 @@ def doubts(
             rest = found.sets.noise.directions if general else 0.0
             weak = cause.log_odds < max(UNKNOWN_NOISE, TIMES * rest / 2)
         if cause not in out and weak:
-            out[cause] = "it may be a part of what is left unexplained"
+            out[cause] = PART_OF_LEFT
         # What is uneven is another cause, and smaller effects beside it may be parts of it.
         if cause not in out and cause.log_odds < uneven:
             out[cause] = "it may be a part of what is uneven over the image"
@@ -85,19 +97,19 @@ def _at_bound(cause: Cause) -> bool:
     return False
 
 
-def _waves(found: Posterior, cause: Cause) -> bool:
+def _one_pattern(found: Posterior, cause: Cause) -> bool:
     typical = found.space.joined("typical")
     part = dict(zip(found.space.candidates, found.space.slices, strict=True))
     shares = []
     for candidate, values in zip(cause.candidates, cause.values, strict=True):
         p = part[candidate]
         curvature = found.sets.form.curvature[p, p] / np.outer(typical[p], typical[p]) / found.samples.best.unit
-        shares.append(_one_wave(values, curvature))
-    return max(shares) > ONE_WAVE
+        shares.append(patterned_share(values, curvature))
+    return max(shares) > ONE_PATTERN
 
 
-def _one_wave(values: Array, information: Array) -> float:
-    """Largest share of what values (N,) explain that one sine over the states would explain as well.
+def patterned_share(values: Array, information: Array) -> float:
+    """Largest share of what values (N,) explain that one sine over the states explains too, or a jump beside a slope.
 
     `information` (N, N) is the curvature of the chi-square: patterns that the unknown sample takes up do not count.
     """
@@ -110,10 +122,14 @@ def _one_wave(values: Array, information: Array) -> float:
     # N values fitted to noise alone explain N.
     if total <= 2 * n:
         return 0.0
+    turns = 2 * np.pi * np.outer(np.linspace(0.5 / n, 0.5, 8 * n), k)
+    waves = np.stack([np.cos(turns), np.sin(turns)], axis=2)
+    jumps = (
+        np.stack([np.stack([k >= first, k - k.mean()], axis=1) for first in range(2, n - 1)]) if n > 3 else waves[:0]
+    )
     best = 0.0
-    for rate in np.linspace(0.5 / n, 0.5, 8 * n):
-        wave = np.stack([np.cos(2 * np.pi * rate * k), np.sin(2 * np.pi * rate * k)], axis=1)
-        u, size, _ = np.linalg.svd(root @ wave, full_matrices=False)
+    for pattern in (*waves, *jumps):
+        u, size, _ = np.linalg.svd(root @ pattern, full_matrices=False)
         along = u[:, size > 1e-6 * size[0]].T @ seen
         best = max(best, float(along @ along))
     return best / (total - n)

@@ -105,7 +105,7 @@ def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
         error_before=error(asked, solved.before),
         error_after=error(asked, kept.after),
         noise_floor_percent=floor(asked.near(kept.space, kept.fit.values)[0]),
-        effects=(*(e for c in named for e in told_effects(problem, c, c in sure)), *switched),
+        effects=(*(e for c in named for e in told_effects(problem, c, doubt.get(c))), *switched),
         unobservable=(
             *dict.fromkeys(c.short for c in unseen),
             *(f"{c.candidates[0].short} (as many values as the data have)" for c in untold),

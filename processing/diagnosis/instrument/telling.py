@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from processing.diagnosis.instrument.closure import closure
+from processing.diagnosis.instrument.combinations import combinations
+from processing.diagnosis.instrument.doubts import PART_OF_LEFT
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.stored import parameters_of, scope_of
 from processing.diagnosis.instrument.structure import Residual
 from processing.diagnosis.instrument.systematic import systematic_error
 from processing.diagnosis.instrument.whole_bench import Solution
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.causes import Cause
+from processing.diagnosis.search.causes import Answer, Cause
 from processing.diagnosis.search.fit import HeldOut
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.result import (
@@ -23,7 +25,7 @@ from processing.diagnosis.search.result import (
     NotMeasured,
     Ranked,
 )
-from processing.diagnosis.search.rules import DECISIVE, NOMINAL_TAU
+from processing.diagnosis.search.rules import DECISIVE, DOUBTED, LIKELY, NOMINAL_TAU, SURE
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import (
     CountsEffect,
@@ -54,8 +56,9 @@ def floor(problem: InstrumentProblem) -> float | None:
     return 100 * float(np.sqrt(np.mean([m.noise_floor**2 for m in problem.moments])))
 
 
-def told_effects(problem: InstrumentProblem, cause: Cause, confident: bool) -> list[FoundEffect]:
-    """A cause as it is told; one for each capture in which it shows."""
+def told_effects(problem: InstrumentProblem, cause: Cause, doubt: str | None) -> list[FoundEffect]:
+    """A cause as it is told, given a reason to doubt it; one for each capture in which it shows."""
+    answer, probability = told_answer(cause, doubt)
     told = []
     strength = [
         float(np.max(np.abs(v) / np.sqrt(np.diag(s)), initial=0.0))
@@ -76,13 +79,24 @@ def told_effects(problem: InstrumentProblem, cause: Cause, confident: bool) -> l
                 scope=scope_of(candidate),
                 capture=None if candidate.capture is None else problem.captures[candidate.capture].name,
                 wavelength_nm=candidate.wavelength_nm,
-                removal_chance=1 - cause.probability,
-                confident=confident,
-                probability=cause.probability,
-                answer=cause.answer,
+                removal_chance=1 - probability,
+                confident=doubt is None and cause.answer != "unknown",
+                probability=probability,
+                answer=answer,
             )
         )
     return told
+
+
+def told_answer(cause: Cause, doubt: str | None) -> tuple[Answer, float]:
+    """The word for a cause and its probability: what may be a part of what is left is not sure, what else is doubted is
+    not told."""
+    if doubt is None:
+        return cause.answer, cause.probability
+    probability = min(cause.probability, DOUBTED)
+    if doubt != PART_OF_LEFT or cause.probability < SURE:
+        return "unknown", min(probability, LIKELY)
+    return "one of" if cause.alternatives else "likely", probability
 
 
 def told_switches(problem: InstrumentProblem, solved: Solution) -> list[FoundEffect]:
@@ -142,7 +156,8 @@ def correction(
             )
         )
     error = systematic_error(problem, found)
-    return Correction(effects=tuple(effects), systematic=error, checks=guard, refused=refused)
+    together = combinations(found, solved) if any_cause else ()
+    return Correction(effects=tuple(effects), systematic=error, combinations=together, checks=guard, refused=refused)
 
 
 def _wavelength(problem: InstrumentProblem, candidate: Candidate) -> float | None:

@@ -80,6 +80,19 @@ class Check(_Part):
     holds: bool
 
 
+class Combination(_Part):
+    """Values that are known together: sum of weight times value; `open_by` moves each of them and is not determined.
+
+    The weight of the value whose unit it has is one.
+    """
+
+    weights: dict[str, float]
+    value: float
+    stderr: float
+    unit: str
+    open_by: dict[str, float]
+
+
 class Correction(_Part):
     """What would be written: means of the posterior, apart from names, and whether it may be used.
 
@@ -87,12 +100,14 @@ class Correction(_Part):
     ----------
     effects : as an instrument file stores them, with their standard errors.
     systematic : what stays uncertain, as a Mueller matrix notices it.
+    combinations : what is determined of values that are not determined one by one.
     checks : figures before and after; one that gets worse refuses the correction.
     refused : why nothing is written; None if the correction holds.
     """
 
     effects: tuple[AppliedEffect, ...]
     systematic: SystematicError | None = None
+    combinations: tuple[Combination, ...] = ()
     checks: tuple[Check, ...] = ()
     refused: str | None = None
 

@@ -52,6 +52,8 @@ WIRING = 5.0
 # ---- names ---------------------------------------------------------------------------------------------------------
 #: Probabilities from which on a cause is called sure, and likely.
 SURE, LIKELY = 0.99, 0.9
+#: Most that is told of a cause that may be a part of what is left unexplained.
+DOUBTED = 0.95
 #: Log odds by which an alternative may be worse in a cause's place and still be named with it: 1 to 1100.
 ALTERNATIVE = 7.0
 #: The same as a share of what the cause explains: no effect's model is exact.

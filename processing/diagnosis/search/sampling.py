@@ -7,20 +7,22 @@ there and now the other. The chain only finds the sets: what they weigh is known
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
-from processing.diagnosis.search.rules import TAU
+from processing.diagnosis.search.rules import ALTERNATIVE, TAU
 from processing.diagnosis.search.sets import Conditional, Sets, State
 
 #: Weight of a set below which it changes no mean.
 LEAST_WEIGHT = 1e-6
 #: How often a group is asked at least, relative to one that is there half of the time.
 LEAST_INTEREST = 0.04
+#: Groups that are tried in the place of one.
+MOST_RIVALS = 8
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,11 @@ class _Average:
         if key not in self._seen or c.score > self._seen[key][0]:
             self._seen[key] = (c.score, c, state.copy(), chance)
 
+    @property
+    def best(self) -> State:
+        """The likeliest set so far."""
+        return max(self._seen.values(), key=lambda v: v[0])[2]
+
     def samples(self) -> Samples:
         seen = sorted(self._seen.values(), key=lambda v: -v[0])
         weight = np.exp(np.array([v[0] for v in seen]) - seen[0][0])
@@ -83,7 +90,7 @@ def sample(sets: Sets, state: State, visits: int, seed: int = 0) -> Samples:
     for _ in range(visits):
         c = sets.conditional(state)
         present = state.tau > 0
-        chance = np.where(sets.free, 1 / (1 + np.exp(-np.clip(c.log_odds, -50, 50))), 1.0)
+        chance = _chance(sets, c)
         average.add(c, state, chance)
         now = np.where(present, chance, 1 - chance)
         rate = np.where(sets.free, interest / np.maximum(now, 1e-12), 0.0)
@@ -93,4 +100,26 @@ def sample(sets: Sets, state: State, visits: int, seed: int = 0) -> Samples:
         k = int(random.choice(rate.size, p=rate / rate.sum()))
         there = random.random() < 0.5
         state.tau[k] = TAU[int(random.choice(TAU.size, p=c.tau_weights[k]))] if there else 0.0
+    for other in _swapped(sets, average.best):
+        c = sets.conditional(other)
+        average.add(c, other, _chance(sets, c))
     return average.samples()
+
+
+def _chance(sets: Sets, c: Conditional) -> Array:
+    return np.where(sets.free, 1 / (1 + np.exp(-np.clip(c.log_odds, -50, 50))), 1.0)
+
+
+def _swapped(sets: Sets, state: State) -> Iterator[State]:
+    """The set with one of its groups in turn exchanged for one that would do nearly as well in its place.
+
+    Of two that say the same the chain may never see the second: it would have to pass a set with both or with none.
+    """
+    for k in np.flatnonzero((state.tau > 0) & sets.free):
+        without = sets.without(state, int(k))
+        c = sets.conditional(without)
+        rivals = np.flatnonzero(sets.free & (state.tau == 0) & (c.log_odds > c.log_odds[k] - ALTERNATIVE))
+        for j in rivals[np.argsort(-c.log_odds[rivals])][:MOST_RIVALS]:
+            other = without.copy()
+            other.tau[j] = TAU[int(np.argmax(c.tau_weights[j]))]
+            yield other
