@@ -124,9 +124,7 @@ def patterned_share(values: Array, information: Array) -> float:
         return 0.0
     turns = 2 * np.pi * np.outer(np.linspace(0.5 / n, 0.5, 8 * n), k)
     waves = np.stack([np.cos(turns), np.sin(turns)], axis=2)
-    jumps = (
-        np.stack([np.stack([k >= first, k - k.mean()], axis=1) for first in range(2, n - 1)]) if n > 3 else waves[:0]
-    )
+    jumps = [np.stack([k >= first, np.ones(n), k / n], axis=1) for first in range(2, n - 1)]
     best = 0.0
     for pattern in (*waves, *jumps):
         u, size, _ = np.linalg.svd(root @ pattern, full_matrices=False)
