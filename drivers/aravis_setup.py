@@ -55,6 +55,9 @@ class Config(BaseModel):
     features: dict[str, bool | int | float | str] = Field(
         default={}, description="any GenICam features by name, set in this order and read back; they win over settings"
     )
+    chunk_timestamp: bool = Field(
+        default=True, description="take the time of an exposure from behind the image, where the camera can send it"
+    )
     mosaic_binning: Literal["like_with_like"] | None = Field(
         default=None, description="on a polarization mosaic the camera bins pixels behind the same polarizer alone"
     )

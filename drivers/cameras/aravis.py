@@ -13,6 +13,7 @@ import time
 from typing import Any, NoReturn
 
 from drivers import genicam
+from drivers.aravis_chunks import ChunkStamps
 from drivers.aravis_frames import counts_of, other_layout
 from drivers.aravis_identity import identify
 from drivers.aravis_library import load_aravis, open_camera
@@ -70,7 +71,9 @@ class AravisCamera(Camera):
         self._camera = camera
         self._features = Features(name, aravis, glib_error, camera)
         self._setup = Setup(name, config, aravis, camera, self._features)
+        self._glib_error = glib_error
         self._stream: FrameStream | None = None
+        self._chunks: ChunkStamps | None = None
         self._camera_clock = CameraClock(name)
         self._counted: dict[str, int] = {}
         self._stale = 0
@@ -143,6 +146,9 @@ class AravisCamera(Camera):
     # --- stream ------------------------------------------------------------------------------------------
 
     def _start(self) -> None:
+        wanted = self._config.chunk_timestamp and "ChunkModeActive" not in self._config.features
+        # It adds to the payload.
+        self._chunks = ChunkStamps(self.name, self._camera, self._features, self._glib_error, wanted=wanted)
         with self._features.asking("start the stream"):
             payload = int(self._camera.get_payload())
             self._stream = FrameStream(
@@ -313,7 +319,8 @@ class AravisCamera(Camera):
             raise self._frame_lost(wrong)
         pixels = counts_of(arrival, fmt, size, self.bits, self._config.shift, f"camera {self.name}")
         host_time_s = arrival.first_packet_s if self._setup.hardware else self._sent_unix_s
-        return Frame(pixels, arrival.frame_id, arrival.camera_time_ns, host_time_s)
+        time_ns = arrival.camera_time_ns if self._chunks is None else self._chunks.time_ns(arrival)
+        return Frame(pixels, arrival.frame_id, time_ns, host_time_s)
 
     def _discard_outstanding(self) -> None:
         """Wait for an exposure that nobody collected, and throw its frame away."""
@@ -386,7 +393,7 @@ class AravisCamera(Camera):
             lost = self._features.control_is_lost()
         # Control is given up when the last reference goes, and an error's traceback may keep this object.
         left = [self._forget_stream(), self._camera]
-        self._camera = None
+        self._camera = self._chunks = None
         self._features.release()
         self._setup.release()
         if lost:

@@ -27,6 +27,7 @@ from drivers.errors import CameraError
 from drivers.pixel_formats import PixelFormat, pixel_format, pixel_format_of
 from simulators.camera import gige_features as features
 from simulators.camera.camera_memory import CameraMemory
+from simulators.camera.chunk_stream import ChunkFrame, send
 from simulators.camera.loopback_address import LoopbackAddress
 from simulators.camera.node_map import node_map
 
@@ -129,6 +130,8 @@ class GigeCamera:
         self._armed_at_s = 0.0
         #: Triggers that came before the camera was armed.
         self.ignored_triggers = 0
+        #: Camera times that were sent behind the images.
+        self.chunk_times_ns: list[int] = []
         # Holds frames of exposures that start from now on back, as a busy host or a full link does.
         self.delivery_delay_s = 0.0
         self._error: BaseException | None = None
@@ -252,13 +255,18 @@ class GigeCamera:
             self.ignored_triggers += 1
             camera.set_property("gvsp-lost-ratio", 1.0)
             return
+        chunked: ChunkFrame | None = None
         try:
             info = self._info(buffer, exposure_us, gain_raw)
             fmt = self._format(code)
             data = fmt.encode(self._checked(self._source(info), info, fmt))
-            ctypes.memmove(self._library.arv_buffer_get_data(buffer, None), data.ctypes.data, data.nbytes)
+            if self._sends_chunks():
+                region = (info.offset_x, info.offset_y, info.width, info.height)
+                chunked = ChunkFrame(info.frame_id, time.time_ns(), code & 0xFFFFFFFF, region, data.tobytes())
+            else:
+                ctypes.memmove(self._library.arv_buffer_get_data(buffer, None), data.ctypes.data, data.nbytes)
             if camera is not None and not self._gone.is_set():
-                camera.set_property("gvsp-lost-ratio", self._lost_ratio)
+                camera.set_property("gvsp-lost-ratio", 1.0 if chunked else self._lost_ratio)
         except BaseException as error:  # noqa: BLE001 - nothing may pass into C; check() raises it where it is seen
             self._error = self._error or error
             if camera is not None:
@@ -268,6 +276,13 @@ class GigeCamera:
         # The frame is sent when this returns, and no frame leaves a camera before its exposure has ended.
         # Real time: the same thread answers commands, and Aravis gives up a camera that is silent for three seconds.
         self._gone.wait(max(0.0, start_s + exposure_us * 1e-6 + delay_s - time.monotonic()))
+        if chunked is not None and self._memory is not None and not self._gone.is_set():
+            self.chunk_times_ns.append(chunked.time_ns)
+            send(chunked, self._memory, self.address, self._lost_ratio)
+
+    def _sends_chunks(self) -> bool:
+        offers = self._table is not None and self._table.chunk_timestamp
+        return offers and bool(self._live_memory().read(features.CHUNK_MODE))
 
     def _arm_after(self, exposed_s: float) -> None:
         if self._arming_s <= 0 or self._gone.is_set():

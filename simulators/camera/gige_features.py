@@ -26,6 +26,11 @@ SOFTWARE_TRIGGER = 0x30C
 TRIGGER_ARMED = 0x4038
 GAIN_RAW, BLACK_LEVEL_RAW, FRAME_RATE_ENABLE, PTP_ENABLE, PTP_STATUS = 0x4040, 0x4044, 0x4048, 0x404C, 0x4050
 PACKET_DELAY = 0x4054
+CHUNK_MODE, CHUNK_TIMESTAMP_ENABLE = 0x4058, 0x405C
+# Behind the image: its number and length, and a time stamp of 8 bytes with the same.
+CHUNK_BYTES = 8 + 8 + 8
+# Number of the chunk with the time stamp.
+TIMESTAMP_CHUNK = 0xFF5A0001
 # Texts of the GigE Vision bootstrap registers, 32 bytes each.
 VENDOR_NAME, MODEL_NAME = 0x48, 0x68
 
@@ -117,8 +122,9 @@ def description(table: NodeMap, width: int, height: int) -> str:
         *_acquisition(table),
         *_light(table),
         *_clock(table),
+        *_chunks(table),
         _integer("GevSCPD", PACKET_DELAY, 0, 1_000_000),
-        _formula("PayloadSize", "W * H * ((F &gt;&gt; 16) &amp; 0xFF) / 8", W="Width", H="Height", F="PixelFormat"),
+        _payload_size(table),
     ]
     names = re.findall(r'<\w+ Name="(\w+)" NameSpace="Standard">', "".join(features))
     listed = "".join(f"<pFeature>{name}</pFeature>" for name in names)
@@ -225,3 +231,26 @@ def _clock(table: NodeMap) -> list[str]:
     status = "PtpStatus" if table.ptp == "PtpEnable" else "GevIEEE1588Status"
     states = {"Disabled": 0, "Listening": 1, "Slave": 2, "Master": 3}
     return [_flag(table.ptp, PTP_ENABLE), _choice(status, PTP_STATUS, states)]
+
+
+def _payload_size(table: NodeMap) -> str:
+    image = "W * H * ((F &gt;&gt; 16) &amp; 0xFF) / 8"
+    sizes = {"W": "Width", "H": "Height", "F": "PixelFormat"}
+    if not table.chunk_timestamp:
+        return _formula("PayloadSize", image, **sizes)
+    return _formula("PayloadSize", f"{image} + C * {CHUNK_BYTES}", **sizes, C="ChunkModeActiveRegister")
+
+
+def _chunks(table: NodeMap) -> list[str]:
+    if not table.chunk_timestamp:
+        return []
+    return [
+        _flag("ChunkModeActive", CHUNK_MODE),
+        _selector("ChunkSelector", ["Timestamp"]),
+        _flag("ChunkEnable", CHUNK_TIMESTAMP_ENABLE),
+        f'<Port Name="TimestampChunk"><ChunkID>{TIMESTAMP_CHUNK:x}</ChunkID></Port>',
+        '<Integer Name="ChunkTimestamp"><pValue>ChunkTimestampRegister</pValue></Integer>',
+        '<IntReg Name="ChunkTimestampRegister"><Address>0</Address><Length>8</Length><AccessMode>RO</AccessMode>'
+        "<pPort>TimestampChunk</pPort><Cachable>NoCache</Cachable><Sign>Unsigned</Sign>"
+        "<Endianess>BigEndian</Endianess></IntReg>",
+    ]

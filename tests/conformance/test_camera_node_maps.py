@@ -34,6 +34,10 @@ class MakersCamera:
         shape = (self.scale * info.height, self.scale * info.width)
         return ((np.arange(shape[0] * shape[1]) * 7 + info.frame_id) % 251).astype(np.uint16).reshape(shape)
 
+    def show_again(self, frame_id: int) -> NDArray[np.uint16]:
+        """What the whole sensor showed in a frame."""
+        return ((np.arange(SIZE[0] * SIZE[1]) * 7 + frame_id) % 251).astype(np.uint16).reshape(SIZE[::-1])
+
     def open(self, **config: object) -> aravis.AravisCamera:
         return self._stack.enter_context(
             aravis.open(
@@ -116,6 +120,25 @@ def test_features_of_the_rig_file_are_set_and_the_node_map_tells_them(maker: Mak
     assert float(found[table.exposure]) == pytest.approx(1000.0)
     assert {"PtpStatus", "GevIEEE1588Status"} & found.keys()
     assert "TriggerSoftware" not in found
+
+
+def test_the_time_of_an_exposure_comes_from_behind_the_image_where_the_camera_sends_it() -> None:
+    with ExitStack() as stack:
+        maker = MakersCamera("flir_bfs_pge_51s5p", stack)
+        maker.simulated.bits = 8
+        camera = maker.open(bits=8)
+        camera.configure(CameraSettings(exposure_s=0.02, pixel_format="Mono8"))
+        assert camera.node_map()["ChunkModeActive"] == "true"
+        frames = camera.capture(3)
+        for frame, sent in zip(frames, maker.simulated.chunk_times_ns, strict=True):
+            assert frame.camera_time_ns == sent
+            np.testing.assert_array_equal(frame.pixels, maker.show_again(frame.frame_id))
+        assert camera.statistics().stale_discarded == 0
+    with ExitStack() as stack:
+        camera = MakersCamera("flir_bfs_pge_51s5p", stack).open(bits=8, chunk_timestamp=False)
+        camera.configure(CameraSettings(exposure_s=1e-3))
+        assert camera.node_map()["ChunkModeActive"] == "false"
+        camera.capture()
 
 
 @pytest.mark.parametrize(
