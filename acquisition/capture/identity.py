@@ -26,7 +26,7 @@ from processing.storage.segments import Identity
 from processing.yaml_file import named_files, parse_yaml
 
 #: Keys of a rig file that tell where something is or who hears of it, not what it is.
-PLACES = ("port", "device", "wire_log", "alert", "held_by")
+PLACES = ("port", "device", "wire_log", "alert", "notify", "held_by")
 #: Properties of a device that stay.
 LASTING = (
     "kind", "vendor", "model", "serial_number", "firmware", "sensor_width", "sensor_height", "pixel_format", "bits",

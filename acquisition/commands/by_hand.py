@@ -29,27 +29,19 @@ def doctor(
 ) -> None:
     """Tell what is there and what is wrong; moves nothing. Exit code 1 if anything is wrong."""
     from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
 
     from acquisition.commands.doctor import examine
+    from acquisition.screen.rows import print_rows
     from acquisition.stop_request import StopRequest
 
     config = _load(rig)
-    table = Table(box=None, show_header=False, pad_edge=False)
-    table.add_column(min_width=3)
-    wrong = []
+    there = []
     with StopRequest(patience=1), Console(stderr=True).status("looking at the rig") as status:
         for finding in examine(config, out, frames):
-            mark = {True: "ok", False: "BAD", None: ""}[finding.well]
-            style = "bold red" if finding.well is False else ""
-            table.add_row(Text(mark, style), Text(finding.what), Text(finding.found, style))
-            if finding.well is False:
-                wrong.append(finding.what)
+            there.append(finding)
             status.update(f"looking at the rig: {finding.what} done")
-    # In a file or a pipe every finding stays on its line.
-    Console(width=None if sys.stdout.isatty() else 10_000).print(table)
-    if wrong:
+    print_rows(finding.row for finding in there)
+    if wrong := [finding.what for finding in there if finding.well is False]:
         typer.echo(f"not as it should be: {', '.join(wrong)}", err=True)
         raise typer.Exit(1)
 

@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Sequence
 from pathlib import Path
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from acquisition.campaign import run as campaign_run
 from acquisition.campaign.identity import campaign_identity, folder_for, require_same_campaign, with_devices
-from acquisition.campaign.log import CampaignFolder
+from acquisition.campaign.log import INDEX, LOG, CampaignFolder
 from acquisition.campaign.plan import Campaign
 from acquisition.campaign.run import CampaignRun, Planned
+from acquisition.campaign.summary import SUMMARY, summary_lines
 from acquisition.capture.checks import Check, refuse_failed
 from acquisition.capture.operator import Operator
 from acquisition.commands.defaults import DEFAULT_RIG, INTERRUPTED
 from acquisition.commands.single import Options, live_page, say_simulated, seeded, show_checks
 from acquisition.rig.config import load_rig
 from acquisition.rig.rig import Rig
+from acquisition.screen.notify import notifying
 from acquisition.screen.observer import Observer
 from acquisition.screen.progress import ConsoleProgress
+from acquisition.screen.rows import print_rows
 from acquisition.screen.run_file import RunFile
 from acquisition.stop_request import StopRequest
 
@@ -51,18 +54,33 @@ def run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Obs
     try:
         operator = Operator(console.print, stop, options.yes, rig_config.simulated)
         told = RunFile(folder, rig_config.simulated)
-        with live_page(options.live, rig_config, stop, console) as page, told:
-            watchers = [ConsoleProgress(console), told, *page, *observers]
-            done = CampaignRun(campaign, rig_config, held, operator, stop, watchers, options.home).run(jobs)
-        complete = sum(entry.get("status") == "complete" for entry in held.index.values())
+        with (
+            notifying(rig_config.notify, folder, rig_config.simulated) as notifier,
+            live_page(options.live, rig_config, stop, console) as page,
+            told,
+        ):
+            watchers = [ConsoleProgress(console), told, notifier, *page, *observers]
+            try:
+                done = CampaignRun(campaign, rig_config, held, operator, stop, watchers, options.home).run(jobs)
+            finally:
+                lines = _sum_up(held, [capture.name for capture, _ in jobs])
+            notifier.tell("end", lines[0] if done else f"stopped: {lines[0]}", summary=lines)
     finally:
         held.close()
-    typer.echo(f"{complete} of {len(jobs)} captures complete in {folder}")
-    typer.echo(f"index {folder / 'index.json'}, log {folder / 'log.jsonl'}")
+    typer.echo("\n".join(lines))
+    typer.echo(f"in {folder}: captures, {SUMMARY}, {INDEX}, {LOG}")
     door = os.environ.get("UMOV_DOOR", "")
     after = f"{door} process campaign {folder} --geometry FILE --material FILE".lstrip()
     typer.echo(f"next: {after}" if done else "next: the same command goes on where it stopped")
     return 0 if done else INTERRUPTED
+
+
+def _sum_up(held: CampaignFolder, names: Sequence[str]) -> list[str]:
+    """Write the summary into the folder, whatever the run came to, if the disc takes it."""
+    lines = summary_lines(held.folder, names, held.index)
+    with contextlib.suppress(OSError):
+        (held.folder / SUMMARY).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return lines
 
 
 def _grouped(checks: Sequence[Check]) -> tuple[Check, ...]:
@@ -80,20 +98,20 @@ def _grouped(checks: Sequence[Check]) -> tuple[Check, ...]:
 
 def _show(planned: Sequence[Planned], checks: Sequence[Check], folder: Path) -> None:
     console = Console(soft_wrap=True)
-    table = Table(box=None)
-    for heading in ("", "capture", "states", "s", "MB", ""):
-        table.add_column(heading, justify="left" if heading in ("", "capture") else "right")
+    rows = [("", "capture", "states", "s", "MB", "")]
     for entry in planned:
         there = (folder / entry.capture.name).exists()
-        table.add_row(
-            str(entry.capture.number),
-            entry.capture.name,
-            str(len(entry.job.table)),
-            f"{entry.seconds:.0f}",
-            f"{entry.size / 1e6:.0f}",
-            "there already" if there else "reference" if entry.capture.reference else "",
+        rows.append(
+            (
+                str(entry.capture.number),
+                entry.capture.name,
+                str(len(entry.job.table)),
+                f"{entry.seconds:.0f}",
+                f"{entry.size / 1e6:.0f}",
+                "there already" if there else "reference" if entry.capture.reference else "",
+            )
         )
-    console.print(table)
+    print_rows(rows, console)
     show_checks(console, _grouped(checks))
     seconds, size = sum(p.seconds for p in planned), sum(p.size for p in planned)
     typer.echo(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -47,17 +46,9 @@ def compress(folder: Folder) -> None:
 
 
 def _show(findings: Iterable[Finding]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
+    from acquisition.screen.rows import print_rows
 
-    table = Table(box=None, show_header=False, pad_edge=False)
-    wrong = 0
-    for finding in findings:
-        style = "bold red" if finding.well is False else ""
-        mark = {True: "ok", False: "BAD", None: ""}[finding.well]
-        table.add_row(Text(mark, style), Text(finding.what), Text(finding.found, style))
-        wrong += finding.well is False
-    Console(width=None if sys.stdout.isatty() else 10_000).print(table)
-    if wrong:
+    there = list(findings)
+    print_rows(finding.row for finding in there)
+    if any(finding.well is False for finding in there):
         raise typer.Exit(1)

@@ -37,6 +37,11 @@ class Finding:
     well: bool | None
     found: str
 
+    @property
+    def row(self) -> tuple[str, str, str]:
+        """As it is shown: ok, BAD or nothing, then what was looked at, then what was found."""
+        return {True: "ok", False: "BAD", None: ""}[self.well], self.what, self.found
+
 
 def examine(config: RigConfig, folder: Path, frames: int = FRAMES) -> Iterator[Finding]:
     """Look at everything that a measurement needs, one finding after another; no device's failure hides another's."""

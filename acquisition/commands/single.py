@@ -10,7 +10,6 @@ from pathlib import Path
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from acquisition.capture import session
 from acquisition.capture.checks import Check, refuse_failed
@@ -24,8 +23,10 @@ from acquisition.commands.defaults import CONFIGS, DEFAULT_RIG, INTERRUPTED
 from acquisition.rig.config import RigConfig, load_rig
 from acquisition.rig.guarded import guarded
 from acquisition.rig.rig import Rig
+from acquisition.screen.notify import notifying
 from acquisition.screen.observer import Observer
 from acquisition.screen.progress import ConsoleProgress
+from acquisition.screen.rows import print_rows
 from acquisition.screen.run_file import RunFile
 from acquisition.stop_request import StopRequest
 from processing.storage.capture import Capture
@@ -75,8 +76,14 @@ def run(options: Options, stop: StopRequest) -> int:
             return INTERRUPTED
         take = session.resume if resuming else session.take
         told = RunFile(path.parent, job.rig.simulated)
-        with guarded(job.rig, path.parent), live_page(options.live, job.rig, stop, console) as page, told:
-            result = take(job, rig, path, stop, [ConsoleProgress(console), told, *page], home=options.home)
+        with (
+            notifying(job.rig.notify, path, job.rig.simulated) as notifier,
+            guarded(job.rig, path.parent),
+            live_page(options.live, job.rig, stop, console) as page,
+            told,
+        ):
+            result = take(job, rig, path, stop, [ConsoleProgress(console), told, notifier, *page], home=options.home)
+            notifier.tell("end", f"{path.name}: {result.states_done} of {result.states} states, {result.status}")
     summarize(job, result)
     return INTERRUPTED if result.status == "aborted" else 0
 
@@ -177,10 +184,7 @@ def say_simulated(console: Console, rig: RigConfig) -> None:
 
 def show_checks(console: Console, checks: tuple[Check, ...]) -> None:
     """One line for each check."""
-    table = Table(box=None, show_header=False)
-    for check in checks:
-        table.add_row("ok" if check.passed else "REFUSED", check.what, check.found)
-    console.print(table)
+    print_rows((("ok" if check.passed else "REFUSED", check.what, check.found) for check in checks), console)
 
 
 def summarize(job: Job, result: Result) -> None:

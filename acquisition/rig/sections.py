@@ -11,6 +11,7 @@ from pydantic import Field
 
 from acquisition.rig.parts import ForbiddenPose, HomingPath, InterlockConfig, ModeConfig, Part, Range
 from acquisition.rig.solids import Solids
+from acquisition.screen.notify import NotifyConfig
 from drivers.motion import AxisConfig
 from drivers.registry import Family, device_kinds
 from processing.storage.capture_schema import Detector
@@ -65,6 +66,7 @@ class RigSections(Part):
     alert: tuple[str, ...] = Field(
         default=(), description="command that is run, with a message as its last argument, when a run fails or dies"
     )
+    notify: NotifyConfig | None = Field(default=None, description="who hears of an end, a failure, an interlock")
     wire_log: Path | None = Field(default=None, description="folder for a transcript of every byte on serial lines")
     forbidden: tuple[ForbiddenPose, ...] = ()
     solids: Solids | None = Field(default=None, description="arm, sample holder, ... that must keep apart")

@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Column
 
 from acquisition.screen.observer import Mosaic, Observer, StateReport
 from processing.instrument.states import StateTable
@@ -27,23 +28,46 @@ class ConsoleProgress(Observer):
         # Real time, as everything that a person reads.
         self._start_s = self._line_s = time.monotonic()
         self._warned: set[str] = set()
+        self._campaign_s: float | None = None
+        self._first = self._current = 0
+        self._captures = ""
+
+    def campaign_progress(self, number: int, total: int, name: str) -> None:
+        self._current = number
+        self._captures = f"capture {number + 1} of {total}"
 
     def run_started(self, title: str, table: StateTable, pending: int, mosaic: Mosaic | None) -> None:
         self._done, self._total, self._pending = 0, len(table), pending
         self._start_s = time.monotonic()
-        self._console.print(f"{title}: {pending} states" + (f" of {len(table)}" if pending < len(table) else ""))
+        text = f"{title}: {pending} states" + (f" of {len(table)}" if pending < len(table) else "")
+        self._print(f"{self._place_in_campaign()}{text}")
         if self._console.is_terminal:
             self._bar = Progress(
-                TextColumn("{task.description}", markup=False),
-                BarColumn(bar_width=24),
+                # What must be seen first; the words give way where the terminal is narrow.
+                *([TextColumn(self._captures.removeprefix("capture "), markup=False)] if self._captures else []),
+                BarColumn(bar_width=16),
                 MofNCompleteColumn(),
                 TimeRemainingColumn(compact=True),
                 TextColumn("left"),
+                TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, ratio=1)),
+                expand=True,
                 console=self._console,
                 transient=True,
             )
             self._task = self._bar.add_task("starting", total=pending)
             self._bar.start()
+
+    def _place_in_campaign(self) -> str:
+        """Which capture of the campaign this is and how long the rest takes, as the ones of this run took."""
+        if not self._captures:
+            return ""
+        now_s = time.monotonic()
+        if self._campaign_s is None:
+            self._campaign_s, self._first = now_s, self._current
+            return f"{self._captures}, "
+        each_s = (now_s - self._campaign_s) / max(self._current - self._first, 1)
+        total = int(self._captures.rsplit(" ", 1)[1])
+        return f"{self._captures}, about {_duration(each_s * (total - self._current))} left, "
 
     def activity(self, text: str) -> None:
         if self._bar is not None:
@@ -81,3 +105,11 @@ class ConsoleProgress(Observer):
     def _print(self, text: str) -> None:
         console = self._console if self._bar is None else self._bar.console
         console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def _duration(seconds: float) -> str:
+    """Seconds, minutes, or hours and minutes, as a person says it."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60:02d} min"

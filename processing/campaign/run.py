@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.campaign.tasks import CaptureMeasure, CaptureTask, locate, measure, task_view
+from processing.doors import read_json
 from processing.errors import NotDetermined, ProcessError
 from processing.geometry.viewing import ViewingGeometry
 from processing.polarization.image_difference import rmsd
@@ -104,8 +105,12 @@ def find_captures(
             with Capture(path) as capture:
                 header, simulated, flat = capture.header, capture.simulated, FlatCapture.of(capture)
                 stokes = capture.header.mosaic is not None and not capture.turned_mosaic
+                done, planned, status = len(capture.done), capture.planned_states, capture.status
         except CaptureError as error:
             left_out.append(f"{path}: {error}")
+            continue
+        if done < planned or status != "complete":
+            left_out.append(f"{path}: {done} of {planned} states, {status}; `acquire` goes on with it")
             continue
         if flat is not None:
             continue
@@ -115,8 +120,11 @@ def find_captures(
         kinds[path] = simulated
         kind = "stokes" if stokes else "mueller"
         found.append((path, kind, float(header.wavelength_nm), float(header.omega_deg)))
+    left_out += _unfinished(folder, out)
     if not found:
-        raise ProcessError(f"{folder} holds no capture of an object with an arm angle. {' '.join(left_out[:3])}")
+        raise ProcessError(
+            f"{folder} holds no complete capture of an object with an arm angle. {' '.join(left_out[:3])}"
+        )
     if len(set(kinds.values())) > 1:
         simulated_one = next(p for p, s in kinds.items() if s)
         measured_one = next(p for p, s in kinds.items() if not s)
@@ -125,6 +133,27 @@ def find_captures(
             "they are never compared as one campaign. Put them into two folders."
         )
     return found, next(iter(kinds.values())), left_out
+
+
+def _unfinished(folder: Path, out: Path | None) -> list[str]:
+    """Captures that are being taken or were interrupted, and those that the index of a campaign has as not complete."""
+    partial = [path for path in sorted(folder.rglob("*.h5.partial")) if out is None or not path.is_relative_to(out)]
+    lines = [f"{path}: a capture that is not finished; `acquire` goes on with it" for path in partial]
+    named = {path.name.removesuffix(".partial") for path in partial}
+    for index in sorted(folder.rglob("index.json")):
+        try:
+            entries = read_json(index)
+        except ProcessError:
+            # Somebody else's, or damaged: the captures tell for themselves.
+            continue
+        if not isinstance(entries, dict):
+            continue
+        lines += [
+            f"{index.parent / name}: {entry.get('status', 'not taken')}"
+            for name, entry in entries.items()
+            if isinstance(entry, dict) and name not in named and not (index.parent / name).exists()
+        ]
+    return lines
 
 
 @dataclass(frozen=True)

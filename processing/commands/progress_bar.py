@@ -19,7 +19,11 @@ def progress_bar(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
 
     def compiling() -> None:
         compile_watch.watchers.clear()
-        console.print("compiling loops for this machine: once after an installation, up to half a minute", style="dim")
+        console.print(
+            "compiling loops for this machine: once after an installation, up to half a minute",
+            style="dim",
+            soft_wrap=True,
+        )
 
     compile_watch.watchers.append(compiling)
     try:

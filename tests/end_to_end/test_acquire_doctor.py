@@ -34,7 +34,7 @@ def changed(small_rig, tmp_path):
 
 
 def _line(out, what):
-    return next(line for line in out.splitlines() if line[5:].startswith(what + "  "))
+    return next(line for line in out.splitlines() if f"  {what}  " in f"  {line}")
 
 
 def test_wrong_devices_are_told_with_what_is_there(acquire, changed):

@@ -1,0 +1,73 @@
+"""What a night has brought, in a few lines: for the folder, the console and whoever is told."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from acquisition.campaign.log import LOG
+from processing.doors import read_text
+from processing.errors import ProcessError
+
+SUMMARY = "summary.txt"
+#: Captures of one kind that are named; the index has them all.
+NAMED = 10
+#: Part of the pixels of a state at full scale that is worth a word.
+SATURATED = 0.001
+
+
+def summary_lines(folder: Path, names: Sequence[str], index: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """What became of each capture, since when, and what is worth looking at.
+
+    Parameters
+    ----------
+    names : of all captures of the campaign, in order.
+    index : what there is of them.
+    """
+    status = {name: str(index.get(name, {}).get("status", "not begun")) for name in names}
+    counts = Counter(status.values())
+    lines = [f"{counts['complete']} of {len(names)} captures complete" + _others(counts)]
+    for word in sorted(set(status.values()) - {"complete", "not begun"}):
+        lines += _named(word, [name for name in names if status[name] == word], index)
+    bright = [name for name in names if (index.get(name, {}).get("saturated_fraction") or 0) > SATURATED]
+    lines += _named("saturated", bright, {})
+    events = _events(folder)
+    if events:
+        lines.append(f"first started {events[0]['time']}, last word {events[-1]['time']}")
+    kinds = Counter(str(event.get("event")) for event in events)
+    told = [f"{kinds[kind]} x {kind}" for kind in ("capture failed", "waiting", "campaign stopped") if kinds[kind]]
+    if told:
+        lines.append(", ".join(told))
+    return lines
+
+
+def _others(counts: Counter[str]) -> str:
+    others = [f"{count} {word}" for word, count in sorted(counts.items()) if word != "complete"]
+    return f" ({', '.join(others)})" if others else ""
+
+
+def _named(word: str, names: Sequence[str], index: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    lines = [f"{word}: {name}" + _why(index.get(name, {})) for name in names[:NAMED]]
+    return lines + ([f"{word}: and {len(names) - NAMED} more"] if len(names) > NAMED else [])
+
+
+def _why(entry: Mapping[str, Any]) -> str:
+    error = entry.get("error")
+    return f" ({' '.join(str(error).split())})" if error else ""
+
+
+def _events(folder: Path) -> list[dict[str, Any]]:
+    """Lines of the log that can be read."""
+    events = []
+    try:
+        for line in read_text(folder / LOG, ProcessError).splitlines():
+            event = json.loads(line)
+            if isinstance(event, dict) and "time" in event:
+                events.append(event)
+    except (ProcessError, ValueError):
+        # A line that was cut off by a full disc: what came before it is told.
+        pass
+    return events

@@ -1,0 +1,112 @@
+"""Tells somebody how a run ended, that it failed, or that an interlock holds it: by a command, a webhook, or both."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import subprocess
+import threading
+import urllib.request
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from acquisition.errors import AcquisitionError
+from acquisition.screen.observer import Observer
+from drivers.errors import DeviceError
+
+log = logging.getLogger(__name__)
+
+Event = Literal["end", "failure", "interlock"]
+#: How long a command or a web server may take, and how long the end of the program waits for it, seconds.
+PATIENCE_S = 10.0
+
+
+class NotifyConfig(BaseModel):
+    """Section `notify` of a rig file: who hears of what."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    command: tuple[str, ...] = Field(
+        default=(), description="command that is run with the message as its last argument and JSON on standard input"
+    )
+    webhook: str | None = Field(
+        default=None, pattern=r"^https?://", description="address that the same JSON is posted to"
+    )
+    on: tuple[Event, ...] = Field(default=("end", "failure", "interlock"), description="what is told")
+
+
+class Notifier(Observer):
+    """Sends messages from threads of its own: nobody waits for them but the end of the program, for a while.
+
+    Parameters
+    ----------
+    what : name of the capture file or of the campaign.
+    """
+
+    def __init__(self, config: NotifyConfig | None, what: Path, simulated: bool) -> None:
+        self._config = config
+        self._facts: dict[str, Any] = {"what": str(what), "simulated": simulated}
+        self._sending: list[threading.Thread] = []
+
+    def warning(self, text: str) -> None:
+        if text.startswith("interlock"):
+            self.tell("interlock", text)
+
+    def tell(self, event: Event, text: str, **details: Any) -> None:
+        """Send a message, if the rig file asks for this event; never raises."""
+        if self._config is None or event not in self._config.on:
+            return
+        now = datetime.now().astimezone().isoformat(timespec="seconds")
+        message = {"event": event, "text": text, "time": now, **self._facts, **details}
+        for send in (self._run, self._post):
+            thread = threading.Thread(target=send, args=(self._config, message), name="notify", daemon=True)
+            self._sending.append(thread)
+            thread.start()
+
+    def _run(self, config: NotifyConfig, message: Mapping[str, Any]) -> None:
+        if not config.command:
+            return
+        words = f"{'SIMULATED ' if message['simulated'] else ''}{message['event']}: {message['text']}"
+        try:
+            done = subprocess.run(
+                [*config.command, words], input=json.dumps(message).encode(), capture_output=True, timeout=PATIENCE_S
+            )
+            if done.returncode:
+                log.warning("notify: %s ended with %d", config.command[0], done.returncode)
+        except (OSError, subprocess.SubprocessError) as error:
+            log.warning("notify: %s cannot be run (%s)", config.command[0], error)
+
+    def _post(self, config: NotifyConfig, message: Mapping[str, Any]) -> None:
+        if config.webhook is None:
+            return
+        request = urllib.request.Request(
+            config.webhook, json.dumps(message).encode(), {"Content-Type": "application/json"}
+        )
+        try:
+            urllib.request.urlopen(request, timeout=PATIENCE_S).close()
+        except (OSError, ValueError) as error:
+            log.warning("notify: %s cannot be told (%s)", config.webhook, error)
+
+    def settle(self) -> None:
+        """Wait until what was sent has arrived, but not for long."""
+        for thread in self._sending:
+            thread.join(PATIENCE_S)
+
+
+@contextmanager
+def notifying(config: NotifyConfig | None, what: Path, simulated: bool) -> Iterator[Notifier]:
+    """A notifier around a run: an error of the run is told as a failure, and raised all the same."""
+    notifier = Notifier(config, what, simulated)
+    try:
+        yield notifier
+    except (AcquisitionError, DeviceError, OSError) as error:
+        notifier.tell("failure", str(error), pid=os.getpid())
+        raise
+    finally:
+        notifier.settle()
