@@ -28,7 +28,7 @@ def calibrate_command(
     from processing.instrument.model import InstrumentModel
     from processing.storage.capture import Capture
 
-    with Capture(capture) as source:
+    with Capture(capture, by_super_pixel=True) as source:
         wavelength = source.header.wavelength_nm
         rows, columns = _region(region, source.frame_shape)
         model = InstrumentModel.load(instrument).at(wavelength)

@@ -114,7 +114,8 @@ def _given(
 ) -> StateTable:
     import numpy as np
 
-    from processing.calibration.state_design import read_table, two_retarders
+    from processing.calibration.state_design import read_table
+    from processing.errors import ProcessError
     from processing.instrument.states import StateTable, rotating_retarders
 
     if table is not None:
@@ -122,8 +123,13 @@ def _given(
     if len(model.axes) == 1:
         turn = step if step is not None else 360 / counts[0]
         return StateTable.of_angles({model.axes[0]: turn * np.arange(counts[0], dtype=float)})
-    generator, analyzer = two_retarders(model)
-    axes = (str(generator.axis), str(analyzer.axis))
+    turning = [next((e.axis for e in train if e.axis), "") for train in (model.generator, model.analyzer)]
+    if sorted(turning) != list(model.axes):
+        raise ProcessError(
+            f"equal steps are for one axis, or one on either side; {model.name!r} turns "
+            f"{', '.join(model.axes) or 'none'}. Give --table FILE or --optimize angles."
+        )
+    axes = (turning[0], turning[1])
     return rotating_retarders(1.0, counts[0], step if step is not None else 360 / counts[0], ratio, axes=axes)
 
 

@@ -73,13 +73,7 @@ def limit(
         for name in RETARDANCE:
             _forget(planes, name, weakest < SEEN * relative)
         _half_turn(planes)
-        for angle, vector in ANGLES.items():
-            if angle in planes:
-                _forget(planes, angle, ~(planes[vector] > SEEN * planes[f"{vector}_errors"]))
-        for name, components in MAGNITUDES.items():
-            if name in planes:
-                # Noise across a vector adds its square; taken as alike in all directions.
-                _magnitude(planes, name, (components - 1) * planes[f"{name}_errors"] ** 2)
+        limit_vectors(planes)
         _index(planes, 15 * relative**2 / 3)
         if "symmetric_d1" in planes:
             _equal_diagonal(planes)
@@ -87,6 +81,18 @@ def limit(
             _equal_eigenvalues(planes, noise)
         lowest = planes["coherency_eigenvalues"][3] < SEEN * planes["coherency_eigenvalues_errors"][3]
         _forget(planes, "entropy", lowest)
+
+
+def limit_vectors(planes: Planes) -> None:
+    """The part that needs no more than the planes: noise off magnitudes, angles only of vectors that are seen."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for angle, vector in ANGLES.items():
+            if angle in planes:
+                _forget(planes, angle, ~(planes[vector] > SEEN * planes[f"{vector}_errors"]))
+        for name, components in MAGNITUDES.items():
+            if name in planes:
+                # Noise across a vector adds its square; taken as alike in all directions.
+                _magnitude(planes, name, (components - 1) * planes[f"{name}_errors"] ** 2)
 
 
 def _forget(planes: Planes, name: str, where: NDArray[np.bool_] | np.bool_) -> None:

@@ -13,13 +13,15 @@ from processing.errors import ProcessError
 from processing.geometry.frames import ScatteringGeometry
 from processing.geometry.viewing import ViewingGeometry
 from processing.reflectance.material_fit import MaterialFit, fit_values
-from processing.storage.images import MuellerImage, StokesImage, require_all_elements
+from processing.storage.images import SMALLEST, MuellerImage, StokesImage
 from processing.storage.product import Product
 
 #: At most so many pixels of each image go into a fit.
 PIXELS = 3000
 #: Pixels nearer than this to the outline are left out: the default demosaicing reaches across it.
 BORDER_PX = 4
+#: Two coefficients of each pixel are fitted with the constants: as many elements leave nothing over.
+LEAST_ELEMENTS = 3
 
 
 def fit_products(sources: Sequence[Path], geometry_file: Path) -> tuple[MaterialFit, float, bool]:
@@ -50,15 +52,20 @@ def fit_products(sources: Sequence[Path], geometry_file: Path) -> tuple[Material
 
 def _fit_mueller(sources: Sequence[Path], view: ViewingGeometry) -> MaterialFit:
     parts, matrices, covariances = [], [], []
+    seen = None
     for source in sources:
         with Product(source) as product:
-            require_all_elements(product)
             points, index = _sample(view, product)
             image = MuellerImage.of(product).at(index)
+        if seen is not None and np.any(seen != image.seen):
+            raise ProcessError(f"{source} determines other elements of M than the first product.")
+        seen = image.seen
         parts.append(points)
-        matrices.append(image.values.reshape(16, -1).astype(float))
-        covariances.append(covariance_by_light(image))
-    return _fit(parts, matrices, np.eye(16), covariances)
+        matrices.append(image.values.reshape(16, -1)[seen].astype(float))
+        covariances.append(covariance_by_light(image)[:, seen][:, :, seen])
+    if seen is None or seen.sum() < LEAST_ELEMENTS:
+        raise ProcessError(f"a fit needs {LEAST_ELEMENTS} elements of M or more; see what `process reduce` determined.")
+    return _fit(parts, matrices, np.eye(16)[seen], covariances)
 
 
 def covariance_by_light(image: MuellerImage) -> NDArray[np.float64]:
@@ -70,7 +77,7 @@ def covariance_by_light(image: MuellerImage) -> NDArray[np.float64]:
         # A floor of nothing, in the dark, would be an infinite weight.
         floor = np.maximum(image.noise_floor, 1e-3 * image.noise_slope**2)
         variance = np.outer(image.noise_slope * image.w[:, 0], light) + floor[:, None]
-    inverse = np.linalg.pinv(image.w)
+    inverse = np.linalg.pinv(image.w, rcond=SMALLEST)
     return np.asarray(np.einsum("np,in,jn->pij", variance, inverse, inverse, optimize=True))
 
 

@@ -14,14 +14,15 @@ from processing.errors import ProcessError
 from processing.maps.coherency_noise import coherency_noise
 from processing.maps.extrapolation import EXTRAPOLATED, ExtrapolatedImage
 from processing.maps.first_order_limits import limit
+from processing.maps.partial_quantities import Pairs, determined_maps, partial_block, partial_facts
 from processing.polarization import gradients
 from processing.polarization.decompositions.differential import differential
 from processing.polarization.decompositions.lu_chipman import lu_chipman
 from processing.polarization.decompositions.symmetric import symmetric
 from processing.polarization.propagation import Derived
-from processing.polarization.quantities import PAPER_PAIRS, NamedStokes
+from processing.polarization.quantities import PAPER_PAIRS
 from processing.reduction.mueller import Progress
-from processing.storage.images import MuellerImage, require_all_elements
+from processing.storage.images import MuellerImage, require_all_elements, seen_elements
 from processing.storage.product import LIT_ERRORS, Plane, Product, ProductWriter, Step
 
 #: Pixels of a block: gradients take 128 bytes a pixel and quantity.
@@ -100,7 +101,7 @@ def quantities_of_mueller(
     out: Path,
     step: Step,
     extra: Sequence[str] = (),
-    pairs: Mapping[str, tuple[NamedStokes, NamedStokes]] = PAPER_PAIRS,
+    pairs: Pairs = PAPER_PAIRS,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -119,31 +120,53 @@ def quantities_of_mueller(
     unknown = sorted(set(extra) - set(EXTRA))
     if unknown:
         raise ProcessError(f"unknown decomposition {unknown[0]!r}; there are: {', '.join(EXTRA)}")
-    maps = _planes(extra, pairs)
+    with Product(source) as product:
+        product.require("mueller", EXTRAPOLATED)
+        maps = _planes(extra, pairs)
+        partial = _determined(product, extra, pairs)
+        if partial:
+            maps = {name: maps[name] for name in [*partial, "lit"]}
+        planes = _with_errors(maps) | ({} if partial else _NOISE)
+        steps = (*product.steps, step)
+        with ProductWriter(out, "quantities", product.header, product.shape, planes, steps, overwrite) as writer:
+            for rows in product.row_blocks(BLOCK_PIXELS):
+                if rows.stop > writer.rows_done:
+                    block = (
+                        partial_block(MuellerImage.of(product, rows), partial, pairs)
+                        if partial
+                        else quantities_block(_image(product, rows), extra, pairs)
+                    )
+                    writer.write(rows, **block)
+                if progress:
+                    progress(rows.stop, product.shape[0])
+            facts = partial_facts(writer, partial) if partial else _facts(writer, maps)
+            writer.seal(facts)
+    return facts
+
+
+def _determined(product: Product, extra: Sequence[str], pairs: Pairs) -> list[str]:
+    """The maps that a partial polarimeter determines; empty for whole matrices.
+
+    Raises
+    ------
+    ProductError : decompositions were asked for, which need whole matrices, or nothing is determined.
+    """
+    if product.kind == EXTRAPOLATED or int(product.facts.get("rank", 16)) == 16:
+        return []
+    names = [] if extra else determined_maps(seen_elements(product.facts), pairs)
+    if not names:
+        require_all_elements(product)
+    return names
+
+
+def _with_errors(maps: Mapping[str, Plane]) -> dict[str, Plane]:
     planes = dict(maps)
     for name, plane in maps.items():
         if plane.dtype is np.float32:
             planes[f"{name}_errors"] = Plane(
                 plane.leading, plane.units, f"standard errors of {name}; NaN: not determined"
             )
-    planes |= _NOISE
-    with Product(source) as product:
-        _require_matrices(product)
-        steps = (*product.steps, step)
-        with ProductWriter(out, "quantities", product.header, product.shape, planes, steps, overwrite) as writer:
-            for rows in product.row_blocks(BLOCK_PIXELS):
-                if rows.stop > writer.rows_done:
-                    writer.write(rows, **quantities_block(_image(product, rows), extra, pairs))
-                if progress:
-                    progress(rows.stop, product.shape[0])
-            facts = _facts(writer, maps)
-            writer.seal(facts)
-    return facts
-
-
-def _require_matrices(product: Product) -> None:
-    if product.kind != EXTRAPOLATED:
-        require_all_elements(product)
+    return planes
 
 
 def _image(product: Product, rows: slice) -> MuellerImage | ExtrapolatedImage:
@@ -152,7 +175,7 @@ def _image(product: Product, rows: slice) -> MuellerImage | ExtrapolatedImage:
     return MuellerImage.of(product, rows)
 
 
-def _planes(extra: Sequence[str], pairs: Mapping[str, tuple[NamedStokes, NamedStokes]]) -> dict[str, Plane]:
+def _planes(extra: Sequence[str], pairs: Pairs) -> dict[str, Plane]:
     found = dict(_MAPS)
     for name, (generator, analyzer) in pairs.items():
         found[name] = Plane((), "", f"light from a {generator} generator through a {analyzer} analyzer, over m00")
@@ -169,7 +192,7 @@ def _planes(extra: Sequence[str], pairs: Mapping[str, tuple[NamedStokes, NamedSt
 
 
 def quantities_block(
-    image: MuellerImage | ExtrapolatedImage, extra: Sequence[str], pairs: Mapping[str, tuple[NamedStokes, NamedStokes]]
+    image: MuellerImage | ExtrapolatedImage, extra: Sequence[str], pairs: Pairs
 ) -> dict[str, NDArray[Any]]:
     """Planes of the product for an image, or for some rows of it."""
     m = image.matrices.astype(float)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -128,6 +130,48 @@ def xi0_of_stokes(
     inside = ndimage.minimum_filter(np.isfinite(m0[..., 0, 0]), size=2 * reach + 1)
     m0[~inside] = np.nan
     found = estimate_from_stokes(image, m0)
+    facts = _facts(found.xi0, found.xi0_stderr, found.valid, "two coefficients of the Stokes image")
+    text = "of the noise of pixels by distance in rows and columns"
+    with _two_coefficients(out, found, facts, header, steps, overwrite) as writer:
+        writer.array("neighbour_correlation", image.neighbour_correlation, "", text)
+    return facts
+
+
+def xi0_of_partial(
+    source: Path, geometry_file: Path, material_file: Path, out: Path, step: Step, overwrite: bool
+) -> dict[str, Any]:
+    """Write the xi0 image of a partial polarimeter's product, with a reflectance model as the dominant process.
+
+    The two coefficients need a measurement matrix of rank two only: whatever elements are determined, they are fitted.
+    Of a weighted product the errors are those of equal weights, a little too large.
+
+    Raises
+    ------
+    ProcessError : the product determines combinations of elements only; see also `dominant_model`.
+    """
+    image = MuellerImage.load(source)
+    if image.seen.sum() < 2:
+        raise ProcessError(f"{source} determines {image.facts['determined']}, and xi0 needs two elements of M or more.")
+    m0 = dominant_model(image.header, geometry_file, material_file, image.mask.shape)
+    fitted = image.w @ np.where(image.seen[:, None], image.values.reshape(16, -1), 0.0)
+    size = (-1, *image.mask.shape)
+    found = estimate(fitted.reshape(size), image.told_variance.reshape(size), image.w, m0)
+    facts = _facts(found.xi0, found.xi0_stderr, found.valid, f"two coefficients of {image.facts['determined']}")
+    with _two_coefficients(out, found, facts, image.header, (*image.steps, step), overwrite):
+        pass
+    return facts
+
+
+@contextmanager
+def _two_coefficients(
+    out: Path,
+    found: Xi0Estimate,
+    facts: dict[str, Any],
+    header: CaptureHeader,
+    steps: tuple[Step, ...],
+    overwrite: bool,
+) -> Iterator[ProductWriter]:
+    """Write an estimate; within the block arrays can be added. Completes the facts."""
     planes: dict[str, NDArray[Any]] = {
         "xi0": found.xi0,
         "xi0_errors": found.xi0_stderr,
@@ -139,15 +183,12 @@ def xi0_of_stokes(
         "unphysical": found.unphysical.astype(np.uint8),
         "valid": found.valid.astype(np.uint8),
     }
-    facts = _facts(found.xi0, found.xi0_stderr, found.valid, "two coefficients of the Stokes image")
     facts["unphysical_pixels"] = int(found.unphysical.sum())
-    shape = image.mask.shape
-    with ProductWriter(out, "xi0", header, (shape[0], shape[1]), STOKES_PLANES, steps, overwrite) as writer:
-        text = "of the noise of pixels by distance in rows and columns"
-        writer.array("neighbour_correlation", image.neighbour_correlation, "", text)
-        writer.write(slice(0, shape[0]), **planes)
+    rows, columns = found.xi0.shape
+    with ProductWriter(out, "xi0", header, (rows, columns), STOKES_PLANES, steps, overwrite) as writer:
+        yield writer
+        writer.write(slice(0, rows), **planes)
         writer.seal(facts)
-    return facts
 
 
 def dominant_model(

@@ -16,8 +16,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def mueller_maps(product: Product, title: str) -> Figure:
-    """xi0, its standard error, xi1 to xi3, the light that the TD model misses, DoLP and AoLP; every k-th pixel."""
+def mueller_maps(product: Product, title: str) -> Figure | None:
+    """xi0, its standard error, xi1 to xi3, the light that the TD model misses, DoLP and AoLP; every k-th pixel.
+
+    Of a partial polarimeter what it determines of them; None if that is nothing.
+    """
     height, width = product.shape
     step = max(1, -(-max(height, width) // PANEL_PIXELS))
     image = MuellerImage.of(product, slice(None, None, step))
@@ -48,4 +51,5 @@ def mueller_maps(product: Product, title: str) -> Figure:
         ("DoLP under unpolarized light", values("polarizance_linear"), {"vmin": 0}),
         ("AoLP under unpolarized light, PSA frame / degrees", angle, CYCLIC),
     ]
-    return grid_figure(panels, title, product.simulated)
+    panels = [panel for panel in panels if np.isfinite(panel[1]).any()]
+    return grid_figure(panels, title, product.simulated) if panels else None

@@ -18,7 +18,9 @@ _FRACTION = {"vmin": 0, "vmax": 1}
 
 
 def quantities_figure(product: Product, title: str) -> Figure:
-    """Five rows of four maps each; angles on a cyclic colour map, NaN and pixels without light in grey."""
+    """Five rows of four maps each, or what a partial polarimeter has; NaN and pixels without light in grey."""
+    if "coherency_eigenvalues" not in product.names:
+        return _partial_figure(product, title)
     lit = thin(product.get("lit")) > 0
 
     def get(name: str) -> NDArray[Any]:
@@ -63,3 +65,20 @@ def quantities_figure(product: Product, title: str) -> Figure:
             text = name.replace("_", " ") + " over $m_{00}$"
             panels.append((label(text, name), get(name), {"cmap": "gray", "vmin": 0}))
     return grid_figure(panels, f"{title}\n($\\pm$: median standard error of a pixel)", product.simulated)
+
+
+def _partial_figure(product: Product, title: str) -> Figure:
+    lit = thin(product.get("lit")) > 0
+    panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = []
+    for name in product.names:
+        if name == "lit" or name.endswith("_errors"):
+            continue
+        shown = np.where(lit, thin(product.get(name)), np.nan)
+        if name.endswith("_orientation_deg"):
+            shown = np.where(thin(product.get(f"{name}_errors")) > WORST_ORIENTATION_DEG, np.nan, shown)
+            panels.append((name.replace("_", " "), shown, CYCLIC))
+        else:
+            signed = max(percentile(np.abs(shown), 99), 1e-6)
+            diverging = {"cmap": "RdBu_r", "vmin": -signed, "vmax": signed}
+            panels.append((name.replace("_", " "), shown, diverging if name.endswith("circular") else {"vmin": 0}))
+    return grid_figure(panels, title, product.simulated)

@@ -215,9 +215,10 @@ def _product(path: Path) -> Section:
             residual = thin(product.get("residual_rms"))
             title = product.header.title
             drawn = map_figure([("residual rms / counts", residual, {"cmap": "magma"})], title, product.simulated)
-            figures.append(
-                Figure(png(mueller_maps(product, title)), "coherency eigenvalues, xi0 and its error, DoLP, AoLP")
-            )
+            if (maps := mueller_maps(product, title)) is not None:
+                whole = int(product.facts.get("rank", 16)) == 16
+                what = "coherency eigenvalues, xi0 and its error, DoLP, AoLP" if whole else "DoLP, AoLP"
+                figures.append(Figure(png(maps), what))
             figures.append(Figure(png(drawn), "residual of the fit"))
         datasets = [("dataset", "unit", "what it is")]
         datasets += [(name, product.units(name), product.long_name(name)) for name in product.names]

@@ -52,7 +52,7 @@ class Xi0(FileStep):
 
     def record(self) -> Step:
         """The source; of a Stokes product geometry and material too, which a Mueller product does not need."""
-        if self._of_stokes():
+        if self._by_model():
             return Step("xi0", {}, _modelled(self.source, *self._model()))
         return Step("xi0", {}, (file_identity(self.source, "source"),))
 
@@ -61,19 +61,26 @@ class Xi0(FileStep):
             product.require("mueller", "stokes")
             return product.kind == "stokes"
 
+    def _by_model(self) -> bool:
+        """Whether the source holds less than whole matrices: the dominant process must be told."""
+        with Product(self.source) as product:
+            return self._of_stokes() or int(product.facts.get("rank", 16)) < 16
+
     def _model(self) -> tuple[Path, Path]:
         if self.geometry is None or self.material is None:
             raise ProcessError(
-                "a linear Stokes capture gives xi0 only with a model of the dominant process: "
-                "give --geometry FILE and --material FILE."
+                f"{self.source} holds less than whole Mueller matrices, and gives xi0 only with a model of the "
+                "dominant process: give --geometry FILE and --material FILE."
             )
         return self.geometry, self.material
 
     def _write(self, out: Path, record: Step, overwrite: bool, progress: Progress | None) -> None:
-        from processing.maps.xi0 import xi0_of_mueller, xi0_of_stokes
+        from processing.maps.xi0 import xi0_of_mueller, xi0_of_partial, xi0_of_stokes
 
         if self._of_stokes():
             xi0_of_stokes(self.source, *self._model(), out, record, overwrite)
+        elif self._by_model():
+            xi0_of_partial(self.source, *self._model(), out, record, overwrite)
         else:
             xi0_of_mueller(self.source, out, record, overwrite, progress)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,8 +11,12 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.arrays import BoolArray
 from processing.storage.capture_schema import CaptureHeader
 from processing.storage.product import Product, ProductError, Step
+
+#: Relative size below which a singular value of W is rounding.
+SMALLEST = 1e-8
 
 
 def require_all_elements(product: Product) -> None:
@@ -20,8 +25,16 @@ def require_all_elements(product: Product) -> None:
     if int(product.facts.get("rank", 16)) < 16:
         raise ProductError(
             f"{product.path} is of a partial polarimeter: it determines {product.facts.get('determined', 'less')}, and "
-            "this needs all 16 elements. What it holds is in the product of `process reduce` itself."
+            "this needs all 16 elements. `process quantities` gives what follows from those that it has."
         )
+
+
+def seen_elements(facts: Mapping[str, Any]) -> BoolArray:
+    """(16,) True for the elements that a Mueller product determines; all of them but for a partial polarimeter."""
+    if int(facts.get("rank", 16)) == 16:
+        return np.ones(16, dtype=bool)
+    names = [f"m{k // 4}{k % 4}" for k in range(16)]
+    return np.isin(names, str(facts["determined"]).split(", "))
 
 
 @dataclass(frozen=True)
@@ -80,6 +93,11 @@ class MuellerImage:
         """View (rows, columns, 4, 4)."""
         return np.moveaxis(self.values, (0, 1), (-2, -1))
 
+    @property
+    def seen(self) -> BoolArray:
+        """(16,) True for the elements that are determined."""
+        return seen_elements(self.facts)
+
     def at(self, pixels: NDArray[np.int64]) -> Self:
         """The image of some pixels alone (n rows of one), given by their numbers in row-major order."""
         count = self.mask.size
@@ -124,10 +142,13 @@ class MuellerImage:
         inverse, variance = self._inverse, self.intensity_variance
         if self.facts["weighted"]:
             normal = np.einsum("np,ni,nj->pij", 1 / variance, self.w, self.w, optimize=True)
-            full = np.linalg.inv(normal)
+            whole = int(self.facts.get("rank", 16)) == 16
+            full = np.linalg.inv(normal) if whole else np.linalg.pinv(normal, rcond=SMALLEST**2, hermitian=True)
         else:
             full = np.einsum("np,in,jn->pij", variance, inverse, inverse, optimize=True)
-        scale = self.errors.reshape(16, -1).T / np.sqrt(np.einsum("pii->pi", full))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = self.errors.reshape(16, -1).T / np.sqrt(np.einsum("pii->pi", full))
+        scale[:, ~self.seen] = 0.0
         full *= scale[:, :, None] * scale[:, None, :]
         return np.asarray(full.reshape(*self.mask.shape, 16, 16))
 
@@ -169,15 +190,21 @@ class MuellerImage:
         noise = self._inverse @ (np.sqrt(variance) * rng.normal(size=variance.shape))
         return np.asarray(noise * np.sqrt(self._told))
 
+    @property
+    def told_variance(self) -> NDArray[np.float64]:
+        """`intensity_variance` (N, pixels) with what dark frames and left-out states add, as the errors hold it."""
+        return np.asarray(self.intensity_variance * self._told)
+
     @cached_property
     def _told(self) -> NDArray[np.float64]:
         # Flats, dark frames and left-out states change all errors of a pixel much alike.
-        plain = np.square(self._inverse).sum(axis=0).astype(np.float32) @ self.intensity_variance
-        return np.asarray(np.square(self.errors.reshape(16, -1)).sum(axis=0) / plain)
+        seen = self.seen
+        plain = np.square(self._inverse[seen]).sum(axis=0).astype(np.float32) @ self.intensity_variance
+        return np.asarray(np.square(self.errors.reshape(16, -1)[seen]).sum(axis=0) / plain)
 
     @cached_property
     def _inverse(self) -> NDArray[np.float64]:
-        return np.asarray(np.linalg.pinv(self.w))
+        return np.asarray(np.linalg.pinv(self.w, rcond=SMALLEST))
 
 
 def neighbour_correlation(product: Product) -> NDArray[np.float64]:

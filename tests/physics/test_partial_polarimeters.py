@@ -3,15 +3,23 @@
 import numpy as np
 import pytest
 
+from processing.calibration.train import calibrate
 from processing.errors import NotDetermined, ProcessError
 from processing.instrument.determined import determined_basis, determined_elements
 from processing.instrument.model import InstrumentModel
+from processing.maps import xi0 as maps
+from processing.maps.quantities import quantities_of_mueller
 from processing.maps.xi0 import xi0_of_mueller
+from processing.polarization import mueller
+from processing.polarization.triply_degenerate import mueller_matrix
 from processing.reduction.mueller import Choice, reduce_mueller
+from processing.reflectance.base import normalized_mueller
+from processing.steps.maps import Xi0
 from processing.storage.capture import Capture
 from processing.storage.images import MuellerImage
 from processing.storage.pixel_mask import Mask
 from processing.storage.product import Product, ProductError, Step
+from processing.yaml_file import dump_yaml
 
 #: Elements that each instrument determines, and angles of its axes that do it.
 INSTRUMENTS = {
@@ -34,9 +42,9 @@ def names_of(seen):
 def noisy(synthetic_capture, configs):
     """Makes a capture of 30 x 40 pixels of one sample, with its own shot and read noise."""
 
-    def make(name, angles, electrons=20_000.0, top=None):
+    def make(name, angles, electrons=20_000.0, top=None, sample=SAMPLE):
         model = InstrumentModel.load(configs / f"instruments/{name}.yaml")
-        signal = model.rows(angles).reshape(-1, 16) @ SAMPLE.reshape(16) * electrons * 2
+        signal = model.rows(angles).reshape(-1, 16) @ sample.reshape(16) * electrons * 2
         random = np.random.default_rng(4)
         light = random.poisson(signal[:, None, None, None], (len(signal), 1, 30, 40))
         counts = (light + random.normal(0, READ, light.shape)) / GAIN + 100
@@ -84,6 +92,54 @@ def test_saturated_states_are_left_out_there_too(weighted, noisy, tmp_path):
     assert stokes.mean(axis=1) == pytest.approx(SAMPLE[:, 0], abs=0.01)
 
 
+@pytest.mark.parametrize("name", INSTRUMENTS)
+def test_quantities_are_those_that_the_elements_give(name, noisy, tmp_path):
+    path, model, _ = noisy(name, INSTRUMENTS[name][1])
+    with Capture(path) as capture:
+        reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
+    quantities_of_mueller(tmp_path / "m.h5", tmp_path / "q.h5", Step("quantities", {}))
+    truth = {
+        "diattenuation_linear": np.hypot(0.2, 0.1),
+        "polarizance_linear": np.hypot(0.15, 0.3),
+        "polarizance": np.linalg.norm([0.15, 0.3, 0.2]),
+        "polarizance_circular": 0.2,
+        "polarizance_orientation_deg": np.rad2deg(np.arctan2(-0.3, 0.15)) / 2 + 180,
+        "crossed_linear": (1 - 0.2 + 0.15 - 0.6) / 2,
+        "aligned_linear": (1 - 0.2 - 0.15 + 0.6) / 2,
+    }
+    there = {
+        "rotating_retarder_stokes": {"polarizance", "polarizance_linear", "polarizance_circular"},
+        "rotating_analyzer": {"polarizance_linear"},
+        "linear_mueller": {"polarizance_linear", "diattenuation_linear", "crossed_linear", "aligned_linear"},
+    }[name] | {"polarizance_orientation_deg"}
+    with Product(tmp_path / "q.h5") as product:
+        assert truth.keys() & set(product.names) == there
+        assert not [other for other in product.names if "eigen" in other or "retard" in other]
+        for quantity in there:
+            pulls = (product.get(quantity) - truth[quantity]) / product.get(f"{quantity}_errors")
+            assert abs(pulls.mean()) < 5 / np.sqrt(pulls.size)
+            assert pulls.std() == pytest.approx(1, abs=5 / np.sqrt(2 * pulls.size))
+        with pytest.raises(ProductError, match="needs all 16"):
+            quantities_of_mueller(tmp_path / "m.h5", tmp_path / "e.h5", Step("quantities", {}), ("differential",))
+
+
+@pytest.mark.parametrize("name", INSTRUMENTS)
+def test_xi0_comes_with_a_model_of_the_dominant_process(name, noisy, tmp_path, monkeypatch):
+    xi0, jones = 0.6, np.array([[1.0, 0.1], [0.2j, -0.6]])
+    m0 = normalized_mueller(jones)
+    path, model, _ = noisy(name, INSTRUMENTS[name][1], sample=np.asarray(mueller_matrix(m0, xi0, 1.0)))
+    with Capture(path) as capture:
+        reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
+    monkeypatch.setattr(maps, "dominant_model", lambda *_: np.tile(m0, (30, 40, 1, 1)))
+    maps.xi0_of_partial(tmp_path / "m.h5", "geometry", "material", tmp_path / "x.h5", Step("xi0", {}), False)
+    with Product(tmp_path / "x.h5") as product:
+        pulls = (product.get("xi0") - xi0) / product.get("xi0_errors")
+    assert abs(pulls.mean()) < 5 / np.sqrt(pulls.size)
+    assert pulls.std() == pytest.approx(1, abs=5 / np.sqrt(2 * pulls.size))
+    with pytest.raises(ProcessError, match="give --geometry FILE and --material FILE"):
+        Xi0(tmp_path / "m.h5").make()
+
+
 def test_states_that_see_less_than_the_instrument_can_are_refused(noisy, tmp_path):
     path, model, _ = noisy("rotating_retarder_stokes", {"psa": np.array([0.0, 90, 180, 270])})
     with Capture(path) as capture, pytest.raises(NotDetermined, match=r"rank \d, and 4 are needed"):
@@ -111,3 +167,28 @@ def test_five_to_one_needs_steps_over_half_a_turn(configs):
 
     assert rank(model.rows(rotating_retarders(1.0, 40, 9.0, 5.0).angles_deg)) == 12
     assert rank(model.rows(rotating_retarders(1.0, 30, 6.0, 5.0).angles_deg)) == 16
+
+
+@pytest.mark.parametrize("name", ["linear_mueller", "polarization_camera_retarder"])
+def test_a_known_sample_calibrates_the_train(name, synthetic_capture, configs):
+    nominal = InstrumentModel.load(configs / f"instruments/{name}.yaml")
+    angles = {"psa": np.tile(22.5 * np.arange(8), 2), "psg": np.repeat([0.0, 60.0], 8)}
+    angles = {axis: angles[axis] for axis in nominal.axes}
+    element = nominal.analyzer[0].name
+    polarizer = 2 * np.asarray(mueller.polarizer(np.array(0.3)))
+    signal = nominal.with_values({element: {"azimuth_deg": 1.5}}).rows(angles) @ polarizer.reshape(16) * 20_000
+    frames = np.zeros((len(signal), 1, 20, 20))
+    for row, line in enumerate(nominal.mosaic or (("camera",),)):
+        for column, channel in enumerate(line):
+            number = [c.name for c in nominal.channels].index(channel)
+            frames[:, 0, row :: nominal.pitch, column :: nominal.pitch] = signal[:, number, None, None]
+    counts = np.random.default_rng(1).poisson(frames + 100).astype(np.uint16)
+    sample = {"kind": "mueller", "mueller": tuple(polarizer.reshape(16))}
+    detector = {"black_level_counts": 100, "bits": 16}
+    path = synthetic_capture(
+        counts, angles, sample=sample, detector=detector, mosaic=nominal.mosaic, instrument_yaml=dump_yaml(nominal)
+    )
+    with Capture(path, by_super_pixel=True) as capture:
+        found = calibrate(capture, nominal, [f"{element}.azimuth_deg"], slice(None), slice(None))
+    assert found.values[0] == pytest.approx(1.5, abs=5 * found.stderr[0])
+    assert found.stderr[0] < 0.1

@@ -1,0 +1,76 @@
+"""Which derived maps the image of a partial polarimeter determines, and those maps.
+
+Diattenuation needs the first row of M, polarizance the first column, light between two polarizers the elements that the
+two polarizations meet. Eigenvalues and decompositions need all 16.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.arrays import BoolArray
+from processing.maps.first_order_limits import limit_vectors
+from processing.polarization import gradients
+from processing.polarization.quantities import POLARIZATIONS, NamedStokes
+from processing.storage.images import MuellerImage
+from processing.storage.product import LIT_ERRORS, ProductWriter
+
+Pairs = Mapping[str, tuple[NamedStokes, NamedStokes]]
+
+_ROW, _COLUMN = (1, 2, 3), (4, 8, 12)
+#: Elements, beside m00, that a map needs.
+NEEDED = {
+    "diattenuation": _ROW,
+    "diattenuation_linear": _ROW[:2],
+    "diattenuation_orientation_deg": _ROW[:2],
+    "diattenuation_circular": _ROW[2:],
+    "polarizance": _COLUMN,
+    "polarizance_linear": _COLUMN[:2],
+    "polarizance_orientation_deg": _COLUMN[:2],
+    "polarizance_circular": _COLUMN[2:],
+}
+
+
+def determined_maps(seen: BoolArray, pairs: Pairs) -> list[str]:
+    """Names of the maps that elements `seen` (16,) determine."""
+    needed = {name: list(elements) for name, elements in NEEDED.items()}
+    for name, (generator, analyzer) in pairs.items():
+        needed[name] = np.flatnonzero(np.outer(POLARIZATIONS[analyzer], POLARIZATIONS[generator])).tolist()
+    return [name for name, elements in needed.items() if seen[0] and seen[elements].all()]
+
+
+def partial_block(image: MuellerImage, names: list[str], pairs: Pairs) -> dict[str, NDArray[Any]]:
+    """The maps of these names with their errors, and `lit`, for an image or for some rows of it."""
+    # What was not determined is not in any of them.
+    m = np.where(image.seen.reshape(4, 4), image.matrices.astype(float), 0.0)
+    found: dict[str, NDArray[Any]] = {}
+    with np.errstate(divide="ignore", invalid="ignore"):
+        derived = gradients.diattenuation(m) | gradients.polarizance(m) | gradients.pairs(m, pairs)
+        for name in names:
+            value, gradient = derived[name]
+            found[name] = value.astype(np.float32)
+            found[f"{name}_errors"] = np.sqrt(image.variance_of(gradient)).astype(np.float32)
+    limit_vectors(found)
+    found["lit"] = (image.values[0, 0] > LIT_ERRORS * np.nan_to_num(image.errors[0, 0])).astype(np.uint8)
+    return found
+
+
+def partial_facts(writer: ProductWriter, names: list[str]) -> dict[str, Any]:
+    """What the product says of itself: the maps that there are, and their medians where there is light."""
+    lit = writer.get("lit") > 0
+    facts: dict[str, Any] = {
+        "pixels": int(lit.size),
+        "pixels_with_light": int(lit.sum()),
+        "maps": ", ".join(names),
+        "warnings": ["of a partial polarimeter: maps that need other elements of M are not there"],
+    }
+    for name in names:
+        for part in (name, f"{name}_errors"):
+            known = writer.get(part)[lit]
+            known = known[np.isfinite(known)]
+            facts[f"median_{part.replace('_errors', '_error')}"] = float(np.median(known)) if known.size else None
+    return facts
