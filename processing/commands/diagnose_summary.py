@@ -30,6 +30,8 @@ def show(d: Diagnosis) -> None:
     typer.echo(f"  held out: {before.held_out}")
     for capture in d.captures:
         _show_capture(capture, several=len(d.wavelengths_nm) > 1)
+    for line in d.noise.told if d.noise is not None else ():
+        typer.echo(f"  the noise is not what is declared: {line}")
     for left_out in d.left_out:
         typer.echo(f"  left out of {left_out.capture}: {left_out.told}")
     for effect in d.effects:

@@ -31,10 +31,18 @@ def taps(shift_px: float) -> NDArray[np.float64]:
     return np.asarray(weights / weights.sum())
 
 
-def neighbour_noise(x_px: float, y_px: float) -> tuple[float, float]:
-    """Covariance of the noise of neighbours down and across an image moved back so, for unit noise before."""
-    across, down = taps(x_px), taps(y_px)
+def noise_taps(shift_px: float, mixed: float = 0.0) -> NDArray[np.float64]:
+    """Weights of independent noises in a pixel moved back so, `mixed` of the next having been in each before."""
+    return np.convolve(taps(shift_px), [1 - mixed, mixed]) if mixed else taps(shift_px)
+
+
+def neighbour_noise(x_px: float, y_px: float, right: float = 0.0, down: float = 0.0) -> tuple[float, float]:
+    """Covariance of the noise of neighbours down and across an image moved back so, for unit noise before.
+
+    `right`, `down` : part of the next pixel that each had in it already.
+    """
+    along_x, along_y = noise_taps(x_px, right), noise_taps(y_px, down)
     return (
-        float(np.sum(down[1:] * down[:-1]) * np.sum(across**2)),
-        float(np.sum(down**2) * np.sum(across[1:] * across[:-1])),
+        float(np.sum(along_y[1:] * along_y[:-1]) * np.sum(along_x**2)),
+        float(np.sum(along_y**2) * np.sum(along_x[1:] * along_x[:-1])),
     )

@@ -12,6 +12,29 @@ from processing.instrument.changes import Conditions
 from processing.reduction.move_image import shifted_back
 
 
+@dataclass(frozen=True)
+class SharedNoise:
+    """What the noise of one pixel has in common with that of others, as the frames were stored.
+
+    Attributes
+    ----------
+    right, down : part of the next pixel that was mixed into each, 0 to 0.5 (resampled or smoothed images).
+    rows, columns : variance common to a row, or a column, of a frame, over that of a pixel.
+    wide : variance of a pattern as wide as the image over what independent pixels would give it.
+    """
+
+    right: float = 0.0
+    down: float = 0.0
+    rows: float = 0.0
+    columns: float = 0.0
+    wide: float = 1.0
+
+    @property
+    def shown(self) -> float:
+        """Variance of a pixel over that before pixels were mixed."""
+        return (1 - 2 * self.right * (1 - self.right)) * (1 - 2 * self.down * (1 - self.down))
+
+
 @dataclass(frozen=True, eq=False)
 class LeftOut:
     """What is no measurement of the sample, and is left out.
@@ -54,6 +77,8 @@ class CaptureData:
     dark_fraction : part of the pixels that are too dark, or too close to dark ones, to be used.
     steep_fraction : part of the pixels that are left out because they lie at sharp edges.
     cut_off : numbers of states that do not count because their counts are cut off at zero.
+    shared : what pixels have of their noise in common; slope and floor are those of wide patterns.
+    noise_told : sentences about the noise where it is not what is declared.
     left_out : frames, hits and pixels that are no measurement of the sample.
     binned : side of the squares over which pixels were averaged.
     pitch : pixels of the sensor from one pixel here to the next.
@@ -82,6 +107,8 @@ class CaptureData:
     true_variance: NDArray[np.float32] | None = None
     moved_px: Array | None = None
     left_out: LeftOut = field(default_factory=LeftOut)
+    shared: SharedNoise = field(default_factory=SharedNoise)
+    noise_told: tuple[str, ...] = ()
 
     @property
     def values_per_pixel(self) -> int:

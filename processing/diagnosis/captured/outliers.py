@@ -16,6 +16,7 @@ from scipy import ndimage
 
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captured.common_rest import Whitened, robust_scale
 
 #: Robust standard deviations, of its row and of its pixel, from which on an intensity is a hit: the largest of 10^9
 #: normal ones is 6.1.
@@ -30,11 +31,6 @@ BAD, BAD_DEVIATIONS = 4.0, 10.0
 AROUND, ALSO_BAD = 5, 0.2
 #: Below so many pixels, or directions over the states that the model leaves over, nothing can stand out.
 FEWEST_PIXELS, FEWEST_DIRECTIONS = 100, 8
-#: Eigenvalue of the residual, over that of noise, from which on a direction over the states is structure.
-STRUCTURE = 1.5
-#: Robust standard deviations at which a residual is cut off before structure is looked for.
-CUT = 4.0
-NORMAL_MAD = 0.6745
 
 
 @dataclass(frozen=True)
@@ -50,54 +46,38 @@ def outliers_of(data: CaptureData, a: Array) -> Outliers:
     rows = data.values_per_pixel
     good, keep = data.usable & ~data.clipped, data.row_counts
     hits, bad = np.zeros((rows, good.size), dtype=bool), np.zeros(good.shape, dtype=bool)
-    u, power, _ = np.linalg.svd(a[keep], full_matrices=True)
-    outside = u[:, int(np.sum(power > 1e-8 * power[0])) :]
-    if good.sum() >= FEWEST_PIXELS and outside.shape[1] >= FEWEST_DIRECTIONS:
-        part = np.ix_(keep, good.reshape(-1))
-        y, variance = data.signal.reshape(rows, -1)[part].astype(np.float64), data.variance().reshape(rows, -1)[part]
-        variance = np.maximum(variance, 0.1 * np.mean(variance, axis=1, keepdims=True))
-        clean = np.ones(y.shape[1], dtype=bool)
-        # Twice: what was struck is no structure of the image.
-        for _ in range(2):
-            rest = _rest(y[:, clean], outside)
-            # In standard deviations as the image itself shows them: what is declared of the noise is not asked.
-            t = (rest @ y) / np.sqrt(np.diag(rest)[:, None] * variance)
-            t /= _scale(t[:, clean])
-            struck, noisy = _hits(t, rest)
-            clean = (np.max(np.abs(t), axis=0) < HIT) & ~struck.any(axis=0)
-            if clean.all() or clean.sum() < FEWEST_PIXELS:
-                break
-        hits[part] = struck
-        map_of = np.full(good.shape, float(np.median(noisy)))
-        map_of[good] = noisy
-        bad = good & _noisier_than_around(map_of, outside.shape[1])
-    return Outliers(hits.reshape(data.signal.shape), bad)
+    found = Outliers(hits.reshape(data.signal.shape), bad)
+    if good.sum() < FEWEST_PIXELS:
+        return found
+    white = Whitened.of(data, a, good)
+    if white.outside.shape[1] < FEWEST_DIRECTIONS:
+        return found
+    sigma = np.sqrt(np.maximum(white.variance, 0.1))
+    clean = np.ones(white.y.shape[1], dtype=bool)
+    # Twice: what was struck is no structure of the image.
+    for _ in range(2):
+        rest = white.rest(clean)
+        # In standard deviations as the image itself shows them: what is declared of the noise is not asked.
+        t = (rest.astype(np.float32) @ white.y) / sigma
+        t /= robust_scale(t[:, clean]).astype(np.float32)
+        struck, noisy = _hits(t, rest)
+        clean = (np.max(np.abs(t), axis=0) < HIT) & ~struck.any(axis=0)
+        if clean.all() or clean.sum() < FEWEST_PIXELS:
+            break
+    hits[np.ix_(keep, good.reshape(-1))] = struck
+    map_of = np.full(good.shape, float(np.median(noisy)))
+    map_of[good] = noisy
+    bad[...] = good & _noisier_than_around(map_of, white.outside.shape[1])
+    return found
 
 
-def _rest(y: Array, outside: Array) -> Array:
-    """Projection (L, L) on what neither the model reaches nor the residual of all pixels has in common."""
-    r = outside @ (outside.T @ y)
-    scale = _scale(r)
-    inner = outside.T @ np.clip(r, -CUT * scale, CUT * scale)
-    value, vector = np.linalg.eigh(inner @ inner.T)
-    # At least half of the directions are left to tell what noise is.
-    half = len(value) // 2
-    structure = outside @ vector[:, half:][:, value[half:] > STRUCTURE * np.median(value)]
-    return np.asarray(outside @ outside.T - structure @ structure.T)
-
-
-def _scale(r: Array) -> Array:
-    """Robust standard deviation (L, 1) of every row."""
-    return np.asarray(np.maximum(np.median(np.abs(r), axis=1, keepdims=True) / NORMAL_MAD, 1e-12))
-
-
-def _hits(t: Array, rest: Array) -> tuple[NDArray[np.bool_], Array]:
+def _hits(t: NDArray[np.float32], rest: Array) -> tuple[NDArray[np.bool_], Array]:
     """Hits (L, P) of residuals t (L, P) in standard deviations, and the mean square (P,) of what is left beside them.
 
     A hit shows in all states through the fit: the strongest is left out of the fit, and the next is looked for.
     """
     hits = np.zeros(t.shape, dtype=bool)
-    noisy = np.mean(t**2, axis=0)
+    noisy = np.asarray(np.mean(t**2, axis=0, dtype=float))
     size = np.sqrt(np.diag(rest))
     for p in np.flatnonzero(np.max(np.abs(t), axis=0) > HIT):
         r, q = t[:, p] * size, rest.copy()

@@ -10,6 +10,7 @@ import numpy as np
 from processing.arrays import Array
 from processing.diagnosis.captured.bad_frames import bad_frames
 from processing.diagnosis.captured.capture_data import CaptureData, LeftOut
+from processing.diagnosis.captured.checked_noise import checked_noise
 from processing.diagnosis.captured.noise_estimate import estimated_noise
 from processing.diagnosis.captured.outliers import outliers_of, without
 from processing.diagnosis.captured.steep_pixels import without_steep_pixels
@@ -18,7 +19,10 @@ from processing.instrument.model import InstrumentModel
 
 
 def screened(data: CaptureData, model: InstrumentModel, say: Callable[[str], None]) -> CaptureData:
-    """The capture without hits, bad pixels, bad frames and sharp edges; `model` is resolved at its wavelength."""
+    """The capture without hits, bad pixels, bad frames and sharp edges, and with the noise that it shows.
+
+    `model` is resolved at its wavelength.
+    """
     a = rows_of(data, model)
     found = outliers_of(data, a)
     hits, bad = np.argwhere(found.hits), np.argwhere(found.bad)
@@ -34,7 +38,10 @@ def screened(data: CaptureData, model: InstrumentModel, say: Callable[[str], Non
         data = replace(data, left_out=replace(data.left_out, frames=misfits))
         say(f"left out of {data.name}: state {', '.join(map(str, misfits))}, which belongs to nothing")
     # After the hits, which are steep as well.
-    return without_steep_pixels(data) if data.noise_known else data
+    data = checked_noise(without_steep_pixels(data) if data.noise_known else data, a)
+    for line in data.noise_told:
+        say(f"the noise of {data.name} is not what is declared: {line}")
+    return data
 
 
 def rows_of(data: CaptureData, model: InstrumentModel) -> Array:

@@ -20,6 +20,7 @@ from processing.diagnosis.instrument.telling import (
     error,
     floor,
     missing,
+    noise_report,
     not_measured,
     ranking,
     told_effects,
@@ -121,6 +122,7 @@ def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
         correction=correction_told,
         wiring=None if wiring is None else wiring.told,
         left_out=not_measured(problem),
+        noise=noise_report(problem),
     )
     return Judged(diagnosis, kept, before, after if refused is None else before)
 

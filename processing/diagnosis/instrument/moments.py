@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.computing.threads import for_ranges
-from processing.diagnosis.captured.capture_data import CaptureData
-from processing.reduction.move_image import taps
+from processing.diagnosis.captured.capture_data import CaptureData, SharedNoise
+from processing.reduction.move_image import noise_taps
 
 #: Features of a signal u (counts over full scale); corrected counts = u + sum of coefficient times feature.
 FEATURES = (
@@ -28,6 +28,7 @@ FEATURES = (
 #: The last of them are derivatives of the image by position.
 DERIVATIVES = 5
 TINY = 1e-6
+NOTHING_SHARED = SharedNoise()
 #: Savitzky-Golay filters of seven points: value (third order), first and second derivative (fourth and fifth order).
 VALUE = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21
 FIRST = np.array([22.0, -67.0, -58.0, 0.0, 58.0, 67.0, -22.0]) / 252
@@ -138,7 +139,7 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
     least = np.repeat(data.floor, c)[:, None] / 2
     mean_variance = np.mean(variance[:, good] / scale[good], axis=1)
     sigma = np.sqrt(np.maximum(mean_variance, np.mean(least / scale[good], axis=1)))
-    shared = np.stack([shared_noise(x, y) for x, y in data.row_moved_px])
+    shared = np.stack([shared_noise(x, y, data.shared) for x, y in data.row_moved_px])
     left = shared[:, 0, 0]
     shown = variance * left[:, None, None]
     tiles, clipped_tiles = None, None
@@ -188,7 +189,7 @@ def tile_products(data: CaptureData, tiles: Tiles, used: Sequence[int]) -> tuple
 def _products(data: CaptureData, tiles: Tiles, used: list[int]) -> tuple[Array, Array]:
     rows, count = data.values_per_pixel, tiles.x.size
     variance, scale = _variance(data)
-    shared = np.stack([shared_noise(x, y) for x, y in data.row_moved_px])
+    shared = np.stack([shared_noise(x, y, data.shared) for x, y in data.row_moved_px])
     around = image_derivatives(data.signal.reshape(rows, *data.signal.shape[2:])).reshape(DERIVATIVES, rows, -1)
     s, noise = np.zeros((count, len(used) * rows, len(used) * rows)), np.zeros((count, rows, len(used), len(used)))
     for t in range(count):
@@ -314,14 +315,14 @@ def _blocks(
     ]
 
 
-def shared_noise(x_px: float, y_px: float) -> Array:
+def shared_noise(x_px: float, y_px: float, mixed: SharedNoise = NOTHING_SHARED) -> Array:
     """Covariance (6, 6) of the noise of a pixel and its derivatives in a frame that was moved back by so many pixels.
 
-    For unit noise of the pixels of the frame as taken, which moving it makes alike among neighbours.
+    For unit noise of wide patterns, which moving the frame, and what was `mixed` before, make alike among neighbours.
     """
-    across = np.stack([np.convolve(kernel, taps(x_px)) for _, kernel in PATTERNS])
-    down = np.stack([np.convolve(kernel, taps(y_px)) for kernel, _ in PATTERNS])
-    return np.asarray((across @ across.T) * (down @ down.T))
+    across = np.stack([np.convolve(kernel, noise_taps(x_px, mixed.right)) for _, kernel in PATTERNS])
+    down = np.stack([np.convolve(kernel, noise_taps(y_px, mixed.down)) for kernel, _ in PATTERNS])
+    return np.asarray((across @ across.T) * (down @ down.T) / mixed.wide)
 
 
 def _noise(slopes: Array, share: Array, shared: Array) -> Array:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
+from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.moments import MARGIN, inside
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import add_response
@@ -101,7 +102,7 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     expected = (free * noise).astype(np.float32)
     good = np.asarray(np.isfinite(r).all(axis=0))
     images = Images(r, around, expected, good)
-    alike = np.array([neighbour_noise(x, y) for x, y in data.row_moved_px])
+    alike = _alike(data)
     tests, left = _tests(images, moments.left, alike, a.shape[1], moments.spread, data.noise_known)
     n, channels = data.signal.shape[:2]
     mean = r[:, good].mean(axis=1) if good.any() else np.zeros(rows)
@@ -124,6 +125,13 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
         leading_share=float(value[-1] / max(value.sum(), 1e-300)),
         left=left,
     )
+
+
+def _alike(data: CaptureData) -> Array:
+    """Covariance (L, 2) of the noise of neighbours down and across, in units of that of wide patterns."""
+    shared = data.shared
+    moved = np.array([neighbour_noise(x, y, shared.right, shared.down) for x, y in data.row_moved_px])
+    return np.asarray((moved + np.array([shared.columns, shared.rows])) / shared.wide)
 
 
 def _around(signal: NDArray[np.float32]) -> NDArray[np.float32]:

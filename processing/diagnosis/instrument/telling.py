@@ -22,6 +22,7 @@ from processing.diagnosis.search.result import (
     Correction,
     Error,
     FoundEffect,
+    NoiseReport,
     NotMeasured,
     Ranked,
 )
@@ -288,3 +289,14 @@ def not_measured(problem: InstrumentProblem) -> tuple[NotMeasured, ...]:
                 )
             )
     return tuple(told)
+
+
+def noise_report(problem: InstrumentProblem) -> NoiseReport:
+    """Whether the noise is what is declared."""
+    several = len(problem.captures) > 1
+    told = tuple(f"{c.name}: {line}" if several else line for c in problem.captures for line in c.noise_told)
+    if told:
+        return NoiseReport(verdict="not_as_declared", told=told)
+    if not problem.noise_known:
+        return NoiseReport(verdict="unknown")
+    return NoiseReport(verdict="estimated" if any(c.noise_estimated for c in problem.captures) else "as_declared")

@@ -169,6 +169,13 @@ class NotMeasured(_Part):
         return "; ".join(parts)
 
 
+class NoiseReport(_Part):
+    """What the noise is, and how it differs from what is declared, for each capture that it differs in."""
+
+    verdict: Literal["as_declared", "not_as_declared", "estimated", "unknown"]
+    told: tuple[str, ...] = ()
+
+
 class Diagnosis(_Part):
     """Result of `diagnose`."""
 
@@ -189,6 +196,7 @@ class Diagnosis(_Part):
     correction: Correction | None = None
     wiring: str | None = None
     left_out: tuple[NotMeasured, ...] = ()
+    noise: NoiseReport | None = None
 
     def applied(self) -> tuple[AppliedEffect, ...]:
         """The effects as an instrument file stores them; none where the correction does not hold."""

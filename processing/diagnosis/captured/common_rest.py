@@ -1,0 +1,69 @@
+"""What is left of a capture when what its pixels have in common is taken away: the model, and structure beside it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.arrays import Array
+from processing.diagnosis.captured.capture_data import CaptureData
+
+#: Eigenvalue of the residual, over the largest that noise alone gives, from which on a direction over the states is
+#: structure.
+STRUCTURE = 1.15
+#: Robust standard deviations at which a residual is cut off before structure is looked for.
+CUT = 4.0
+NORMAL_MAD = 0.6745
+
+
+@dataclass(frozen=True)
+class Whitened:
+    """Some pixels of a capture, every row in units of its noise.
+
+    Attributes
+    ----------
+    y : (L, P) intensities of the rows that count; variance : (L, P), one on average.
+    level : (L,) noise of each row in full scales; inside : (L, K), outside : (L, free) orthonormal directions that the
+        unknowns of a pixel reach, and do not reach.
+    """
+
+    y: NDArray[np.float32]
+    variance: NDArray[np.float32]
+    level: Array
+    inside: Array
+    outside: Array
+
+    @classmethod
+    def of(cls, data: CaptureData, a: Array, good: NDArray[np.bool_]) -> Whitened:
+        """Pixels `good` (rows, columns) against rows a (L, K) of the model."""
+        rows, keep = data.values_per_pixel, data.row_counts
+        part = np.ix_(keep, good.reshape(-1))
+        y = data.signal.reshape(rows, -1)[part]
+        variance = data.variance().reshape(rows, -1)[part].astype(np.float32)
+        mean = np.mean(variance, axis=1, dtype=float)
+        level = np.sqrt(np.maximum(mean, 1e-3 * mean.max()))
+        u, power, _ = np.linalg.svd(a[keep] / level[:, None], full_matrices=True)
+        rank = int(np.sum(power > 1e-8 * power[0]))
+        y /= level[:, None].astype(np.float32)
+        variance /= (level[:, None] ** 2).astype(np.float32)
+        return cls(y, variance, level, u[:, :rank], u[:, rank:])
+
+    def rest(self, clean: NDArray[np.bool_]) -> Array:
+        """Projection (L, L) on what neither the model reaches nor the residual of the `clean` pixels has in common."""
+        r = self.outside @ (self.outside.T @ self.y[:, clean])
+        scale = robust_scale(r)
+        inner = self.outside.T @ np.clip(r, -CUT * scale, CUT * scale)
+        value, vector = np.linalg.eigh(inner @ inner.T / inner.shape[1])
+        # Largest eigenvalue of noise over the median one (Marchenko and Pastur).
+        edge = STRUCTURE * (1 + np.sqrt(len(value) / inner.shape[1])) ** 2
+        # At least half of the directions are left to tell what noise is.
+        half = len(value) // 2
+        structure = self.outside @ vector[:, half:][:, value[half:] > edge * np.median(value)]
+        return np.asarray(self.outside @ self.outside.T - structure @ structure.T)
+
+
+def robust_scale(r: NDArray[np.floating]) -> Array:
+    """Robust standard deviation (L, 1) of every row."""
+    return np.asarray(np.maximum(np.median(np.abs(r), axis=1, keepdims=True) / NORMAL_MAD, 1e-12))

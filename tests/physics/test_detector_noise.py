@@ -1,0 +1,99 @@
+"""The detector's noise is found from the images themselves, told where it is not as declared, and then counted with."""
+
+import numpy as np
+import pytest
+
+from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.captured.screening import screened
+from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.run import diagnose_captures
+from processing.diagnosis.instrument.structure import residual
+from processing.diagnosis.search.fit import minimize
+from processing.diagnosis.search.space import Space
+from processing.instrument.model import InstrumentModel
+from processing.storage.capture import Capture
+from processing.storage.capture_schema import Sample
+from simulators.blind.detector_cases import DETECTOR
+from simulators.blind.suite import state_angles
+from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
+
+STATES = 40
+OPTICS = "instruments/rgb950.yaml"
+
+
+@pytest.fixture
+def taken(tmp_path, configs):
+    def capture(bench: Bench, air: bool, seed: int = 3, states: int = STATES):
+        random = np.random.default_rng(seed)
+        angles = state_angles(states, False, False)
+        light = expose(bench, Scene(random, np.eye(4) if air else None), angles)
+        path, sample = tmp_path / "capture.h5", Sample(kind="air" if air else "unknown")
+        write_capture(path, bench, digitize(bench, light, random), angles, sample, (configs / OPTICS).read_text())
+        return path
+
+    return capture
+
+
+def read(path, configs) -> tuple[CaptureData, dict[str, float], float]:
+    """The screened capture, the tests of its residual against the model as declared, and chi-square."""
+    model = InstrumentModel.load(configs / OPTICS).at(662)
+    with Capture(path) as capture:
+        data = screened(read_capture(capture, model), model, lambda line: None)
+    problem = InstrumentProblem(model, [data])
+    fit = minimize(problem, Space(()), np.zeros(0))
+    tests = residual(problem, 0, Space(()), fit).tests
+    return data, tests, float(1 + fit.sums.excess.sum() / fit.sums.freedom.sum())
+
+
+def spoiled(name: str, seed: int, **bench) -> Bench:
+    out = Bench(**{"rows": 40, "columns": 40} | bench)
+    if name in DETECTOR:
+        DETECTOR[name](out, np.random.default_rng(seed), STATES)
+    elif name == "row_noise_10_e":
+        out.noise.append(lambda e, r: e + 10.0 * r.standard_normal((*e.shape[:2], 1)))
+    return out
+
+
+@pytest.mark.parametrize("air", [True, False])
+@pytest.mark.parametrize(
+    ("name", "bench", "words"),
+    [
+        ("nothing", {}, None),
+        ("gain_misstated", {}, "of a gain of 0.5"),
+        ("gain_not_stated", {}, None),
+        ("resampled", {}, "resampled"),
+        ("row_noise_10_e", {}, "every row of a frame"),
+        ("read_noise_doubled", {"electrons": 400.0}, "as of a read noise of"),
+    ],
+)
+def test_noise_is_told_and_does_not_alarm(taken, configs, name, bench, words, air):
+    data, tests, chi2 = read(taken(spoiled(name, 3, **bench), air), configs)
+    assert len(data.noise_told) == (words is not None), data.noise_told
+    assert words is None or words in data.noise_told[0], data.noise_told
+    assert data.noise_estimated == (name == "gain_not_stated")
+    assert max(tests.values()) < 5, tests
+    assert chi2 == pytest.approx(1.0, abs=0.03)
+
+
+def test_optics_are_judged_with_the_noise_that_is_found(taken, configs):
+    """A gain that is misstated, beside a plate 2 degrees off: both are told, each as what it is."""
+    bench = spoiled("gain_misstated", 3, rows=24, columns=24, dg=np.deg2rad(127.12 + 2.0))
+    judged, _ = diagnose_captures([taken(bench, air=True, states=18)], InstrumentModel.load(configs / OPTICS))
+    d = judged.diagnosis
+    assert d.noise is not None
+    assert d.noise.verdict == "not_as_declared"
+    assert d.verdict == "explained"
+    (effect,) = d.effects
+    assert (effect.kind, effect.confident) == ("psg_retardance", True)
+    assert d.error_after.chi2_reduced == pytest.approx(1.0, abs=0.03)
+
+
+def test_a_fault_of_the_optics_is_no_noise(taken, configs):
+    """Not an image that wanders, a bent response, a source that flickers, or all of them."""
+    bench = Bench(rows=40, columns=40, og=np.deg2rad(-16.0))
+    bench.level.append(lambda k, a: 1 + 0.02 * np.sin(1.7 * k**2))
+    bench.shift.append(lambda k, a: (0.4 * np.cos(a["psa"]), 0.4 * np.sin(a["psa"])))
+    bench.transfer.append(lambda e: e - 3e-6 * e**2)
+    data, _, _ = read(taken(bench, air=False), configs)
+    assert not data.noise_told
