@@ -79,7 +79,7 @@ def _factors(found: DetectorNoise, shown: float, estimated: bool) -> tuple[float
     """Factors on the variance with and without light; one where the images agree with what is declared."""
     both = np.array([found.shot, found.dark]) / shown
     white = found.white / shown
-    inverse = np.linalg.inv(found.covariance / shown**2)
+    inverse = np.asarray(np.linalg.inv(found.covariance / shown**2), dtype=float)
     if estimated:
         return _balanced(found, white, max(float(both[1]), LEAST_DARK))
     usual = 1.0, 1.0

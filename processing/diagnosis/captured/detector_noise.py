@@ -154,7 +154,7 @@ def _levels(r: Array, light: Array, dark: Array, free: float) -> tuple[float, fl
     first, second = _pairs(r, FAR[0], 2)
     half = (first - second) ** 2 / 2
     used = np.isfinite(half)
-    design = np.stack([sum(_pairs(x, FAR[0], 2))[used] / 2 for x in (light, dark)], axis=1)
+    design = np.stack([np.mean(_pairs(x, FAR[0], 2), axis=0)[used] for x in (light, dark)], axis=1)
     found = np.ones(2)
     for _ in range(3):
         weight = 1 / (design @ np.maximum(found, 0.01)) ** 2

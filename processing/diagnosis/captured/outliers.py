@@ -58,8 +58,8 @@ def outliers_of(data: CaptureData, a: Array) -> Outliers:
     for _ in range(2):
         rest = white.rest(clean)
         # In standard deviations as the image itself shows them: what is declared of the noise is not asked.
-        t = (rest.astype(np.float32) @ white.y) / sigma
-        t /= robust_scale(t[:, clean]).astype(np.float32)
+        r = rest.astype(np.float32) @ white.y / sigma
+        t = np.asarray(r / robust_scale(r[:, clean]), dtype=np.float32)
         struck, noisy = _hits(t, rest)
         clean = (np.max(np.abs(t), axis=0) < HIT) & ~struck.any(axis=0)
         if clean.all() or clean.sum() < FEWEST_PIXELS:
