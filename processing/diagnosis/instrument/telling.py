@@ -61,14 +61,13 @@ def told_effects(problem: InstrumentProblem, cause: Cause, doubt: str | None) ->
     """A cause as it is told, given a reason to doubt it; one for each capture in which it shows."""
     answer, probability = told_answer(cause, doubt)
     told = []
-    strength = [
-        float(np.max(np.abs(v) / np.sqrt(np.diag(s)), initial=0.0))
-        for v, s in zip(cause.values, cause.covariance, strict=True)
-    ]
+    # Of one with values of its own in every capture, those captures are told in which it shows.
+    pairs = zip(cause.values, cause.covariance, strict=True)
+    shown = [float(v @ np.linalg.solve(s, v)) / _least_shown(v.size) for v, s in pairs]
     for candidate, values, covariance, size in zip(
-        cause.candidates, cause.values, cause.covariance, strength, strict=True
+        cause.candidates, cause.values, cause.covariance, shown, strict=True
     ):
-        if len(strength) > 1 and size < 3 and size < max(strength):
+        if size < min(1.0, max(shown)):
             continue
         told.append(
             FoundEffect(
@@ -87,6 +86,11 @@ def told_effects(problem: InstrumentProblem, cause: Cause, doubt: str | None) ->
             )
         )
     return told
+
+
+def _least_shown(values: int) -> float:
+    """Chi-square from which on so many values are not zero: three standard deviations."""
+    return max(9.0, values + 3 * float(np.sqrt(2 * values)))
 
 
 def told_answer(cause: Cause, doubt: str | None) -> tuple[Answer, float]:
