@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from processing.diagnosis.instrument.mueller_slopes import mueller_slopes
 from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.systematic import ELEMENTS
 from processing.diagnosis.instrument.whole_bench import Solution
 from processing.diagnosis.search.fit import Fit
+from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.result import Check
 from processing.diagnosis.search.space import Space
+from processing.instrument.effects.base import FieldEffect, Switch
 
 #: Growth of the residual that is still put down to chance.
 WORSE = 1.002
@@ -18,8 +22,8 @@ WORSE_CONDITION = 1.5
 RANK = 1e-6
 
 
-def checks(problem: InstrumentProblem, solved: Solution) -> tuple[Check, ...]:
-    """Held-out residual, rank and condition of W, before and after."""
+def checks(problem: InstrumentProblem, found: Posterior, solved: Solution) -> tuple[Check, ...]:
+    """Held-out residual, predicted error of M, rank and condition of W, before and after."""
     stretch = _stretch(problem, solved)
     before, after = 100 * solved.before.rms, 100 * solved.after.rms / stretch
     out = [
@@ -30,6 +34,8 @@ def checks(problem: InstrumentProblem, solved: Solution) -> tuple[Check, ...]:
             holds=bool(after <= WORSE * before),
         )
     ]
+    told, off = predicted_error(problem, found, solved)
+    out.append(Check(name="predicted error of M/m00, rms", before=off, after=told, holds=bool(told <= off)))
     for k, data in enumerate(problem.captures):
         (rank, condition), (new_rank, new_condition) = (
             _of_rows(problem, k, space, fit)
@@ -46,6 +52,21 @@ def checks(problem: InstrumentProblem, solved: Solution) -> tuple[Check, ...]:
             )
         )
     return tuple(out)
+
+
+def predicted_error(problem: InstrumentProblem, found: Posterior, solved: Solution) -> tuple[float, float]:
+    """Rms error of M/m00 of these captures that the posterior expects with the correction, and without it."""
+    part = dict(zip(found.space.candidates, found.space.slices, strict=True))
+    space = Space(tuple(c for c in solved.effects if not isinstance(c.effect, FieldEffect | Switch)))
+    if not space.size:
+        return 0.0, 0.0
+    index = np.concatenate([np.r_[part[c]] for c in space.candidates])
+    mean = found.values[index]
+    products, light = mueller_slopes(problem, space, mean)
+    left = float(np.sum(products * found.covariance[np.ix_(index, index)]))
+    removed = float(mean @ products @ mean)
+    scale = max(light, 1e-300) * ELEMENTS
+    return float(np.sqrt(max(left, 0.0) / scale)), float(np.sqrt(max(left + removed, 0.0) / scale))
 
 
 def refusal(found: tuple[Check, ...]) -> str | None:

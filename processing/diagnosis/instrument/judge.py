@@ -73,7 +73,7 @@ def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
         after = tuple(residual(asked, k, solved.space, solved.fit) for k in captures)
     else:
         units = np.ones(len(after))
-    guard = checks(asked, solved)
+    guard = checks(asked, found, solved)
     refused = f"change this first: {wiring.told}" if wiring is not None else refusal(guard)
     structure = _structure(problem, after)
     left = float(sum(r.left / u for r, u in zip(after, units, strict=True))) if structure else 0.0
