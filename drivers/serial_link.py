@@ -8,7 +8,7 @@ import os
 import termios
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self, TypeVar
@@ -321,6 +321,16 @@ class LineRegistry:
                 )
             self._lines[key] = (line, users + 1)
             return line
+
+    @contextlib.contextmanager
+    def taken(self, port: str, kind: type[L], make: Callable[[Transcript | None], L]) -> Iterator[L]:
+        """Take a line for a device that is opened inside the block; it is given back if that fails."""
+        line = self.take(port, kind, make)
+        try:
+            yield line
+        except BaseException:
+            self.release(port)
+            raise
 
     def release(self, port: str) -> None:
         """Give a line back; the last user closes it."""

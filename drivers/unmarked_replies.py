@@ -1,23 +1,33 @@
-"""Questions over lines whose replies carry neither address nor question: only order and form tell whose they are."""
+"""Questions over lines whose replies do not tell which question they answer: order and form alone tell it."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from typing import TypeVar
 
 from drivers.errors import ReplyError, ReplyTimeout
 from drivers.serial_link import SerialLink
 
+T = TypeVar("T")
+
 
 def ask(
-    link: SerialLink, question: bytes, form: re.Pattern[str], reply_s: float, asked: str, what_to_check: str
-) -> str:
-    """Ask a question and return the first reply of the given form; once more if none came.
+    link: SerialLink,
+    question: bytes,
+    read: Callable[[bytes], T | None],
+    reply_s: float,
+    asked: str,
+    what_to_check: str,
+    tries: int = 2,
+) -> T:
+    """Ask a question and return what is read from the first reply to it; again if none came.
 
     Parameters
     ----------
     question : bytes to write.
-    form : what the whole reply looks like, without its line end.
-    reply_s : longest wait, for each of the two tries.
+    read : gets each frame and returns what it says, or None if it is no reply to this question.
+    reply_s : longest wait, for each of the tries.
     asked, what_to_check : for the messages.
 
     Raises
@@ -25,18 +35,27 @@ def ask(
     ReplyTimeout, ReplyError
     """
     seen: list[bytes] = []
-    for _ in range(2):
+    for _ in range(tries):
         with link.lock:
             # What waits here was not asked for now.
             link.purge(0.0)
             link.write(question)
             deadline_s = link.clock.now_s() + reply_s
             while (frame := link.read_frame(deadline_s)) is not None:
-                text = frame.decode("ascii", "replace").strip()
-                if form.fullmatch(text):
-                    return text
+                if (reply := read(frame)) is not None:
+                    return reply
                 seen.append(frame)
             link.purge()
     if seen:
-        raise ReplyError(asked, f"no valid reply, but {seen[:3]}", "Check cable and baud rate")
+        raise ReplyError(asked, f"no valid reply, but {seen[:3]}", what_to_check)
     raise ReplyTimeout(asked, f"nothing within {reply_s} s", what_to_check)
+
+
+def text_of(form: re.Pattern[str]) -> Callable[[bytes], str | None]:
+    """Read a line of text that has a form as a whole."""
+
+    def read(frame: bytes) -> str | None:
+        text = frame.decode("ascii", "replace").strip()
+        return text if form.fullmatch(text) else None
+
+    return read

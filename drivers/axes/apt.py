@@ -11,15 +11,17 @@ from __future__ import annotations
 import logging
 import struct
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 from pydantic import Field
 
 from drivers.apt_frames import REPLY_NAMES, apt_framer, long_message, short_message
 from drivers.clock import Clock
-from drivers.errors import CommandRejected, ReplyError, ReplyTimeout, WrongDevice
+from drivers.errors import CommandRejected, ReplyError, WrongDevice
 from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
 from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed
+from drivers.unmarked_replies import ask
 
 log = logging.getLogger(__name__)
 
@@ -68,11 +70,11 @@ class Config(AxisConfig):
 class APTLine:
     """The port of one APT unit."""
 
-    def __init__(
-        self, port: str, reply_s: float, transcript: Transcript | None, clock: Clock, held_by: str | None = None
-    ) -> None:
-        self.link = SerialLink(port, 115_200, apt_framer, transcript=transcript, clock=clock, held_by=held_by)
-        self.reply_s = reply_s
+    def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
+        self.link = SerialLink(
+            config.port, 115_200, apt_framer, transcript=transcript, clock=clock, held_by=config.held_by
+        )
+        self.reply_s = config.reply_s or 0.5
         # The vendor's order of opening: a unit that is not reset so can stay silent.
         self.link.set_rts(True)
         clock.sleep_s(0.05)
@@ -91,25 +93,15 @@ class APTLine:
         ------
         ReplyTimeout, ReplyError
         """
-        seen: list[bytes] = []
-        for _ in range(2):
-            with self.link.lock:
-                # Replies carry no id of their request: drop what waits, it was not asked for now.
-                self.link.purge(0.0)
-                self.link.write(request)
-                deadline_s = self.link.clock.now_s() + self.reply_s
-                while (frame := self.link.read_frame(deadline_s)) is not None:
-                    # All but the hardware information start with the channel, which is 1.
-                    whole = reply_id == 0x0006 or frame[6:8] == b"\x01\x00"
-                    if whole and int.from_bytes(frame[:2], "little") == reply_id:
-                        return frame[6:]
-                    seen.append(frame)
-                self.link.purge()
+
+        def data_of(frame: bytes) -> bytes | None:
+            # All but the hardware information start with the channel, which is 1.
+            whole = reply_id == 0x0006 or frame[6:8] == b"\x01\x00"
+            return frame[6:] if whole and int.from_bytes(frame[:2], "little") == reply_id else None
+
         asked = f"APT {self.link.port}, {REPLY_NAMES.get(reply_id, hex(reply_id))}"
         advice = "Is it an APT unit, and the only program on it? A frozen unit needs its power switched off and on"
-        if seen:
-            raise ReplyError(asked, f"no valid reply, but {[frame.hex(' ') for frame in seen[:3]]}", advice)
-        raise ReplyTimeout(asked, f"nothing within {self.reply_s} s", advice)
+        return ask(self.link, request, data_of, self.reply_s, asked, advice)
 
 
 class APTAxis(MotionAxis):
@@ -246,13 +238,6 @@ class APTAxis(MotionAxis):
 
 def open(name: str, config: Config, lines: LineRegistry) -> APTAxis:
     """Open one unit; reads its identity, homing parameters and speed and moves nothing."""
-    line = lines.take(
-        config.port,
-        APTLine,
-        lambda transcript: APTLine(config.port, config.reply_s or 0.5, transcript, lines.clock, config.held_by),
-    )
-    try:
+    make = partial(APTLine, config, lines.clock)
+    with lines.taken(config.port, APTLine, make) as line:
         return APTAxis(name, config, line, lines)
-    except BaseException:
-        lines.release(config.port)
-        raise

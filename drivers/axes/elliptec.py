@@ -65,11 +65,11 @@ class Config(SessionReferenceConfig):
 class ElliptecLine:
     """Up to 16 modules on one line; replies are sorted by address and letters."""
 
-    def __init__(
-        self, port: str, reply_s: float, transcript: Transcript | None, clock: Clock, held_by: str | None = None
-    ) -> None:
-        self.link = SerialLink(port, 9600, line_framer, transcript=transcript, clock=clock, held_by=held_by)
-        self.reply_s = reply_s
+    def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
+        self.link = SerialLink(
+            config.port, 9600, line_framer, transcript=transcript, clock=clock, held_by=config.held_by
+        )
+        self.reply_s = config.reply_s or 0.6
         # Last message of each module that nobody had asked for: the end of its move.
         self.ended: dict[str, tuple[str, str]] = {}
         self._unanswered_stops: Counter[str] = Counter()
@@ -280,13 +280,6 @@ class ElliptecAxis(SessionReferenceAxis):
 
 def open(name: str, config: Config, lines: LineRegistry) -> ElliptecAxis:
     """Open one module; reads its identity and velocity and moves nothing."""
-    line = lines.take(
-        config.port,
-        ElliptecLine,
-        lambda transcript: ElliptecLine(config.port, config.reply_s or 0.6, transcript, lines.clock, config.held_by),
-    )
-    try:
+    make = partial(ElliptecLine, config, lines.clock)
+    with lines.taken(config.port, ElliptecLine, make) as line:
         return ElliptecAxis(name, config, line, lines)
-    except BaseException:
-        lines.release(config.port)
-        raise

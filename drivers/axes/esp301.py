@@ -8,6 +8,7 @@ whether an axis is homed. Use RS-232: USB is reported unusable on Linux.
 from __future__ import annotations
 
 import re
+from functools import partial
 from typing import ClassVar, Literal
 
 from pydantic import Field
@@ -17,7 +18,7 @@ from drivers.errors import CommandRejected, ReplyError, WrongDevice
 from drivers.motion import AxisIdentity
 from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
 from drivers.session_reference import SessionReferenceAxis, SessionReferenceConfig
-from drivers.unmarked_replies import ask
+from drivers.unmarked_replies import ask, text_of
 
 ERRORS = {6: "no such command", 7: "parameter out of range", 9: "axis out of range", 37: "axis number missing"}
 AXIS_ERRORS = {
@@ -61,20 +62,17 @@ class Config(SessionReferenceConfig):
 class ESP301Line:
     """The port of one controller, shared by its axes."""
 
-    def __init__(
-        self,
-        port: str,
-        baudrate: int,
-        rtscts: bool,
-        reply_s: float,
-        transcript: Transcript | None,
-        clock: Clock,
-        held_by: str | None = None,
-    ) -> None:
+    def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
         self.link = SerialLink(
-            port, baudrate, line_framer, rtscts=rtscts, transcript=transcript, clock=clock, held_by=held_by
+            config.port,
+            config.baudrate,
+            line_framer,
+            rtscts=config.rtscts,
+            transcript=transcript,
+            clock=clock,
+            held_by=config.held_by,
         )
-        self.reply_s = reply_s
+        self.reply_s = config.reply_s or 2.0
         # The controller has one error memory for all axes, and reading takes out: each axis's own are kept here.
         self._errors: dict[int, list[int]] = {}
 
@@ -94,7 +92,7 @@ class ESP301Line:
         ReplyTimeout, ReplyError
         """
         asked, check = f"ESP301 {self.link.port}, {command}", "Check power, cable, baud rate and RTS/CTS"
-        return ask(self.link, f"{command}\r".encode("ascii"), form, self.reply_s, asked, check)
+        return ask(self.link, f"{command}\r".encode("ascii"), text_of(form), self.reply_s, asked, check)
 
     def take_errors(self, axis: int) -> list[int]:
         """Empty the controller's error memory and return what concerns an axis, oldest first.
@@ -214,15 +212,6 @@ class ESP301Axis(SessionReferenceAxis):
 
 def open(name: str, config: Config, lines: LineRegistry) -> ESP301Axis:
     """Open one axis; reads its identity, limits and speed and moves nothing."""
-    line = lines.take(
-        config.port,
-        ESP301Line,
-        lambda transcript: ESP301Line(
-            config.port, config.baudrate, config.rtscts, config.reply_s or 2.0, transcript, lines.clock, config.held_by
-        ),
-    )
-    try:
+    make = partial(ESP301Line, config, lines.clock)
+    with lines.taken(config.port, ESP301Line, make) as line:
         return ESP301Axis(name, config, line, lines)
-    except BaseException:
-        lines.release(config.port)
-        raise

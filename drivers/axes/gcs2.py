@@ -9,6 +9,7 @@ Unverified on hardware: everything; that `FRF` wants the servo on, and that limi
 from __future__ import annotations
 
 import re
+from functools import partial
 from typing import Literal
 
 from pydantic import Field
@@ -17,7 +18,7 @@ from drivers.clock import Clock
 from drivers.errors import CommandRejected, NotHomedError, ReplyError, WrongDevice
 from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
 from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
-from drivers.unmarked_replies import ask
+from drivers.unmarked_replies import ask, text_of
 
 ERRORS = {
     1: "parameter syntax error",
@@ -52,7 +53,7 @@ class Config(AxisConfig):
 class GCS2Line:
     """The port of one controller, shared by its axes."""
 
-    def __init__(self, config: Config, transcript: Transcript | None, clock: Clock) -> None:
+    def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
         self.link = SerialLink(
             config.port, config.baudrate, line_framer, transcript=transcript, clock=clock, held_by=config.held_by
         )
@@ -74,7 +75,7 @@ class GCS2Line:
         ReplyTimeout, ReplyError
         """
         asked = f"GCS2 {self.link.port}, {command!r}"
-        return ask(self.link, _bytes(command), form, self.reply_s, asked, "Check power, cable and baud rate")
+        return ask(self.link, _bytes(command), text_of(form), self.reply_s, asked, "Check power, cable and baud rate")
 
 
 def _bytes(command: str) -> bytes:
@@ -183,9 +184,6 @@ class GCS2Axis(MotionAxis):
 
 def open(name: str, config: Config, lines: LineRegistry) -> GCS2Axis:
     """Open one axis; reads its identity, limits and speed and moves nothing."""
-    line = lines.take(config.port, GCS2Line, lambda transcript: GCS2Line(config, transcript, lines.clock))
-    try:
+    make = partial(GCS2Line, config, lines.clock)
+    with lines.taken(config.port, GCS2Line, make) as line:
         return GCS2Axis(name, config, line, lines)
-    except BaseException:
-        lines.release(config.port)
-        raise

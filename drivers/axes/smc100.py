@@ -8,6 +8,7 @@ PR50CC as a member of it.
 from __future__ import annotations
 
 import re
+from functools import partial
 from typing import ClassVar, Literal
 
 from pydantic import Field
@@ -16,6 +17,7 @@ from drivers.clock import Clock
 from drivers.errors import CommandRejected, DeviceError, NotHomedError, ReplyError, ReplyTimeout, WrongDevice
 from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
 from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed, line_framer
+from drivers.unmarked_replies import ask
 
 ERRORS = {
     "A": "unknown message or bad address",
@@ -87,19 +89,17 @@ class Config(AxisConfig):
 class SMC100Line:
     """One line of controllers; replies are matched by address and command letters."""
 
-    def __init__(
-        self,
-        port: str,
-        baudrate: int,
-        reply_s: float,
-        transcript: Transcript | None,
-        clock: Clock,
-        held_by: str | None = None,
-    ) -> None:
+    def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
         self.link = SerialLink(
-            port, baudrate, line_framer, xonxoff=True, transcript=transcript, clock=clock, held_by=held_by
+            config.port,
+            config.baudrate,
+            line_framer,
+            xonxoff=True,
+            transcript=transcript,
+            clock=clock,
+            held_by=config.held_by,
         )
-        self.reply_s = reply_s
+        self.reply_s = config.reply_s or 0.5
 
     def close(self) -> None:
         """Close the port."""
@@ -116,36 +116,21 @@ class SMC100Line:
         ------
         ReplyTimeout, ReplyError
         """
-        with self.link.lock:
-            reply, seen = self._exchange(address, command, value, reply_s or self.reply_s)
-            if reply is None and reply_s is None:
-                reply, seen = self._exchange(address, command, value, self.reply_s)
-        if reply is not None:
-            return reply
-        asked = f"SMC100 {self.link.port} address {address}, {command}"
-        if seen:
-            raise ReplyError(asked, f"no valid reply, but {seen[:3]}", "Check cable, baud rate and addresses")
-        raise ReplyTimeout(
-            asked, f"nothing within {reply_s or self.reply_s} s", "Check power, cable, baud rate, address"
-        )
-
-    def _exchange(
-        self, address: int, command: str, value: re.Pattern[str], reply_s: float
-    ) -> tuple[str | None, list[bytes]]:
-        link = self.link
-        seen: list[bytes] = []
-        # Replies carry no id: one that waits here already belongs to an earlier question.
-        link.purge(0.0)
-        self.send(address, command)
-        deadline_s = link.clock.now_s() + reply_s
         start = f"{address}{command[:2]}"
-        while (frame := link.read_frame(deadline_s)) is not None:
-            text = frame.decode("ascii", "replace")
-            if text.startswith(start) and value.fullmatch(text[len(start) :].strip()):
-                return text[len(start) :].strip(), seen
-            seen.append(frame)
-        link.purge()
-        return None, seen
+
+        def value_of(frame: bytes) -> str | None:
+            said = frame.decode("ascii", "replace")
+            behind = said.removeprefix(start).strip()
+            return behind if said.startswith(start) and value.fullmatch(behind) else None
+
+        question, asked = (
+            f"{address}{command}\r\n".encode("ascii"),
+            f"SMC100 {self.link.port} address {address}, {command}",
+        )
+        # Who sets a time asks again by itself.
+        tries = 2 if reply_s is None else 1
+        check = "Check power, cable, baud rate, address"
+        return ask(self.link, question, value_of, reply_s or self.reply_s, asked, check, tries)
 
 
 _STATE = re.compile(r"[0-9A-Fa-f]{6}")
@@ -291,15 +276,6 @@ class SMC100Axis(MotionAxis):
 
 def open(name: str, config: Config, lines: LineRegistry) -> SMC100Axis:
     """Open one axis; reads its identity, limits and speed and moves nothing."""
-    line = lines.take(
-        config.port,
-        SMC100Line,
-        lambda transcript: SMC100Line(
-            config.port, config.baudrate, config.reply_s or 0.5, transcript, lines.clock, config.held_by
-        ),
-    )
-    try:
+    make = partial(SMC100Line, config, lines.clock)
+    with lines.taken(config.port, SMC100Line, make) as line:
         return SMC100Axis(name, config, line, lines)
-    except BaseException:
-        lines.release(config.port)
-        raise

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 from pydantic import Field
@@ -65,7 +66,7 @@ class Config(SessionReferenceConfig):
 class StandaLine:
     """The port of one controller."""
 
-    def __init__(self, config: Config, transcript: Transcript | None, clock: Clock) -> None:
+    def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
         self.link = SerialLink(
             config.port,
             115_200,
@@ -271,9 +272,6 @@ def _words(flags: int) -> list[str]:
 
 def open(name: str, config: Config, lines: LineRegistry) -> StandaAxis:
     """Open one axis; reads identity, speeds and borders and moves nothing."""
-    line = lines.take(config.port, StandaLine, lambda transcript: StandaLine(config, transcript, lines.clock))
-    try:
+    make = partial(StandaLine, config, lines.clock)
+    with lines.taken(config.port, StandaLine, make) as line:
         return StandaAxis(name, config, line, lines)
-    except BaseException:
-        lines.release(config.port)
-        raise

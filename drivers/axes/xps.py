@@ -11,7 +11,9 @@ compare is refused. The unit must be degrees, which is not asked.
 
 from __future__ import annotations
 
+import contextlib
 import re
+from functools import partial
 from typing import ClassVar, Literal
 
 from pydantic import Field
@@ -20,7 +22,7 @@ from drivers.clock import Clock
 from drivers.errors import CommandRejected, LimitError, NotHomedError, ReplyError, ReplyTimeout, WrongDevice
 from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
 from drivers.serial_link import LineRegistry, SerialLink, Transcript, agreed
-from drivers.unmarked_replies import ask
+from drivers.unmarked_replies import ask, text_of
 
 END = b",EndOfAPI"
 READY = range(10, 19)
@@ -67,7 +69,7 @@ def framer(buffer: bytearray) -> bytes | None:
 class XPSLine:
     """The connection for questions, shared by the axes of one controller."""
 
-    def __init__(self, config: Config, transcript: Transcript | None, clock: Clock) -> None:
+    def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
         self.link = SerialLink(config.port, 9600, framer, transcript=transcript, clock=clock, held_by=config.held_by)
         self.reply_s = config.reply_s or 1.0
 
@@ -83,7 +85,7 @@ class XPSLine:
         CommandRejected, ReplyTimeout, ReplyError
         """
         asked = f"XPS {self.link.port}, {call}"
-        whole = re.compile(rf"0,{form}|{_ERROR}")
+        whole = text_of(re.compile(rf"0,{form}|{_ERROR}"))
         answer = ask(self.link, call.encode("ascii"), whole, self.reply_s, asked, "Check power, cable and address")
         return _values(answer, asked)
 
@@ -279,14 +281,12 @@ class XPSAxis(MotionAxis):
 
 def open(name: str, config: Config, lines: LineRegistry) -> XPSAxis:
     """Open one axis; reads identity, limits and speed and moves nothing."""
-    line = lines.take(config.port, XPSLine, lambda transcript: XPSLine(config, transcript, lines.clock))
-    own: list[SerialLink] = []
-    try:
+    make = partial(XPSLine, config, lines.clock)
+    with lines.taken(config.port, XPSLine, make) as line, contextlib.ExitStack() as failed:
+        own: list[SerialLink] = []
         for _ in range(2):
             own.append(SerialLink(config.port, 9600, framer, clock=lines.clock))
-        return XPSAxis(name, config, line, lines, *own)
-    except BaseException:
-        for link in own:
-            link.close()
-        lines.release(config.port)
-        raise
+            failed.callback(own[-1].close)
+        axis = XPSAxis(name, config, line, lines, *own)
+        failed.pop_all()
+        return axis

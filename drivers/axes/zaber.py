@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import re
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 from pydantic import Field
@@ -110,17 +111,11 @@ def parse_reply(frame: bytes) -> Reply | None:
 class ZaberLine:
     """One chain of devices: sends commands, gives each reply to its request by address, axis and id."""
 
-    def __init__(
-        self,
-        port: str,
-        baudrate: int,
-        reply_s: float,
-        transcript: Transcript | None,
-        clock: Clock,
-        held_by: str | None = None,
-    ) -> None:
-        self.link = SerialLink(port, baudrate, line_framer, transcript=transcript, clock=clock, held_by=held_by)
-        self.reply_s = reply_s
+    def __init__(self, config: Config, clock: Clock, transcript: Transcript | None) -> None:
+        self.link = SerialLink(
+            config.port, config.baudrate, line_framer, transcript=transcript, clock=clock, held_by=config.held_by
+        )
+        self.reply_s = config.reply_s or 0.5
         # A stop from another thread takes an id at the same time: never the same one.
         self._message_ids = itertools.cycle(range(1, 100))
         # Devices set to answer without checksums (`comm.checksum` 0). From others such a reply is a damaged one.
@@ -320,15 +315,6 @@ class ZaberAxis(MotionAxis):
 
 def open(name: str, config: Config, lines: LineRegistry) -> ZaberAxis:
     """Open one axis; reads its identity, limits and speed and moves nothing."""
-    line = lines.take(
-        config.port,
-        ZaberLine,
-        lambda transcript: ZaberLine(
-            config.port, config.baudrate, config.reply_s or 0.5, transcript, lines.clock, config.held_by
-        ),
-    )
-    try:
+    make = partial(ZaberLine, config, lines.clock)
+    with lines.taken(config.port, ZaberLine, make) as line:
         return ZaberAxis(name, config, line, lines)
-    except BaseException:
-        lines.release(config.port)
-        raise

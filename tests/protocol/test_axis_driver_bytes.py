@@ -76,7 +76,7 @@ def test_zaber_exchange_sorts_out_what_is_not_its_reply() -> None:
         (b"/" + summed("2 1 02") + b"\n", b"@" + summed("02 1 02 OK BUSY WR 0") + b"\r\n"),
         (b"/" + summed("2 1 03 fly") + b"\n", b"@" + summed("02 1 03 RJ IDLE -- BADCOMMAND") + b"\r\n"),
     ) as path:
-        line = zaber.ZaberLine(path, 115200, 0.5, None, patient_clock())
+        line = zaber.ZaberLine(zaber.Config(port=path), patient_clock(), None)
         assert line.ask(2, 1, "get pos", repeat=True).data == "-77"
         assert line.ask(2, 1, "", repeat=True).busy
         with pytest.raises(CommandRejected, match="BADCOMMAND"):
@@ -110,7 +110,7 @@ def test_elliptec_real_captures() -> None:
 
 def test_elliptec_move_bytes() -> None:
     with scripted((b"0ma00008C00", b""), (b"0maFFFFE0E4", b"")) as path:
-        line = elliptec.ElliptecLine(path, 0.3, None, patient_clock())
+        line = elliptec.ElliptecLine(elliptec.Config(port=path), patient_clock(), None)
         for deg in (90.0, -20.0):
             line.start("0", f"ma{round(deg * 143360 / 360) & 0xFFFFFFFF:08X}", 0.0)
         line.close()
@@ -350,7 +350,7 @@ def test_zaber_replies_without_checksum_count_where_the_device_says_that_it_send
         # A checksum that is there must still be right.
         (b"/" + summed("1 1 05 get pos") + b"\n", b"@01 1 05 OK IDLE -- -77:00\r\n"),
     ) as path:
-        line = zaber.ZaberLine(path, 115200, 0.2, None, patient_clock())
+        line = zaber.ZaberLine(zaber.Config(port=path, reply_s=0.2), patient_clock(), None)
         assert [reply.data for reply in line.ask_all("get system.serial")] == ["4711"]
         assert line.ask(1, 1, "get pos", repeat=False).data == "-77"
         with pytest.raises(ReplyError):
@@ -365,7 +365,7 @@ def test_a_zaber_reply_that_lost_its_checksum_is_not_believed() -> None:
         (b"/" + summed("1 0 03 get comm.checksum") + b"\n", b"@" + summed("01 0 03 OK IDLE -- 1") + b"\r\n"),
         (b"/" + summed("1 1 04 get pos") + b"\n", b"@01 1 04 OK IDLE -- 7\r\n"),
     ) as path:
-        line = zaber.ZaberLine(path, 115200, 0.2, None, patient_clock())
+        line = zaber.ZaberLine(zaber.Config(port=path, reply_s=0.2), patient_clock(), None)
         assert line.ask_all("get system.serial") == []
         with pytest.raises(ReplyError):
             line.ask(1, 1, "get pos", repeat=False)
