@@ -10,6 +10,7 @@ from processing.commands import (
     camera,
     campaign,
     design,
+    exporting,
     geometry,
     importing,
     quantities,
@@ -33,6 +34,7 @@ reduce.register(app)
 report.register(app)
 campaign.register(app)
 design.register(app)
+exporting.register(app)
 geometry.register(app)
 reflectance.register(app)
 tables.register(app)

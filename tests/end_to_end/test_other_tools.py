@@ -7,6 +7,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import pandas
 import pytest
 import xarray as xr
 
@@ -150,3 +151,72 @@ def test_compressed_planes_are_plain_deflate_and_read_the_same(tmp_path):
         assert product.facts == {"rank": 16}
         np.testing.assert_array_equal(product.get("spread", slice(100, 111)), values["spread"][:, 100:111])
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.fixture
+def exported(product, capture, tmp_path, capsys):
+    """Runs `process export`; the files it names."""
+    from processing.commands.application import main
+
+    def run(which: str, *options: str) -> list[Path]:
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            main(["export", str({"product": product, "capture": capture}[which]), "--out", f"{tmp_path}/e", *options])
+        assert end.value.code == 0, capsys.readouterr().err
+        return [Path(line) for line in capsys.readouterr().out.split()]
+
+    return run
+
+
+def test_exported_numbers_are_the_same(exported, product, capture):
+    from astropy.io import fits
+    from PIL import Image
+    from scipy.io import loadmat
+
+    image, counts = open_dataset(product), open_dataset(capture)
+    mueller = image["mueller"].values
+    with Image.open(exported("product", "--to", "tiff", "--plane", "mueller")[0]) as tiff:
+        assert tiff.n_frames == 16
+        tiff.seek(6)
+        np.testing.assert_array_equal(np.asarray(tiff), mueller[1, 2])
+        assert "row 1, column 2" in tiff.tag_v2[270]
+    with Image.open(exported("capture", "--to", "tiff")[0]) as tiff:
+        tiff.seek(5)
+        np.testing.assert_array_equal(np.asarray(tiff), counts["counts"].values[5, 0])
+    mat = loadmat(exported("product", "--to", "mat")[0])
+    np.testing.assert_array_equal(mat["mueller"], mueller)
+    assert mat["units"]["mueller"][0, 0][0] == "count"
+    assert mat["about"]["simulated"][0, 0][0, 0] == 1
+    with fits.open(exported("capture", "--to", "fits")[0]) as hdus:
+        np.testing.assert_array_equal(hdus["counts"].data, counts["counts"].values)
+        np.testing.assert_array_equal(hdus["states"].data["psg_deg"], counts["psg_deg"].values)
+        assert hdus["counts"].header["BUNIT"] == "count"
+
+
+def test_exported_tables_read_back_exactly(exported, product, capture):
+    pixels = pandas.read_csv(exported("product", "--to", "csv")[0], comment="#")
+    image = open_dataset(product)
+    np.testing.assert_array_equal(pixels["mueller_1_2"].to_numpy(np.float32), image["mueller"].values[1, 2].ravel())
+    np.testing.assert_array_equal(pixels["y"].to_numpy().reshape(SHAPE)[3], 3)
+    path = exported("capture", "--to", "csv", "--overwrite")[0]
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+    assert len(lines) == 1 + STATES
+    assert "# simulated: 1" in path.read_text()
+    at = lines[0].split(",").index("psa_deg")
+    assert [float(line.split(",")[at]) for line in lines[1:]] == list(open_dataset(capture)["psa_deg"].values)
+
+
+def test_figures_are_written_and_nothing_is_replaced(exported, product, tmp_path, capsys):
+    from processing.commands.application import main
+
+    path = exported("product", "--to", "pdf", "--plane", "mueller_errors")[0]
+    assert path.read_bytes().startswith(b"%PDF")
+    for options, told in (
+        (["--to", "pdf"], "exists"),
+        (["--to", "doc"], "unknown format"),
+        (["--to", "csv", "--plane", "nothing"], "has no 'nothing'"),
+    ):
+        with pytest.raises(SystemExit) as end:
+            main(["export", str(product), "--out", f"{tmp_path}/e", *options])
+        assert end.value.code == 2
+        assert told in capsys.readouterr().err
