@@ -18,6 +18,7 @@ def problem(folder, configs, bench, told, air):
     random = np.random.default_rng(4)
     angles = state_angles(40, False, False)
     counts = digitize(bench, expose(bench, Scene(random, np.eye(4) if air else None), angles), random)
+    folder.mkdir(exist_ok=True)
     path, file = folder / "capture.h5", configs / "instruments/rgb950.yaml"
     write_capture(path, bench, counts, told(angles), Sample(kind="air" if air else "unknown"), file.read_text())
     model = InstrumentModel.load(file).at(662)
@@ -32,6 +33,8 @@ def problem(folder, configs, bench, told, air):
         (lambda a: a | {"psa": -a["psa"]}, "'psa' turns the other way"),
         (lambda a: {"psg": a["psa"], "psa": a["psg"]}, "each other's place"),
         (lambda a: a | {"psg": 2 * a["psg"]}, "'psg' are told in half degrees"),
+        (lambda a: {k: 2 * v for k, v in a.items()}, "'psa' and 'psg' are told in half degrees"),
+        (lambda a: {k: v / 2 for k, v in a.items()}, "'psa' and 'psg' are told in units of two degrees"),
         (lambda a: a | {"psa": a["psa"] * 4.91 / 5}, "5 instead of 4.91"),
         (lambda a: {k: np.roll(v, 1) for k, v in a.items()}, "one early"),
     ],
@@ -50,3 +53,33 @@ def test_what_is_no_mistake_is_not_called_one(configs, tmp_path, air, degrees):
     bench = Bench(og=np.deg2rad(-17.02 + degrees), dg=np.deg2rad(127.12 + degrees))
     bench.level.append(lambda k, a: 1 + 0.02 * np.sin(k))
     assert miswired(problem(tmp_path, configs, bench, lambda a: a, air)) is None
+
+
+@pytest.mark.parametrize("air", [True, False])
+def test_the_filter_of_another_wavelength_is_told(configs, tmp_path, air):
+    # The plates of this bench have the retardances of 451 nm; the file says 662.
+    bench = Bench(dg=np.deg2rad(130.01), da=np.deg2rad(143.13))
+    declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
+    found = miswired(problem(tmp_path, configs, bench, lambda a: a, air), declared)
+    if not air:
+        # Retardances are what an unknown sample absorbs: nothing is told, and nothing wrong.
+        assert found is None or "451" in found.told
+        return
+    assert found is not None
+    assert "the light is of 451 nm, not of 662" in found.told
+    assert "wavelength_nm: 451" in found.told
+
+
+def test_a_mistake_is_told_where_the_train_has_nominal_values(configs, tmp_path):
+    """Azimuths and retardances that `calibrate` leaves open do not mend an axis that turns the other way."""
+    bench = Bench(rows=9, columns=9, og=np.deg2rad(-3.0), dg=np.deg2rad(120.0), oa=np.deg2rad(30.0))
+    whole = problem(tmp_path, configs, bench, lambda a: a | {"psa": -a["psa"]}, air=True)
+    nominal = ("psg_retarder.azimuth_deg", "psg_retarder.retardance_deg", "psa_retarder.azimuth_deg")
+    whole.models = tuple(m.model_copy(update={"calibrate": nominal}) for m in whole.models)
+    whole.model = whole.models[0]
+    found = miswired(whole)
+    assert found is not None
+    assert "'psa' turns the other way" in found.told
+    straight = problem(tmp_path / "straight", configs, bench, lambda a: a, air=True)
+    straight.models, straight.model = whole.models, whole.model
+    assert miswired(straight) is None

@@ -34,6 +34,7 @@ from processing.diagnosis.search.posterior import Posterior, Say
 from processing.diagnosis.search.result import Diagnosis, Unexplained, Verdict
 from processing.diagnosis.search.rules import LIKELY
 from processing.instrument.effects.base import ValuePerState
+from processing.instrument.model import InstrumentModel
 
 #: Autocorrelation over the states, in standard deviations, from which on a residual of few pixels is not white.
 WHITE = 4.0
@@ -51,9 +52,12 @@ class Judged:
     after: tuple[Residual, ...]
 
 
-def diagnose(problem: InstrumentProblem, say: Say) -> Judged:
-    """Find the posterior, test what is left, guard the correction, and name causes."""
-    wiring = miswired(problem)
+def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | None = None) -> Judged:
+    """Find the posterior, test what is left, guard the correction, and name causes.
+
+    `declared` is the instrument at all the wavelengths of its file.
+    """
+    wiring = miswired(problem, declared)
     if wiring is not None:
         say(wiring.told)
         problem = wiring.problem

@@ -37,4 +37,4 @@ def diagnose_captures(
             models.append(model.nominal_at(capture.header.wavelength_nm))
             data.append(screened(read_capture(capture, models[-1]), models[-1], say))
     problem = InstrumentProblem(models, data)
-    return diagnose(problem, say), problem
+    return diagnose(problem, say, model), problem

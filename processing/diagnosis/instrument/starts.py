@@ -17,6 +17,8 @@ from processing.instrument.effects.base import SourceEffect, ValuePerState
 #: Relative rms residual above which nominal values, and what else has far starts, are searched for from many starts.
 FAR_OFF = 0.05
 STARTS = 24
+#: Relative rms residual below which no better start is looked for.
+NEAR_ENOUGH = 0.01
 #: Half widths of the starts of nominal values, in degrees: azimuths, which come round again; retardances of plates of a
 #: known order, and of elements of which no more than "some retardance" is known.
 ANY_AZIMUTH, NEAR, FAR = 90.0, 20.0, 120.0
@@ -54,15 +56,25 @@ def _searched(problem: InstrumentProblem, base: Space, pool: Sequence[Candidate]
     return _by_candidate(wide, _best_start(problem, wide, values, fit.excess))
 
 
-def _best_start(problem: InstrumentProblem, space: Space, values: Array, best: float) -> Array:
+def best_of_starts(problem: InstrumentProblem, space: Space, starts: int) -> Fit:
+    """The best fit of nominal values alone, from zero and, where that is far off, from so many places about it."""
+    fit = minimize(problem, space, np.zeros(space.size))
+    if rms(fit) < FAR_OFF:
+        return fit
+    return minimize(problem, space, _best_start(problem, space, fit.values, fit.excess, starts), expansions=0)
+
+
+def _best_start(problem: InstrumentProblem, space: Space, values: Array, best: float, starts: int = STARTS) -> Array:
     """The best of fits from `values` and from many places about zero, if one leaves less than `best`."""
     random, start = np.random.default_rng(0), values
-    for k in range(STARTS + 1):
+    for k in range(starts + 1):
         width = _widths(space, NEAR if k % 2 else FAR)
         here = random.uniform(-1, 1, space.size) * width if k else start
         tried = minimize(problem, space, here, expansions=0)
         if tried.excess < best:
             values, best = tried.values, tried.excess
+            if rms(tried) < NEAR_ENOUGH:
+                break
     return values
 
 

@@ -7,7 +7,7 @@ element a quarter turn off, angles told in other units, states that are one off,
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,12 +16,15 @@ import numpy as np
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.starts import FAR_OFF, STARTS, best_of_starts, rms
 from processing.diagnosis.search.rules import DECISIVE, WIRING
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
 
 #: Ratios of two gears that are taken for one another in rotating-retarder polarimeters.
 GEARS = {"5 instead of 4.91": 5 / 4.91, "4.91 instead of 5": 4.91 / 5}
+#: Places from which nominal values are fitted for each mistake.
+FEW_STARTS = 5
 
 
 @dataclass(frozen=True)
@@ -38,24 +41,43 @@ class Wiring:
         return f"{self.what}: {self.change}"
 
 
-def miswired(problem: InstrumentProblem) -> Wiring | None:
-    """The mistake without which far less is left over; None if there is none."""
-    if problem.nominal():
-        # Nominal values are far off by declaration.
-        return None
+def miswired(problem: InstrumentProblem, declared: InstrumentModel | None = None) -> Wiring | None:
+    """The mistake without which far less is left over; None if there is none.
+
+    Where the train has nominal values, each mistake is judged by what the best of them leave.
+
+    Parameters
+    ----------
+    declared : the instrument at all the wavelengths of its file.
+    """
     nothing = Space(())
-    start = _left(problem, nothing)
-    best, least = None, start / WIRING
-    for wiring in _mistakes(problem):
-        left = _left(wiring.problem, nothing)
-        if left < least and start - left > DECISIVE:
-            best, least = wiring, left
-    return best
+    start = _left(problem, nothing, np.zeros(0))
+    mistakes = [*_mistakes(problem), *_other_wavelengths(problem, declared)]
+    if problem.nominal():
+        start, lefts = _beside_nominal(problem, mistakes)
+    else:
+        lefts = [_left(w.problem, nothing, np.zeros(0)) for w in mistakes]
+    found = [(left, k) for k, left in enumerate(lefts) if left < start / WIRING and start - left > DECISIVE]
+    return mistakes[min(found)[1]] if found else None
 
 
-def _left(problem: InstrumentProblem, nothing: Space) -> float:
+def _beside_nominal(problem: InstrumentProblem, mistakes: Sequence[Wiring]) -> tuple[float, list[float]]:
+    """What the best nominal values leave without any mistake and with each; nothing where they are good as it is."""
+    whole = problem.at(problem.wavelengths_nm[0])
+    base = Space(whole.nominal())
+    fit = best_of_starts(whole, base, STARTS)
+    if rms(fit) < FAR_OFF:
+        return 0.0, []
+    lefts = []
+    for wiring in mistakes:
+        other = wiring.problem.at(problem.wavelengths_nm[0])
+        lefts.append(_left(other, base, best_of_starts(other, base, FEW_STARTS).values))
+    return _left(whole, base, fit.values), lefts
+
+
+def _left(problem: InstrumentProblem, space: Space, values: Array) -> float:
     """Chi-square that is left; its own scatter is no reason to believe in a mistake."""
-    sums = problem.sums(nothing, np.zeros(0), derivatives=False)
+    sums = problem.sums(space, values, derivatives=False)
     excess, freedom = float(sums.excess.sum()), float(sums.freedom.sum())
     if not problem.noise_known:
         return excess + freedom
@@ -65,17 +87,20 @@ def _left(problem: InstrumentProblem, nothing: Space) -> float:
 def _mistakes(problem: InstrumentProblem) -> Iterator[Wiring]:
     model = problem.model
     axes = model.axes
-    for group in ((a,) for a in axes):
-        yield _scaled(problem, group, -1.0, f"axis {group[0]!r} turns the other way")
+    for axis in axes:
+        yield _scaled(problem, (axis,), -1.0, f"axis {axis!r} turns the other way")
     if len(axes) == 2:
         yield _scaled(problem, axes, -1.0, "both axes turn the other way")
         swap = dict(zip(axes, reversed(axes), strict=True))
         elements = {e.name: {"axis": swap[e.axis]} for e in model.elements() if e.axis in swap}
         change = f"in the instrument file give each element the other axis ({axes[0]} and {axes[1]})"
         yield Wiring("the two axes are in each other's place", change, _with_values(problem, elements))
+    groups: list[tuple[str, ...]] = [*((a,) for a in axes), tuple(axes)]
+    for group in dict.fromkeys(groups):
+        which = " and ".join(repr(a) for a in group)
+        yield _scaled(problem, group, 0.5, f"angles of {which} are told in half degrees")
+        yield _scaled(problem, group, 2.0, f"angles of {which} are told in units of two degrees")
     for axis in axes:
-        yield _scaled(problem, (axis,), 0.5, f"angles of {axis!r} are told in half degrees")
-        yield _scaled(problem, (axis,), 2.0, f"angles of {axis!r} are told in units of two degrees")
         for name, factor in GEARS.items():
             yield _scaled(problem, (axis,), factor, f"axis {axis!r} was driven with a ratio of {name}")
     for element in model.elements():
@@ -89,6 +114,17 @@ def _mistakes(problem: InstrumentProblem) -> Iterator[Wiring]:
     yield Wiring("the states are in reverse order", "turn states.csv over", _with_states(problem, lambda v: v[::-1]))
     if model.mosaic is not None:
         yield from _turned_mosaics(problem)
+
+
+def _other_wavelengths(problem: InstrumentProblem, declared: InstrumentModel | None) -> Iterator[Wiring]:
+    """The light is of another wavelength than the captures say, of those that the instrument file has."""
+    told = set(problem.wavelengths_nm)
+    for wavelength in (declared.wavelengths_nm or ()) if declared is not None and len(told) == 1 else ():
+        if wavelength not in told:
+            at = declared.nominal_at(wavelength)  # type: ignore[union-attr]
+            what = f"the light is of {wavelength:g} nm, not of {told.copy().pop():g}"
+            change = f"in the capture (or the states file), wavelength_nm: {wavelength:g}"
+            yield Wiring(what, change, _changed(problem, lambda _, m=at: m))  # type: ignore[misc]
 
 
 def _scaled(problem: InstrumentProblem, axes: tuple[str, ...], factor: float, what: str) -> Wiring:
