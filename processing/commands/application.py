@@ -2,48 +2,26 @@
 
 from __future__ import annotations
 
+import pkgutil
 from collections.abc import Sequence
+from importlib import import_module
 
-from processing.commands import (
-    axostep,
-    calibrate,
-    camera,
-    campaign,
-    design,
-    exporting,
-    geometry,
-    importing,
-    quantities,
-    reduce,
-    reflectance,
-    report,
-    tables,
-    xi0,
-)
+import processing.commands as folder
 from processing.commands.command_line import Version, application, run
 
 app = application("process", "Captures to Mueller and Stokes images, reflectance, coherency eigenvalues and reports.")
-
-# One line a module that brings commands. It must not import anything heavy at its top: `--help` is fast.
-axostep.register(app)
-calibrate.register(app)
-camera.register(app)
-importing.register(app)
-quantities.register(app)
-reduce.register(app)
-report.register(app)
-campaign.register(app)
-design.register(app)
-exporting.register(app)
-geometry.register(app)
-reflectance.register(app)
-tables.register(app)
-xi0.register(app)
 
 
 @app.callback(no_args_is_help=True)
 def _process(version: Version = False) -> None:
     pass
+
+
+# Every module beside this one that has `register` brings commands. It must not import anything heavy at its top:
+# `--help` is fast.
+for _module in pkgutil.iter_modules(folder.__path__, f"{folder.__name__}."):
+    if _module.name != __name__ and not _module.ispkg and hasattr(import_module(_module.name), "register"):
+        import_module(_module.name).register(app)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -80,7 +80,7 @@ def design_command(
     noise = Noise(electrons, read_noise)
     counts = _counts(states)
     if optimize is not None and "angles" in optimize:
-        from processing.commands.design_angles import optimize_angles
+        from processing.commands.loaded_late.design_angles import optimize_angles
 
         chosen = optimize_angles(model, noise, counts, optimize, speed or (), weighted, jitter)
     elif optimize is not None:

@@ -41,11 +41,11 @@ def diagnose_command(
 
             raise ProcessError(f"{target} exists and is not replaced. Give another name.")
     if reflectance is not None or geometry is not None:
-        from processing.commands.diagnose_surface import diagnose_reflectance
+        from processing.commands.loaded_late.diagnose_surface import diagnose_reflectance
 
         diagnose_reflectance(captures, instrument, reflectance, geometry, write, json, report)
         return
-    from processing.commands.diagnose_summary import show
+    from processing.commands.loaded_late.diagnose_summary import show
     from processing.diagnosis.instrument.run import diagnose_captures
     from processing.instrument.model import InstrumentModel
 

@@ -14,6 +14,7 @@ from scipy.special import ndtr
 
 from processing.polarization.eigenvalue_noise import EigenvalueNoise
 from processing.polarization.quantities import deviation_from_td
+from processing.polarization.scalar_files import scalar_quantities
 
 Planes = dict[str, NDArray[Any]]
 
@@ -89,7 +90,8 @@ def limit_vectors(planes: Planes) -> None:
         for angle, vector in ANGLES.items():
             if angle in planes:
                 _forget(planes, angle, ~(planes[vector] > SEEN * planes[f"{vector}_errors"]))
-        for name, components in MAGNITUDES.items():
+        lengths = {name: s.components for name, s in scalar_quantities().items() if s.components}
+        for name, components in (MAGNITUDES | lengths).items():
             if name in planes:
                 # Noise across a vector adds its square; taken as alike in all directions.
                 _magnitude(planes, name, (components - 1) * planes[f"{name}_errors"] ** 2)

@@ -21,6 +21,7 @@ from processing.polarization.decompositions.lu_chipman import lu_chipman
 from processing.polarization.decompositions.symmetric import symmetric
 from processing.polarization.propagation import Derived
 from processing.polarization.quantities import PAPER_PAIRS
+from processing.polarization.scalar_files import scalar_quantities
 from processing.reduction.mueller import Progress
 from processing.storage.images import MuellerImage, require_all_elements, seen_elements
 from processing.storage.product import LIT_ERRORS, Plane, Product, ProductWriter, Step
@@ -177,6 +178,8 @@ def _image(product: Product, rows: slice) -> MuellerImage | ExtrapolatedImage:
 
 def _planes(extra: Sequence[str], pairs: Pairs) -> dict[str, Plane]:
     found = dict(_MAPS)
+    for scalar in scalar_quantities().values():
+        found[scalar.name] = Plane((), scalar.units, scalar.title)
     for name, (generator, analyzer) in pairs.items():
         found[name] = Plane((), "", f"light from a {generator} generator through a {analyzer} analyzer, over m00")
     defined = ["lu_chipman", *extra]
@@ -202,6 +205,7 @@ def quantities_block(
     with np.errstate(divide="ignore", invalid="ignore"):
         for group in _GROUPS:
             derived |= group(m)
+        derived |= {name: scalar.derived(m) for name, scalar in scalar_quantities().items()}
         derived |= gradients.pairs(m, pairs)
         if "symmetric" in extra:
             derived |= gradients.symmetric_quantities(lit)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.polarization.quantities import PAPER_PAIRS
+from processing.polarization.scalar_files import scalar_quantities
 from processing.reports.figure_style import CYCLIC, WORST_ORIENTATION_DEG, grid_figure, percentile, thin
 from processing.storage.product import Product
 
@@ -60,6 +61,9 @@ def quantities_figure(product: Product, title: str) -> Figure:
             CYCLIC,
         ),
     ]
+    for name in scalar_quantities():
+        if name in product.names:
+            panels.append((label(name.replace("_", " "), name), get(name), {"vmin": 0}))
     for name in product.names:
         if name in PAPER_PAIRS or ("_to_" in name and not name.endswith("_errors")):
             text = name.replace("_", " ") + " over $m_{00}$"

@@ -63,7 +63,8 @@ class Skew(ReflectanceEffect):
 #: What a user's commands do with the two folders.
 USE = """
 import numpy as np, sys
-import processing.commands.diagnose, processing.commands.diagnose_surface, processing.diagnosis.surface.write
+import processing.commands.diagnose, processing.commands.loaded_late.diagnose_surface
+import processing.diagnosis.surface.write
 from processing.diagnosis.search.candidate import pool
 from processing.instrument.changes import Conditions
 from processing.instrument.model import InstrumentModel

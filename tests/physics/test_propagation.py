@@ -12,6 +12,7 @@ from processing.instrument.states import rotating_retarders
 from processing.polarization import gradients, mueller
 from processing.polarization.propagation import Derived, numeric_gradient
 from processing.polarization.quantities import PAPER_PAIRS
+from processing.polarization.scalar_files import Scalar, scalar_quantities
 
 Array = NDArray[np.float64]
 Group = Callable[[Array], dict[str, Derived]]
@@ -34,6 +35,18 @@ NUMERIC: list[Group] = [
     gradients.dominant,
     gradients.lu_chipman_quantities,
 ]
+
+
+def scalar_group(scalar: Scalar) -> Group:
+    def group(m: Array) -> dict[str, Derived]:
+        return {scalar.name: scalar.derived(m)}
+
+    group.__name__ = scalar.name
+    return group
+
+
+for _scalar in scalar_quantities().values():
+    (NUMERIC if _scalar.gradient is None else CLOSED_FORM).append(scalar_group(_scalar))
 EVERY = CLOSED_FORM + NUMERIC
 
 

@@ -1,14 +1,18 @@
 """Quantities of a Mueller matrix: analytic cases, physical ranges, rotation of the frames."""
 
+from types import ModuleType
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from processing.polarization import mueller, quantities, triply_degenerate
+from processing.errors import ProcessError
+from processing.polarization import mueller, quantities, scalar_files, triply_degenerate
 from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
 from processing.polarization.quantities import PAPER_PAIRS, POLARIZATIONS, between
+from processing.polarization.scalar_files import scalar_quantities
 
 Array = NDArray[np.float64]
 
@@ -160,3 +164,19 @@ def test_dominant_process_of_a_depolarized_retarder_keeps_its_diattenuation() ->
     dominant = xi0_and_dominant(triply_degenerate.mueller_matrix(m0, 0.4, 9.0))[1]
     d, d0 = quantities.diattenuation_vector(dominant), quantities.diattenuation_vector(m0)
     np.testing.assert_allclose(d, d0, atol=1e-14)
+
+
+def test_the_components_of_purity_make_up_the_depolarization_index() -> None:
+    # Gil, JOSA A 28, 1578 (2011): P_delta^2 = 2/3 P_P^2 + P_S^2; a retarder is all sphere, a polarizer all polarizance.
+    found = scalar_quantities()
+    m = np.random.default_rng(5).normal(size=(50, 4, 4)) * 0.2 + 3 * np.eye(4)
+    p, s = (found[name].value(m) for name in ("polarizance_purity", "spherical_purity"))
+    np.testing.assert_allclose(np.sqrt(2 / 3 * p**2 + s**2), quantities.depolarization_index(m), rtol=1e-12)
+    for name, of in (("spherical_purity", mueller.retarder(0.3, 1.0)), ("polarizance_purity", mueller.polarizer(0.3))):
+        assert float(found[name].value(7 * of)) == pytest.approx(1)
+
+
+def test_a_file_that_is_no_quantity_is_refused() -> None:
+    module = ModuleType("nothing", "A title.")
+    with pytest.raises(ProcessError, match=r"nothing is no quantity: .*value"):
+        scalar_files._scalar("nothing", module)

@@ -23,7 +23,7 @@ def diagnose_reflectance(
     """Diagnose, print a summary and write what was asked for. Raises ProcessError."""
     if reflectance is None or geometry is None:
         raise ProcessError("a triply degenerate sample needs both --reflectance MATERIAL and --geometry GEOMETRY.")
-    from processing.commands.diagnose_summary import show
+    from processing.commands.loaded_late.diagnose_summary import show
     from processing.diagnosis.surface.run import diagnose_object
     from processing.diagnosis.surface.write import targets, write_surface
     from processing.geometry.viewing import ViewingGeometry
