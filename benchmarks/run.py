@@ -19,6 +19,7 @@ from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import error_bar_tasks as error_bars
 import image_tasks as image
 import reduction_tasks as reduction
 import reflectance_tasks as reflectance
@@ -49,6 +50,8 @@ def tasks(peers: PeerProcess | None, folder: Path) -> list[tuple[str, Callable[[
         ("cloude large", lambda: image.dominant(LARGE, 150, None)),
         ("eigenvalues", lambda: image.eigenvalues(LARGE, 2000)),
         ("lu-chipman", lambda: image.polar(SMALL, 20, peers)),
+        ("error bars, xi0", error_bars.xi0),
+        ("error bars, quantities", error_bars.all_quantities),
         ("mosaic", lambda: image.mosaic(LARGE, 12, peers)),
         ("xi0", lambda: reflectance.xi0(10)),
         ("table", lambda: reflectance.table(60)),

@@ -46,18 +46,29 @@ def test_farther_from_180_degrees_the_axis_is_determined():
     assert found["retardance_axis_flip"].max() < 1e-3
 
 
-def test_the_joint_region_of_the_retardance_vector_covers():
-    m = triply_degenerate.mueller_matrix(mueller.retarder(0.4, 1.2) @ mueller.rotation(0.2), 0.9)
-    found, truth = block(m, 200), block(m, 1e13)
-    error = (found["retardance_vector_deg"] - truth["retardance_vector_deg"].mean(axis=-1, keepdims=True)).reshape(
-        3, -1
-    )
+@pytest.mark.parametrize("degrees", [69, 178, 179, 180])
+def test_the_joint_region_of_the_retardance_vector_covers_at_180_degrees_too(degrees):
+    m = triply_degenerate.mueller_matrix(mueller.retarder(0.4, np.deg2rad(degrees)) @ mueller.rotation(0.2), 0.9)
+    found, truth = block(m, 200), block(m, 1e13)["retardance_vector_deg"].reshape(3, -1)[:, :1]
     packed = found["retardance_vector_covariance"].reshape(6, -1)
     covariance = np.moveaxis(packed[[0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(3, 3, -1), -1, 0)
-    distance = np.einsum("ip,pij,jp->p", error, np.linalg.inv(covariance.astype(float)), error)
+    inverse = np.linalg.inv(covariance.astype(float))
+    # The same retarder, turned the other way round.
+    same = (truth, truth - 360 * truth / np.linalg.norm(truth))
+    errors = [found["retardance_vector_deg"].reshape(3, -1) - vector for vector in same]
+    distance = np.min([np.einsum("ip,pij,jp->p", error, inverse, error) for error in errors], axis=0)
     # Chi-square of three degrees of freedom.
     assert np.mean(distance) == pytest.approx(3, abs=0.5)
     assert np.mean(distance < 7.815) == pytest.approx(0.95, abs=0.04)
+
+
+@pytest.mark.parametrize("degrees", [180, 179, 178])
+def test_the_error_bar_of_a_folded_retardance_covers(degrees):
+    found = block(triply_degenerate.mueller_matrix(mueller.retarder(0.4, np.deg2rad(degrees)), 0.9), 200)
+    off = np.abs(found["retardance_deg"] - degrees) / found["retardance_deg_errors"]
+    # At 180 degrees half a normal distribution; half an error and an error away the fold only helps.
+    assert np.mean(off < 1) > 0.68 - 3 * np.sqrt(0.68 * 0.32 / PIXELS)
+    assert np.mean(off < 1.96) > 0.95 - 3 * np.sqrt(0.95 * 0.05 / PIXELS)
 
 
 def test_noise_alone_is_taken_off_what_td_misses():
