@@ -114,7 +114,7 @@ def draw(titles: list[str], maps: list[dict[str, Any]]) -> Any:
     for row, (title, found) in enumerate(zip(titles, maps, strict=True)):
         for axis, key in zip(axes[row], wide, strict=True):
             image: Array = found[key]
-            drawn_image = axis.imshow(image, vmin=-wide[key], vmax=wide[key], cmap="RdBu")
+            drawn_image = axis.imshow(image, vmin=-wide[key], vmax=wide[key], cmap="RdBu_r")
             axis.set_title(f"{units[key]}: {title}, rms {found[key + '_rms']:.3g}", fontsize=8)
             axis.set_axis_off()
             figure.colorbar(drawn_image, ax=axis, shrink=0.8)

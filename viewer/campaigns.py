@@ -209,19 +209,26 @@ def _in_words(event: dict[str, Any]) -> str:
     return ": ".join(parts[:2]) + ("" if len(parts) < 3 else f" ({'; '.join(parts[2:])})")
 
 
-def seconds_left(view: CampaignView, left_now_s: float | None) -> float | None:
-    """How long the captures that are missing will take, by the median of those that were taken; None without any.
+def seconds_left(view: CampaignView, run: dict[str, Any]) -> float | None:
+    """How long the rest of a running campaign will take; None while nothing tells.
+
+    The captures that are missing count as the median of those that were taken, else as the one that is being taken.
 
     Parameters
     ----------
-    left_now_s : of the capture that is being taken; None where none is.
+    run : what the run says of itself (`acquisition.screen.run_file`).
     """
+    left_s, pending, done = run.get("left_s"), run.get("pending") or 0, run.get("done") or 0
     taken = sorted(
         (datetime.fromisoformat(bar.end) - datetime.fromisoformat(bar.start)).total_seconds()
         for bar in view.bars
         if bar.end is not None and bar.status in ("done", "flagged")
     )
     missing = sum(cell.status in ("missing", "partial", "failed") for cell in view.cells)
-    if missing and not taken:
+    if taken:
+        each_s = taken[len(taken) // 2]
+    elif left_s is not None and pending > done:
+        each_s = left_s * pending / (pending - done)
+    else:
         return None
-    return (taken[len(taken) // 2] * missing if taken else 0.0) + (left_now_s or 0.0)
+    return each_s * missing + (left_s or 0.0)

@@ -59,7 +59,7 @@ def seen(folder: Path, library: Library) -> dict[str, Any]:
     if view is not None:
         found |= {"complete": view.complete, "cells": {cell.name: cell.status for cell in view.cells}}
         if run is not None:
-            found["night_s"] = seconds_left(view, run.get("left_s"))
+            found["night_s"] = seconds_left(view, run)
     if run is None:
         return found
     found |= {key: run.get(key) for key in ("title", "activity", "done", "pending", "left_s", "messages", "capture")}

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.reports import colours
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -19,7 +21,7 @@ PAGE_DPI = 100
 #: Orientation is drawn in grey where its standard error is above this: it is not known there.
 WORST_ORIENTATION_DEG = 20.0
 #: Keywords of `imshow` for orientations.
-CYCLIC = {"cmap": "twilight", "vmin": 0, "vmax": 180}
+CYCLIC = {"cmap": colours.CYCLIC, "vmin": 0, "vmax": 180}
 
 
 def map_figure(panels: Sequence[tuple[str, NDArray[Any], dict[str, Any]]], title: str, simulated: bool) -> Figure:
@@ -72,7 +74,14 @@ def _map(figure: Figure, axis: Any, values: NDArray[Any], label: str, **keywords
     axis.set_facecolor("0.85")
     axis.set_xticks([])
     axis.set_yticks([])
-    figure.colorbar(shown, ax=axis, shrink=0.85)
+    figure.colorbar(shown, ax=axis, shrink=0.85, extend=clipped(values, *shown.get_clim()))
+
+
+def clipped(values: NDArray[Any], low: float, high: float) -> str:
+    """Which ends of a colour bar get an arrow because there are values beyond them: matplotlib's `extend`."""
+    finite = values[np.isfinite(values)]
+    ends = (bool(np.any(finite < low)), bool(np.any(finite > high)))
+    return {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}[ends]
 
 
 def entitle(figure: Figure, title: str, simulated: bool) -> None:

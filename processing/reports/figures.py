@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.errors import ProcessError
+from processing.reports.colours import SIGNED
 from processing.reports.figure_style import (
     CYCLIC,
     WORST_ORIENTATION_DEG,
+    clipped,
     entitle,
     grid_figure,
     map_figure,
@@ -107,9 +109,9 @@ def mueller_figure(elements: NDArray[Any], lit: NDArray[np.bool_], title: str, s
             if i == j == 0:
                 panel.imshow(m00, cmap="gray", vmin=0, vmax=max(percentile(m00, 99.5), 1e-30))
                 continue
-            shown = panel.imshow(normalized[i, j], cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
+            shown = panel.imshow(normalized[i, j], cmap=SIGNED, vmin=-limit, vmax=limit, interpolation="nearest")
     label = "$m_{ij}/m_{00}$, instrument frames (first panel: $m_{00}$; plain grey: too dark)"
-    figure.colorbar(shown, ax=panels, shrink=0.8, label=label)
+    figure.colorbar(shown, ax=panels, shrink=0.8, label=label, extend=clipped(rest, -limit, limit))
     entitle(figure, title, simulated)
     return figure
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from processing.polarization.quantities import PAPER_PAIRS
 from processing.polarization.scalar_files import scalar_quantities
+from processing.reports.colours import SIGNED
 from processing.reports.figure_style import CYCLIC, WORST_ORIENTATION_DEG, grid_figure, percentile, thin
 from processing.storage.product import Product
 
@@ -38,7 +39,7 @@ def quantities_figure(product: Product, title: str) -> Figure:
 
     xi, deviation = get("coherency_eigenvalues"), get("eigenvalue_deviation")
     spread = max(percentile(np.abs(deviation), 99), 1e-6)
-    signed = {"cmap": "RdBu_r", "vmin": -spread, "vmax": spread}
+    signed = {"cmap": SIGNED, "vmin": -spread, "vmax": spread}
     panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = [
         (label(r"$\xi_0$", "coherency_eigenvalues"), xi[0], {"vmin": 0.25}),
         *((rf"$\xi_{k}$", xi[k], {"vmin": 0, "vmax": 1 / 3}) for k in (1, 2, 3)),

@@ -11,6 +11,7 @@ from processing.calibration.illumination_design import Prediction
 from processing.campaign.run import PAPER, CampaignResult
 from processing.geometry.viewing import ViewingGeometry
 from processing.reflectance.tables import ScatteringTable
+from processing.reports.colours import SIGNED
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -68,7 +69,7 @@ def tables_figure(
         [
             ("$\\xi_0$, reference", a, both),
             ("$\\xi_0$, other", b, both),
-            ("other - reference", b - a, {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}),
+            ("other - reference", b - a, {"cmap": SIGNED, "vmin": -limit, "vmax": limit}),
         ],
         f"virtual object, {reference.wavelength_nm:g} nm, $\\Omega$ = {omega_deg:g} degrees",
         reference.simulated,

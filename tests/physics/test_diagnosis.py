@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from processing.commands import diagnose as cli
+from processing.diagnosis.instrument.residual_file import read_residuals
 from processing.diagnosis.instrument.run import diagnose_captures
 from processing.diagnosis.search.result import Diagnosis
 from processing.instrument.model import EffectParameter, InstrumentModel
@@ -218,7 +219,7 @@ def test_what_is_written_is_used_and_nothing_is_overwritten(configs, tmp_path, c
     report, out = tmp_path / "report.html", tmp_path / "out.json"
     call = [str(path), "--instrument", str(instrument), "--write", str(new)]
     with pytest.raises(SystemExit) as ended:
-        cli.main([*call, "--json", str(out), "--report", str(report)])
+        cli.main([*call, "--json", str(out), "--report", str(report), "--residuals", str(tmp_path / "r.npz")])
     assert ended.value.code == 0
     assert "psg_retardance" in capsys.readouterr().out
     keys = {"verdict", "error_before", "error_after", "noise_floor_percent", "effects", "unobservable"}
@@ -228,7 +229,12 @@ def test_what_is_written_is_used_and_nothing_is_overwritten(configs, tmp_path, c
     assert {"rms_percent", "chi2_reduced", "held_out"} <= set(said["error_after"])
     page = report.read_text()
     assert page.count("data:image/png;base64,") == 2
-    assert "src='http" not in page
+    assert 'src="http' not in page
+    assert "SIMULATED" in page
+    (left,) = read_residuals(tmp_path / "r.npz")
+    loud = {moment: np.nanmean(np.square(image.astype(float))) for moment, image in left.images.items()}
+    assert loud["after"] < loud["before"]
+    assert left.images["after"].shape[0] == len(left.per_state["after"]) == STATES
     model = InstrumentModel.load(new)
     assert model.effects[0].kind == "psg_retardance"
     assert path.name in model.effects[0].captures[0]

@@ -2,7 +2,7 @@
 
 import "./start.js";
 import { ImageView, place, readPlane } from "./images.js";
-import { accent, at, byId, draw, duration, embedded, narrow, post, quiet, say, statusColour } from "./plots.js";
+import { accent, at, byId, draw, duration, embedded, getJson, narrow, post, quiet, say, statusColour } from "./plots.js";
 
 const run = byId("run"), folder = run.dataset.folder;
 let view = null, shown = {};
@@ -38,11 +38,25 @@ function drawLamp(lamp) {
     () => ({ xaxis: { title: { text: "state" } }, yaxis: { title: { text: "lamp / %" }, zerolinecolor: quiet() }, margin: { t: 4 } }));
 }
 
+/** Signs of the grid as they change; links come when the page is loaded anew. */
+function grid(now) {
+  const signs = byId("signs") ? embedded("signs") : {};
+  document.querySelectorAll(".cell[data-name]").forEach(cell => {
+    const status = now.cells?.[cell.dataset.name];
+    if (!status || cell.classList.contains(status)) return;
+    cell.className = `cell ${status}`;
+    cell.textContent = signs[status] ?? "";
+    cell.title = `${cell.dataset.name}: ${status}`;
+    cell.setAttribute("aria-label", cell.title);
+  });
+  byId("complete").textContent = `${now.complete} of ${now.total}`;
+}
+
 async function lastFrame(now) {
   if (!now.file || !now.states || (shown.file === now.file && shown.states === now.states)) return;
   shown = now;
   if (!view) {
-    const states = await (await fetch(at("states", { file: now.file }))).json();
+    const states = await getJson("states", { file: now.file });
     view = new ImageView(byId("frame"), {
       shape: states.shape,
       read: (window, signal) => readPlane("frame", { file: shown.file, state: -1, ...window }, signal),
@@ -53,8 +67,7 @@ async function lastFrame(now) {
       ],
     });
   }
-  // A capture that was just sealed has lost its partial name: the next event brings the new one.
-  await view.refresh().catch(() => { shown = {}; });
+  await view.refresh();
 }
 
 function show(now) {
@@ -71,6 +84,7 @@ function show(now) {
   byId("progress").max = now.pending || 1;
   byId("progress").value = now.done;
   byId("activity").textContent = now.activity;
+  grid(now);
   facts(byId("axes"), Object.entries(now.axes_deg).map(([name, value]) => [name, `${value.toFixed(3)}°`]));
   if (now.lamp) drawLamp(now.lamp);
   byId("messages").replaceChildren(...(now.messages.length ? now.messages : ["none"]).map(text => {
@@ -78,7 +92,8 @@ function show(now) {
     line.textContent = text;
     return line;
   }));
-  return lastFrame(now);
+  // A capture that was just sealed has lost its partial name: the next event brings the new one.
+  return lastFrame(now).catch(() => { shown = {}; });
 }
 
 byId("stop").addEventListener("click", async event => {

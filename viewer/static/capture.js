@@ -2,7 +2,7 @@
 
 import "./start.js";
 import { ImageView, place, readPlane } from "./images.js";
-import { accent, bad, byId, draw, embedded, getJson, ink, narrow, say } from "./plots.js";
+import { accent, at, bad, byId, draw, embedded, getJson, ink, narrow, say } from "./plots.js";
 import { drawCurve, showProbe } from "./probe.js";
 
 const file = byId("look").dataset.file;
@@ -105,7 +105,15 @@ document.addEventListener("keydown", event => {
 });
 
 async function follow() {
-  const now = await getJson("states", { file });
+  let now;
+  try {
+    now = await getJson("states", { file });
+  } catch (error) {
+    // When it is complete it loses its partial name.
+    if (!file.endsWith(".partial")) throw error;
+    location.replace(at("capture", { file: file.slice(0, -".partial".length) }));
+    return;
+  }
   const atEnd = Number(slider.value) === states.number.length - 1 || !states.number.length;
   states = now;
   slider.max = Math.max(states.number.length - 1, 0);

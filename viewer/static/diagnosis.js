@@ -52,6 +52,7 @@ async function pixel(region, k) {
   views[1 - k].choose(region, false);
   const found = await getJson("residual-curve", { name, capture: number(), ...region });
   byId("pixel").textContent = found.where;
+  byId("curve").hidden = false;
   draw(byId("curve"), () => MOMENTS.map(moment => ({ y: found[moment], mode: "markers", name: moment, marker: { size: 6, color: colourOf(moment), symbol: moment === "before" ? "circle-open" : "circle" } })),
     () => ({ showlegend: true, xaxis: { title: { text: "state (and channel)" } }, yaxis: { title: { text: "residual / noise" } } }));
 }

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import html
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,27 +16,32 @@ from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.space import Space
 from processing.errors import ProcessError
 from processing.polarization.cloude import xi0_and_dominant
+from processing.reports.colours import SIGNED
+from processing.reports.design import style, templates
+from processing.reports.figure_style import png
+from processing.reports.template import Figure as Picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-STYLE = """body{font:15px/1.45 sans-serif;max-width:62em;margin:2em auto;padding:0 1em;color:#222}
-table{border-collapse:collapse;margin:1em 0}td,th{border-bottom:1px solid #ccc;padding:.25em .8em;text-align:left}
-img{max-width:100%}.warn{background:#fff3cd;padding:.5em 1em}h1{font-size:1.5em}h2{font-size:1.15em;margin-top:2em}"""
-
-
 def write_report(path: Path, judged: Judged, problem: InstrumentProblem) -> None:
     """Write the report to a new file. Raises ProcessError if it exists."""
-    parts = [_summary(judged), _effects(judged), _ranking(judged)]
-    for k, data in enumerate(problem.captures):
-        parts.append(f"<h2>{html.escape(data.name)}</h2>")
-        parts.append(_picture(_maps(judged.before[k], judged.after[k]), "Residual over the image"))
-        parts.append(_picture(_states(judged.before[k], judged.after[k]), "Residual of each state, and its harmonics"))
-        parts.append(_quantities(judged, problem, k))
-    title = f"diagnose: {judged.diagnosis.instrument}"
-    text = f"<!doctype html><html lang='en'><meta charset='utf-8'><title>{html.escape(title)}</title>"
-    text += f"<style>{STYLE}</style><h1>{html.escape(title)}</h1>" + "\n".join(parts) + "</html>\n"
+    found = judged.diagnosis
+    text = (
+        templates()
+        .get_template("diagnosis_report.html")
+        .render(
+            title=f"diagnose: {found.instrument}",
+            style=style(),
+            simulated=found.simulated,
+            d=found,
+            errors=_errors(judged),
+            effects=_effects(judged),
+            ranking=_ranking(judged),
+            captures=[_capture(judged, problem, k) for k in range(len(problem.captures))],
+        )
+    )
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
@@ -47,36 +49,19 @@ def write_report(path: Path, judged: Judged, problem: InstrumentProblem) -> None
         raise ProcessError(f"{path} exists and is not replaced. Give another --report.") from error
 
 
-def _table(head: list[str], rows: list[list[Any]]) -> str:
-    cells = "".join(f"<th>{html.escape(h)}</th>" for h in head)
-    lines = ["<tr>" + "".join(f"<td>{html.escape(str(c))}</td>" for c in row) + "</tr>" for row in rows]
-    return f"<table><tr>{cells}</tr>{''.join(lines)}</table>"
-
-
-def _summary(judged: Judged) -> str:
+def _errors(judged: Judged) -> list[list[str]]:
     d = judged.diagnosis
-    out = "<p class='warn'>SIMULATED data</p>" if d.simulated else ""
-    at = ", ".join(f"{w:g}" for w in d.wavelengths_nm)
-    out += f"<p><b>{d.verdict.replace('_', ' ')}</b> at {at} nm. Held out: {d.error_before.held_out}.</p>"
     floor = "not known" if d.noise_floor_percent is None else f"{d.noise_floor_percent:.4f}"
-    rows = [
+    return [
+        ["", "rms, % of the mean signal", "chi2 / dof"],
         ["before", f"{d.error_before.rms_percent:.4f}", f"{d.error_before.chi2_reduced:.4g}"],
         ["after", f"{d.error_after.rms_percent:.4f}", f"{d.error_after.chi2_reduced:.4g}"],
         ["noise", floor, "1"],
     ]
-    out += _table(["", "rms, % of the mean signal", "chi2 / dof"], rows)
-    if d.unexplained is not None:
-        lines = "".join(f"<li>{html.escape(line)}</li>" for line in d.unexplained.description)
-        out += f"<p>Unexplained structure is left:</p><ul>{lines}</ul>"
-        if d.unexplained.empirical is not None:
-            e = d.unexplained.empirical
-            out += f"<p class='warn'>{e.kind}: {e.rms_percent_in_sample:.4f} % in sample; {html.escape(e.note)}</p>"
-    if d.unobservable:
-        out += f"<p>Cannot be seen with these captures: {html.escape(', '.join(d.unobservable))}.</p>"
-    return out + f"<p>Recommendation: {html.escape(d.recommendation)}</p>"
 
 
-def _effects(judged: Judged) -> str:
+def _effects(judged: Judged) -> list[list[str]]:
+    """Rows of a table with its head; empty where no effect is named."""
     rows = []
     several = len(judged.diagnosis.captures) > 1
     for e in judged.diagnosis.effects:
@@ -92,34 +77,26 @@ def _effects(judged: Judged) -> str:
             # Non-breaking spaces: a number stays on one line with its error and unit.
             value = f"{p.told} {p.unit if p.unit != '1' else ''}".strip().replace(" ", "\u00a0")
             rows.append([*first[:2], name, value, *first[2:]])
-    if not rows:
-        return "<p>No effect is named.</p>" + _correction(judged)
     head = ["effect", "of", "parameter", "value", "name", "chi2 explained", "or it is"]
-    return "<h2>Effects</h2>" + _table(head, rows) + _correction(judged)
+    return [head, *rows] if rows else []
 
 
-def _correction(judged: Judged) -> str:
-    """What is written, apart from names: its fate, and the figures that the guard looked at."""
-    found = judged.diagnosis.correction
-    if found is None:
-        return ""
-    fate = f"Refused: {found.refused}" if found.refused else "It holds, and is what --write puts into the file."
-    rows = [[c.name, f"{c.before:.4g}", f"{c.after:.4g}"] for c in found.checks]
-    return f"<h2>Correction</h2><p>{fate}</p>" + _table(["figure", "before", "after"], rows)
-
-
-def _ranking(judged: Judged) -> str:
+def _ranking(judged: Judged) -> list[list[str]]:
     rows = [[r.candidate, f"{r.evidence:.0f}", f"{r.rms_percent:.4f}"] for r in judged.diagnosis.ranking]
-    if not rows:
-        return ""
-    head = ["candidate, alone", "chi2 gain on held-out data", "rms left, %"]
-    return "<h2>Candidates of the first round</h2>" + _table(head, rows)
+    return [["candidate, alone", "chi2 gain on held-out data", "rms left, %"], *rows] if rows else []
 
 
-def _picture(figure: Figure, alt: str) -> str:
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=100, bbox_inches="tight")
-    return f"<img alt='{html.escape(alt)}' src='data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}'>"
+def _capture(judged: Judged, problem: InstrumentProblem, k: int) -> dict[str, Any]:
+    """Title, figures and the change of the Mueller elements of one capture."""
+    before, after = judged.before[k], judged.after[k]
+    return {
+        "name": problem.captures[k].name,
+        "figures": [
+            Picture(png(_maps(before, after)), "Residual over the image"),
+            Picture(png(_states(before, after)), "Residual of each state, and its harmonics"),
+        ],
+        "change": _change(judged, problem, k),
+    }
 
 
 def _maps(before: Residual, after: Residual) -> Figure:
@@ -136,7 +113,7 @@ def _maps(before: Residual, after: Residual) -> Figure:
         image = axes[0, column].imshow(loud[column], vmin=0, vmax=top)
         axes[0, column].set_title(f"{name}: rms over the states")
         figure.colorbar(image, ax=axes[0, column], label="residual / noise of one intensity")
-        image = axes[1, column].imshow(states[column], vmin=-wide, vmax=wide, cmap="RdBu")
+        image = axes[1, column].imshow(states[column], vmin=-wide, vmax=wide, cmap=SIGNED)
         axes[1, column].set_title(f"{name}: leading pattern over the states of before")
         figure.colorbar(image, ax=axes[1, column], label="amplitude / noise of one intensity")
         for axis in axes[:, column]:
@@ -170,19 +147,20 @@ def _states(before: Residual, after: Residual) -> Figure:
     return figure
 
 
-def _quantities(judged: Judged, problem: InstrumentProblem, k: int) -> str:
-    """What the correction changes in the Mueller elements and in xi0, where the states allow an inversion."""
+def _change(judged: Judged, problem: InstrumentProblem, k: int) -> dict[str, Any] | None:
+    """What the correction changes in the Mueller elements and in xi0; None where the states allow no inversion."""
     found = judged.found
     first = _mueller(problem, k, found.base, found.before_fit)
     second = _mueller(problem, k, found.space, found.fit)
     if first is None or second is None:
-        return "<p>These states do not determine a Mueller matrix; no change of final quantities is given.</p>"
+        return None
     difference = np.sqrt(np.mean((second - first) ** 2, axis=0)).reshape(4, 4)
-    rows = [[f"{v:.5f}" for v in line] for line in difference]
-    out = "<p>Change of the Mueller elements over m00, rms over the pixels:</p>" + _table([""] * 4, rows)
     before, after = (xi0_and_dominant(m.reshape(-1, 4, 4))[0] for m in (first, second))
-    median = f"{np.nanmedian(before):.5f} to {np.nanmedian(after):.5f}"
-    return out + f"<p>Median xi0 {median}, rms change {np.sqrt(np.nanmean((after - before) ** 2)):.5f}.</p>"
+    return {
+        "elements": [[""] * 4, *([f"{v:.5f}" for v in line] for line in difference)],
+        "xi0": f"Median xi0 {np.nanmedian(before):.5f} to {np.nanmedian(after):.5f}, rms change "
+        f"{np.sqrt(np.nanmean((after - before) ** 2)):.5f}.",
+    }
 
 
 def _mueller(problem: InstrumentProblem, k: int, space: Space, fit: Fit) -> Array | None:

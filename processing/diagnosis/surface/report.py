@@ -15,6 +15,7 @@ from processing.diagnosis.surface.judge import SurfaceJudged
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.diagnosis.surface.quantities import dominant_errors, quantities
 from processing.errors import ProcessError
+from processing.reports.colours import SIGNED
 from processing.reports.template import Figure, Section, render
 
 
@@ -95,7 +96,7 @@ def residual_figure(judged: SurfaceJudged, problem: SurfaceProblem, k: int) -> A
             scales = [(0.0, top), (-wide, wide), (0.25, float(np.nanpercentile(xi0, 99.5)))]
         names = ("rms residual / noise", "leading residual, mean of tiles / noise", "xi0")
         for axis, values_of, (low, high), name, colours in zip(
-            axes[row], maps, scales, names, ("magma", "RdBu", "viridis"), strict=True
+            axes[row], maps, scales, names, ("magma", SIGNED, "viridis"), strict=True
         ):
             drawn = axis.imshow(_image(data.where, data.shape, values_of), vmin=low, vmax=high, cmap=colours)
             figure.colorbar(drawn, ax=axis)
@@ -134,7 +135,7 @@ def dominant_figure(judged: SurfaceJudged, problem: SurfaceProblem, k: int) -> A
         errors = dominant_errors(problem, k, space, values, data.y) or ()
         for row, ((name, wide), error) in enumerate(zip(names, errors, strict=False)):
             axis = axes[2 * row + column]
-            drawn = axis.imshow(_image(data.where, data.shape, error), vmin=-wide, vmax=wide, cmap="RdBu")
+            drawn = axis.imshow(_image(data.where, data.shape, error), vmin=-wide, vmax=wide, cmap=SIGNED)
             figure.colorbar(drawn, ax=axis, shrink=0.8)
             axis.set_title(f"{name}, {'after' if column else 'before'}", fontsize=9)
             axis.set_axis_off()
