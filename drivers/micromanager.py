@@ -28,7 +28,7 @@ def running_core(asked: str, configuration: Path | None, device: str) -> Any:
     try:
         from pymmcore_plus import CMMCorePlus
     except ImportError as error:
-        raise DeviceError(asked, "pymmcore-plus is not installed", "pip install 'umov[micromanager]'") from error
+        raise DeviceError(asked, "pymmcore-plus is not installed", "Install it: pip install pymmcore-plus") from error
     core: Any = CMMCorePlus.instance()
     if configuration is not None and device not in core.getLoadedDevices():
         with asking(f"{asked}, load {configuration}", "Try the file in Micro-Manager"):
@@ -38,7 +38,7 @@ def running_core(asked: str, configuration: Path | None, device: str) -> Any:
 
 def loaded_devices(core: Any) -> str:
     """The devices that the core holds, in words."""
-    return ", ".join(label for label in core.getLoadedDevices() if label != "Core") or "none"
+    return ", ".join(label for label in core.getLoadedDevices() if label != "Core") or "no device"
 
 
 @contextmanager

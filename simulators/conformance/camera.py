@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from drivers.camera import Camera, CameraSettings
 from drivers.errors import CameraBusy, CameraError, CameraLost, CameraNotFound, DeviceError, FrameLost
+from drivers.pixel_formats import pixel_format
 from drivers.registry import device_kinds, open_camera
 from simulators.camera.gige_camera import ExposureInfo, GigeCamera
+from simulators.camera.node_map import node_map
 from simulators.camera.pixel_stamp import read_stamp, stamp
 from simulators.clock import patient_clock
 
@@ -55,10 +57,21 @@ class CameraTwin(Protocol):
 
 
 class GigeTwin:
-    """The GigE Vision camera on loopback, for drivers that speak that protocol."""
+    """The GigE Vision camera on loopback, for drivers that speak that protocol.
 
-    def __init__(self, show: Show) -> None:
+    Parameters
+    ----------
+    show : callable
+        What it shows.
+    description : str
+        Name of a maker's feature table, of which it takes the first format with room for its counts.
+    """
+
+    def __init__(self, show: Show, description: str = "loopback") -> None:
+        formats = node_map(description).pixel_formats
+        wide = next(name for name in formats if pixel_format(name).bits >= 12)
         self.entry: dict[str, Any] = {"device": "127.0.0.1", "packet_size": 1500, "bits": 12}
+        self.entry["settings"] = {"pixel_format": wide}
         self.elsewhere: dict[str, Any] = {"device": "NOT-THERE"}
         self.size = (128, 64)
         self.bits = 12
@@ -66,7 +79,7 @@ class GigeTwin:
         def source(info: ExposureInfo) -> NDArray[np.uint16]:
             return show(info.width, info.height, info.exposure_s)
 
-        self._camera = GigeCamera("TWIN-1", *self.size, source, bits=self.bits)
+        self._camera = GigeCamera("TWIN-1", *self.size, source, bits=self.bits, description=description)
 
     def start(self) -> None:
         """Start the camera."""
