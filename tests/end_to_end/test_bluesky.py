@@ -1,0 +1,106 @@
+"""An unmodified RunEngine drives the emulated rig: scans, and a whole capture that it pauses and resumes."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+from bluesky import RunEngine
+from bluesky.plans import count, scan
+from bluesky.protocols import Movable, Pausable, Readable, Triggerable
+from bluesky.utils import FailedStatus, RunEngineInterrupted
+
+from acquisition.bluesky_devices import open_bench
+from acquisition.capture.plan import MeasurementPlan
+from processing.storage.capture import Capture
+
+PLAN = MeasurementPlan(omega_deg=35.0)
+
+
+@pytest.fixture
+def bench(small_rig):
+    with open_bench(small_rig(top={"settle_s": 0.0}, rows=24, columns=32), home=True) as bench:
+        yield bench
+
+
+@pytest.fixture
+def engine():
+    """A RunEngine as it comes, and the documents that it has sent."""
+    documents = []
+    engine = RunEngine(context_managers=[])
+    engine.subscribe(lambda name, document: documents.append((name, document)))
+    return engine, documents
+
+
+def _events(documents):
+    return [document["data"] for name, document in documents if name == "event"]
+
+
+def test_a_scan_of_an_axis_reads_where_it_is(bench, engine):
+    run, documents = engine
+    psg = bench.axes["psg"]
+    assert isinstance(psg, Movable)
+    assert isinstance(psg, Readable)
+    assert isinstance(bench.camera, Triggerable)
+    run(scan([bench.camera], psg, 10, 40, 4))
+    angles = [event["psg"] for event in _events(documents)]
+    np.testing.assert_allclose(angles, [10, 20, 30, 40], atol=0.01)
+    frames = [event["camera_frame"] for event in _events(documents)]
+    assert all(np.shape(frame) == (24, 32) for frame in frames)
+    assert not np.array_equal(frames[0], frames[2])
+
+
+def test_what_the_rig_forbids_fails_the_plan(bench, engine):
+    run, _ = engine
+    with pytest.raises(FailedStatus):
+        run(scan([], bench.axes["arm"], 0, 720, 2))
+
+
+def test_a_capture_of_40_states_is_paused_and_resumed(bench, engine, tmp_path):
+    run, documents = engine
+    device = bench.capture(PLAN, tmp_path / "captures")
+    assert isinstance(device, Pausable)
+
+    def pause() -> None:
+        # Once states are in the file, so that there is something to go on with.
+        while not any(_states(path) >= 5 for path in (tmp_path / "captures").glob("*.partial")):
+            time.sleep(0.002)
+        run.request_pause()
+
+    thread = threading.Thread(target=pause)
+    thread.start()
+    with pytest.raises(RunEngineInterrupted):
+        run(count([device]))
+    thread.join()
+    (half,) = (tmp_path / "captures").glob("*.h5*")
+    with Capture(half) as capture:
+        assert capture.status == "aborted"
+        assert 5 <= len(capture.done) < capture.planned_states
+    run.resume()
+    (event,) = _events(documents)
+    with Capture(event["capture_file"]) as capture:
+        assert capture.status == "complete"
+        assert len(capture.done) == len(device._job.table) == 44
+        assert [len(segment.states) > 0 for segment in capture.segments] == [True, True]
+        np.testing.assert_array_equal(event["capture_psg_deg"], capture.angles_deg["psg"])
+        assert [name for name, _ in documents if name.startswith("stream")] == ["stream_resource", "stream_datum"]
+        resource = next(document for name, document in documents if name == "stream_resource")
+        assert resource["uri"].endswith(capture.path.name)
+        descriptor = next(document for name, document in documents if name == "descriptor")
+        key = descriptor["data_keys"]["capture_frames"]
+        assert key["shape"] == [44, 1, 24, 32]
+    # The next one is a capture of its own.
+    run(count([device]))
+    assert len(list((tmp_path / "captures").glob("*.h5"))) == 2
+
+
+def _states(path) -> int:
+    import h5py
+
+    try:
+        with h5py.File(path, "r", locking=False) as file:
+            return int(np.count_nonzero(file["entry/states/done"][...]))
+    except (OSError, KeyError, RuntimeError):
+        return 0
