@@ -27,6 +27,7 @@ VERDICTS = {
     "explained": "The captures disagree with the instrument model, and what was found explains all of it.",
     "partly_explained": "Something was found, but more is left over than noise.",
     "unexplained": "The captures disagree with the instrument model, and nothing that is known explains it.",
+    "undetermined": "Nothing can be said: a fault of typical size would not have been seen in these captures.",
 }
 
 

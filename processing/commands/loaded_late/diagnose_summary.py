@@ -20,6 +20,8 @@ def show(d: Diagnosis) -> None:
         typer.echo("SIMULATED data")
     wavelengths = ", ".join(f"{w:g}" for w in d.wavelengths_nm)
     typer.echo(f"{d.instrument}, {wavelengths} nm: {d.verdict.replace('_', ' ')}")
+    if d.verdict == "undetermined":
+        typer.echo("  nothing can be said: a fault of typical size would not have been seen")
     if d.wiring is not None:
         typer.echo(f"  first of all: {d.wiring}")
     before, after = d.error_before, d.error_after

@@ -9,6 +9,7 @@ import numpy as np
 
 from processing.diagnosis.instrument.doubts import doubts, testable
 from processing.diagnosis.instrument.empirical import empirical
+from processing.diagnosis.instrument.evidence import wanted_for_evidence, would_be_seen
 from processing.diagnosis.instrument.guard import checks, refusal
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.recommend import recommended
@@ -94,6 +95,8 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
     verdict = _verdict((*named, *switched), (*sure, *switched), structure or bool(untold))
     if wiring is not None or (refused is not None and named):
         verdict = "unexplained"
+    if verdict == "consistent" and not would_be_seen(found):
+        verdict = "undetermined"
     rivals = [(c.candidates[0], *c.alternatives) for c in named if c.alternatives]
     unexplained = None
     if verdict in ("unexplained", "partly_explained"):
@@ -115,7 +118,9 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
             *dict.fromkeys(c.short for c in unseen),
             *(f"{c.candidates[0].short} (as many values as the data have)" for c in untold),
         ),
-        recommendation=recommended(problem, kept.space, kept.fit, rivals, missing(unseen)),
+        recommendation=wanted_for_evidence(problem)
+        if verdict == "undetermined"
+        else recommended(problem, kept.space, kept.fit, rivals, missing(unseen)),
         unexplained=unexplained,
         calibrated=calibrated(problem, found, solved),
         ranking=ranking(found, solved.before),

@@ -21,6 +21,8 @@ from processing.reduction.move_image import neighbour_noise
 #: Standard deviations beyond which a test says "structure".
 LIMIT = 5.0
 HARMONICS = 4
+#: Pixels from which on tests by signal and by place are made.
+FEWEST_PIXELS = 30
 
 
 @dataclass(frozen=True)
@@ -181,13 +183,16 @@ def _tests(
     """
     r, expected, good = images.residual, images.expected, images.good
     count = int(good.sum())
-    if count < 30 or not noise_known:
+    if count == 0 or not noise_known:
         return {}, 0.0
     flat, wanted = r[:, good].astype(np.float64), expected[:, good].astype(np.float64)
     # Of smooth patterns moved frames keep all the noise, of single pixels only a part.
     freedom = shown @ wanted.sum(axis=1)
     # Name to chi-square beyond noise, and its standard deviation with nothing but noise.
-    found = {"sum of squares": (np.sum(flat**2) - freedom, np.sqrt(2 * freedom * spread))}
+    found = {"sum of squares": (np.sum(flat**2) - freedom, np.sqrt(2 * max(freedom, 1e-300) * spread))}
+    if count < FEWEST_PIXELS:
+        # What goes with the signal, or with the place, needs an image.
+        return _in_deviations(found)
     # Linear in the signal: every pixel's residual against the leading components of the fitted signal near by.
     s = images.around[:, good].astype(np.float64)
     _, size, vt = np.linalg.svd(s @ s.T)
@@ -217,6 +222,11 @@ def _tests(
                 found[name] = (product.sum() - null, np.sqrt(np.sum(product**2)))
     # Tiles: mean residual of every row over patches of the image.
     found["patches"] = _patches(r, expected, spread)
+    return _in_deviations(found)
+
+
+def _in_deviations(found: dict[str, tuple[float, float]]) -> tuple[dict[str, float], float]:
+    """Each test in standard deviations, and the most that one finds beyond two of them."""
     left = max(chi2 - 2 * deviation for chi2, deviation in found.values())
     return {k: float(chi2 / deviation) for k, (chi2, deviation) in found.items()}, max(float(left), 0.0)
 

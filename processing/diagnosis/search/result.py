@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict
 
 from processing.instrument.model import AppliedEffect, EffectParameter, SystematicError
 
-Verdict = Literal["consistent", "explained", "partly_explained", "unexplained"]
+Verdict = Literal["consistent", "explained", "partly_explained", "unexplained", "undetermined"]
 
 
 class _Part(BaseModel):

@@ -58,6 +58,8 @@ DOUBTED = 0.95
 ALTERNATIVE = 7.0
 #: The same as a share of what the cause explains: no effect's model is exact.
 ALIKE = 1e-3
+#: Standard deviations by which an effect of typical size has to stand out for its absence to mean anything.
+VISIBLE_FAULT = 4.0
 #: Gain in chi-square from which on something that needs a search of its own (a retardance that varies over the image,
 #: clipped pixels, a far start) is looked into.
 DECISIVE = 25.0
