@@ -25,12 +25,14 @@ class NoiseModel:
     read : counts^2; read noise.
     rounding : counts^2; 1/12 for whole counts, 0 for floating numbers.
     source : where the numbers come from, for the provenance.
+    stated : counts^2; whole variance of one intensity of each state that is reduced, where the data state it.
     """
 
     slope: float
     read: float
     rounding: float
     source: str
+    stated: tuple[float, ...] = ()
 
     @classmethod
     def of(cls, detector: Detector, integer: bool) -> NoiseModel | None:
@@ -46,6 +48,11 @@ class NoiseModel:
         read = (detector.read_noise_e or 0.0) / gain
         return cls(1.0 / gain, read**2, QUANTIZATION if integer else 0.0, source)
 
+    @classmethod
+    def of_sigma(cls, sigma: ArrayLike) -> NoiseModel:
+        """From the standard deviation (N,) of one intensity of each state, counts: column `sigma` of the states."""
+        return cls(0.0, 0.0, 0.0, "column sigma of the states", tuple(np.square(sigma).tolist()))
+
     @property
     def floor(self) -> float:
         """Variance without light, counts^2."""
@@ -54,6 +61,12 @@ class NoiseModel:
     def averaged_floor(self, repeats: ArrayLike, excess: ArrayLike = 0.0) -> NDArray[np.float64]:
         """Variance without light of means of `repeats` frames, counts^2; `excess` is what a frame has above `read`."""
         return np.asarray((self.read + np.asarray(excess, dtype=float)) / np.asarray(repeats, float) + self.rounding)
+
+    def floor_of_rows(self, repeats: ArrayLike, excess: ArrayLike, channels: int) -> NDArray[np.float64]:
+        """Variance without light (N channels,) of rows of W, counts^2; stated noise is all that there is."""
+        if self.stated:
+            return np.repeat(np.array(self.stated), channels)
+        return self.averaged_floor(repeats, excess)
 
     def variance(self, signal: ArrayLike) -> NDArray[np.float64]:
         """Variance, counts^2, at a signal in counts above black; a negative signal has the floor's."""

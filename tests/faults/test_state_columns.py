@@ -5,7 +5,9 @@ import pytest
 
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.instrument.model import InstrumentModel
+from processing.reduction.mueller import Choice, reduce_mueller
 from processing.storage.capture import Capture
+from processing.storage.images import MuellerImage
 from processing.storage.importing import ImportRequest, import_capture
 from processing.storage.state_csv import ImportFailed, read_states
 
@@ -29,6 +31,33 @@ def test_noise_of_each_state_is_what_the_file_says(tmp_path, configs):
     assert data.noise_known
     full_scale = data.conditions.full_scale
     assert np.sqrt(data.variance()[:, 1, 0, 0]) * full_scale == pytest.approx(2.0 + np.arange(46))
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_a_reduction_weighs_and_tells_errors_by_the_noise_that_is_stated(tmp_path, configs, weighted):
+    """Elements scatter by their errors over many captures of which half of the states are ten times as noisy."""
+    instrument, random = configs / "instruments/drr_wollaston.yaml", np.random.default_rng(3)
+    psg = 4.0 * np.arange(46)
+    w = InstrumentModel.load(instrument).nominal_at(1200).rows({"psg": psg}).reshape(46, 2, 16)
+    light = 1000 * w @ np.eye(4).reshape(16)
+    sigma = np.where(np.arange(46) % 2, 1.0, 10.0)
+    found, errors = [], []
+    for k in range(12):
+        noisy = light + sigma[:, None] * random.standard_normal(light.shape)
+        rows = [f"{n},{psg[n]},{a},{b},{sigma[n]}" for n, (a, b) in enumerate(noisy)]
+        out, product = tmp_path / f"c{k}.h5", tmp_path / f"m{k}.h5"
+        import_capture(ImportRequest(written(tmp_path, HEAD + ",sigma", rows), out, 1200, instrument=instrument))
+        with Capture(out) as capture:
+            model = InstrumentModel.load(instrument).nominal_at(1200)
+            facts = reduce_mueller(capture, model, product, (), choice=Choice(weighted=weighted))
+        image = MuellerImage.load(product)
+        found.append(image.values[..., 0, 0])
+        errors.append(image.errors[..., 0, 0])
+    assert "sigma" in facts["noise"]
+    pull = (np.array(found) - 1000 * np.eye(4)) / np.array(errors)
+    assert np.sqrt(np.mean(pull**2)) == pytest.approx(1.0, abs=0.25)
+    # Weights use the precise half; without them the noisy half decides.
+    assert (errors[0].max() < 12.0) == weighted
 
 
 def test_a_capture_without_stated_noise_has_none(tmp_path):

@@ -39,7 +39,9 @@ class MuellerSolver:
         black = reader.correction.black
         excess = np.repeat(black.excess(noise, reader.exposure_s), channels)
         #: Variance without light of each intensity (N,), counts^2.
-        self.intensity_floor = noise.averaged_floor(self.repeats, excess) if noise else np.zeros(inversion.w.shape[0])
+        self.intensity_floor = (
+            noise.floor_of_rows(self.repeats, excess, channels) if noise else np.zeros(inversion.w.shape[0])
+        )
         self.floor = (squares * self.intensity_floor).reshape(17, -1, channels).sum(axis=1).astype(np.float32)
         # The black is the same in all states of one exposure of a channel, so its error is common to them.
         self.black_variance = black.mean_variance(noise)
