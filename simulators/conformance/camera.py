@@ -71,7 +71,8 @@ class GigeTwin:
         formats = node_map(description).pixel_formats
         wide = next(name for name in formats if pixel_format(name).bits >= 12)
         self.entry: dict[str, Any] = {"device": "127.0.0.1", "packet_size": 1500, "bits": 12}
-        self.entry["settings"] = {"pixel_format": wide}
+        if description != "loopback":
+            self.entry["settings"] = {"pixel_format": wide}
         self.elsewhere: dict[str, Any] = {"device": "NOT-THERE"}
         self.size = (128, 64)
         self.bits = 12

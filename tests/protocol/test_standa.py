@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
 
@@ -22,11 +23,12 @@ BORDERS = bytes.fromhex("73656473 06 01 9cffffff fdff c8000000 0700 cccccccccccc
 
 
 @contextmanager
-def opened(homed: bool = True, **changes: object) -> Iterator[tuple[StandaEmulator, standa.StandaAxis]]:
-    emulator = emulated.make(ServeOptions(homed=homed, clock=Clock(200.0, base=patient_clock())))
+def opened(homed: bool = True, **options: Any) -> Iterator[tuple[StandaEmulator, standa.StandaAxis]]:
+    clock = Clock(200.0, base=patient_clock())
+    emulator = emulated.make(ServeOptions(**{"homed": homed, "clock": clock} | options))
     with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
         entry = {"port": port.path, "steps_per_deg": 100, "poll_s": 0.002, "reply_s": 0.25, "assume_homed": homed}
-        yield emulator, standa.open("psg", standa.Config.model_validate(entry | changes), lines)
+        yield emulator, standa.open("psg", standa.Config.model_validate(entry), lines)
 
 
 def test_the_emulator_takes_the_bytes_of_the_makers_library() -> None:
@@ -88,8 +90,8 @@ def test_home_gives_the_count_a_zero_and_needs_both_the_flag_and_this_session() 
 
 
 def test_a_homing_that_was_stopped_makes_no_reference() -> None:
-    with opened(homed=False) as (emulator, axis):
-        emulator.clock.speed = 1.0
+    # So slow that it does not get home before the stop, however late that comes.
+    with opened(homed=False, speed_deg_s=1.0, clock=Clock(1.0, base=patient_clock())) as (_, axis):
         axis.home()
         axis.stop()
         while axis.is_moving():
