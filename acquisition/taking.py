@@ -20,12 +20,15 @@ def take_capture(plan: MeasurementPlan, rig: RigConfig, folder: Path | str, home
 
     Parameters
     ----------
-    folder : for the file, which is named as `acquire` names it.
-    home : home axes without a reference before the first move; nothing homes unless asked here or by the rig file.
+    folder
+        For the file, which is named as `acquire` names it.
+    home
+        Home axes without a reference before the first move; nothing homes unless asked here or by the rig file.
 
     Raises
     ------
-    AcquisitionError, DeviceError : it was refused, failed or was stopped; the message names what is left to go on with.
+    AcquisitionError, DeviceError
+        It was refused, failed or was stopped; the message names what is left to go on with.
     """
     job = prepare(plan, rig)
     path = Path(folder) / default_name(plan)

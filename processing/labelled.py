@@ -36,12 +36,15 @@ def reduce_to_dataset(capture: Path | str, instrument: Path | str | None = None,
 
     Parameters
     ----------
-    instrument : file to use instead of the model in the capture.
-    options : of `processing.Reduction`, for instance `weighted=True`.
+    instrument
+        File to use instead of the model in the capture.
+    options
+        Of `processing.Reduction`, for instance `weighted=True`.
 
     Raises
     ------
-    ProcessError : what `process reduce` would say.
+    ProcessError
+        What `process reduce` would say.
     """
     step = Reduction(Path(capture), Path(instrument) if instrument else None, **options)
     with tempfile.TemporaryDirectory() as folder:
@@ -56,7 +59,8 @@ def write_dataset(dataset: xr.Dataset, path: Path | str) -> Path:
 
     Raises
     ------
-    ProcessError : the file exists, or something needed is missing.
+    ProcessError
+        The file exists, or something needed is missing.
     """
     path = Path(path)
     if path.exists():

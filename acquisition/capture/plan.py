@@ -161,8 +161,10 @@ class MeasurementPlan(_Part):
 
         Parameters
         ----------
-        pose_deg : angle of every axis that stands still during the capture (the arm, a Stokes pose).
-        exposure_s : exposure of every state in seconds, times the factors of the bracket.
+        pose_deg
+            Angle of every axis that stands still during the capture (the arm, a Stokes pose).
+        exposure_s
+            Exposure of every state in seconds, times the factors of the bracket.
         """
         turning = self.states.angles_deg()
         if self.repeat_first:

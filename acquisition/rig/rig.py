@@ -50,7 +50,8 @@ class Rig:
 
     Parameters
     ----------
-    ask : shows the operator what a source without a cable needs and returns True when it is done.
+    ask
+        Shows the operator what a source without a cable needs and returns True when it is done.
     """
 
     def __init__(

@@ -34,9 +34,12 @@ class Goal:
 
     Attributes
     ----------
-    noise : weigh each state by its shot and read noise at this light; None: equal weights.
-    jitter_deg : standard deviation of every angle in every state, which acts like noise on a polarizing sample.
-    polarization : rms of m_ij / m00 that the sample is expected to have, for `jitter_deg`.
+    noise
+        Weigh each state by its shot and read noise at this light; None: equal weights.
+    jitter_deg
+        Standard deviation of every angle in every state, which acts like noise on a polarizing sample.
+    polarization
+        Rms of m_ij / m00 that the sample is expected to have, for `jitter_deg`.
     """
 
     noise: Noise | None = None
@@ -50,11 +53,16 @@ class FreeDesign:
 
     Attributes
     ----------
-    angles_deg : axis name to (states,).
-    retardances_deg : element name to retardance; those of the model where they were not free.
-    variance : trace of the inverse information of what the instrument determines, for unit noise.
-    bound : the least that any table of as many intensities can have.
-    rank : number of elements, or combinations of them, that are determined.
+    angles_deg
+        Axis name to (states,).
+    retardances_deg
+        Element name to retardance; those of the model where they were not free.
+    variance
+        Trace of the inverse information of what the instrument determines, for unit noise.
+    bound
+        The least that any table of as many intensities can have.
+    rank
+        Number of elements, or combinations of them, that are determined.
     """
 
     angles_deg: Mapping[str, Array]
@@ -176,13 +184,17 @@ def free_design(
 
     Parameters
     ----------
-    model : resolved at a wavelength, without effects.
-    free_retardances : those of turning retarders may change too.
-    first : a table to start from besides, degrees.
+    model
+        Resolved at a wavelength, without effects.
+    free_retardances
+        Those of turning retarders may change too.
+    first
+        A table to start from besides, degrees.
 
     Raises
     ------
-    ProcessError : nothing turns, or too few states for what the instrument can determine.
+    ProcessError
+        Nothing turns, or too few states for what the instrument can determine.
     """
     if not model.axes:
         raise ProcessError(f"no element of {model.name!r} turns, so there are no states to choose.")

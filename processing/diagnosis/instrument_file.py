@@ -49,11 +49,13 @@ def write_instrument(path: Path, model: InstrumentModel, diagnosis: Diagnosis, n
 
     Parameters
     ----------
-    note : why it is believed, for the head of the file.
+    note
+        Why it is believed, for the head of the file.
 
     Raises
     ------
-    WriteError : the file exists, or there is nothing to write.
+    WriteError
+        The file exists, or there is nothing to write.
     """
     if diagnosis.correction is not None and diagnosis.correction.refused is not None:
         raise WriteError(f"{path} was not written: {diagnosis.correction.refused}.")

@@ -59,9 +59,12 @@ class ViewingGeometry(BaseModel):
 
         Parameters
         ----------
-        omega_deg : angle between camera and source, degrees.
-        rows, columns : image size; default, the camera's own.
-        block : rows of the image to work out.
+        omega_deg
+            Angle between camera and source, degrees.
+        rows, columns
+            Image size; default, the camera's own.
+        block
+            Rows of the image to work out.
         """
         camera = self.camera
         if rows is not None and columns is not None:

@@ -132,8 +132,10 @@ class SystematicError(_Part):
 
     Attributes
     ----------
-    directions : effects of each direction, the one that a Mueller matrix notices most first.
-    rms_over_m00 : standard error of the elements of M/m00 that all of them make in the captures they were found in.
+    directions
+        Effects of each direction, the one that a Mueller matrix notices most first.
+    rms_over_m00
+        Standard error of the elements of M/m00 that all of them make in the captures they were found in.
     """
 
     directions: tuple[tuple[AppliedEffect, ...], ...]
@@ -307,7 +309,8 @@ class InstrumentModel(_Part):
 
         Raises
         ------
-        ValueError : the model has effects, and nobody said what they change.
+        ValueError
+            The model has effects, and nobody said what they change.
         """
         if changes is None and self.effects:
             raise ValueError(f"instrument {self.name!r} has effects: rows() needs the changes that they make")

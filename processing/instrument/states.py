@@ -23,7 +23,8 @@ class StateTable:
 
     Attributes
     ----------
-    angles_deg : mapping of axis name to array (N,), target angles in degrees.
+    angles_deg
+        Mapping of axis name to array (N,), target angles in degrees.
     exposure_s : array (N,), seconds.
     role : tuple of N roles.
     repeats : array (N,), frames averaged for the state.

@@ -66,7 +66,8 @@ def xi0_and_dominant(m: RealArray, out: tuple[RealArray, RealArray] | None = Non
     Parameters
     ----------
     m : (..., 4, 4), float32 or float64, as in `coherency_eigenvalues`.
-    out : what an earlier call for the same shape returned, to fill again: the first touch of new memory costs as much
+    out
+        What an earlier call for the same shape returned, to fill again: the first touch of new memory costs as much
         as the arithmetic.
 
     Returns

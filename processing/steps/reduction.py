@@ -25,14 +25,22 @@ class Reduction(FileStep):
 
     Attributes
     ----------
-    capture : to be reduced.
-    instrument : file to use instead of the model in the capture.
-    weighted, covariance, physical : see `processing.reduction.mueller.Choice`; for a Mueller capture.
-    camera : noise and bad pixels, a product of `process camera`.
-    dark : other capture whose dark states are subtracted.
-    flat : captures of the flat field, or folders of which the one that belongs to the capture is taken.
-    leave_out : result of `diagnose --json`: states, struck intensities and bad pixels that it names are left out.
-    demosaic, analyzers : method (None: the default) and analysis vectors of the pixels; for a mosaic capture.
+    capture
+        To be reduced.
+    instrument
+        File to use instead of the model in the capture.
+    weighted, covariance, physical
+        See `processing.reduction.mueller.Choice`; for a Mueller capture.
+    camera
+        Noise and bad pixels, a product of `process camera`.
+    dark
+        Other capture whose dark states are subtracted.
+    flat
+        Captures of the flat field, or folders of which the one that belongs to the capture is taken.
+    leave_out
+        Result of `diagnose --json`: states, struck intensities and bad pixels that it names are left out.
+    demosaic, analyzers
+        Method (None: the default) and analysis vectors of the pixels; for a mosaic capture.
     """
 
     capture: Path
@@ -115,7 +123,8 @@ def reduced(source: Path, instrument: Path | None = None, progress: Progress | N
 
     Raises
     ------
-    ProcessError : an instrument file was given for a product.
+    ProcessError
+        An instrument file was given for a product.
     """
     if not is_product(source):
         return Reduction(source, instrument).found_or_made(progress=progress)

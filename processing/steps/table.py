@@ -21,10 +21,14 @@ class Tabulation(FileStep):
 
     Attributes
     ----------
-    sources : products.
-    geometry : file of camera, source and shape.
-    out : the table; it has no other usual name.
-    layout : of the bins.
+    sources
+        Products.
+    geometry
+        File of camera, source and shape.
+    out
+        The table; it has no other usual name.
+    layout
+        Of the bins.
     """
 
     sources: tuple[Path, ...]
@@ -50,7 +54,8 @@ class Tabulation(FileStep):
 
         Raises
         ------
-        ProcessError : a source is in the table already, and its samples would count twice.
+        ProcessError
+            A source is in the table already, and its samples would count twice.
         """
         if not self.out.exists():
             return self.make(progress=progress)

@@ -44,12 +44,14 @@ class MuellerImage:
     Attributes
     ----------
     values : (4, 4, rows, columns) float32, counts, not normalized; NaN where nothing was determined.
-    errors : same shape, standard errors; NaN where they are not known.
+    errors
+        Same shape, standard errors; NaN where they are not known.
     mask : (rows, columns) uint8, bits of `processing.reduction.counts_to_signal.Mask`.
     residual_rms : (rows, columns), counts.
     w : (N, 16), measurement matrix, rows scaled with the exposure.
     noise_slope, noise_floor : (N,), variance of intensity n = slope * signal + floor; NaN where noise is not known.
-    header, steps, simulated, facts : as in the product.
+    header, steps, simulated, facts
+        As in the product.
     """
 
     values: NDArray[np.float32]

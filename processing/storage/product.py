@@ -59,17 +59,24 @@ class ProductWriter:
 
     Parameters
     ----------
-    path : of the finished product.
-    kind : "mueller", "stokes", ...
-    header : of the capture that the product comes from.
+    path
+        Of the finished product.
+    kind
+        "mueller", "stokes", ...
+    header
+        Of the capture that the product comes from.
     shape : (rows, columns).
-    planes : dataset name to Plane; the first one is the default signal of a viewer.
-    steps : provenance so far, oldest first.
-    overwrite : replace a finished product of that name.
+    planes
+        Dataset name to Plane; the first one is the default signal of a viewer.
+    steps
+        Provenance so far, oldest first.
+    overwrite
+        Replace a finished product of that name.
 
     Raises
     ------
-    ProductError : the product exists and `overwrite` is false, or the space cannot be had.
+    ProductError
+        The product exists and `overwrite` is false, or the space cannot be had.
     """
 
     def __init__(
@@ -229,7 +236,8 @@ class Product:
     kind : str; "mueller", "stokes", ...
     simulated : bool
     header : CaptureHeader of the capture it comes from
-    steps : provenance, oldest first
+    steps
+        Provenance, oldest first
     facts : dict of numbers and warnings of the last step
     shape : (rows, columns)
     """

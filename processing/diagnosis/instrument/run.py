@@ -22,12 +22,15 @@ def diagnose_captures(
 
     Parameters
     ----------
-    captures : of one instrument, at one wavelength or several; what is known of each sample is in the file.
-    model : as loaded from its file.
+    captures
+        Of one instrument, at one wavelength or several; what is known of each sample is in the file.
+    model
+        As loaded from its file.
 
     Raises
     ------
-    CaptureError : a file cannot be used.
+    CaptureError
+        A file cannot be used.
     """
     models: list[InstrumentModel] = []
     data: list[CaptureData] = []
