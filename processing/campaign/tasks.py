@@ -114,27 +114,29 @@ def reduced_product(task: CaptureTask) -> Path:
 
 
 def _measure_mueller(task: CaptureTask, product: Path, view: ViewingGeometry) -> CaptureMeasure:
-    image = MuellerImage.load(product)
-    m = image.matrices
-    geometry = view.at(float(image.header.omega_deg or 0.0), *image.mask.shape)
+    whole = MuellerImage.load(product)
+    geometry = view.at(float(whole.header.omega_deg or 0.0), *whole.mask.shape)
+    # The object alone, as rows of one pixel: what lies beside it costs as much.
+    image = whole.at(np.flatnonzero(geometry.mask))
+    m = image.matrices[:, 0].astype(float)
     model = load_reflectance(task.material).mueller_jones(geometry.points, image.header.wavelength_nm)
-    inside = geometry.mask
-    m0 = xi0_and_dominant(m[inside].astype(float))[1]
-    eigenvalues, noise = coherency_eigenvalues(m).astype(float), coherency_noise(image)
-    found = corrected(eigenvalues, noise)
-    xi0, stderr = found.xi0[inside], (found.interval_68[1] - found.interval_68[0])[inside] / 2
+    m0 = xi0_and_dominant(m)[1]
+    noise, eigenvalues = coherency_noise(image), coherency_eigenvalues(m)
+    found = corrected(np.asarray(eigenvalues[:, None], dtype=float), noise)
+    xi0, stderr = found.xi0[:, 0], (found.interval_68[1] - found.interval_68[0])[:, 0] / 2
     # A limit on the noise: one on the outcome would keep upward fluctuations only.
-    good = np.isfinite(xi0) & ~(noise.coupling[inside] > MAX_STDERR) & _inner(geometry, task.border_px)
+    good = np.isfinite(xi0) & ~(noise.coupling[:, 0] > MAX_STDERR) & _inner(geometry, task.border_px)
     measured, modelled = linear_diattenuation(m0), linear_diattenuation(model)
     psi = orientation_difference(modelled, measured)[good]
-    psi_noise, magnitude_noise = _noise_of_dominant(image, np.flatnonzero(geometry.mask)[good])
-    deviation = np.abs(deviation_from_td(eigenvalues)).max(axis=-1)[inside][good]
-    most, by_noise = (_most(v) for v in (deviation, largest_deviation_by_noise(image)[inside][good]))
+    chosen = np.flatnonzero(good)
+    psi_noise, magnitude_noise = _noise_of_dominant(image, chosen)
+    deviation = np.abs(deviation_from_td(eigenvalues)).max(axis=-1)[good]
+    most, by_noise = (_most(v) for v in (deviation, largest_deviation_by_noise(image.at(chosen))))
     return CaptureMeasure(
         kind="mueller",
         wavelength_nm=image.header.wavelength_nm,
         omega_deg=float(image.header.omega_deg or 0.0),
-        shape=(image.mask.shape[0], image.mask.shape[1]),
+        shape=(whole.mask.shape[0], whole.mask.shape[1]),
         table=_table(task, product, geometry, (xi0, stderr, good), image.header.wavelength_nm, image.simulated),
         psi_deg=float(np.rad2deg(rmsd(psi))),
         magnitude_percent=100 * rmsd((magnitude(modelled) - magnitude(measured))[good]),

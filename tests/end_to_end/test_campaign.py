@@ -234,7 +234,7 @@ def test_design_recommends_vertical_light(configs, process, tmp_path):
 
 
 def test_what_cannot_be_a_campaign_is_refused(folder, configs, tmp_path):
-    with pytest.raises(ProcessError, match="no capture"):
+    with pytest.raises(ProcessError, match="no complete capture"):
         find_captures(tmp_path)
     for name in ("drr_35.h5", "drr_60.h5"):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
