@@ -57,10 +57,6 @@ class ReflectanceProblem:
         self.fold = np.random.default_rng(0).permutation(n) % FOLDS if folds is None else folds
         self._mean = float(np.mean(np.abs(intensities[:, 0])))
 
-    def nominal(self) -> tuple[Candidate, ...]:
-        """Nothing is nominal."""
-        return ()
-
     def pool(self) -> tuple[Candidate, ...]:
         """All effects of the reflectance."""
         found = []
@@ -100,9 +96,9 @@ class ReflectanceProblem:
         """Nothing is expanded here."""
         return False
 
-    def adopt_noise(self, space: Space, values: Array) -> bool:
-        """The noise does not depend on the effects."""
-        return False
+    def noise_information(self, space: Space, values: Array) -> Array:
+        """Nothing is known from the slopes of noise here."""
+        return np.zeros((space.size, space.size))
 
     def residual_squares(self, space: Space, values: Array) -> Array:
         """Sum of squares (N,) that each point leaves over, in the units of the intensities."""

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from measured_points import ReflectanceProblem
 
-from processing.diagnosis.search.search import Search
+from processing.diagnosis.search.fit import held_out
+from processing.diagnosis.search.own_minima import OwnMinima
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
@@ -46,13 +47,15 @@ def test_first_surface_alone_lacks_polarized_diffuse(sphere):
     constants = scene.material.constants[662]
     index = complex(constants.n, constants.k)
     problem = ReflectanceProblem(points, noisy, w, index, sigma)
-    found = Search(problem, lambda line: None).run()
-    assert [c.kind for c in found.effects] == ["polarized_diffuse"]
-    assert not found.sets[found.effects[0]]
+    search = OwnMinima(problem, lambda line: None)
+    found = search.run()
+    assert [c.kind for c in found.space.candidates] == ["polarized_diffuse"]
+    (cause,) = search.causes(found, 0.0).values()
+    assert cause.answer == "sure"
     a, log_b = found.fit.values
     assert a == pytest.approx(constants.a, abs=0.02)
     assert np.exp(log_b) == pytest.approx(constants.b, abs=0.3)
-    assert found.after.chi2_reduced < 1.02
+    assert held_out(problem, found.space, found.fit).chi2_reduced < 1.02
 
     true = scene.material.mueller_jones(points, WAVELENGTH_NM)
     xi0 = truth.xi0[truth.mask]

@@ -10,15 +10,11 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from processing.arrays import Array
-from processing.diagnosis.instrument.whole_bench import Solution
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.result import Combination
+from processing.diagnosis.search.rules import OPEN, TOGETHER
+from processing.diagnosis.search.solution import Solution
 from processing.instrument.effects.base import ValuePerState
-
-#: Correlation from which on two values are told together.
-TOGETHER = 0.9
-#: Ratio of the largest to the least error among the directions of values that are told together.
-OPEN = 5.0
 
 
 @dataclass(frozen=True)

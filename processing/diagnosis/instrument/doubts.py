@@ -9,29 +9,12 @@ import numpy as np
 from processing.arrays import Array
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.unevenness import unevenness
-from processing.diagnosis.instrument.whole_bench import Solution
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause
 from processing.diagnosis.search.posterior import Posterior
+from processing.diagnosis.search.rules import BOUND, ONE_PATTERN, TESTABLE, TIMES, UNEVEN, UNEVEN_SHARE, UNKNOWN_NOISE
+from processing.diagnosis.search.solution import Solution
 from processing.instrument.effects.base import FieldEffect, GeneralEffect, PointwiseEffect, SourceEffect, ValuePerState
-
-#: Share of the scatter of values that belong to one state each which a single wave, or a jump beside a slope, may hold,
-#: if they are to be random.
-ONE_PATTERN = 0.85
-#: Standard deviations, and share of what it explains, by which the size of an effect of the source may differ over the
-#: image.
-UNEVEN, UNEVEN_SHARE = 6.0, 0.01
-#: Share of the directions of the data that values for each state, with all others, may have.
-TESTABLE = 0.75
-#: With structure left something is there that is not in the list, and causes that are may be parts of it: one alone has
-#: to explain this many times what is left, the second strongest four times as much, the third nine times, ...
-TIMES = 100.0
-#: Log odds that a name needs where nothing but what is left tells the noise: part of it may be structure. What can
-#: describe any pattern (a bend of the response, a value for each state) has to explain `TIMES` what is left.
-UNKNOWN_NOISE = 25.0
-#: Part of the range of a parameter that is its bound.
-BOUND = 1e-3
-
 
 #: The one reason that leaves a name likely.
 PART_OF_LEFT = "it may be a part of what is left unexplained"

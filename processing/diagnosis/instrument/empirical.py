@@ -6,17 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
-from processing.diagnosis.instrument.whole_bench import Solution
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.result import Empirical
-from processing.diagnosis.search.rules import TAU
+from processing.diagnosis.search.rules import ALSO, EMPIRICAL_SHARE, TAU
+from processing.diagnosis.search.solution import Solution
 from processing.instrument.effects.base import GeneralEffect
-
-#: Share of the excess that an empirical correction must take.
-LEAST_SHARE = 0.1
-#: Share of what the best takes by which another may do worse and still be one that would also fit.
-ALSO = 0.02
 
 
 def empirical(found: Posterior, solved: Solution) -> Empirical | None:
@@ -33,7 +28,7 @@ def empirical(found: Posterior, solved: Solution) -> Empirical | None:
     if not fits:
         return None
     left, best, values = min(fits, key=lambda f: f[0])
-    if left > (1 - LEAST_SHARE) * before or not isinstance(best.effect, GeneralEffect):
+    if left > (1 - EMPIRICAL_SHARE) * before or not isinstance(best.effect, GeneralEffect):
         return None
     freedom = found.sets.noise.slack + ALSO * (before - left)
     total = max(solved.before.excess + solved.before.freedom, 1e-300)

@@ -7,17 +7,14 @@ import numpy as np
 from processing.diagnosis.instrument.mueller_slopes import mueller_slopes
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.systematic import ELEMENTS
-from processing.diagnosis.instrument.whole_bench import Solution
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.result import Check
+from processing.diagnosis.search.rules import WORSE, WORSE_CONDITION
+from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import FieldEffect, Switch
 
-#: Growth of the residual that is still put down to chance.
-WORSE = 1.002
-#: Growth of the condition number of W that a correction may cause: beyond it the states would be other ones.
-WORSE_CONDITION = 1.5
 #: Singular values below this, relative to the largest, are none.
 RANK = 1e-6
 

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from processing.arrays import Array
 from processing.diagnosis.instrument.doubts import doubts, testable
 from processing.diagnosis.instrument.empirical import empirical
 from processing.diagnosis.instrument.evidence import wanted_for_evidence, would_be_seen
 from processing.diagnosis.instrument.guard import checks, refusal
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.recommend import recommended
-from processing.diagnosis.instrument.structure import LIMIT, Residual, description, residual
+from processing.diagnosis.instrument.structure import Residual, description, residual
 from processing.diagnosis.instrument.telling import (
     calibrated,
     capture_report,
@@ -28,19 +29,15 @@ from processing.diagnosis.instrument.telling import (
     told_switches,
     unobservable,
 )
-from processing.diagnosis.instrument.whole_bench import Solution, WholeBench, predicts, solution
+from processing.diagnosis.instrument.whole_bench import WholeBench, predicts, solution
 from processing.diagnosis.instrument.wiring import miswired
 from processing.diagnosis.search.causes import Cause, causes
 from processing.diagnosis.search.posterior import Posterior, Say
 from processing.diagnosis.search.result import Diagnosis, Unexplained, Verdict
-from processing.diagnosis.search.rules import LIKELY
+from processing.diagnosis.search.rules import GROWTH, LIKELY, LIMIT, WHITE
+from processing.diagnosis.search.solution import Solution
 from processing.instrument.effects.base import ValuePerState
 from processing.instrument.model import InstrumentModel
-
-#: Autocorrelation over the states, in standard deviations, from which on a residual of few pixels is not white.
-WHITE = 4.0
-#: Growth of the unit of chi-square, by what the tests of the residual find, from which on the sets are visited again.
-GROWTH = 1.05
 
 
 @dataclass(frozen=True)
@@ -71,7 +68,7 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
     before = tuple(residual(asked, k, solved.base, solved.before_fit) for k in captures)
     after = tuple(residual(asked, k, solved.space, solved.fit) for k in captures)
     units = np.array([1 + r.left / directions(asked, k) for k, r in enumerate(after)])
-    if problem.noise_known and units.max() > GROWTH * found.samples.best.unit:
+    if problem.noise_known and _grown(units, found.samples.best.unit):
         # Single tests see structure that the sum of squares does not.
         found = bench.weighed(found, units)
         solved = solution(bench, found)
@@ -134,6 +131,10 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
         noise=noise_report(problem),
     )
     return Judged(diagnosis, kept, before, after if refused is None else before)
+
+
+def _grown(units: Array, unit: float) -> bool:
+    return bool(units.max() > GROWTH * unit)
 
 
 def directions(problem: InstrumentProblem, k: int) -> float:

@@ -11,7 +11,7 @@ from processing.arrays import Array
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit
-from processing.diagnosis.search.rules import APART
+from processing.diagnosis.search.rules import APART, VISIBLE
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import CountsEffect, InstrumentEffect, ValuePerState
 from processing.polarization import mueller
@@ -24,8 +24,6 @@ SAMPLES: dict[str, NDArray[np.float64]] = {
     "a mirror": mueller.IDEAL_MIRROR,
     "a depolarizing white target (integrating sphere)": mueller.IDEAL_DEPOLARIZER,
 }
-#: Signature, relative to the signal for a typical size, below which a capture does not see an effect.
-VISIBLE = 1e-4
 
 
 def recommended(

@@ -11,14 +11,11 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit, minimize
 from processing.diagnosis.search.posterior import Say
+from processing.diagnosis.search.rules import FAR_OFF, NEAR_ENOUGH
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import SourceEffect, ValuePerState
 
-#: Relative rms residual above which nominal values, and what else has far starts, are searched for from many starts.
-FAR_OFF = 0.05
 STARTS = 24
-#: Relative rms residual below which no better start is looked for.
-NEAR_ENOUGH = 0.01
 #: Half widths of the starts of nominal values, in degrees: azimuths, which come round again; retardances of plates of a
 #: known order, and of elements of which no more than "some retardance" is known.
 ANY_AZIMUTH, NEAR, FAR = 90.0, 20.0, 120.0

@@ -14,12 +14,11 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import add_response
 from processing.diagnosis.instrument.tile_sums import tile_columns
 from processing.diagnosis.search.fit import Fit
+from processing.diagnosis.search.rules import LIMIT
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import FIELD_TERMS, Changes, field_terms
 from processing.reduction.move_image import neighbour_noise
 
-#: Standard deviations beyond which a test says "structure".
-LIMIT = 5.0
 HARMONICS = 4
 #: Pixels from which on tests by signal and by place are made.
 FEWEST_PIXELS = 30

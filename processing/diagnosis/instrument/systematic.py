@@ -11,10 +11,10 @@ import numpy as np
 from processing.arrays import Array
 from processing.diagnosis.instrument.mueller_slopes import mueller_slopes
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.stored import parameters_of, scope_of
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import TAKES_PART, UNSEEN
 from processing.diagnosis.search.space import Space
+from processing.diagnosis.search.stored import parameters_of, scope_of
 from processing.instrument.effects.base import FieldEffect, Switch
 from processing.instrument.model import AppliedEffect, EffectParameter, SystematicError
 

@@ -8,10 +8,8 @@ from processing.diagnosis.instrument.closure import closure
 from processing.diagnosis.instrument.combinations import combinations
 from processing.diagnosis.instrument.doubts import PART_OF_LEFT
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.stored import parameters_of, scope_of
 from processing.diagnosis.instrument.structure import Residual
 from processing.diagnosis.instrument.systematic import systematic_error
-from processing.diagnosis.instrument.whole_bench import Solution
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Answer, Cause
 from processing.diagnosis.search.fit import HeldOut
@@ -26,8 +24,10 @@ from processing.diagnosis.search.result import (
     NotMeasured,
     Ranked,
 )
-from processing.diagnosis.search.rules import DECISIVE, DOUBTED, LIKELY, NOMINAL_TAU, SURE
+from processing.diagnosis.search.rules import DECISIVE, DOUBTED, LIKELY, NOISE_ERROR, NOMINAL_TAU, SEEN, SURE
+from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
+from processing.diagnosis.search.stored import parameters_of, scope_of
 from processing.instrument.effects.base import (
     CountsEffect,
     FieldEffect,
@@ -36,11 +36,6 @@ from processing.instrument.effects.base import (
     Switch,
 )
 from processing.instrument.model import AppliedEffect, EffectParameter
-
-#: An information about a parameter below this, in chi-square for its typical size, is none.
-SEEN = 4.0
-#: Relative error of the noise: information that is less than this share of it may be noise.
-NOISE_ERROR = 0.05
 
 
 def error(problem: InstrumentProblem, out: HeldOut) -> Error:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -15,39 +14,12 @@ from processing.diagnosis.instrument.starts import first_values
 from processing.diagnosis.instrument.undone import exactly_undone
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
-from processing.diagnosis.search.fit import Fit, HeldOut, held_out, minimize, prior, score
+from processing.diagnosis.search.fit import Fit, held_out, minimize, prior, score
 from processing.diagnosis.search.posterior import Posterior, Say, posterior, quadratic, resampled
-from processing.diagnosis.search.rules import DECISIVE, LIKELY, REFUTED, SHARES, TAKES_PART
+from processing.diagnosis.search.rules import BESIDE_FIELD, DECISIVE, LIKELY, REFUTED, SHARES, TAKES_PART
+from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import FieldEffect, ImageShift, PointwiseEffect, Switch, ValuePerState
-
-#: Groups of single values that may take part where every tile of the image has a matrix of its own.
-BESIDE_FIELD = 90
-
-
-@dataclass
-class Solution:
-    """Before and after, on data that the fit did not see.
-
-    Attributes
-    ----------
-    base : what is always fitted; space : that, and the effects of the correction (the mean of the posterior).
-    before_fit, fit : at these; before, after : predictions of what was held out.
-    weak : (K,) curvature of the prior of the values of `space`.
-    """
-
-    base: Space
-    before_fit: Fit
-    before: HeldOut
-    space: Space
-    fit: Fit
-    after: HeldOut
-    weak: Array = field(default_factory=lambda: np.zeros(0))
-
-    @property
-    def effects(self) -> tuple[Candidate, ...]:
-        """Effects of the correction."""
-        return self.space.candidates[len(self.base.candidates) :]
 
 
 def predicts(problem: InstrumentProblem) -> InstrumentProblem:

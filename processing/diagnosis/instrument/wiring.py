@@ -16,8 +16,8 @@ import numpy as np
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.starts import FAR_OFF, STARTS, best_of_starts, rms
-from processing.diagnosis.search.rules import DECISIVE, WIRING
+from processing.diagnosis.instrument.starts import STARTS, best_of_starts, rms
+from processing.diagnosis.search.rules import DECISIVE, FAR_OFF, WIRING
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
 

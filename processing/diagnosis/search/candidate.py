@@ -46,11 +46,6 @@ class Candidate:
         return len(self.parameters)
 
     @property
-    def cost(self) -> float:
-        """Parameters that a fit has to pay for; the state of a slip is chosen among many."""
-        return self.size + (3.0 if self.state_chosen else 0.0)
-
-    @property
     def state_chosen(self) -> bool:
         """The state that it starts at is chosen among many."""
         return isinstance(self.effect, FromAState)

@@ -60,11 +60,11 @@ def causes(found: Posterior, left: float) -> tuple[Cause, ...]:
     out = []
     for k in map(int, np.flatnonzero((state.tau > 0) & sets.free)):
         odds = sets.conditional(sets.without(state, k)).log_odds
-        least = odds[k] - max(ALTERNATIVE, ALIKE * odds[k], 0.5 * left / state.unit)
+        least = least_odds(odds[k], left / state.unit)
         others = [
             int(j)
             for j in np.argsort(-odds)
-            if sets.free[j] and state.tau[j] == 0 and odds[j] > max(least, 0.0) and not _same_family(found, int(j), k)
+            if sets.free[j] and state.tau[j] == 0 and odds[j] > least and not _same_family(found, int(j), k)
         ]
         candidates = tuple(found.space.candidates[m] for m in found.members[k])
         values, errors = [], []
@@ -80,6 +80,14 @@ def causes(found: Posterior, left: float) -> tuple[Cause, ...]:
         probability = min(samples.any_of(members), float(1 / (1 + np.exp(-np.clip(total, -50, 50)))))
         out.append(Cause(candidates, tuple(values), tuple(errors), probability, float(odds[k]), names))
     return tuple(sorted(out, key=lambda c: -c.log_odds))
+
+
+def least_odds(odds: float, left: float) -> float:
+    """Log odds from which on another group in a cause's place is named with it.
+
+    `left` is the chi-square that nothing explains, in its unit.
+    """
+    return max(odds - max(ALTERNATIVE, ALIKE * odds, 0.5 * left), 0.0)
 
 
 def _same_family(found: Posterior, j: int, k: int) -> bool:

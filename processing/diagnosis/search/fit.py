@@ -45,19 +45,21 @@ def minimize(
     free: NDArray[np.bool_] | None = None,
     steps: int = STEPS,
     expansions: int = EXPANSIONS,
+    least_gain: float = LEAST_GAIN,
 ) -> Fit:
     """Least squares by Levenberg-Marquardt with bounds, on the data of the folds given; `free` (K,) may hold some.
 
+    It ends when a step gains less than `least_gain`.
     Corrections of counts are expanded about the start, and at most `expansions` times anew about where the fit ended.
     """
     if folds is None and expansions:
         problem.relinearize(space, start)
-    fit = _descend(problem, space, start, folds, free, steps)
+    fit = _descend(problem, space, start, folds, free, steps, least_gain)
     if folds is None:
         for _ in range(expansions):
             if not problem.relinearize(space, fit.values):
                 break
-            fit = _descend(problem, space, fit.values, folds, free, steps)
+            fit = _descend(problem, space, fit.values, folds, free, steps, least_gain)
     return fit
 
 
@@ -68,6 +70,7 @@ def _descend(
     folds: Sequence[int] | None,
     free: NDArray[np.bool_] | None,
     steps: int,
+    least_gain: float,
 ) -> Fit:
     use = list(range(problem.folds) if folds is None else folds)
     weak = prior(space)
@@ -84,7 +87,7 @@ def _descend(
         if not move.any():
             break
         gm, hm = g[move], h[np.ix_(move, move)]
-        if damping <= 1e-6 and _promise(gm, hm) < LEAST_GAIN + LEAST_RELATIVE * abs(cost):
+        if damping <= 1e-6 and _promise(gm, hm) < least_gain + LEAST_RELATIVE * abs(cost):
             break
         while True:
             step = np.zeros_like(x)
@@ -100,7 +103,7 @@ def _descend(
         gain = cost - new_cost
         x, sums, cost = tried, new, new_cost
         damping = max(damping / 10, 1e-9)
-        if gain < LEAST_GAIN + LEAST_RELATIVE * abs(cost):
+        if gain < least_gain + LEAST_RELATIVE * abs(cost):
             break
     return Fit(x, sums, float(sums.excess[use].sum()))
 
@@ -224,16 +227,3 @@ def _one_step(full: Fit, space: Space, folds: Sequence[int], weak: Array) -> Arr
     lower, upper = space.joined("lower"), space.joined("upper")
     step = np.where(space.fixed, 0.0, np.linalg.solve(h, g))
     return np.asarray(np.clip(full.values - step, lower, upper))
-
-
-def covariance(space: Space, fit: Fit, noise_only: Array) -> tuple[Array, Array]:
-    """Covariance (K, K) of the values of a fit, for noise of one; and the inverse (K, K) of the gradient's slope.
-
-    The part `noise_only` (K, K) of the curvature comes from noise in the derivatives: it adds to the scatter of the
-    gradient, not to its slope.
-    """
-    weak = np.diag(prior(space))
-    raw = fit.sums.curvature.sum(axis=0) + weak
-    told = raw - noise_only
-    bread = np.linalg.inv(told if space.size and np.linalg.eigvalsh(told).min() > 0 else raw)
-    return bread @ raw @ bread, bread

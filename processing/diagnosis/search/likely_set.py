@@ -4,15 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from processing.diagnosis.search.rules import TAU
+from processing.diagnosis.search.rules import HOPE, NEEDED, PATIENCE, TAU
 from processing.diagnosis.search.sets import Sets, State
 
-#: Changes that are tried one after the other without a gain before a climb ends.
-PATIENCE = 8
-#: Loss in log probability, at the present unit, of a change that is still tried: the unit may fall with it.
-HOPE = -6.0
-#: Log odds from which on a group is not taken away any more.
-NEEDED = 12.0
 STEPS = 60
 
 
@@ -40,7 +34,7 @@ def climb(sets: Sets, state: State) -> State:
         if now > best:
             state, best = tried, now
             barred[:] = False
-            _retune(sets, state)
+            retune(sets, state)
         else:
             barred[k] = True
     return sets.settled(state)
@@ -63,11 +57,11 @@ def thinned(sets: Sets) -> State:
             return kept
         worst = np.argsort(odds)[: max(1, int(np.sum(odds < 0)) // 6)]
         state.tau[worst] = 0.0
-        _retune(sets, state)
+        retune(sets, state)
         sets.settled(state)
 
 
-def _retune(sets: Sets, state: State) -> None:
+def retune(sets: Sets, state: State) -> None:
     """Every group at its likeliest variance."""
     c = sets.conditional(state)
     there = (state.tau > 0) & sets.free

@@ -16,6 +16,7 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.likely_set import climb, likely_set
 from processing.diagnosis.search.problem import Problem
 from processing.diagnosis.search.rules import (
+    BENT,
     LEAST_NOISE,
     NOMINAL_TAU,
     ROUNDS,
@@ -36,8 +37,6 @@ Say = Callable[[str], None]
 STEPS = 6
 #: Times that everything is linearized anew before groups are chosen.
 EXPANSIONS = 8
-#: Unit of chi-square, after the first choice of groups, from which on the first linearization is not believed.
-BENT = 2.0
 #: The descent ends when a step gains less than this in chi-square, or this fraction of it.
 LEAST_GAIN, LEAST_RELATIVE = 0.05, 1e-7
 

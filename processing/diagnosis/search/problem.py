@@ -34,20 +34,12 @@ class Problem(Protocol):
         """Every effect at every place."""
         ...
 
-    def nominal(self) -> tuple[Candidate, ...]:
-        """Values that are always fitted, because the model gives them as nominal only."""
-        ...
-
     def powers(self) -> list[tuple[int, Array]]:
         """Rows that the unknowns leave over, and the power of each component of the signal, for each capture."""
         ...
 
     def relinearize(self, space: Space, values: Array) -> bool:
         """Take these values as the point that corrections are expanded about; False if one as close is known."""
-        ...
-
-    def adopt_noise(self, space: Space, values: Array) -> bool:
-        """Take the noise from the light that these values tell, for all that follows; False if that is as before."""
         ...
 
     def noise_information(self, space: Space, values: Array) -> Array:

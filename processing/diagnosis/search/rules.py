@@ -1,65 +1,159 @@
-"""Constants by which the diagnosis decides, shared by instrument and surface; each with its unit and its reason."""
+"""Constants by which the diagnosis decides, shared by instrument and surface; each with its unit and its reason.
+
+docs/diagnosis-rules.md is made of this file (`python benchmarks/rules_page.py`). Every one of them has a decision in
+tests/physics/test_diagnosis_rules.py that is another one when it is changed by a fifth.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-#: Sine of the angle between two signatures from which on a capture tells them apart.
-APART = 0.3
-
 # ---- prior: what is plausible before the data are seen -------------------------------------------------------------
-#: Standard deviations of the values of a group, in typical sizes, and how plausible each is. Mounts are set to a
-#: fraction of a degree far more often than they are left wrong by three typical sizes.
+#: [typical sizes] Standard deviations of the values of a group. Mounts are set to a fraction of a degree far more often
+#: than they are left wrong by three typical sizes.
 TAU = np.array([0.03, 0.1, 0.3, 1.0, 3.0])
+#: [probability] How plausible each of these standard deviations is.
 TAU_WEIGHT = np.array([0.1, 0.2, 0.3, 0.3, 0.1])
-#: Weight of the prior for few causes: with k of n groups there, one more has odds of (1 + k) to ((1 + this) n - k - 1).
-#: A clean bench has few causes, one with six faults may well have a seventh.
+#: [1] Weight of the prior for few causes: with k of n groups there, one more has odds of (1 + k) to ((1 + this) n - k -
+#: 1). A clean bench has few causes, one with six faults may well have a seventh.
 FEW_CAUSES = 0.5
-#: Standard deviation of a nominal value of the train, in typical sizes (30 degrees): the weakest prior that keeps it.
+#: [typical sizes] Standard deviation of a nominal value of the train (30 degrees): the weakest prior that keeps it.
 NOMINAL_TAU = 10.0
+#: [probability] Share of benches on which an effect is there at its typical size, for what the data say nothing of: a
+#: bench that is new has a third of the list.
+UNSEEN = 0.3
 
 # ---- noise ---------------------------------------------------------------------------------------------------------
-#: Standard deviations of the noise's own chi-square up to which a total excess is no structure.
+#: [standard deviations] Total excess over the noise's own chi-square up to which it is no structure.
 SLACK = 2.0
-#: Least residual, relative to the signal, that is taken as noise where the noise is not known: no bench repeats better.
+#: [of the signal] Least residual that is taken as noise where the noise is not known: no bench repeats better.
 LEAST_NOISE = 1e-4
-
-#: Log odds of the scatter of the counts against the noise that a correction of them tells, from which on it is dropped.
+#: [log odds] Of the scatter of the counts against the noise that a correction of them tells, from which on it is
+#: dropped: 1 to 160 000.
 REFUTED = 12.0
 
 # ---- search --------------------------------------------------------------------------------------------------------
-#: Times that the problem is linearized anew about its solution.
-ROUNDS = 7
-#: A move, in standard deviations of the posterior, below which no new linearization is needed.
-SETTLED = 0.3
-#: Sets that are visited in the last round, and in those before.
-SAMPLES, SAMPLES_BEFORE = 300, 80
-#: Probability from which on a group takes part when the solution is improved, and in the correction that is written.
-#: What is less likely moves the mean by less than its own error.
-TAKES_PART = 0.25
-
-#: Share of benches on which an effect is there at its typical size, for what the data say nothing of: a bench that is
-#: new has a third of the list.
-UNSEEN = 0.3
-
-#: Probability from which on a member of a class that is likely as a whole takes its share in the correction.
-SHARES = 0.01
+#: [of the signal] Residual above which nominal values, and what else has far starts, are searched for from many starts.
+FAR_OFF = 0.05
+#: [of the signal] Residual below which no better start is looked for.
+NEAR_ENOUGH = 0.01
+#: [unit of chi-square] After the first choice of groups, from which on the first linearization is not believed.
+BENT = 2.0
+#: [log odds] Loss of a change of the set that is still tried: the unit of chi-square may fall with it.
+HOPE = -6.0
+#: [log odds] From which on a group is not taken away any more on the way down from all groups.
+NEEDED = 12.0
+#: [chi-square] Gain from which on something that needs a search of its own (a retardance that varies over the image,
+#: clipped pixels, a mistake of wiring) is looked into.
+DECISIVE = 25.0
+#: [1] Single values that may take part where every tile of the image has a matrix of its own, for the memory's sake.
+BESIDE_FIELD = 90
+#: [1] Growth of the unit of chi-square, by what the tests of the residual find, from which on the sets are visited
+#: again.
+GROWTH = 1.05
 
 # ---- wiring --------------------------------------------------------------------------------------------------------
-#: Factor by which less must be left over without a mistake of wiring (tests/physics/test_diagnosis_wiring.py).
+#: [1] Factor by which less must be left over without a mistake of wiring: no small change of a value does that.
 WIRING = 5.0
 
+# ---- correction ----------------------------------------------------------------------------------------------------
+#: [probability] From which on a group takes part in the correction that is written. What is less likely moves the mean
+#: by less than its own error.
+TAKES_PART = 0.25
+#: [probability] From which on a member of a class that is likely as a whole takes its share in the correction.
+SHARES = 0.01
+#: [1] Growth of the residual on held-out data that is still put down to chance.
+WORSE = 1.002
+#: [1] Growth of the condition number of W that a correction may cause: beyond it the states would be other ones.
+WORSE_CONDITION = 1.5
+#: [of the excess] What a correction without a name (an empirical one) has to take away.
+EMPIRICAL_SHARE = 0.1
+#: [of what the best takes] By which another such correction may do worse and still be one that would also fit.
+ALSO = 0.02
+
+# ---- structure -----------------------------------------------------------------------------------------------------
+#: [standard deviations] Beyond which a test of the residual says "structure".
+LIMIT = 5.0
+#: [standard deviations] Autocorrelation over the states from which on the residual of few pixels is not white.
+WHITE = 4.0
+
 # ---- names ---------------------------------------------------------------------------------------------------------
-#: Probabilities from which on a cause is called sure, and likely.
-SURE, LIKELY = 0.99, 0.9
-#: Most that is told of a cause that may be a part of what is left unexplained.
+#: [probability] From which on a cause is called sure.
+SURE = 0.99
+#: [probability] From which on a cause is called likely.
+LIKELY = 0.9
+#: [probability] Most that is told of a cause that may be a part of what is left unexplained.
 DOUBTED = 0.95
-#: Log odds by which an alternative may be worse in a cause's place and still be named with it: 1 to 1100.
+#: [log odds] By which an alternative may be worse in a cause's place and still be named with it: 1 to 1100.
 ALTERNATIVE = 7.0
-#: The same as a share of what the cause explains: no effect's model is exact.
+#: [of what the cause explains] The same: no effect's model is exact.
 ALIKE = 1e-3
-#: Standard deviations by which an effect of typical size has to stand out for its absence to mean anything.
+
+# ---- why a name is doubted -----------------------------------------------------------------------------------------
+#: [of the range] How close to the end of a parameter's range a value stands at its bound.
+BOUND = 1e-3
+#: [of their scatter] What a single wave, or a jump beside a slope, may hold of values that belong to one state each, if
+#: they are to be random.
+ONE_PATTERN = 0.85
+#: [standard deviations] By which the size of an effect of the source may differ over the image.
+UNEVEN = 6.0
+#: [of what it explains] The same, for a large effect.
+UNEVEN_SHARE = 0.01
+#: [of the directions of the data] What values for each state, with all others, may have.
+TESTABLE = 0.75
+#: [1] With structure left something is there that is not in the list, and causes that are may be parts of it: one alone
+#: has to explain this many times what is left, the second strongest four times as much, the third nine times, ...
+TIMES = 100.0
+#: [log odds] That a name needs where nothing but what is left tells the noise: part of it may be structure. What can
+#: describe any pattern (a bend of the response, a value for each state) has to explain `TIMES` what is left.
+UNKNOWN_NOISE = 25.0
+
+# ---- values that are told together ---------------------------------------------------------------------------------
+#: [correlation] From which on two values are told together.
+TOGETHER = 0.9
+#: [1] Ratio of the largest to the least error among the directions of values that are told together.
+OPEN = 5.0
+
+# ---- what captures can show ----------------------------------------------------------------------------------------
+#: [chi-square] Information about a typical size below which an effect cannot be seen.
+SEEN = 4.0
+#: [standard deviations] By which an effect of typical size has to stand out for its absence to mean anything.
 VISIBLE_FAULT = 4.0
-#: Gain in chi-square from which on something that needs a search of its own (a retardance that varies over the image,
-#: clipped pixels, a far start) is looked into.
-DECISIVE = 25.0
+#: [of the noise] Information from slopes of noise, not of light, that counts as none: noise is known to some percent.
+NOISE_ERROR = 0.05
+#: [sine] Of the angle between two signatures, from which on a capture tells them apart.
+APART = 0.3
+#: [of the signal] Signature of a typical size below which a capture does not see an effect.
+VISIBLE = 1e-4
+
+# ---- surfaces ------------------------------------------------------------------------------------------------------
+#: [log odds] That a group needs: smooth patterns over an object imitate each other.
+IMITATES = 20.0
+#: [of what is left over] What a group must explain to be added while structure is left: several that each take a little
+#: together imitate nearly any smooth pattern.
+EXPLAINS = 0.3
+#: [of each test's excess] What may be left where something is named all the same.
+LEFT_OVER = 0.03
+#: [1] More effects than this at once are not an explanation.
+MOST_EFFECTS = 3
+#: [of the signal] Structure up to which a linear Stokes camera cannot tell an effect from small eigenvalues that are
+#: not equal: apart by what the paper saw (9 % at 451 nm, 3 % at 662 nm) they leave 0.1 to 2 % on the simulated sphere.
+AS_LIKELY = 0.015
+#: [of the median] Brightness below which a pixel of an object is shadow or background.
+DARK = 0.1
+#: [of the noise of a pixel] Modulated light of a tile from which on its pixels have a say in the dominant process.
+LEAST_MODULATION = 1.0
+
+# ---- effort: what a search may cost --------------------------------------------------------------------------------
+#: [rounds] Times that the problem is linearized anew about its solution.
+ROUNDS = 7
+#: [standard deviations] A move of the solution below which no new linearization is needed.
+SETTLED = 0.3
+#: [sets] That are visited in the last round.
+SAMPLES = 300
+#: [sets] That are visited in the rounds before.
+SAMPLES_BEFORE = 80
+#: [changes] That are tried one after the other without a gain before a climb ends.
+PATIENCE = 8
+#: [groups] That are fitted beside a set of effects of a surface: what one step promises says little there.
+LEADERS = 12

@@ -116,15 +116,18 @@ class Conditional(Fitted):
 
 
 class Sets:
-    """Sets of groups in one quadratic problem."""
+    """Sets of groups in one quadratic problem.
 
-    def __init__(self, form: Quadratic, groups: Sequence[Group], noise: Noise) -> None:
+    `count` is the number of groups that might be there, if these are not all of them.
+    """
+
+    def __init__(self, form: Quadratic, groups: Sequence[Group], noise: Noise, count: float | None = None) -> None:
         self.form, self.groups, self.noise = form, tuple(groups), noise
-        self.free = np.array([g.fixed_tau is None for g in groups])
+        self.free = np.array([g.fixed_tau is None for g in groups], dtype=bool)
         self.share = np.array([g.share for g in groups])
         self.size = form.gradient.size
         # The alternatives of one group count once.
-        self.count = float(np.sum(1 / self.share[self.free]))
+        self.count = float(np.sum(1 / self.share[self.free])) if count is None else count
         sizes = np.array([g.index.size for g in groups])
         self._alike = [np.flatnonzero((sizes == n) & self.free) for n in np.unique(sizes)]
 
@@ -155,6 +158,11 @@ class Sets:
     def fitted(self, state: State) -> Fitted:
         """Posterior of the parameters that are there."""
         return self._solved(state)[0]
+
+    def score_at(self, state: State, unit: float) -> float:
+        """Log probability of a set with a given unit of chi-square, a constant left out."""
+        fit = self.fitted(State(state.tau, unit))
+        return fit.score - self.noise.log_likelihood(fit.left) - 0.5 * fit.left / unit
 
     def _solved(self, state: State) -> tuple[Fitted, Array, Array]:
         u, tau = state.unit, state.tau

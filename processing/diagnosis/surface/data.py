@@ -11,6 +11,7 @@ from scipy import ndimage
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.search.rules import DARK, LEAST_MODULATION
 from processing.diagnosis.surface.view import SurfaceView
 from processing.errors import ProcessError
 from processing.geometry.pinhole import PinholeCamera
@@ -29,13 +30,9 @@ FEWEST_PIXELS = 100
 #: Rim that is left out, as part of the object's radius and in pixels of the camera: an object off its place, and
 #: interpolation of a mosaic, would mix object and background there.
 RIM, RIM_PX = 0.06, 6
-#: Pixels darker than this part of the median are shadow or background.
-DARK = 0.1
 #: Tiles along each side of the object, half of them held out in turn.
 TILES = 8
 FOLDS = 2
-#: Mean square of the modulated signal of a tile's pixels from which on they are used, in units of their noise.
-LEAST_MODULATION = 1.0
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,9 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.outcome import Found
+from processing.diagnosis.search.causes import Cause
+from processing.diagnosis.search.own_minima import OwnMinima, Visited
+from processing.diagnosis.search.posterior import Say
 from processing.diagnosis.search.result import (
     CaptureReport,
     Diagnosis,
@@ -19,33 +21,24 @@ from processing.diagnosis.search.result import (
     Unexplained,
     Verdict,
 )
-from processing.diagnosis.search.search import CHANCE, Say
+from processing.diagnosis.search.rules import AS_LIKELY, LEFT_OVER, LIMIT, MOST_EFFECTS, SEEN
+from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
+from processing.diagnosis.search.stored import parameters_of
+from processing.diagnosis.surface.naming import named_causes, roughness, solution
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.diagnosis.surface.quantities import Quantities, quantities
 from processing.diagnosis.surface.recommend import recommended
-from processing.diagnosis.surface.search import SurfaceSearch, roughness
 from processing.diagnosis.surface.standard_errors import standard_errors
-from processing.instrument.model import EffectParameter
+from processing.diagnosis.surface.structure import structure
 from processing.polarization.image_difference import rmsd
 
 CONFIRM = (
     " Confirm with a full Mueller capture: linear Stokes cannot test that the three other processes are equal, and so "
     "small a residual may come from that alone."
 )
-#: Standard deviations beyond which a test says "structure".
-LIMIT = 5.0
-#: Share of every test's excess that must be explained before anything is named while structure is left.
-SHARE = 0.97
-#: Information, in chi-square for a typical size, below which an effect cannot be seen.
-SEEN = 4.0
 #: What a linear Stokes camera cannot tell from a small effect: that the three other processes are not equal.
 DEGENERACY = "not_triply_degenerate"
-#: Structure over the mean signal up to which that is as likely: small eigenvalues apart by what the paper saw (9 % at
-#: 451 nm, 3 % at 662 nm) leave 0.1 to 2 % on the simulated sphere, more at larger arm angles.
-AS_LIKELY = 0.015
-#: More effects than this at once are not an explanation.
-MOST_EFFECTS = 3
 
 
 class SurfaceDiagnosis(Diagnosis):
@@ -60,89 +53,68 @@ class SurfaceDiagnosis(Diagnosis):
 
 @dataclass(frozen=True)
 class SurfaceJudged:
-    """The diagnosis and what the report draws."""
+    """The diagnosis, and before and after for the report."""
 
     diagnosis: SurfaceDiagnosis
-    found: Found
+    found: Solution
 
 
 def diagnose_surface(problem: SurfaceProblem, material: str, say: Say) -> SurfaceJudged:
     """Search, test what is left, and judge."""
-    search = SurfaceSearch(problem, say)
-    found = search.run()
-    say("testing what is left over")
+    search = OwnMinima(problem, say)
     captures = range(len(problem.captures))
-    none = np.zeros(0)
-    before = [structure(problem, k, found.base, none) for k in captures]
-    after = [structure(problem, k, found.space, found.fit.values) for k in captures]
-    verdict = _verdict(found, before, after)
-    tried: tuple[Candidate, ...] = ()
+    likeliest, nothing = search.run(), search.at(frozenset())
+    say("testing what is left over")
+    before, at_best = ([structure(problem, k, v.space, v.fit.values) for k in captures] for v in (nothing, likeliest))
+    here, named = nothing, tuple[Cause, ...]()
+    if _explains(likeliest.space.candidates, before, at_best):
+        here, named = named_causes(search, likeliest)
+    solved = solution(problem, search, here)
+    after = [structure(problem, k, solved.space, solved.fit.values) for k in captures]
+    verdict = _verdict(named, before, after)
+    ranking = _ranking(search)
+    tried: tuple[str, ...] = ()
     if verdict == "unexplained":
-        tried = found.effects or tuple(t.candidate for t in found.ranking[:5])
-        found.space, found.fit, found.after, after = found.base, found.before_fit, found.before, before
-    rivals = [c for e in found.effects for c in (e, *found.sets.get(e, ())) if found.sets.get(e)]
+        tried = tuple(c.label for c in likeliest.space.candidates) or tuple(r.candidate for r in ranking[:5])
+        named, after = (), before
+        solved = Solution(solved.base, solved.before_fit, solved.before, solved.base, solved.before_fit, solved.before)
+    rivals = [c for cause in named if cause.alternatives for c in (*cause.candidates, *cause.alternatives)]
     lines = tuple(
         f"{problem.captures[k].name}: {name}, {value:.0f} standard deviations above noise"
         for k in captures
         for name, value in after[k].items()
         if value > LIMIT
     )
-    first = [quantities(problem, k, found.base, none) for k in captures]
-    last = [quantities(problem, k, found.space, found.fit.values) for k in captures]
+    first, last = (
+        [quantities(problem, k, space, fit.values) for k in captures]
+        for space, fit in ((solved.base, solved.before_fit), (solved.space, solved.fit))
+    )
+    in_doubt = _degeneracy_in_doubt(problem, solved)
     diagnosis = SurfaceDiagnosis(
         verdict=verdict,
-        error_before=_error(problem, found.before.rms, found.before.chi2_reduced),
-        error_after=_error(problem, found.after.rms, found.after.chi2_reduced),
+        error_before=_error(problem, solved.before.rms, solved.before.chi2_reduced),
+        error_after=_error(problem, solved.after.rms, solved.after.chi2_reduced),
         noise_floor_percent=100 * noise_floor(problem),
-        effects=_effects(problem, search, found),
-        unobservable=_unobservable(found),
-        recommendation=recommended(problem, found.space, found.fit, rivals, verdict, before)
-        + (CONFIRM if found.effects and _degeneracy_in_doubt(problem, found) else ""),
+        effects=_effects(problem, solved, named, here.state.unit, in_doubt),
+        unobservable=_unobservable(search, here),
+        recommendation=recommended(problem, solved.space, solved.fit, rivals, verdict, before)
+        + (CONFIRM if named and in_doubt else ""),
         unexplained=None
         if verdict in ("consistent", "explained")
-        else Unexplained(description=lines, tried=tuple(c.label for c in tried), empirical=None),
+        else Unexplained(description=lines, tried=tried, empirical=None),
         calibrated={},
-        ranking=tuple(
-            Ranked(candidate=t.candidate.label, evidence=round(t.evidence, 1), rms_percent=100 * t.out.rms)
-            for t in found.ranking[:10]
-        ),
+        ranking=ranking,
         captures=tuple(_capture(problem, k, before[k], after[k]) for k in captures),
         instrument=problem.model.name,
         wavelengths_nm=(problem.captures[0].wavelength_nm,),
         simulated=any(c.simulated for c in problem.captures),
         material=material,
-        constants=constants(problem, found.space, found.fit.values),
+        constants=constants(problem, solved.space, solved.fit.values),
         quantities_before=tuple(q for q, _ in first),
         quantities_after=tuple(q for q, _ in last),
         xi0_change=tuple(rmsd(b[np.isfinite(b)]) for b in (y - x for (_, x), (_, y) in zip(first, last, strict=True))),
     )
-    return SurfaceJudged(diagnosis, found)
-
-
-def structure(problem: SurfaceProblem, k: int, space: Space, values: Array) -> dict[str, float]:
-    """Tests of a capture's residual: name to standard deviations from what noise gives.
-
-    Sums over tiles of the object, split into what some Mueller matrix could cause and what none could, which speaks
-    against the instrument's model and not against the reflectance.
-    """
-    here, data = problem.pixels(k, space, values), problem.captures[k]
-    r, noise = here.residual, problem.noise[k] * here.free
-    out = {"sum of squares": float((np.sum(r**2) - noise.sum()) / np.sqrt(2 * noise.sum()))}
-    w = problem.rows(k, problem.changes(k, space, values)[0]) / np.mean(problem.sigma[k], axis=0)[:, None]
-    u, size, _ = np.linalg.svd(w, full_matrices=False)
-    basis = u[:, size > 1e-8 * size[0]]
-    rows, rank = basis.shape
-    tiles = np.unique(data.tile)
-    totals = np.stack([r[data.tile == t].sum(axis=0) for t in tiles])
-    level = np.array([noise[data.tile == t].sum() for t in tiles]) / (rows - 2)
-    inside = np.sum((totals @ basis) ** 2)
-    for name, square, directions in (
-        ("smooth over the object", inside, rank - 2),
-        ("smooth over the object, of the instrument", np.sum(totals**2) - inside, rows - rank),
-    ):
-        if directions > 0:
-            out[name] = float((square - directions * level.sum()) / np.sqrt(2 * directions * np.sum(level**2)))
-    return out
+    return SurfaceJudged(diagnosis, solved)
 
 
 def constants(problem: SurfaceProblem, space: Space, values: Array) -> dict[str, float]:
@@ -159,67 +131,84 @@ def noise_floor(problem: SurfaceProblem) -> float:
     return float(np.sqrt(np.mean(parts)))
 
 
-def _verdict(found: Found, before: Sequence[dict[str, float]], after: Sequence[dict[str, float]]) -> Verdict:
+def _verdict(named: Sequence[Cause], before: Sequence[dict[str, float]], after: Sequence[dict[str, float]]) -> Verdict:
     left = any(value > LIMIT for tests in after for value in tests.values())
-    if not found.effects:
+    if not named:
         return "unexplained" if left else "consistent"
-    if len(found.effects) > MOST_EFFECTS:
+    if len(named) > MOST_EFFECTS or not _explains([c for cause in named for c in cause.candidates], before, after):
         return "unexplained"
-    if not left:
-        return "explained"
-    # Of what is smooth over the object, which noise is not.
+    return "partly_explained" if left else "explained"
+
+
+def _explains(
+    candidates: Sequence[Candidate], before: Sequence[dict[str, float]], after: Sequence[dict[str, float]]
+) -> bool:
+    """Little is left of what is smooth over the object, which noise is not."""
     share = max(
-        y[name] / max(x[name], LIMIT) for x, y in zip(before, after, strict=True) for name in x if y[name] > LIMIT
+        (y[name] / max(x[name], LIMIT) for x, y in zip(before, after, strict=True) for name in x if y[name] > LIMIT),
+        default=0.0,
     )
-    rough = max(roughness(c) for c in found.effects)
-    sure = all(found.chance.get(c, 1.0) < CHANCE for c in found.effects)
-    return "partly_explained" if share <= max(1 - SHARE, rough) and sure else "unexplained"
+    return share <= max(LEFT_OVER, *(roughness(c) for c in candidates), 0.0)
 
 
-def _degeneracy_in_doubt(problem: SurfaceProblem, found: Found) -> bool:
+def _degeneracy_in_doubt(problem: SurfaceProblem, solved: Solution) -> bool:
     full = (
-        np.linalg.matrix_rank(problem.rows(k, problem.changes(k, found.base, np.zeros(0))[0]), rtol=1e-8) == 16
+        np.linalg.matrix_rank(problem.rows(k, problem.changes(k, solved.base, np.zeros(0))[0]), rtol=1e-8) == 16
         for k in range(len(problem.captures))
     )
-    excess = found.before.excess / max(found.before.excess + found.before.freedom, 1e-300)
-    return not any(full) and found.before.rms * float(np.sqrt(max(excess, 0.0))) < AS_LIKELY
+    excess = solved.before.excess / max(solved.before.excess + solved.before.freedom, 1e-300)
+    return not any(full) and solved.before.rms * float(np.sqrt(max(excess, 0.0))) < AS_LIKELY
 
 
 def _error(problem: SurfaceProblem, rms: float, chi2: float) -> Error:
     return Error(rms_percent=100 * rms, chi2_reduced=chi2, held_out=problem.held_out)
 
 
-def _effects(problem: SurfaceProblem, search: SurfaceSearch, found: Found) -> tuple[FoundEffect, ...]:
-    spread = 1.0 + search.structure(found.after, found.space.size)
-    error = standard_errors(problem, found.space, found.fit, spread)
-    doubt = (DEGENERACY,) if _degeneracy_in_doubt(problem, found) else ()
-    out = []
-    for candidate in found.effects:
-        part = found.space.slices[found.space.candidates.index(candidate)]
-        rivals = dict.fromkeys(c.short for c in found.sets.get(candidate, ()))
-        out.append(
-            FoundEffect(
-                kind=candidate.kind,
-                element=candidate.place or None,
-                parameters={
-                    p.name: EffectParameter(value=float(v), stderr=float(s), unit=p.unit)
-                    for p, v, s in zip(candidate.parameters, found.fit.values[part], error[part], strict=True)
-                },
-                evidence=found.evidence.get(candidate, 0.0),
-                indistinguishable_from=(*rivals, *doubt),
-                scope="instrument",
-                removal_chance=found.chance.get(candidate, 1.0),
-                confident=True,
-            )
+def _effects(
+    problem: SurfaceProblem, solved: Solution, named: Sequence[Cause], unit: float, in_doubt: bool
+) -> tuple[FoundEffect, ...]:
+    error = standard_errors(problem, solved.space, solved.fit, unit)
+    part = dict(zip(solved.space.candidates, solved.space.slices, strict=True))
+    doubt = (DEGENERACY,) if in_doubt else ()
+    return tuple(
+        FoundEffect(
+            kind=candidate.kind,
+            element=candidate.place or None,
+            parameters=parameters_of(candidate, solved.fit.values[part[candidate]], error[part[candidate]]),
+            evidence=2 * cause.log_odds,
+            indistinguishable_from=(*dict.fromkeys(c.short for c in cause.alternatives), *doubt),
+            scope="instrument",
+            removal_chance=1 - cause.probability,
+            confident=True,
+            probability=cause.probability,
+            answer="one of" if doubt else cause.answer,
         )
-    return tuple(out)
+        for cause in named
+        for candidate in cause.candidates
+    )
 
 
-def _unobservable(found: Found) -> tuple[str, ...]:
+def _ranking(search: OwnMinima) -> tuple[Ranked, ...]:
+    """What each effect would explain by itself, the best first."""
+    nothing = search.at(frozenset())
+    unit = nothing.state.unit
+    start = nothing.score_at(unit)
+    alone = [(v.score_at(unit) - start, v) for v in search.visited.values() if len(v.groups) == 1]
+    return tuple(
+        Ranked(candidate=v.space.candidates[0].label, evidence=round(2 * odds, 1), rms_percent=100 * v.rms)
+        for odds, v in sorted(alone, key=lambda item: -item[0])[:10]
+    )
+
+
+def _unobservable(search: OwnMinima, here: Visited) -> tuple[str, ...]:
+    """Effects about which the captures say nothing beside what was found; without it the normal is hardly known."""
+    sets, state = search.beside(here)
+    told = sets.given_others(state)
     return tuple(
         candidate.short
-        for candidate, information in found.information.items()
-        if np.all(np.diag(information) * candidate.typical**2 < SEEN)
+        for g, (curvature, _) in told.items()
+        if g not in here.groups and np.all(np.diag(curvature) * state.unit < SEEN)
+        for candidate in search.members[g]
     )
 
 

@@ -106,10 +106,6 @@ class SurfaceProblem:
             )
         return tuple(out)
 
-    def nominal(self) -> tuple[Candidate, ...]:
-        """Nothing is nominal."""
-        return ()
-
     def pool(self) -> tuple[Candidate, ...]:
         """The effects of the reflectance, and those of the optics: with m0 known, an unknown xi0 hides few of them."""
         conditions = self.captures[0].conditions
@@ -208,10 +204,6 @@ class SurfaceProblem:
         """Nothing is expanded here."""
         return False
 
-    def adopt_noise(self, space: Space, values: Array) -> bool:
-        """The noise does not depend on the effects."""
-        return False
-
     def sums(self, space: Space, values: Array, *, derivatives: bool = True) -> Sums:
         """Excess, and with `derivatives` its half gradient and curvature, of every fold."""
         out = Sums.empty(self.folds, space.size if derivatives else 0)
@@ -253,6 +245,8 @@ class SurfaceProblem:
     def noise_information(self, space: Space, values: Array) -> Array:
         """Part (K, K) of the curvature that comes from the noise of alpha_0 and tells nothing about the values."""
         out = np.zeros((space.size, space.size))
+        if not space.size:
+            return out
         typical = space.joined("typical")
         for k in range(len(self.captures)):
             here = self.pixels(k, space, values)

@@ -27,7 +27,7 @@ def write_surface_report(path: Path, judged: SurfaceJudged, problem: SurfaceProb
         for name, p in e.parameters.items():
             also = ", ".join(e.indistinguishable_from)
             rows.append([e.kind, e.element or "", name, p.told, p.unit, f"{e.evidence:.0f}", also])
-    ranking = [["candidate, alone", "chi2 gain on held-out data", "rms left, %"]]
+    ranking = [["candidate, alone", "evidence", "rms left, %"]]
     ranking += [[r.candidate, f"{r.evidence:.0f}", f"{r.rms_percent:.4f}"] for r in d.ranking]
     summary = [
         ("verdict", d.verdict.replace("_", " ")),
@@ -144,7 +144,7 @@ def dominant_figure(judged: SurfaceJudged, problem: SurfaceProblem, k: int) -> A
 
 def _models(judged: SurfaceJudged) -> tuple[tuple[Space, Array], tuple[Space, Array]]:
     found = judged.found
-    return (found.base, np.zeros(0)), (found.space, found.fit.values)
+    return (found.base, found.before_fit.values), (found.space, found.fit.values)
 
 
 def _image(where: NDArray[np.int64], shape: tuple[int, int], values: Array) -> Array:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from processing.diagnosis.search.search import Say
+from processing.diagnosis.search.posterior import Say
 from processing.diagnosis.surface.data import SurfaceData, read_surface
 from processing.diagnosis.surface.judge import SurfaceJudged, diagnose_surface
 from processing.diagnosis.surface.problem import SurfaceProblem

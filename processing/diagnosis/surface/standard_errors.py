@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from processing.arrays import Array
-from processing.diagnosis.search.fit import Fit, covariance, minimize
+from processing.diagnosis.search.fit import Fit, minimize, prior
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.problem import SurfaceProblem
-from processing.diagnosis.surface.search import bent
+from processing.reflectance.effects.base import BentValley
 
 #: The excess is looked at this many errors from the minimum; errors grow at most by the factor.
 AT, WIDEST = 3.0, 32.0
@@ -23,13 +24,31 @@ def standard_errors(problem: SurfaceProblem, space: Space, fit: Fit, spread: flo
     """
     if not space.size:
         return np.zeros(0)
-    both, bread = covariance(space, fit, problem.noise_information(space, fit.values))
+    both, bread = _covariance(space, fit, problem.noise_information(space, fit.values))
     error = np.sqrt(np.maximum(np.diag(both), 0.0))
     wide = np.ones(space.size)
     for j in np.flatnonzero(bent(space)):
         step = AT * error[j]
         wide[j] = _wide(problem, space, fit, int(j), step, step**2 / max(bread[j, j], 1e-300))
     return np.asarray(error * wide * np.sqrt(spread))
+
+
+def _covariance(space: Space, fit: Fit, noise_only: Array) -> tuple[Array, Array]:
+    """Covariance (K, K) of the values of a fit, for noise of one; and the inverse (K, K) of the gradient's slope.
+
+    The part `noise_only` (K, K) of the curvature comes from noise in the derivatives: it adds to the scatter of the
+    gradient, not to its slope.
+    """
+    weak = np.diag(prior(space))
+    raw = fit.sums.curvature.sum(axis=0) + weak
+    told = raw - noise_only
+    bread = np.linalg.inv(told if space.size and np.linalg.eigvalsh(told).min() > 0 else raw)
+    return bread @ raw @ bread, bread
+
+
+def bent(space: Space) -> NDArray[np.bool_]:
+    """(K,) values of effects whose valley is bent."""
+    return np.array([isinstance(c.effect, BentValley) for c in space.candidates for _ in c.parameters], dtype=bool)
 
 
 def _wide(problem: SurfaceProblem, space: Space, fit: Fit, j: int, step: float, promised: float) -> float:

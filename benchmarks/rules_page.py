@@ -1,0 +1,45 @@
+"""Write docs/diagnosis-rules.md from the constants of the diagnosis and the comments above them.
+
+python benchmarks/rules_page.py
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCE = ROOT / "processing/diagnosis/search/rules.py"
+PAGE = ROOT / "docs/diagnosis-rules.md"
+HEAD = """# Rules of the diagnosis
+
+Every constant by which `diagnose` decides, with its unit and its reason. This page is made of
+`processing/diagnosis/search/rules.py` by `python benchmarks/rules_page.py`. A test changes each by a fifth (a whole
+number by one) and holds that a decision is another one then (`tests/physics/test_diagnosis_rules.py`). Steps and
+tolerances of the fits stand beside the code that uses them, and what is left out of a capture beside its reading
+(`processing/diagnosis/captured`).
+"""
+CONSTANT = re.compile(r"((?:^#:[^\n]*\n)+)^([A-Z_]+) = (.+)$", re.MULTILINE)
+SECTION = re.compile(r"^# ---- (.+?) -+$", re.MULTILINE)
+
+
+def page() -> str:
+    """The page as it should be."""
+    text = SOURCE.read_text(encoding="utf-8")
+    marks = [(m.start(), m) for pattern in (SECTION, CONSTANT) for m in pattern.finditer(text)]
+    lines = [HEAD]
+    for _, m in sorted(marks, key=lambda mark: mark[0]):
+        if m.re is SECTION:
+            lines.append(
+                f"\n## {m[1][0].upper()}{m[1][1:]}\n\n| constant | value | unit | reason |\n|---|---|---|---|\n"
+            )
+            continue
+        comment = " ".join(line.removeprefix("#:").strip() for line in m[1].splitlines())
+        unit, _, reason = comment.removeprefix("[").partition("] ")
+        value = m[3].removeprefix("np.array([").removesuffix("])")
+        lines.append(f"| `{m[2]}` | {value} | {unit} | {reason} |\n")
+    return "".join(lines)
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
