@@ -123,6 +123,8 @@ class XPSAxis(MotionAxis):
         self.config: Config = config
         self._line, self._lines, self._moving, self._stopping = line, lines, moving, stopping
         self._homing = False
+        # Motions whose answer has not come, which it may do after the next one was asked for.
+        self._unanswered = 0
         positioner = f"{config.group}.{config.positioner}"
         self._positioner = positioner
         self._require_group(f"axis {name} on {config.port}")
@@ -231,12 +233,19 @@ class XPSAxis(MotionAxis):
 
     def _start(self, call: str) -> None:
         """Start a motion on its own connection, whose answer comes at its end unless it is refused."""
-        link = self._moving
-        link.purge(0.0)
-        link.write(call.encode("ascii"))
-        frame = link.read_frame(link.clock.now_s() + REFUSAL_S)
-        if frame is not None:
-            _values(frame.decode("ascii", "replace"), f"axis {self.name}, {call}")
+        self._moving.write(call.encode("ascii"))
+        self._unanswered += 1
+        answer = self._answer_to_last_motion(self.clock.now_s() + REFUSAL_S)
+        if answer is not None:
+            _values(answer, f"axis {self.name}, {call}")
+
+    def _answer_to_last_motion(self, deadline_s: float) -> str | None:
+        """Read answers, which come in the order of the motions: None while that to the last one has not come."""
+        while (frame := self._moving.read_frame(deadline_s)) is not None:
+            self._unanswered = max(0, self._unanswered - 1)
+            if self._unanswered == 0:
+                return frame.decode("ascii", "replace")
+        return None
 
     def _do_start_move(self, counts: float) -> None:
         self._homing = False
@@ -263,11 +272,11 @@ class XPSAxis(MotionAxis):
         self._stopping.write(f"{call}({self.config.group})".encode("ascii"))
 
     def _do_check_fault(self) -> None:
-        while (frame := self._moving.read_frame(0.0)) is not None:
-            code = frame.decode("ascii", "replace").partition(",")[0]
-            if code not in ("0", str(ABORTED)):
-                words = ERRORS.get(int(code), "see the manual") if re.fullmatch(r"-\d+", code) else "garbled"
-                raise CommandRejected(f"axis {self.name}, motion", f"error {code}: {words}", "Remove the cause")
+        answer = self._answer_to_last_motion(0.0)
+        code = "0" if answer is None else answer.partition(",")[0]
+        if code not in ("0", str(ABORTED)):
+            words = ERRORS.get(int(code), "see the manual") if re.fullmatch(r"-\d+", code) else "garbled"
+            raise CommandRejected(f"axis {self.name}, motion", f"error {code}: {words}", "Remove the cause")
 
     def _do_warnings(self) -> list[str]:
         status = self._status()

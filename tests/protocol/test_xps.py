@@ -3,10 +3,11 @@
 import pytest
 
 from drivers.axes import xps
-from drivers.errors import LimitError
+from drivers.errors import LimitError, MotionStopped
 from drivers.serial_link import LineRegistry
 from simulators.clock import Clock, ManualClock, patient_clock
 from simulators.controllers import xps as xps_emulator
+from simulators.serial.emulator import Emulator
 from simulators.serial.serve_options import ServeOptions
 from simulators.serial.tcp_port import port_for
 
@@ -68,3 +69,37 @@ def test_an_xps_puts_out_a_pulse_at_every_step_that_it_passes() -> None:
     talk = xps_emulator.make(ServeOptions(clock=Clock(instant=True))).connect()
     talk.receive(b"PositionerPositionCompareSet(Group1.Pos,0,10,0.5)")
     assert talk.take_output() == b"-22,PositionerPositionCompareSet(Group1.Pos,0,10,0.5),EndOfAPI"
+
+
+class HoldsAnAbortedMotionBack:
+    """A connection whose answer to a motion that was aborted arrives only after the next motion has been asked for."""
+
+    def __init__(self, conversation: Emulator) -> None:
+        self._conversation = conversation
+        self.next_output_s = conversation.next_output_s
+        self._moves, self._held = 0, b""
+
+    def receive(self, data: bytes) -> None:
+        self._moves += data.count(b"GroupMoveAbsolute")
+        self._conversation.receive(data)
+
+    def take_output(self) -> bytes:
+        output = self._conversation.take_output()
+        if output.startswith(b"-27") and self._moves == 1:
+            self._held, output = output, b""
+        if self._held and self._moves == 2:
+            output, self._held = self._held + output, b""
+        return output
+
+
+def test_the_answer_of_an_aborted_motion_is_not_taken_for_that_of_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    emulator = xps_emulator.make(ServeOptions(clock=Clock(20.0, base=patient_clock()), homed=True, speed_deg_s=10.0))
+    connect = emulator.connect
+    monkeypatch.setattr(emulator, "connect", lambda: HoldsAnAbortedMotionBack(connect()))
+    with port_for(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
+        axis = xps.open("arm", xps.Config(port=port.path, group="Group1", poll_s=0.002), lines)
+        motion = axis.start_move(160.0)
+        axis.stop()
+        with pytest.raises(MotionStopped):
+            motion.wait()
+        assert axis.start_move(5.0).wait().deg == pytest.approx(5.0, abs=0.05)
