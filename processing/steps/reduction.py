@@ -77,7 +77,14 @@ class Reduction(FileStep):
             self._refuse(("leave_out",), "a mosaic capture; bad pixels come from --camera, and states are images each")
             options: dict[str, Any] = {"demosaic": self.demosaic or _default_method()}
         else:
-            self._refuse(("demosaic", "analyzers"), "reduced super-pixel by super-pixel, or has no mosaic")
+            with Capture(self.capture) as capture:
+                mosaic = capture.header.mosaic is not None
+            self._refuse(
+                ("demosaic", "analyzers"),
+                "reduced super-pixel by super-pixel, for something turns before its mosaic"
+                if mosaic
+                else "not a mosaic capture",
+            )
             options = {name: getattr(self, name) for name in ("weighted", "covariance", "physical")}
         named = ("capture", "instrument", "camera", "dark", "leave_out", "analyzers")
         files = [(role, getattr(self, role)) for role in named] + [("flat", path) for path in flats]

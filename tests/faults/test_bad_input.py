@@ -141,7 +141,7 @@ CAMPAIGNS = {
     "no angles": ("omega_deg: []", "omega_deg"),
     "a reference in an unknown mode": ("references: [{sample: {name: x}, omega_deg: 35, modes: [drrr]}]", "drrr"),
     "a million angles": ("omega_deg: {start: 0, stop: 180, step: 1.0e-6}", "angles"),
-    "unknown mode of a plan": ("plans: {drrr: drr.yaml}", "drrr"),
+    "a plan that is not there": ("plans: {drr: drrr.yaml}", "drrr.yaml: cannot be read"),
     "no plans": ("plans: {}", "plans"),
 }
 
