@@ -95,12 +95,14 @@ class AxisPromises(ServedAxis):
                 axis.start_move(10.1)
 
     def test_two_moves_at_once_on_one_axis_are_refused(self, kind: str) -> None:
-        with self.served(kind, speed=3.0) as bench:
+        # So slow that nobody arrives before the second move is asked for, however late this thread gets to run.
+        with self.served(kind, speed=0.1) as bench:
             axis = bench.open()
             motion = axis.start_move(60.0)
             assert not motion.done()
             with pytest.raises(CommandRejected, match="still moving"):
                 axis.start_move(0.0)
+            bench.emulator.clock.speed = 1000.0
             assert motion.wait().deg == pytest.approx(60.0, abs=0.05)
 
     def test_stop_from_another_thread(self, kind: str, caplog: pytest.LogCaptureFixture) -> None:
