@@ -33,6 +33,7 @@ def application(folder: Path, token: str) -> Starlette:
         Route("/capture", frames.capture),
         Route("/states", frames.states),
         Route("/frame", frames.frame),
+        Route("/preview", frames.preview),
         Route("/histogram", frames.histogram),
         Route("/product", products.product),
         Route("/plane", products.plane),

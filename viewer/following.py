@@ -66,11 +66,17 @@ def seen(folder: Path, library: Library) -> dict[str, Any]:
     found |= {"number": run.get("campaign_done", 0) + 1, "total": run.get("campaign_total", 1)}
     # What turns on and on is told within one turn.
     found["axes_deg"] = {name: degrees % 360 for name, degrees in (run.get("axes_deg") or {}).items()}
-    partial = folder / f"{run.get('capture')}{PARTIAL}"
-    if partial.exists():
-        with Capture(partial) as capture:
-            found |= {"file": library.name(partial), "states": len(capture.done), "lamp": lamp(capture)}
+    found |= _taken(folder / str(run.get("capture")), library)
     return found
+
+
+def _taken(final: Path, library: Library) -> dict[str, Any]:
+    """The capture that is being taken, or was just sealed: its file, states done, and the lamp."""
+    for path in (final.with_name(final.name + PARTIAL), final):
+        if path.is_file():
+            with Capture(path) as capture:
+                return {"file": library.name(path), "states": len(capture.done), "lamp": lamp(capture)}
+    return {}
 
 
 async def stop(request: Request) -> JSONResponse:

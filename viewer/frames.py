@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
@@ -21,6 +22,9 @@ from viewer.starting import instrument_files
 
 #: Most bars of a histogram.
 BARS = 256
+#: Longest side of a preview, pixels.
+PREVIEW = 480
+RED_BGR = (45, 18, 227)
 
 
 async def capture(request: Request) -> HTMLResponse:
@@ -65,6 +69,7 @@ def _capture(pages: Pages, path: Path) -> HTMLResponse:
         notes=notes,
         warnings=warnings,
         states=states,
+        first=next((k for k, role in enumerate(states["role"]) if role != "dark"), 0),
         made=[(e, pages.shown_at(e)) for e in made_into(entry, entries, library.root)],
         others=others(entry, entries),
         writing=entry.status == "running",
@@ -125,6 +130,26 @@ def _frame(path: Path, query: Any) -> Response:
     mean = window.mean(counts)
     red = np.zeros_like(mean) if top is None else window.largest(counts) >= top
     return sent(window, np.stack([mean, red.astype(np.float32)]), state=state)
+
+
+async def preview(request: Request) -> Response:
+    """A frame as a small picture (PNG): what is seen until the page's script has drawn the one that can be zoomed."""
+    return Response(await run_in_threadpool(_preview, file_of(request), request.query_params), media_type="image/png")
+
+
+def _preview(path: Path, query: Any) -> bytes:
+    with Capture(path) as opened:
+        state, channel = chosen(opened, query)
+        window = Window.asked({}, opened.frame_shape, most=PREVIEW)
+        counts = opened.frames(state)[channel]
+        top, black = saturation(opened), opened.header.detector.black_level_counts
+    mean = window.mean(counts)
+    high = float(np.nanmax(mean)) if top is None else top
+    grey = np.nan_to_num(np.clip((mean - black) / max(high - black, 1.0), 0, 1)) * 255
+    picture = np.repeat(grey.astype(np.uint8)[..., np.newaxis], 3, axis=2)
+    if top is not None:
+        picture[window.largest(counts) >= top] = RED_BGR
+    return cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
 
 
 def chosen(opened: Capture, query: Any) -> tuple[int, int]:

@@ -32,7 +32,7 @@ def lamp(capture: Capture) -> dict[str, Any]:
     except ProcessError as error:
         return {"states": [], "ratio": [], "told": str(error)}
     if fitted is not None:
-        told = "dark-corrected mean of each state over what polarization makes of it"
+        told = "dark-corrected mean of each state over what polarization makes of it by the other states"
         return _told(capture, light, signal / fitted, told)
     same = _repeats(capture, light)
     if same.sum() > 1:
@@ -78,5 +78,19 @@ def _fitted(capture: Capture, light: NDArray[np.int64], signal: NDArray[np.float
     known = np.isfinite(signal)
     if known.sum() < np.linalg.matrix_rank(w[known], rtol=1e-6) + SPARE:
         return None
-    m, *_ = np.linalg.lstsq(w[known], signal[known], rcond=1e-8)
-    return np.asarray(w @ m)
+    return np.asarray(_from_the_others(w, signal, known))
+
+
+def _from_the_others(
+    w: NDArray[np.float64], signal: NDArray[np.float64], known: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """What the other states make of each one: a fit with all of them would follow a flash halfway."""
+    u, s, _ = np.linalg.svd(w[known], full_matrices=False)
+    u = u[:, s > 1e-8 * s[0]]
+    leverage = np.square(u).sum(axis=1)
+    residual = signal[known] - u @ (u.T @ signal[known])
+    out = np.full(len(signal), np.nan)
+    # A state that alone tells one of the numbers tells nothing of the lamp.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        out[known] = np.where(leverage < 0.99, signal[known] - residual / (1 - leverage), np.nan)
+    return out

@@ -73,8 +73,7 @@ def _resume(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
 def _reduce(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
     capture = library.path(asked.get("file", ""))
     command = ["process", "reduce", str(capture)]
-    if instrument := asked.get("instrument"):
-        file = instrument_files(library)[instrument]
+    if (file := _instrument(library, asked)) is not None:
         out = capture.with_name(f"{capture.stem}.{file.stem}.mueller.h5")
         command += ["--instrument", str(file), "--out", str(out)]
     return jobs.start(f"reduce {capture.name}", command, {"file": library.name(capture)}, library.root)
@@ -88,9 +87,7 @@ def _quantities(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
 
 def _diagnose(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
     captures = [library.path(name) for name in asked.get("files", "").split("\n") if name]
-    chosen = asked.get("instrument", "")
-    instrument = instrument_files(library).get(chosen) if chosen else None
-    name, folder = Diagnoses(library).begin(captures, instrument)
+    name, folder = Diagnoses(library).begin(captures, _instrument(library, asked))
     command = ["diagnose", *map(str, captures), "--instrument", str(folder / "instrument.yaml")]
     for option, file in (("--json", "diagnosis.json"), ("--report", "report.html"), ("--residuals", "residuals.npz")):
         command += [option, str(folder / file)]
@@ -102,6 +99,17 @@ def instrument_files(library: Library) -> dict[str, Path]:
     """Instrument files by the name that a page shows: those of the folder, and those that come with the program."""
     files = {library.name(path): path for path in library.yaml_files("instrument")}
     return files | {f"example: {path.stem}": path for path in sorted((CONFIGS / "instruments").glob("*.yaml"))}
+
+
+def _instrument(library: Library, asked: dict[str, str]) -> Path | None:
+    """The instrument file that a page chose; None for the model in the capture. Raises NotHere."""
+    name = asked.get("instrument")
+    if not name:
+        return None
+    file = instrument_files(library).get(name)
+    if file is None:
+        raise NotHere(f"{name}: there is no such instrument file")
+    return file
 
 
 KINDS: dict[str, Callable[[Library, Jobs, dict[str, str]], Job]] = {

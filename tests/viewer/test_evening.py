@@ -14,6 +14,7 @@ import urllib.parse
 from pathlib import Path
 
 import pytest
+from PIL import Image
 from playwright.sync_api import ConsoleMessage, Page, expect, sync_playwright
 from ruamel.yaml import YAML
 
@@ -102,7 +103,10 @@ def keep(page: Page, name: str) -> None:
     """A picture for the docs, where they are wanted."""
     if folder := os.environ.get("UMOV_SCREENSHOTS"):
         page.wait_for_timeout(600)
-        page.screenshot(path=Path(folder) / f"view_{name}.png", full_page=True)
+        path = Path(folder) / f"view_{name}.png"
+        page.screenshot(path=path, full_page=True)
+        # A page has few colours: a third of the bytes.
+        Image.open(path).convert("RGB").quantize(192).save(path, optimize=True)
 
 
 def ready(page: Page) -> None:
@@ -142,6 +146,7 @@ def _start_watch_stop_resume(page: Page, other: Page, lab: Path, address: str) -
     other.goto(page.url)
     expect(other.locator("#captures")).to_have_text(re.compile(r"\d+ of 26"))
     expect(other.locator("#lampwords")).to_have_text(re.compile("dark-corrected mean of each state"))
+    expect(other.locator("#frame .nsewdrag")).to_be_attached()
     keep(other, "campaign")
     partial = next((lab / "evening").glob("*.partial"), None)
     if partial is not None:

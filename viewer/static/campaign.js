@@ -1,7 +1,7 @@
 // The page of a campaign: its timeline, and what a run does while it runs.
 
 import "./start.js";
-import { ImageView, place, readPlane } from "./images.js";
+import { ImageView, place, readPlane, saturated } from "./images.js";
 import { accent, at, byId, draw, duration, embedded, getJson, narrow, post, quiet, say, statusColour } from "./plots.js";
 
 const run = byId("run"), folder = run.dataset.folder;
@@ -63,7 +63,7 @@ async function lastFrame(now) {
       traces: plane => [
         { type: "heatmap", z: plane.planes[0], ...place(plane), zmin: states.black, zmax: states.saturation ?? undefined, colorscale: [[0, "#000"], [1, "#fff"]],
           hovertemplate: "%{z:.0f} counts<extra></extra>", colorbar: { title: { text: "counts", side: "right" }, thickness: 10, outlinewidth: 0 } },
-        { type: "heatmap", z: plane.planes[1].map(row => Array.from(row, v => v ? 1 : null)), ...place(plane), hoverinfo: "skip", showscale: false, colorscale: [[0, "#e3122d"], [1, "#e3122d"]] },
+        ...saturated(plane),
       ],
     });
   }

@@ -1,7 +1,7 @@
 // The page of a capture: frames with a slider, histogram, and the intensities of a pixel.
 
 import "./start.js";
-import { ImageView, place, readPlane } from "./images.js";
+import { ImageView, place, readPlane, saturated } from "./images.js";
 import { accent, at, bad, byId, draw, embedded, getJson, ink, narrow, say } from "./plots.js";
 import { drawCurve, showProbe } from "./probe.js";
 
@@ -16,11 +16,10 @@ const view = new ImageView(byId("frame"), {
   shape: states.shape,
   read: (window, signal) => readPlane("frame", { file, state: slider.value, channel: channel.value || 0, ...window }, signal),
   traces: plane => [
-    { type: "heatmap", z: plane.planes[0], ...place(plane), colorscale: "Greys", reversescale: false, zmin: states.black,
+    { type: "heatmap", z: plane.planes[0], ...place(plane), zmin: states.black,
       zmax: states.saturation ?? undefined, hovertemplate: "column %{x}, row %{y}<br>%{z:.1f} counts<extra></extra>",
       colorscale: [[0, "#000"], [1, "#fff"]], colorbar: { title: { text: "counts", side: "right" }, thickness: 12, outlinewidth: 0, len: 0.9 } },
-    { type: "heatmap", z: plane.planes[1].map(row => Array.from(row, v => v ? 1 : null)), ...place(plane), hoverinfo: "skip",
-      showscale: false, zmin: 0, zmax: 1, colorscale: [[0, "#e3122d"], [1, "#e3122d"]] },
+    ...saturated(plane),
   ],
   chosen: region => probe(region),
 });
@@ -68,7 +67,14 @@ async function show() {
   if (!states.number.length) { byId("which").textContent = "no state is done yet"; return; }
   told(k);
   slider.setAttribute("aria-valuetext", byId("which").textContent);
-  await run(() => Promise.all([view.refresh(), drawHistogram()]));
+  await run(() => view.refresh());
+  histogramSoon();
+}
+
+// The picture comes first; while the slider is drawn along, only the last histogram is worth drawing.
+function histogramSoon() {
+  clearTimeout(histogramSoon.pause);
+  histogramSoon.pause = setTimeout(() => run(drawHistogram), 60);
 }
 
 function play(on) {

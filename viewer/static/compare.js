@@ -24,7 +24,7 @@ async function refresh(leader = views[0]) {
   try {
     const plane = await read(leader.window(), reading.signal);
     const told = v => (v === null ? "not known" : v.toPrecision(3));
-    byId("told").textContent = `rms difference ${told(plane.rms)} ${plane.units}; over its error ${told(plane.rms_over)} (1 is noise alone)`;
+    byId("told").textContent = `rms difference ${told(plane.rms)}${plane.units && ` ${plane.units}`}; over its error ${told(plane.rms_over)} (1 is noise alone)`;
     const ranges = leader.node.layout && [leader.node.layout.xaxis.range, leader.node.layout.yaxis.range];
     for (const view of views) {
       view.plane = plane;

@@ -18,6 +18,12 @@ export async function readPlane(what, query, signal) {
   return { ...told, planes };
 }
 
+/** Saturated pixels in red, where there are any: the second plane of a frame. */
+export const saturated = plane => !plane.planes[1].some(row => row.some(v => v > 0)) ? [] : [{
+  type: "heatmap", z: plane.planes[1].map(row => Array.from(row, v => v ? 1 : null)), ...place(plane), hoverinfo: "skip",
+  showscale: false, zmin: 0, zmax: 1, colorscale: [[0, "#e3122d"], [1, "#e3122d"]],
+}];
+
 /** Where a picture's pixels lie, as a heat map wants it: centres, in pixels of the image. */
 export const place = plane => ({
   x0: plane.x0 + (plane.step - 1) / 2, dx: plane.step, y0: plane.y0 + (plane.step - 1) / 2, dy: plane.step,
@@ -63,7 +69,10 @@ export class ImageView {
     if (!this.plane) return;
     const first = !this.node.layout;
     await draw(this.node, () => this.traces(this.plane), () => this.frame());
-    if (first) this.listen();
+    if (first) {
+      this.node.querySelector(".preview")?.remove();
+      this.listen();
+    }
   }
 
   frame() {

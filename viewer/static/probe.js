@@ -70,7 +70,7 @@ function quantityTable(quantities) {
   for (const [name, [label, digits]] of Object.entries(NAMES)) {
     const found = quantities[name];
     if (!found) continue;
-    const text = found.value.map((v, k) => pm(v, found.error[k], digits)).join("   ");
+    const text = found.value.map((v, k) => pm(v, found.error[k], digits)).join(", ");
     table.append(row(cell(label, "th"), cell(text)));
   }
   return table;

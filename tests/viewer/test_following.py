@@ -1,0 +1,212 @@
+"""A run seen from outside: what it says of itself, its grid, the time left, the lamp, and what a page starts."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+
+import h5py
+import numpy as np
+import pytest
+
+from acquisition.screen.observer import StateReport
+from acquisition.screen.run_file import RunFile, begun_ticks, running_in
+from drivers.motion import Position
+from processing.instrument.model import InstrumentModel
+from processing.storage.capture import Capture
+from viewer.campaigns import read_campaign, seconds_left
+from viewer.following import seen
+from viewer.jobs import Jobs
+from viewer.lamp import lamp
+from viewer.library import Library
+
+
+def until(condition):
+    while not (found := condition()):
+        time.sleep(0.01)
+    return found
+
+
+def report(number):
+    positions = {"psg": Position(9.0 * number, number)}
+    return StateReport(number, "sample", positions, 0.01, 0.0, 0.0, 1e5, np.zeros((4, 4), np.uint16))
+
+
+def test_a_run_says_where_it_is_while_it_runs_and_nothing_afterwards(lab):
+    with RunFile(lab, simulated=True) as told:
+        told.campaign_progress(2, 5, "three.h5")
+        told.run_started("red sphere", None, 44, None)
+        for number in range(41):
+            told.state_done(report(number))
+        told.warning("a wire is loose")
+        facts = until(lambda: (found := running_in(lab)) and found["done"] == 41 and found["messages"] and found)
+        assert (facts["capture"], facts["campaign_total"], facts["pending"]) == ("three.h5", 5, 44)
+        assert "a wire is loose" in facts["messages"][0]
+        assert facts["left_s"] >= 0
+        shown = seen(lab, Library(lab))
+        assert (shown["number"], shown["total"]) == (3, 5)
+        # The axis stands at its second turn.
+        assert shown["axes_deg"] == {"psg": 0.0}
+    assert running_in(lab) is None
+    assert list(lab.iterdir()) == []
+
+
+def test_a_process_that_has_ended_or_another_with_its_number_runs_nothing(lab):
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    mine = {"pid": os.getpid(), "begun_ticks": begun_ticks(os.getpid()) - 1}
+    for name, facts in (("1", {"pid": ended.pid, "begun_ticks": 5}), ("2", mine), ("3", {"pid": "x"}), ("4", [])):
+        (lab / f".run-{name}.json").write_text(json.dumps(facts))
+    (lab / ".run-5.json").write_text("{half a")
+    assert running_in(lab) is None
+    # The next run takes away what they have left behind.
+    with RunFile(lab, simulated=False):
+        until(lambda: running_in(lab))
+    assert list(lab.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_written_keeps_no_run_from_measuring(lab):
+    with RunFile(lab / "gone", simulated=False) as told:
+        told.run_started("x", None, 3, None)
+        told.state_done(report(0))
+
+
+def campaign(lab, drr_capture):
+    """A campaign of five captures: complete, flagged, aborted, unreadable, and one that is not there."""
+    folder = lab / "night"
+    folder.mkdir()
+    for name in ("1.h5", "2.h5", "3.h5"):
+        drr_capture(f"night/{name}", shape=(4, 4))
+    with h5py.File(folder / "2.h5", "r+") as h5:
+        h5["entry/states/saturated_fraction"][...] = 0.2
+    with h5py.File(folder / "3.h5", "r+") as h5:
+        h5["entry/states/done"][20:] = 0
+        h5["entry"].attrs.modify("status", np.array(b"aborted", dtype=h5["entry"].attrs["status"].dtype))
+    (folder / "4.h5").write_bytes(b"broken")
+    plan = {
+        f"{k}.h5": {
+            "mode": "drr",
+            "wavelength_nm": 662,
+            "omega_deg": 30 + k,
+            "sample": {"name": "leaf", "kind": "unknown"},
+        }
+        for k in range(1, 6)
+    }
+    (folder / "identity.json").write_text(json.dumps({"plan": plan, "simulated": True, "rig_file": "rig.yaml"}))
+    (folder / "index.json").write_text("{}")
+    lines = [
+        {"time": "2026-01-01T20:00:00+00:00", "event": "campaign started"},
+        {"time": "2026-01-01T20:00:00+00:00", "event": "capture started", "capture": "1.h5"},
+        {
+            "time": "2026-01-01T20:01:00+00:00",
+            "event": "capture ended",
+            "capture": "1.h5",
+            "status": "complete",
+            "states": 44,
+        },
+        {"time": "2026-01-01T20:01:00+00:00", "event": "capture started", "capture": "2.h5"},
+    ]
+    (folder / "log.jsonl").write_text("\n".join(json.dumps(line) for line in lines) + '\n{"time": "cut o')
+    return folder
+
+
+def test_each_capture_of_a_campaign_has_its_sign(lab, client, drr_capture):
+    folder = campaign(lab, drr_capture)
+    view = read_campaign(folder, Library(lab), running=None)
+    assert [cell.status for cell in view.cells] == ["done", "flagged", "partial", "failed", "missing"]
+    assert "20 % of the pixels" in view.cells[1].told.replace("20.00", "20")
+    assert [(bar.name, bar.status) for bar in view.bars] == [("1.h5", "done"), ("2.h5", "running")]
+    (block,) = view.blocks()
+    assert block.angles_deg == (31, 32, 33, 34, 35)
+    # What is running now is running, whatever its file looks like.
+    assert read_campaign(folder, Library(lab), running="3.h5").cells[2].status == "running"
+    page = client.get("/campaign", params={"folder": "night"}).text
+    assert "2 of 5" in page
+    assert client.get("/campaign", params={"folder": "."}).status_code == 404
+
+
+def test_the_time_left_is_what_captures_have_taken(lab, drr_capture):
+    view = read_campaign(campaign(lab, drr_capture), Library(lab), running="3.h5")
+    # One minute each for the two that are failed and missing, and the rest of the one that runs.
+    assert seconds_left(view, {"left_s": 20.0, "pending": 44, "done": 30}) == 2 * 60 + 20
+    fresh = type(view)(view.name, True, "", view.cells, (), ())
+    assert seconds_left(fresh, {"left_s": 30.0, "pending": 40, "done": 10}) == pytest.approx(2 * 40 + 30)
+    assert seconds_left(fresh, {"left_s": None}) is None
+
+
+@pytest.fixture
+def flickering(drr_capture, configs):
+    """A capture whose frame means are modulated by polarization, and whose lamp was 1 % brighter in one state."""
+    model = InstrumentModel.load(configs / "instruments" / "rgb950.yaml").at(662)
+    path = drr_capture("lamp.h5", shape=(4, 4))
+    with h5py.File(path, "r+") as h5:
+        angles = {name: h5[f"entry/instrument/{name}/value"][4:] for name in ("psg", "psa")}
+        mean = model.rows(angles, None).reshape(40, 16) @ np.diag([1.0, 0.5, 0.4, 0.3]).reshape(16) * 1e5
+        mean[17] *= 1.01
+        # The pedestal of the dark states is in every frame.
+        h5["entry/states/monitor"][...] = np.concatenate([np.zeros(4), mean]) + 3000
+    return path
+
+
+def test_the_lamp_is_told_from_polarization(flickering):
+    with Capture(flickering) as capture:
+        told = lamp(capture)
+        modulated = capture.column("monitor")[4:]
+    assert np.ptp(modulated) / modulated.mean() > 0.3
+    ratio = np.array(told["ratio"])
+    assert told["states"][int(np.argmax(ratio))] == 21
+    assert ratio.max() == pytest.approx(1.01, abs=1e-6)
+    assert np.std(np.delete(ratio, 17)) < 0.002
+
+
+def test_a_few_states_tell_no_lamp_yet(flickering):
+    with h5py.File(flickering, "r+") as h5:
+        h5["entry/states/done"][15:] = 0
+    with Capture(flickering) as capture:
+        assert lamp(capture)["ratio"] == []
+    with h5py.File(flickering, "r+") as h5:
+        h5["entry/states/done"][...] = 0
+    with Capture(flickering) as capture:
+        assert lamp(capture)["told"] == "no light state is done yet"
+
+
+def test_a_command_is_followed_to_its_end_and_known_afterwards(lab, client, drr_capture):
+    drr_capture("one.h5", shape=(4, 4))
+    origin = {"origin": "http://127.0.0.1:8000"}
+    answer = client.post("/start", json={"what": "reduce", "file": "one.h5"}, headers=origin)
+    assert answer.status_code == 200, answer.text
+    (job,) = Jobs(lab).all()
+    until(lambda: Jobs(lab).status(job) == "done")
+    assert (lab / "one.mueller.h5").exists()
+    page = client.get("/job", params={"name": job.name}).text
+    assert "./lab process reduce" in page
+    assert "mueller: one.mueller.h5" in page
+    refused = client.post("/stop-job", json={"name": job.name}, headers=origin)
+    assert (refused.status_code, "ended already" in refused.text) == (422, True)
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"what": "shell"},
+        {"what": "reduce", "file": "../one.h5"},
+        {"what": "campaign", "file": "/etc/passwd"},
+        {"what": "reduce", "file": "one.h5", "instrument": "../../x.yaml"},
+        {"what": "diagnose", "files": "one.h5", "instrument": "nobody.yaml"},
+        {"what": "diagnose", "files": ""},
+        {"what": 3},
+        ["what"],
+    ],
+)
+def test_nothing_else_is_started(lab, client, drr_capture, asked):
+    drr_capture("one.h5", shape=(4, 4))
+    answer = client.post("/start", json=asked, headers={"origin": "http://127.0.0.1:8000"})
+    assert answer.status_code in (404, 422)
+    assert Jobs(lab).all() == []
+
+
+@pytest.mark.parametrize("name", ["", "..", "../../x", "nothing"])
+def test_a_job_or_a_diagnosis_that_is_not_there(client, name):
+    for what in ("job", "diagnosis", "diagnosis-report", "residual-map"):
+        assert client.get(f"/{what}", params={"name": name}).status_code == 404
