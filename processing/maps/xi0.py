@@ -22,6 +22,7 @@ from processing.reduction.mueller import Progress
 from processing.reflectance.base import load_reflectance
 from processing.storage.capture_schema import CaptureHeader
 from processing.storage.images import MuellerImage, StokesImage, require_all_elements
+from processing.storage.pixel_mask import Mask
 from processing.storage.product import Plane, Product, ProductWriter, Step
 
 #: Limits of the validity mask (docs/quantities.md, "xi0 and its interval"): on the noise, not on the outcome.
@@ -150,11 +151,12 @@ def xi0_of_partial(
     ProcessError : the product determines combinations of elements only; see also `dominant_model`.
     """
     image = MuellerImage.load(source)
-    if image.seen.sum() < 2:
-        raise ProcessError(f"{source} determines {image.facts['determined']}, and xi0 needs two elements of M or more.")
+    known = image.seen if image.sent is None else np.isfinite(image.sent).any(axis=(1, 2))
+    if known.sum() < 2:
+        raise ProcessError(f"{source} determines {image.facts['determined']}, and xi0 needs two numbers or more.")
     m0 = dominant_model(image.header, geometry_file, material_file, image.mask.shape)
-    fitted = image.w @ np.where(image.seen[:, None], image.values.reshape(16, -1), 0.0)
     size = (-1, *image.mask.shape)
+    fitted = np.where(image.mask.reshape(-1) & ~np.uint8(Mask.SATURATED), np.nan, image.fitted)
     found = estimate(fitted.reshape(size), image.told_variance.reshape(size), image.w, m0)
     facts = _facts(found.xi0, found.xi0_stderr, found.valid, f"two coefficients of {image.facts['determined']}")
     with _two_coefficients(out, found, facts, image.header, (*image.steps, step), overwrite):

@@ -31,6 +31,8 @@ from processing.reduction.effects_of_capture import (
 from processing.reduction.facts import mueller_facts
 from processing.reduction.left_out import LeftOut
 from processing.reduction.noise import NoiseModel
+from processing.reduction.sent_light import PLANES as SENT_PLANES
+from processing.reduction.sent_light import SentLight
 from processing.reduction.solvers.field import Field, FieldSolver
 from processing.reduction.solvers.inversion import ELEMENTS, Inversion
 from processing.reduction.solvers.plain import MuellerSolver
@@ -242,6 +244,8 @@ def reduce_mueller(
         )
     solver = choice.solver(MuellerSolver(inversion, reader, noise), field_of(capture, model, states, changes))
     planes = choice.planes(known_noise=noise is not None)
+    sent = SentLight.of(inversion)
+    planes |= SENT_PLANES if sent is not None else {}
     systematic = _systematic(capture, model, states, inversion)
     if systematic is not None:
         planes["mueller_systematic"] = SYSTEMATIC
@@ -253,7 +257,7 @@ def reduce_mueller(
             stored: Future[None] | None = None
             for rows in capture.row_blocks(BLOCK_PIXELS):
                 if rows.stop > product.rows_done:
-                    block = _block(solver, rows, planes, systematic)
+                    block = _block(solver, rows, planes, systematic, sent)
                     if stored:
                         stored.result()
                     stored = storing.submit(product.write, rows, **block)
@@ -266,8 +270,7 @@ def reduce_mueller(
         except CaptureError as error:
             raise CaptureError(f"{capture.path}: {error}{_without_numbers(capture, states)}") from error
         facts["warnings"] += cut_off
-        if choice.physical:
-            facts["physical_estimate"] = f"{choice.physical}, as mueller_physical beside the plain one"
+        facts |= _further_facts(choice, sent)
         product.seal(facts)
     return facts
 
@@ -284,6 +287,15 @@ def _noise_of(capture: Capture, states: NDArray[np.int64]) -> NoiseModel | None:
     if capture.sigma is not None:
         return NoiseModel.of_sigma(capture.sigma[states])
     return NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
+
+
+def _further_facts(choice: Choice, sent: SentLight | None) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    if sent is not None:
+        found["determined"] = sent.named
+    if choice.physical:
+        found["physical_estimate"] = f"{choice.physical}, as mueller_physical beside the plain one"
+    return found
 
 
 def _store_noise(product: ProductWriter, noise: NoiseModel | None, solver: Solver) -> None:
@@ -311,12 +323,14 @@ def _systematic(
 
 
 def _block(
-    solver: Solver, rows: slice, planes: Mapping[str, Plane], systematic: Systematic | None
+    solver: Solver, rows: slice, planes: Mapping[str, Plane], systematic: Systematic | None, sent: SentLight | None
 ) -> dict[str, NDArray[Any]]:
     frames = solver.reader.read(rows)
     found = solver.solve(frames)
     mask = found["pixel_mask"]
     lost = (mask & np.uint8(Mask.NOT_FINITE | Mask.BAD | Mask.NOT_DETERMINED)) != 0
+    if sent is not None:
+        found |= sent.planes(found["mueller"], found["residual_rms"], solver)
     unseen = ~determined_elements(solver.inversion.basis)
     if unseen.any():
         found["mueller"][unseen] = np.nan

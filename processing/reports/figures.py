@@ -47,6 +47,8 @@ def draw_product(path: Path, figure: Path) -> None:
 
 def product_figure(product: Product) -> Figure:
     """Matplotlib figure of a product; raises ProcessError for a kind without one."""
+    if product.kind == "mueller" and "stokes" in product.names:
+        return _sent_figure(product)
     if product.kind in ("mueller", "extrapolated"):
         elements = thin(product.get("mueller"))
         lit = _lit(elements[0, 0], thin(product.get("mueller_errors")[0, 0]))
@@ -159,3 +161,19 @@ def _title(product: Product) -> str:
     header = product.header
     wavelength = f"{header.wavelength_nm:g} nm"
     return header.title if wavelength in header.title else f"{header.title}, {wavelength}"
+
+
+def _sent_figure(product: Product) -> Figure:
+    """S0 and what is polarized of the light that a sample sends back, lit in one state."""
+    stokes, errors = thin(product.get("stokes")), thin(product.get("stokes_errors"))
+    lit = _lit(stokes[0], errors[0])
+    panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = [
+        ("$S_0$ / counts", stokes[0], {"cmap": "gray", "vmin": 0})
+    ]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for k in range(1, 4):
+            shown = np.where(lit, stokes[k] / stokes[0], np.nan)
+            if np.isfinite(shown).any():
+                limit = max(percentile(np.abs(shown), 99.5), 1e-6)
+                panels.append((f"$S_{k} / S_0$", shown, {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}))
+    return grid_figure(panels, _title(product), product.simulated)

@@ -52,6 +52,7 @@ class MuellerImage:
     noise_slope, noise_floor : (N,), variance of intensity n = slope * signal + floor; NaN where noise is not known.
     header, steps, simulated, facts
         As in the product.
+    sent : (4, rows, columns), Stokes vector that the sample sends back, where no element is determined alone.
     """
 
     values: NDArray[np.float32]
@@ -65,6 +66,7 @@ class MuellerImage:
     steps: tuple[Step, ...]
     simulated: bool
     facts: dict[str, Any]
+    sent: NDArray[np.float32] | None = None
 
     @classmethod
     def load(cls, path: Path | str, rows: slice = slice(None)) -> Self:
@@ -88,6 +90,7 @@ class MuellerImage:
             steps=product.steps,
             simulated=product.simulated,
             facts=product.facts,
+            sent=product.get("stokes", rows) if "stokes" in product.names else None,
         )
 
     @property
@@ -113,7 +116,16 @@ class MuellerImage:
             errors=pick(self.errors),
             mask=pick(self.mask),
             residual_rms=pick(self.residual_rms),
+            sent=None if self.sent is None else pick(self.sent),
         )
+
+    @property
+    def fitted(self) -> NDArray[np.floating]:
+        """Intensities (N, pixels) that the fit gives, counts."""
+        if self.sent is not None:
+            # Rows of W are kron(a, g): every fourth column is a, times the light's intensity.
+            return np.asarray(self.w[:, ::4] @ np.nan_to_num(self.sent.reshape(4, -1)))
+        return np.asarray(self.w.astype(np.float32) @ np.nan_to_num(self.values.reshape(16, -1)))
 
     @cached_property
     def intensity_variance(self) -> NDArray[np.float32]:
@@ -125,8 +137,7 @@ class MuellerImage:
             with np.errstate(divide="ignore", invalid="ignore"):
                 level = self.residual_rms.reshape(-1).astype(float) ** 2 * n / free if free else np.nan
             return np.asarray(np.broadcast_to(level, (n, rows * columns)), dtype=np.float32)
-        shot = (self.noise_slope[:, None] * self.w).astype(np.float32)
-        variance = shot @ np.nan_to_num(self.values.reshape(16, -1))
+        variance = self.noise_slope[:, None].astype(np.float32) * self.fitted.astype(np.float32)
         floor = self.noise_floor[:, None].astype(np.float32)
         variance += floor
         return np.asarray(np.maximum(variance, 0.5 * floor, out=variance))
@@ -201,6 +212,8 @@ class MuellerImage:
     def _told(self) -> NDArray[np.float64]:
         # Flats, dark frames and left-out states change all errors of a pixel much alike.
         seen = self.seen
+        if not seen.any():
+            return np.ones(self.mask.size)
         plain = np.square(self._inverse[seen]).sum(axis=0).astype(np.float32) @ self.intensity_variance
         return np.asarray(np.square(self.errors.reshape(16, -1)[seen]).sum(axis=0) / plain)
 

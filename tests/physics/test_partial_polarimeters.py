@@ -6,7 +6,7 @@ import pytest
 from processing.calibration.train import calibrate
 from processing.errors import NotDetermined, ProcessError
 from processing.instrument.determined import determined_basis, determined_elements
-from processing.instrument.model import InstrumentModel
+from processing.instrument.model import InstrumentModel, Polarizer
 from processing.maps import xi0 as maps
 from processing.maps.quantities import quantities_of_mueller
 from processing.maps.xi0 import xi0_of_mueller
@@ -14,6 +14,7 @@ from processing.polarization import mueller
 from processing.polarization.triply_degenerate import mueller_matrix
 from processing.reduction.mueller import Choice, reduce_mueller
 from processing.reflectance.base import normalized_mueller
+from processing.reports.figures import product_figure
 from processing.steps.maps import Xi0
 from processing.storage.capture import Capture
 from processing.storage.images import MuellerImage
@@ -42,8 +43,12 @@ def names_of(seen):
 def noisy(synthetic_capture, configs):
     """Makes a capture of 30 x 40 pixels of one sample, with its own shot and read noise."""
 
-    def make(name, angles, electrons=20_000.0, top=None, sample=SAMPLE):
+    def make(name, angles, electrons=20_000.0, top=None, sample=SAMPLE, sent_deg=None):
         model = InstrumentModel.load(configs / f"instruments/{name}.yaml")
+        if sent_deg is not None:
+            model = model.model_copy(
+                update={"generator": (Polarizer(kind="polarizer", name="sent", azimuth_deg=sent_deg),)}
+            )
         signal = model.rows(angles).reshape(-1, 16) @ sample.reshape(16) * electrons * 2
         random = np.random.default_rng(4)
         light = random.poisson(signal[:, None, None, None], (len(signal), 1, 30, 40))
@@ -140,6 +145,31 @@ def test_xi0_comes_with_a_model_of_the_dominant_process(name, noisy, tmp_path, m
         Xi0(tmp_path / "m.h5").make()
 
 
+@pytest.mark.parametrize("name", ["rotating_retarder_stokes", "rotating_analyzer"])
+def test_polarized_light_gives_the_stokes_vector_that_is_sent_back_and_xi0(name, noisy, tmp_path, monkeypatch):
+    m0, xi0 = normalized_mueller(np.array([[1.0, 0.1], [0.2j, -0.6]])), 0.6
+    sample = np.asarray(mueller_matrix(m0, xi0, 1.0))
+    path, model, scale = noisy(name, INSTRUMENTS[name][1], sample=sample, sent_deg=20.0)
+    with Capture(path) as capture:
+        facts = reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
+    count = facts["rank"]
+    assert facts["determined"].startswith(", ".join(f"S{k}" for k in range(count)) + " of the light")
+    light = np.array([0.5, 0.5 * np.cos(np.deg2rad(40)), 0.5 * np.sin(np.deg2rad(40)), 0])
+    with Product(tmp_path / "m.h5") as product:
+        stokes, errors = (product.get(plane).reshape(4, -1) for plane in ("stokes", "stokes_errors"))
+        assert product_figure(product)
+    # For a light of intensity 1.
+    pulls = (stokes - scale * (sample @ light / 0.5)[:, None]) / errors
+    assert np.isnan(pulls[count:]).all()
+    assert np.abs(pulls[:count].mean(axis=1)).max() < 5 / np.sqrt(pulls.shape[1])
+    assert pulls[:count].std(axis=1) == pytest.approx(1, abs=5 / np.sqrt(2 * pulls.shape[1]))
+    monkeypatch.setattr(maps, "dominant_model", lambda *_: np.tile(m0, (30, 40, 1, 1)))
+    maps.xi0_of_partial(tmp_path / "m.h5", "geometry", "material", tmp_path / "x.h5", Step("xi0", {}), False)
+    with Product(tmp_path / "x.h5") as product:
+        pulls = (product.get("xi0") - xi0) / product.get("xi0_errors")
+    assert pulls.std() == pytest.approx(1, abs=5 / np.sqrt(2 * pulls.size))
+
+
 def test_states_that_see_less_than_the_instrument_can_are_refused(noisy, tmp_path):
     path, model, _ = noisy("rotating_retarder_stokes", {"psa": np.array([0.0, 90, 180, 270])})
     with Capture(path) as capture, pytest.raises(NotDetermined, match=r"rank \d, and 4 are needed"):
@@ -155,8 +185,6 @@ def test_what_needs_the_whole_matrix_says_so(noisy, tmp_path):
     with pytest.raises(ProductError, match="determines m00, m10, m20, and this needs all 16"):
         xi0_of_mueller(tmp_path / "m.h5", tmp_path / "x.h5", Step("xi0", {}), False, None)
     with Product(tmp_path / "m.h5") as product:
-        from processing.reports.figures import product_figure
-
         assert product_figure(product)
 
 

@@ -1,0 +1,78 @@
+"""Polarimeters that light the sample in one state: no element of M is determined alone, but the light sent back is.
+
+Every row of W is kron(a, g) with the same g, so intensities are a . (M g): the Stokes vector that the sample sends back
+for this light. For unpolarized light it is the first column of M, and elements are determined after all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.arrays import BoolArray
+from processing.instrument.determined import determined_elements
+from processing.reduction.solvers.inversion import Inversion
+from processing.reduction.solvers.plain import LEAST, MuellerSolver
+from processing.storage.product import Plane
+
+PLANES = {
+    "stokes": Plane((4,), "count", "Stokes vector S0 to S3 that the sample sends back for the light that it gets"),
+    "stokes_errors": Plane((4,), "count", "standard errors of stokes"),
+}
+#: Relative difference of generator states that is rounding of what the axes read.
+ALIKE = 1e-6
+
+
+@dataclass(frozen=True)
+class SentLight:
+    """Stokes vector of the light that the sample sends back.
+
+    Attributes
+    ----------
+    rows : (4, 16), S = rows . vec(M), for a light of intensity 1.
+    seen : (4,), which of S0 to S3 the states determine.
+    """
+
+    rows: NDArray[np.float64]
+    seen: BoolArray
+
+    @classmethod
+    def of(cls, inversion: Inversion) -> Self | None:
+        """None where the generator turns, or where elements of M are determined by themselves."""
+        if determined_elements(inversion.basis).any():
+            return None
+        _, size, vt = np.linalg.svd(inversion.w.reshape(-1, 4), full_matrices=False)
+        if size[1] > ALIKE * size[0]:
+            return None
+        rows = np.kron(np.eye(4), vt[0] / vt[0, 0])
+        inside = np.sum((rows @ inversion.basis) ** 2, axis=1) > (1 - 1e-9) * np.sum(rows**2, axis=1)
+        return cls(rows, inside)
+
+    @property
+    def named(self) -> str:
+        """What is determined, in words."""
+        names = ", ".join(f"S{k}" for k in np.flatnonzero(self.seen))
+        return f"{names} of the light that the sample sends back (dataset stokes)"
+
+    def planes(self, mueller: NDArray[np.float32], residual_rms: NDArray[np.float32], solver: Any) -> dict[str, Any]:
+        """Datasets `PLANES` (4, pixels) from the solution of least norm (16, pixels)."""
+        plain: MuellerSolver = getattr(solver, "plain", solver)
+        inversion = plain.inversion
+        stokes = (self.rows @ mueller).astype(np.float32)
+        n, dof = inversion.w.shape[0], inversion.degrees_of_freedom
+        if plain.noise is None:
+            variance = np.tile(residual_rms**2 * n / dof if dof else np.nan, (n, 1))
+        else:
+            floor = plain.intensity_floor[:, None]
+            shot = (plain.noise.slope / plain.repeats)[:, None] * (inversion.w @ mueller)
+            variance = np.maximum(shot + floor, LEAST * floor)
+        solve = self.rows @ inversion.pinv
+        channels = plain.reader.capture.channels
+        drive = np.einsum("knc,nd->kcd", solve.reshape(4, -1, channels), plain.reader.black_weights) ** 2
+        dark = (drive @ plain.black_variance).sum(axis=1)
+        errors = np.sqrt(solve**2 @ variance + dark[:, None]).astype(np.float32)
+        stokes[~self.seen], errors[~self.seen] = np.nan, np.nan
+        return {"stokes": stokes, "stokes_errors": errors}
