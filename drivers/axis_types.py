@@ -7,6 +7,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+# Controllers that tell a limit of every stage tell one as large as this where there is none.
+NO_LIMIT_DEG = 1e6
+
 
 @dataclass(frozen=True, slots=True)
 class Position:
@@ -46,6 +49,11 @@ def _ascending(ends: tuple[float | None, float | None]) -> tuple[float | None, f
     if low is not None and high is not None and low >= high:
         raise ValueError(f"the limits {low:g} to {high:g} are high first or leave no way. Swap them")
     return ends
+
+
+def stage_limit(told_deg: float) -> float | None:
+    """A limit as a controller tells it, in degrees; None for a number so large that the stage has none."""
+    return None if abs(told_deg) >= NO_LIMIT_DEG else told_deg
 
 
 class AxisConfig(BaseModel):

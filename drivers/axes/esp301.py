@@ -13,6 +13,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
+from drivers.axis_types import stage_limit
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, ReplyError, WrongDevice
 from drivers.motion import AxisIdentity
@@ -31,8 +32,6 @@ AXIS_ERRORS = {
     30: "not allowed during homing",
 }
 DEGREE = 7
-# Limits as large as this are those of a stage that has none.
-NO_LIMIT_DEG = 1e6
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _FLAG = re.compile(r"[01]")
 _INTEGER = re.compile(r"\d{1,4}")
@@ -149,8 +148,7 @@ class ESP301Axis(SessionReferenceAxis):
         return agreed(lambda: self._number(command))
 
     def _limit(self, command: str) -> float | None:
-        value = self._constant(command)
-        return None if abs(value) >= NO_LIMIT_DEG else value
+        return stage_limit(self._constant(command))
 
     def _raise_errors(self, asked: str) -> None:
         own = self._line.take_errors(self.config.axis)

@@ -14,6 +14,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from drivers.axis_types import stage_limit
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, NotHomedError, ReplyError, WrongDevice
 from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
@@ -31,8 +32,6 @@ ERRORS = {
 }
 NOT_REFERENCED, STOPPED = 5, 10
 MOVING = "\x05"
-# Limits as large as this are those of a stage that has none.
-NO_LIMIT_DEG = 1e6
 _HEX = re.compile(r"[0-9A-Fa-f]{1,8}")
 _CODE = re.compile(r"-?\d{1,5}")
 _IDENTITY = re.compile(r"[^,]+,[^,]+,[^,]+,[^,]+")
@@ -120,8 +119,7 @@ class GCS2Axis(MotionAxis):
         return agreed(lambda: self._number(query))
 
     def _limit(self, query: str) -> float | None:
-        value = self._constant(query)
-        return None if abs(value) >= NO_LIMIT_DEG else value
+        return stage_limit(self._constant(query))
 
     def _take_error(self) -> int:
         """Read the last error, which clears it."""

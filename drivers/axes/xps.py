@@ -18,6 +18,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
+from drivers.axis_types import stage_limit
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, LimitError, NotHomedError, ReplyError, ReplyTimeout, WrongDevice
 from drivers.motion import AxisConfig, AxisIdentity, MotionAxis
@@ -32,8 +33,6 @@ HOMING = 43
 MOVING = range(43, 49)
 ERRORS = {-17: "parameter out of range", -19: "no such group", -22: "not allowed in this state", -27: "aborted"}
 NOT_ALLOWED, ABORTED = -22, -27
-# Limits as large as this are those of a stage that has none.
-NO_LIMIT_DEG = 1e6
 # GroupInitialize starts the motor's control loop; a refusal of a move comes at once.
 INITIALIZE_S = 20.0
 REFUSAL_S = 0.1
@@ -136,7 +135,7 @@ class XPSAxis(MotionAxis):
         if min(speed[:2]) <= 0:
             raise ReplyError(f"axis {name}, speed", f"{speed[:2]}", "Set the parameters of the stage")
         limits = agreed(lambda: self._ask("PositionerUserTravelLimitsGet", 2))
-        self._device_min_deg, self._device_max_deg = (None if abs(end) >= NO_LIMIT_DEG else end for end in limits)
+        self._device_min_deg, self._device_max_deg = map(stage_limit, limits)
         self._identity = AxisIdentity(
             kind=config.kind,
             model=firmware.partition(" ")[0],

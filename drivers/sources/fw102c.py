@@ -10,6 +10,8 @@ blocked answers.
 
 from __future__ import annotations
 
+import contextlib
+from functools import partial
 from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -139,17 +141,18 @@ class FilterWheel(LightSource):
 
 def open(config: Config, lines: LineRegistry) -> FilterWheel:
     """Open the wheel, and the shutter where there is one; asks who they are and changes nothing."""
-    link = lines.take(config.port, SerialLink, lambda transcript: _link(config, transcript, lines.clock))
-    shutter: LightSource | None = None
-    try:
-        shutter = None if config.shutter is None else sc10.open(config.shutter, lines)
-        return FilterWheel(config, link, shutter, lines)
-    except BaseException:
-        if shutter is not None:
-            shutter.close()
-        lines.release(config.port)
-        raise
+    with (
+        lines.taken(config.port, SerialLink, partial(_link, config, lines.clock)) as link,
+        contextlib.ExitStack() as failed,
+    ):
+        shutter: LightSource | None = None
+        if config.shutter is not None:
+            shutter = sc10.open(config.shutter, lines)
+            failed.callback(shutter.close)
+        wheel = FilterWheel(config, link, shutter, lines)
+        failed.pop_all()
+        return wheel
 
 
-def _link(config: Config, transcript: Transcript | None, clock: Clock) -> SerialLink:
+def _link(config: Config, clock: Clock, transcript: Transcript | None) -> SerialLink:
     return SerialLink(config.port, BAUDRATE, prompt_framer, transcript=transcript, clock=clock, held_by=config.held_by)

@@ -7,6 +7,7 @@ driver; not yet tried on the real box).
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -86,13 +87,9 @@ class Shutter(LightSource):
 
 def open(config: Config, lines: LineRegistry) -> Shutter:
     """Open the shutter; sends one `id?` and changes nothing."""
-    link = lines.take(config.port, SerialLink, lambda transcript: _link(config, transcript, lines.clock))
-    try:
+    with lines.taken(config.port, SerialLink, partial(_link, config, lines.clock)) as link:
         return Shutter(config, link, lines)
-    except BaseException:
-        lines.release(config.port)
-        raise
 
 
-def _link(config: Config, transcript: Transcript | None, clock: Clock) -> SerialLink:
+def _link(config: Config, clock: Clock, transcript: Transcript | None) -> SerialLink:
     return SerialLink(config.port, BAUDRATE, prompt_framer, transcript=transcript, clock=clock, held_by=config.held_by)
