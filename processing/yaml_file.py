@@ -16,6 +16,7 @@ from ruamel.yaml.events import AliasEvent
 
 from processing.doors import MOST_DEPTH, one_line, read_text
 from processing.errors import ProcessError
+from processing.yaml_words import words_of
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -189,14 +190,7 @@ def _plain(node: Any) -> Any:
 def _describe(source: str, tree: CommentedMap, entry: Any) -> str:
     location: Sequence[int | str] = entry["loc"]
     where = ".".join(str(part) for part in location)
-    return ": ".join(filter(None, (f"{source}:{_line(tree, location)}", one_line(where), one_line(message_of(entry)))))
-
-
-def message_of(entry: Any) -> str:
-    """What one entry of a ValidationError says, without the library's own words before it."""
-    if entry["type"] == "extra_forbidden":
-        return "unknown key"
-    return str(entry["msg"]).removeprefix("Value error, ")
+    return ": ".join(filter(None, (f"{source}:{_line(tree, location)}", one_line(where), one_line(words_of(entry)))))
 
 
 def _line(tree: Any, location: Sequence[int | str]) -> int:

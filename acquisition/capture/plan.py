@@ -19,7 +19,8 @@ from processing.instrument.states import (
     rotating_retarders,
 )
 from processing.storage.capture_schema import Sample
-from processing.yaml_file import ConfigError, load_yaml, message_of
+from processing.yaml_file import ConfigError, load_yaml
+from processing.yaml_words import words_of
 
 #: Name of a mode of the rig file; file names of captures hold it.
 Mode = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
@@ -153,7 +154,7 @@ class MeasurementPlan(_Part):
         try:
             return MeasurementPlan.model_validate(self.model_dump() | chosen)
         except ValidationError as error:
-            lines = [": ".join(filter(None, (".".join(map(str, e["loc"])), message_of(e)))) for e in error.errors()]
+            lines = [": ".join(filter(None, (".".join(map(str, e["loc"])), words_of(e)))) for e in error.errors()]
             raise ConfigError("\n".join(lines)) from error
 
     def state_table(self, pose_deg: Mapping[str, float], exposure_s: float) -> StateTable:

@@ -1,4 +1,4 @@
-"""JSON Schemas of rig, plan, campaign and instrument files, for editors that complete and check YAML.
+"""JSON Schemas of every kind of YAML file, for editors that complete and check them.
 
 `python -m acquisition.commands.schemas` writes them; a test fails while the committed ones are stale.
 """
@@ -6,29 +6,48 @@
 from __future__ import annotations
 
 import json
+from functools import reduce
+from operator import or_
 from pathlib import Path
+from typing import Any
 
-from pydantic import BaseModel
+from pydantic import TypeAdapter
 
 from acquisition.campaign.plan import Campaign
 from acquisition.capture.plan import MeasurementPlan
 from acquisition.commands.defaults import CONFIGS
+from acquisition.commands.key_texts import OF_KEY, OF_SECTION
 from acquisition.rig.config import RigConfig
+from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
+from processing.reflectance.base import kinds
+from simulators.bench.scene import AnyScene
 
 FOLDER = CONFIGS / "schemas"
-MODELS: dict[str, type[BaseModel]] = {
+MODELS: dict[str, Any] = {
     "rig": RigConfig,
     "plan": MeasurementPlan,
     "campaign": Campaign,
     "instrument": InstrumentModel,
+    "geometry": ViewingGeometry,
+    "scene": AnyScene,
+    "material": reduce(or_, kinds().values()),
 }
 
 
 def text_of(name: str) -> str:
-    """The schema as it is committed."""
-    schema = {"$schema": "https://json-schema.org/draft/2020-12/schema"} | MODELS[name].model_json_schema()
+    """The schema as it is committed, with a description of every key."""
+    schema = {"$schema": "https://json-schema.org/draft/2020-12/schema"} | TypeAdapter(MODELS[name]).json_schema()
+    for section in (schema, *schema.get("$defs", {}).values()):
+        for key, entry in section.get("properties", {}).items():
+            entry.setdefault("description", _told(section, key))
     return json.dumps(schema, indent=1, sort_keys=True) + "\n"
+
+
+def _told(section: dict[str, Any], key: str) -> str:
+    """What a key means: told for its section, or wherever it stands, or what its section is."""
+    about = str(section.get("description", section.get("title", ""))).split("\n")[0]
+    return OF_SECTION.get(f"{section.get('title')}.{key}") or OF_KEY.get(key) or f"{key.replace('_', ' ')}, of: {about}"
 
 
 def path_of(name: str) -> Path:

@@ -1,6 +1,7 @@
 """Every committed rig, plan and campaign loads, keeps its meaning through YAML, and passes its checks."""
 
 import itertools
+import json
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,23 @@ def _files(folder):
 @pytest.mark.parametrize("name", list(schemas.MODELS))
 def test_committed_schema_is_fresh(name):
     assert schemas.path_of(name).read_text() == schemas.text_of(name), "run: python -m acquisition.commands.schemas"
+
+
+@pytest.mark.parametrize("name", list(schemas.MODELS))
+def test_every_key_of_a_schema_is_described(name):
+    schema = json.loads(schemas.text_of(name))
+    for section in (schema, *schema.get("$defs", {}).values()):
+        for key, entry in section.get("properties", {}).items():
+            assert len(entry["description"]) > 1, key
+            if name in ("campaign", "plan", "instrument"):
+                assert ", of: " not in entry["description"], f"{section['title']}.{key}: say what it is in key_texts.py"
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*/*.yaml")), ids=lambda p: p.stem)
+def test_every_file_names_its_schema(path):
+    first = path.read_text().splitlines()[0]
+    assert first.startswith("# yaml-language-server: $schema=")
+    assert (path.parent / first.split("=")[1]).exists()
 
 
 @pytest.mark.parametrize("path", _files("rigs"), ids=lambda p: p.stem)

@@ -1,0 +1,70 @@
+"""What is wrong with a value of a YAML file, in words that need no knowledge of the program."""
+
+from __future__ import annotations
+
+from typing import Any
+
+#: By the library's name of the mistake; `{...}` are what it tells beside the name.
+WORDS = {
+    "missing": "is missing",
+    "extra_forbidden": "unknown key",
+    "finite_number": "must be a finite number",
+    "greater_than": "must be more than {gt}",
+    "greater_than_equal": "must be {ge} or more",
+    "less_than": "must be less than {lt}",
+    "less_than_equal": "must be {le} or less",
+    "literal_error": "must be {expected}",
+    "enum": "must be {expected}",
+    "int_from_float": "must be a whole number",
+    "too_short": "needs {min_length} or more entries, has {actual_length}",
+    "too_long": "may have {max_length} entries, has {actual_length}",
+    "string_too_short": "needs {min_length} or more characters",
+    "string_too_long": "may have {max_length} characters",
+    "string_pattern_mismatch": "must match {pattern}",
+    "union_tag_invalid": "{tag} is none of {expected_tags}",
+    "union_tag_not_found": "needs the key {discriminator}",
+    "recursion_loop": "contains itself",
+}
+#: By the type that the value should have, the first word of such a name.
+TYPES = {
+    "float": "a number",
+    "decimal": "a number",
+    "int": "a whole number",
+    "string": "text",
+    "bool": "true or false",
+    "path": "a file name",
+    "tuple": "a list",
+    "list": "a list",
+    "dict": "keys and values",
+    "model": "keys and values",
+    "mapping": "keys and values",
+    "none": "nothing",
+    "url": "an address such as https://...",
+}
+#: Longest value that is shown.
+SHOWN = 40
+
+
+def words_of(entry: Any) -> str:
+    """What one entry of a ValidationError says.
+
+    Parameters
+    ----------
+    entry : of `ValidationError.errors()`.
+    """
+    kind = str(entry["type"])
+    if kind in WORDS:
+        return WORDS[kind].format_map(entry.get("ctx", {})) + _found(kind, entry)
+    stem, _, rest = kind.partition("_")
+    if stem in TYPES and rest in ("type", "parsing", "parsing_size", "attributes_type"):
+        return f"must be {TYPES[stem]}" + _found(kind, entry)
+    return str(entry["msg"]).removeprefix("Value error, ")
+
+
+def _found(kind: str, entry: Any) -> str:
+    """The value itself, where it is short and not told already."""
+    value = entry.get("input")
+    if kind in ("missing", "extra_forbidden", "union_tag_invalid") or isinstance(value, dict | list | tuple):
+        return ""
+    text = repr(value)
+    return f", not {text}" if len(text) <= SHOWN else ""
