@@ -38,9 +38,8 @@ class Capture:
     ----------
     verify : False to look at damaged states as well, for `damaged_states`.
     by_super_pixel
-        Of a polarization mosaic, give each super-pixel as one pixel with four channels.
-
-    Images of several beams on one detector are channels always.
+        Of a polarization mosaic, give each super-pixel as one pixel with four channels. Images of several beams on one
+        detector are channels always.
 
     Attributes
     ----------
