@@ -101,6 +101,8 @@ class GigeCamera:
         Name of a table in `node_maps/`, or "aravis" for Aravis' own description with older names (ExposureTimeAbs).
     wait_s : float
         How long to wait for the address if another simulated camera has it.
+    elsewhere : bool
+        Take another loopback address of this machine at once, if there is one that no camera has.
     arming_s : float
         Time after an exposure in which a trigger is ignored; None for that of the table.
     """
@@ -117,6 +119,7 @@ class GigeCamera:
         description: str = "loopback",
         wait_s: float = 60.0,
         arming_s: float | None = None,
+        elsewhere: bool = False,
     ) -> None:
         self.serial = serial
         self.address = address
@@ -138,7 +141,7 @@ class GigeCamera:
         self._gone = threading.Event()
         self._camera: Any = None
         self._memory: CameraMemory | None = None
-        self._loopback = LoopbackAddress(address)
+        self._loopback = LoopbackAddress(address, elsewhere)
         self._library = ctypes.CDLL("libaravis-0.8.so.0")
         self._library.arv_buffer_get_data.restype = ctypes.c_void_p
         self._library.arv_buffer_get_data.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
@@ -171,6 +174,7 @@ class GigeCamera:
         """
         aravis, _ = load_aravis()
         self._loopback.take(self._wait_s)
+        self.address = self._loopback.address
         with tempfile.TemporaryDirectory() as folder:
             path = None
             if self._table is not None:

@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 import errno
+import re
 import socket
 import time
+from pathlib import Path
 
 from drivers.errors import CameraError
 
 _CONTROL_PORT = 3956
+_ADDRESSES = Path("/proc/net/fib_trie")
+
+
+def loopback_addresses() -> list[str]:
+    """Every address in 127.0.0.0/8 that an interface of this machine has."""
+    try:
+        text = _ADDRESSES.read_text()
+    except OSError:
+        return []
+    return sorted(set(re.findall(r"\|-- (127\.\d+\.\d+\.\d+)\n\s+/32 host LOCAL", text)))
 
 
 class LoopbackAddress:
@@ -16,10 +28,16 @@ class LoopbackAddress:
 
     An abstract socket is the lock: the kernel frees it whatever way the process ends, and it lives in the same
     network namespace as the port.
+
+    Parameters
+    ----------
+    elsewhere : where another camera has the address, take any other loopback address of this machine; `address` is
+        then the one that was taken.
     """
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, elsewhere: bool = False) -> None:
         self.address = address
+        self._elsewhere = elsewhere
         self._held: socket.socket | None = None
 
     def take(self, wait_s: float) -> None:
@@ -35,24 +53,33 @@ class LoopbackAddress:
         # Real time: whoever holds the address may be another program.
         deadline_s = time.monotonic() + wait_s
         while True:
-            held = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-            try:
-                held.bind(f"\0umov simulated camera {self.address}")
-                # Cameras that were started by other programs do not know our lock, but they have the port.
-                with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-                    probe.bind((self.address, _CONTROL_PORT))
-            except OSError as error:
-                held.close()
-                if error.errno != errno.EADDRINUSE:
-                    raise self._error(str(error.strerror), f"Add it: ip addr add {self.address}/8 dev lo") from error
-                if time.monotonic() > deadline_s:
-                    raise self._error(
-                        f"another camera had it for {wait_s:g} s", "End the other simulated camera or use 127.0.0.2"
-                    ) from error
-                time.sleep(0.05)
-            else:
-                self._held = held
-                return
+            others = [one for one in loopback_addresses() if one != self.address] if self._elsewhere else []
+            for address in (self.address, *others):
+                if (held := self._bound(address)) is not None:
+                    self.address, self._held = address, held
+                    return
+            if time.monotonic() > deadline_s:
+                raise self._error(
+                    f"another camera had it for {wait_s:g} s",
+                    "End the other simulated camera, or give this machine one more address for it: "
+                    f"ip addr add 127.0.0.{2 + len(others)}/8 dev lo",
+                )
+            time.sleep(0.05)
+
+    def _bound(self, address: str) -> socket.socket | None:
+        """The lock of an address, None where another camera has it. Raises CameraError."""
+        held = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            held.bind(f"\0umov simulated camera {address}")
+            # Cameras that were started by other programs do not know our lock, but they have the port.
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+                probe.bind((address, _CONTROL_PORT))
+        except OSError as error:
+            held.close()
+            if error.errno == errno.EADDRINUSE:
+                return None
+            raise self._error(str(error.strerror), f"Add it: ip addr add {address}/8 dev lo") from error
+        return held
 
     def release(self) -> None:
         """Let the next camera have the address; releasing twice is harmless."""

@@ -59,7 +59,10 @@ class SimulatorConfig(_Part):
     camera: str = Field(
         default="loopback", description="feature table of a maker's camera, simulators/camera/node_maps"
     )
-    camera_address: str = Field(default="127.0.0.1", description="loopback address that the camera occupies")
+    camera_address: str = Field(
+        default="127.0.0.1",
+        description="loopback address of the camera; any other of this machine where another camera has it",
+    )
     camera_wait_s: float = Field(default=10.0, ge=0, description="wait for that address while another run has it")
     packet_loss: float = Field(default=0.0, ge=0, lt=1)
     stamp: bool = False

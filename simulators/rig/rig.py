@@ -109,6 +109,7 @@ class SimulatedRig:
             address=config.camera_address,
             description=config.camera,
             wait_s=config.camera_wait_s,
+            elsewhere=True,
         )
         self.camera.start()
 
@@ -120,7 +121,7 @@ class SimulatedRig:
 
     def camera_device(self) -> str:
         """What the rig file of a real camera would give as `device`."""
-        return self.config.camera_address
+        return self.camera.address if self.camera is not None else self.config.camera_address
 
     # --- what acquisition asks ---------------------------------------------------------------------------
 
