@@ -10,6 +10,7 @@ import contextlib
 import logging
 import threading
 import time
+from collections import Counter
 from typing import Any, NoReturn
 
 from drivers import genicam
@@ -75,7 +76,7 @@ class AravisCamera(Camera):
         self._stream: FrameStream | None = None
         self._chunks: ChunkStamps | None = None
         self._camera_clock = CameraClock(name)
-        self._counted: dict[str, int] = {}
+        self._counted: Counter[str] = Counter()
         self._stale = 0
         self._asked_structure: tuple[object, ...] | None = None
         self._format: PixelFormat | None = None
@@ -168,8 +169,7 @@ class AravisCamera(Camera):
     def _forget_stream(self) -> FrameStream | None:
         stream, self._stream = self._stream, None
         if stream is not None:
-            for name, count in stream.counters().items():
-                self._counted[name] = self._counted.get(name, 0) + count
+            self._counted.update(stream.counters())
         return stream
 
     def _restart(self) -> None:
@@ -371,16 +371,13 @@ class AravisCamera(Camera):
 
     def _do_statistics(self, retakes: int) -> StreamStatistics:
         now = {} if self._stream is None else self._stream.counters()
-
-        def total(name: str) -> int:
-            return self._counted.get(name, 0) + now.get(name, 0)
-
+        total = self._counted + Counter(now)
         return StreamStatistics(
-            completed=total("n_completed_buffers"),
-            failures=total("n_failures"),
-            underruns=total("n_underruns"),
-            missing_packets=total("n_missing_packets"),
-            resent_packets=total("n_resent_packets"),
+            completed=total["n_completed_buffers"],
+            failures=total["n_failures"],
+            underruns=total["n_underruns"],
+            missing_packets=total["n_missing_packets"],
+            resent_packets=total["n_resent_packets"],
             retakes=retakes,
             stale_discarded=self._stale,
         )
