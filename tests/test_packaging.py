@@ -66,6 +66,10 @@ def test_the_wheel_works_where_there_is_no_checkout(tmp_path: Path) -> None:
     (wheel,) = tmp_path.glob("umov-*.whl")
     with zipfile.ZipFile(wheel) as file:
         file.extractall(tmp_path / "installed")
+        # Pages are made of more than Python.
+        carried = set(file.namelist())
+    pages = {f"viewer/{f.relative_to(ROOT / 'viewer')}" for f in (ROOT / "viewer").rglob("*.*") if f.suffix != ".pyc"}
+    assert pages | {"processing/reports/design/umov.css", "processing/reports/design/page.html"} <= carried
     # The folder stands in for site-packages; the lines below fail where the checkout is imported instead.
     code = (
         "import acquisition, sys; assert acquisition.__file__.startswith(sys.argv[1]);"

@@ -17,6 +17,8 @@ from processing.reduction.effects_of_capture import capture_changes
 from processing.reduction.mueller import angles_of
 from processing.storage.capture import Capture
 
+#: Leverage beyond which the other states say too little of one: the noise of its lamp would be ten times its own.
+TELLING = 0.9
 #: States more than unknowns before a fit tells anything.
 SPARE = 4
 
@@ -92,5 +94,5 @@ def _from_the_others(
     out = np.full(len(signal), np.nan)
     # A state that alone tells one of the numbers tells nothing of the lamp.
     with np.errstate(divide="ignore", invalid="ignore"):
-        out[known] = np.where(leverage < 0.99, signal[known] - residual / (1 - leverage), np.nan)
+        out[known] = np.where(leverage < TELLING, signal[known] - residual / (1 - leverage), np.nan)
     return out

@@ -56,6 +56,10 @@ def _product(pages: Pages, path: Path) -> HTMLResponse:
 
 
 def _shown(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name.replace('_', ' ')} {_shown(one)}" for name, one in value.items())
+    if value is None:
+        return "not known"
     return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
