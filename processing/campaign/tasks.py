@@ -25,7 +25,7 @@ from processing.reflectance.base import load_reflectance
 from processing.reflectance.tables import ScatteringTable
 from processing.steps.maps import geometry_identities
 from processing.steps.reduction import Reduction
-from processing.storage.images import MuellerImage, StokesImage, neighbour_correlation
+from processing.storage.images import MuellerImage, StokesImage, neighbour_correlation, require_all_elements
 from processing.storage.product import Product
 from processing.storage.provenance import Step, file_identity
 
@@ -114,7 +114,9 @@ def reduced_product(task: CaptureTask) -> Path:
 
 
 def _measure_mueller(task: CaptureTask, product: Path, view: ViewingGeometry) -> CaptureMeasure:
-    whole = MuellerImage.load(product)
+    with Product(product) as opened:
+        require_all_elements(opened)
+        whole = MuellerImage.of(opened)
     geometry = view.at(float(whole.header.omega_deg or 0.0), *whole.mask.shape)
     # The object alone, as rows of one pixel: what lies beside it costs as much.
     image = whole.at(np.flatnonzero(geometry.mask))
@@ -131,7 +133,8 @@ def _measure_mueller(task: CaptureTask, product: Path, view: ViewingGeometry) ->
     chosen = np.flatnonzero(good)
     psi_noise, magnitude_noise = _noise_of_dominant(image, chosen)
     deviation = np.abs(deviation_from_td(eigenvalues)).max(axis=-1)[good]
-    most, by_noise = (_most(v) for v in (deviation, largest_deviation_by_noise(image.at(chosen))))
+    most = _most(deviation)
+    by_noise = _most(largest_deviation_by_noise(image.at(chosen))) if chosen.size else float("nan")
     return CaptureMeasure(
         kind="mueller",
         wavelength_nm=image.header.wavelength_nm,

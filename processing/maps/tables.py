@@ -17,6 +17,7 @@ from processing.reflectance.shared_noise import shared_variance
 from processing.reflectance.table_axes import Layout
 from processing.reflectance.tables import ScatteringTable
 from processing.storage.images import neighbour_correlation as noise_between
+from processing.storage.images import require_all_elements
 from processing.storage.product import Product
 
 
@@ -62,6 +63,8 @@ def tabulate(
     for done, source in enumerate(sources, 1):
         with Product(source) as product:
             product.require("mueller", "xi0")
+            if product.kind == "mueller":
+                require_all_elements(product)
             header, simulated, kind = product.header, product.simulated, product.kind
             if header.omega_deg is None:
                 raise ProcessError(f"{source}: the capture does not say its arm angle; it belongs to no bin.")

@@ -10,6 +10,7 @@ import numpy as np
 
 from processing.storage.axostep import AxoStepError, MuellerFile, read_mueller_file, write_mueller_file
 from processing.storage.capture_schema import CaptureHeader
+from processing.storage.images import require_all_elements
 from processing.storage.mueller_planes import MUELLER_PLANES
 from processing.storage.pixel_mask import Mask
 from processing.storage.product import Product, ProductWriter, Step, file_identity
@@ -87,7 +88,7 @@ def axostep_of_product(source: Path, out: Path, overwrite: bool) -> None:
     if out.exists() and not overwrite:
         raise AxoStepError(f"{out} exists. Give another --out, or --overwrite to replace it.")
     with Product(source) as product:
-        product.require("mueller")
+        require_all_elements(product)
         values, nm = product.get("mueller").astype(np.float32), product.header.wavelength_nm
     empty = np.empty((0, *values.shape[-2:]), np.float32)
     write_mueller_file(out, MuellerFile(values, empty, {"wavelength_nm": nm}))

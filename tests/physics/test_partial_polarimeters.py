@@ -9,6 +9,7 @@ from processing.instrument.determined import determined_basis, determined_elemen
 from processing.instrument.model import InstrumentModel, Polarizer
 from processing.maps import xi0 as maps
 from processing.maps.quantities import quantities_of_mueller
+from processing.maps.tables import tabulate
 from processing.maps.xi0 import xi0_of_mueller
 from processing.polarization import mueller
 from processing.polarization.triply_degenerate import mueller_matrix
@@ -16,6 +17,7 @@ from processing.reduction.mueller import Choice, reduce_mueller
 from processing.reflectance.base import normalized_mueller
 from processing.reports.figures import product_figure
 from processing.steps.maps import Xi0
+from processing.storage.axostep_product import axostep_of_product
 from processing.storage.capture import Capture
 from processing.storage.images import MuellerImage
 from processing.storage.pixel_mask import Mask
@@ -176,7 +178,7 @@ def test_states_that_see_less_than_the_instrument_can_are_refused(noisy, tmp_pat
         reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
 
 
-def test_what_needs_the_whole_matrix_says_so(noisy, tmp_path):
+def test_what_needs_the_whole_matrix_says_so(noisy, configs, tmp_path):
     path, model, _ = noisy("rotating_analyzer", INSTRUMENTS["rotating_analyzer"][1])
     with Capture(path) as capture:
         with pytest.raises(ProcessError, match="3 of 16 numbers"):
@@ -184,6 +186,12 @@ def test_what_needs_the_whole_matrix_says_so(noisy, tmp_path):
         reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
     with pytest.raises(ProductError, match="determines m00, m10, m20, and this needs all 16"):
         xi0_of_mueller(tmp_path / "m.h5", tmp_path / "x.h5", Step("xi0", {}), False, None)
+    for refused in (
+        lambda: tabulate([tmp_path / "m.h5"], configs / "geometries/one_inch_sphere.yaml", "degree"),
+        lambda: axostep_of_product(tmp_path / "m.h5", tmp_path / "m.cmmi", False),
+    ):
+        with pytest.raises(ProductError, match="needs all 16"):
+            refused()
     with Product(tmp_path / "m.h5") as product:
         assert product_figure(product)
 
