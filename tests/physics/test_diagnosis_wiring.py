@@ -5,7 +5,8 @@ import pytest
 
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.wiring import miswired
+from processing.diagnosis.instrument.whole_bench import WholeBench
+from processing.diagnosis.instrument.wiring import miswired, miswired_train
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture import Capture
 from processing.storage.capture_schema import Sample
@@ -77,9 +78,10 @@ def test_a_mistake_is_told_where_the_train_has_nominal_values(configs, tmp_path)
     nominal = ("psg_retarder.azimuth_deg", "psg_retarder.retardance_deg", "psa_retarder.azimuth_deg")
     whole.models = tuple(m.model_copy(update={"calibrate": nominal}) for m in whole.models)
     whole.model = whole.models[0]
-    found = miswired(whole)
+    assert WholeBench(whole, lambda line: None).train_is_off
+    found = miswired_train(whole)
     assert found is not None
     assert "'psa' turns the other way" in found.told
     straight = problem(tmp_path / "straight", configs, bench, lambda a: a, air=True)
     straight.models, straight.model = whole.models, whole.model
-    assert miswired(straight) is None
+    assert not WholeBench(straight, lambda line: None).train_is_off

@@ -30,7 +30,7 @@ from processing.diagnosis.instrument.telling import (
     unobservable,
 )
 from processing.diagnosis.instrument.whole_bench import WholeBench, predicts, solution
-from processing.diagnosis.instrument.wiring import miswired
+from processing.diagnosis.instrument.wiring import miswired, miswired_train
 from processing.diagnosis.search.causes import Cause, causes
 from processing.diagnosis.search.posterior import Posterior, Say
 from processing.diagnosis.search.result import Diagnosis, Unexplained, Verdict
@@ -60,6 +60,13 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
         say(wiring.told)
         problem = wiring.problem
     bench = WholeBench(problem, say)
+    if bench.train_is_off:
+        say("no values of the train fit: looking for a mistake of wiring")
+        wiring = miswired_train(problem, declared)
+        if wiring is not None:
+            say(wiring.told)
+            problem = wiring.problem
+            bench = WholeBench(problem, say)
     found = bench.run()
     solved = solution(bench, found)
     say("testing what is left over")

@@ -53,16 +53,23 @@ def _searched(problem: InstrumentProblem, base: Space, pool: Sequence[Candidate]
     return _by_candidate(wide, _best_start(problem, wide, values, fit.excess))
 
 
-def best_of_starts(problem: InstrumentProblem, space: Space, starts: int) -> Fit:
-    """The best fit of nominal values alone, from zero and, where that is far off, from so many places about it."""
-    fit = minimize(problem, space, np.zeros(space.size))
-    if rms(fit) < FAR_OFF:
+def best_of_starts(problem: InstrumentProblem, space: Space, starts: int, begin: Array | None = None) -> Fit:
+    """The best fit of nominal values alone, from `begin` (K,) and, where that is far off, so many places about it."""
+    fit = minimize(problem, space, np.zeros(space.size) if begin is None else begin)
+    if rms(fit) < FAR_OFF or not starts:
         return fit
-    return minimize(problem, space, _best_start(problem, space, fit.values, fit.excess, starts), expansions=0)
+    return minimize(
+        problem, space, _best_start(problem, space, fit.values, fit.excess, starts, NEAR_ENOUGH), expansions=0
+    )
 
 
-def _best_start(problem: InstrumentProblem, space: Space, values: Array, best: float, starts: int = STARTS) -> Array:
-    """The best of fits from `values` and from many places about zero, if one leaves less than `best`."""
+def _best_start(
+    problem: InstrumentProblem, space: Space, values: Array, best: float, starts: int = STARTS, enough: float = 0.0
+) -> Array:
+    """The best of fits from `values` and from many places about zero, if one leaves less than `best`.
+
+    `enough` : relative rms residual below which no better start is looked for.
+    """
     random, start = np.random.default_rng(0), values
     for k in range(starts + 1):
         width = _widths(space, NEAR if k % 2 else FAR)
@@ -70,7 +77,7 @@ def _best_start(problem: InstrumentProblem, space: Space, values: Array, best: f
         tried = minimize(problem, space, here, expansions=0)
         if tried.excess < best:
             values, best = tried.values, tried.excess
-            if rms(tried) < NEAR_ENOUGH:
+            if rms(tried) < enough:
                 break
     return values
 

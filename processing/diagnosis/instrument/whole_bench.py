@@ -10,7 +10,7 @@ from processing.arrays import Array
 from processing.diagnosis.instrument.moments import MARGIN
 from processing.diagnosis.instrument.noise_of_light import scatter_prefers
 from processing.diagnosis.instrument.problem import EXACT, InstrumentProblem
-from processing.diagnosis.instrument.starts import first_values
+from processing.diagnosis.instrument.starts import FAR_OFF, best_of_starts, first_values, rms
 from processing.diagnosis.instrument.undone import exactly_undone
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
@@ -43,6 +43,19 @@ class WholeBench:
         self.pool = problem.pool()
         self._free = [c.values_per_pixel - self._unknowns(k) for k, c in enumerate(self.whole.captures)]
         self._start = first_values(self.whole, self.base, self.pool, say)
+
+    @property
+    def train_is_off(self) -> bool:
+        """Nominal values, of one wavelength, none of which fit, whatever the source and the channels do beside them."""
+        if not self.base.size or len(set(self.whole.wavelengths_nm)) > 1:
+            return False
+        # With one channel a value for each state takes up any mistake.
+        beside = len(self.whole.model.channels) > 1
+        start = {c: v for c, v in self._start.items() if beside or c in self.base.candidates}
+        space, values = Space(tuple(start)), np.concatenate([np.zeros(0), *start.values()])
+        if not beside:
+            values = best_of_starts(self.whole, space, 0, values).values
+        return rms(Fit(values, self.whole.sums(space, values, derivatives=False), 0.0)) > FAR_OFF
 
     def run(self) -> Posterior:
         """The posterior; again with the noise that its light tells, and with what varies over the image."""

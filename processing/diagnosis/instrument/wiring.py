@@ -16,8 +16,8 @@ import numpy as np
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.starts import STARTS, best_of_starts, rms
-from processing.diagnosis.search.rules import DECISIVE, FAR_OFF, WIRING
+from processing.diagnosis.instrument.starts import best_of_starts
+from processing.diagnosis.search.rules import DECISIVE, WIRING
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
 
@@ -42,37 +42,33 @@ class Wiring:
 
 
 def miswired(problem: InstrumentProblem, declared: InstrumentModel | None = None) -> Wiring | None:
-    """The mistake without which far less is left over; None if there is none.
-
-    Where the train has nominal values, each mistake is judged by what the best of them leave.
+    """The mistake without which far less is left over; None if there is none, or where the train is only nominal.
 
     Parameters
     ----------
     declared : the instrument at all the wavelengths of its file.
     """
-    nothing = Space(())
-    start = _left(problem, nothing, np.zeros(0))
-    mistakes = [*_mistakes(problem), *_other_wavelengths(problem, declared)]
     if problem.nominal():
-        start, lefts = _beside_nominal(problem, mistakes)
-    else:
-        lefts = [_left(w.problem, nothing, np.zeros(0)) for w in mistakes]
+        return None
+    nothing, none = Space(()), np.zeros(0)
+    mistakes = [*_mistakes(problem), *_other_wavelengths(problem, declared)]
+    return _best(mistakes, [_left(w.problem, nothing, none) for w in mistakes], _left(problem, nothing, none))
+
+
+def miswired_train(problem: InstrumentProblem, declared: InstrumentModel | None = None) -> Wiring | None:
+    """The same where the train has nominal values, none of which fit: each mistake is judged by the best of them."""
+    base = Space(problem.nominal())
+    mistakes = [*_mistakes(problem), *_other_wavelengths(problem, declared)]
+
+    def left(tried: InstrumentProblem) -> float:
+        return _left(tried, base, best_of_starts(tried, base, FEW_STARTS).values)
+
+    return _best(mistakes, [left(w.problem.undivided()) for w in mistakes], left(problem.undivided()))
+
+
+def _best(mistakes: Sequence[Wiring], lefts: Sequence[float], start: float) -> Wiring | None:
     found = [(left, k) for k, left in enumerate(lefts) if left < start / WIRING and start - left > DECISIVE]
     return mistakes[min(found)[1]] if found else None
-
-
-def _beside_nominal(problem: InstrumentProblem, mistakes: Sequence[Wiring]) -> tuple[float, list[float]]:
-    """What the best nominal values leave without any mistake and with each; nothing where they are good as it is."""
-    whole = problem.at(problem.wavelengths_nm[0])
-    base = Space(whole.nominal())
-    fit = best_of_starts(whole, base, STARTS)
-    if rms(fit) < FAR_OFF:
-        return 0.0, []
-    lefts = []
-    for wiring in mistakes:
-        other = wiring.problem.at(problem.wavelengths_nm[0])
-        lefts.append(_left(other, base, best_of_starts(other, base, FEW_STARTS).values))
-    return _left(whole, base, fit.values), lefts
 
 
 def _left(problem: InstrumentProblem, space: Space, values: Array) -> float:
