@@ -10,13 +10,13 @@ from processing.arrays import Array
 from processing.diagnosis.instrument.moments import MARGIN
 from processing.diagnosis.instrument.noise_of_light import scatter_prefers
 from processing.diagnosis.instrument.problem import EXACT, InstrumentProblem
-from processing.diagnosis.instrument.starts import FAR_OFF, best_of_starts, first_values, rms
+from processing.diagnosis.instrument.starts import best_of_starts, first_values, rms
 from processing.diagnosis.instrument.undone import exactly_undone
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.fit import Fit, held_out, minimize, prior, score
 from processing.diagnosis.search.posterior import Posterior, Say, posterior, quadratic, resampled
-from processing.diagnosis.search.rules import BESIDE_FIELD, DECISIVE, LIKELY, REFUTED, SHARES, TAKES_PART
+from processing.diagnosis.search.rules import BESIDE_FIELD, DECISIVE, FAR_OFF, LIKELY, REFUTED, SHARES, TAKES_PART
 from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import FieldEffect, ImageShift, PointwiseEffect, Switch, ValuePerState
