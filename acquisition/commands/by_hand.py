@@ -1,4 +1,4 @@
-"""The rig by hand: `acquire doctor`, `home`, `move`, `stop` and `snap`."""
+"""The rig by hand: `acquire init`, `doctor`, `home`, `move`, `stop` and `snap`."""
 
 from __future__ import annotations
 
@@ -16,10 +16,19 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    for command in (doctor, home, stop, snap):
+    for command in (init, doctor, home, stop, snap):
         app.command()(command)
     # So that -30 is an angle and not an option.
     app.command(context_settings={"ignore_unknown_options": True})(move)
+
+
+def init(
+    out: Annotated[Path, typer.Option(help="rig file to write; an existing one is kept")] = Path("rig.yaml"),
+) -> None:
+    """Write a rig file to begin with, from the cameras and serial ports that are there; opens no port."""
+    from acquisition.commands.init import write_rig
+
+    typer.echo(write_rig(out))
 
 
 def doctor(
