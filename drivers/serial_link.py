@@ -248,7 +248,8 @@ def _owner(port: str) -> str:
 def _ports_hint() -> str:
     from serial.tools.list_ports import comports
 
-    names = [f"{entry.device} ({entry.description})" for entry in comports()]
+    # pyserial says "n/a" of what has no description.
+    names = [e.device if e.description == "n/a" else f"{e.device} ({e.description})" for e in comports()]
     by_id = sorted(str(path) for path in Path("/dev/serial/by-id").glob("*"))
     found = ", ".join(names + by_id) or "none"
     return f"Serial ports found: {found}. Correct `port` in the rig file or plug the device in"

@@ -108,7 +108,9 @@ def _instrument(path: Path) -> str:
 def _axis(axis: MotionAxis) -> str:
     who = axis.describe()
     limits = axis.limits
-    ends = " to ".join("no limit" if end is None else f"{end:g}" for end in (limits.min_deg, limits.max_deg))
+    ends = "limits " + " to ".join("none" if end is None else f"{end:g}" for end in (limits.min_deg, limits.max_deg))
+    if limits.min_deg is None and limits.max_deg is None:
+        ends = "no limits"
     axis.check_fault()
     homed = "homed" if axis.is_homed() else "NOT homed"
     moving = ", MOVING" if axis.is_moving() else ""
@@ -116,7 +118,7 @@ def _axis(axis: MotionAxis) -> str:
     warnings = "".join(f", warning: {text}" for text in axis.warnings())
     stop = "" if axis.can_stop_a_move else ", cannot be stopped once it moves"
     name = f"{who.kind} {who.model}, serial {who.serial_number}, firmware {who.firmware}"
-    return f"{name}, {who.port}: {homed}{moving}, {position}limits {ends}{stop}{warnings}"
+    return f"{name}, {who.port}: {homed}{moving}, {position}{ends}{stop}{warnings}"
 
 
 def _source(rig: Rig) -> str:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Any, Self
 
@@ -13,7 +14,7 @@ from acquisition.rig.config import RigConfig
 from acquisition.rig.way import concerned, find_homing_obstacle, find_obstacle
 from drivers.camera import Camera, CameraSettings
 from drivers.clock import REAL, Clock
-from drivers.errors import LimitError, MotionFailed
+from drivers.errors import DeviceError, LimitError, MotionFailed
 from drivers.motion import Motion, MotionAxis, Position
 from drivers.registry import open_axis, open_camera, open_source
 from drivers.serial_link import LineRegistry
@@ -34,6 +35,17 @@ REST_WITHIN_S = 60.0
 def clock_of(config: RigConfig) -> Clock:
     """The clock of a rig: real devices keep real time, emulators may be kept from running."""
     return patient_clock() if config.simulated else REAL
+
+
+@contextmanager
+def _said_of(device: str) -> Iterator[None]:
+    """Errors of opening a port name the port; a person looks for the device that the rig file names."""
+    try:
+        yield
+    except DeviceError as error:
+        if device not in error.asked:
+            error.asked = f"{device}, {error.asked}"
+        raise
 
 
 class Rig:
@@ -94,9 +106,11 @@ class Rig:
         if self.config.simulator is not None:
             self.start_simulation()
         for name in self.config.axes:
-            self.open_axis(name)
+            with _said_of(f"axis {name}"):
+                self.open_axis(name)
         if self.config.source is not None:
-            self.open_source()
+            with _said_of("source"):
+                self.open_source()
         if self._with_camera:
             self.open_camera()
 

@@ -37,10 +37,13 @@ def quantities_command(
 ) -> None:
     """Eigenvalues, depolarization, diattenuation, polarizance, retardance and their standard errors."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from processing.maps.quantities import require_decompositions
     from processing.polarization.quantities import PAPER_PAIRS
     from processing.steps.maps import Quantities
 
     pairs = {**PAPER_PAIRS, **dict(_pair(text) for text in pair or ())}
+    # Before a capture is reduced for nothing.
+    require_decompositions(also or ())
     step = Quantities(reduced_source(source, instrument), tuple(also or ()), pairs)
     with progress_bar("quantities", "rows") as tick:
         product = step.make(out, overwrite, tick)

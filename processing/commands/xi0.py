@@ -36,9 +36,14 @@ def xi0_command(
     """xi0 from a Mueller capture (coherency eigenvalues) or a linear Stokes capture (two coefficients)."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from processing.steps.maps import Xi0
+    from processing.storage.product import Product
 
-    step = Xi0(reduced_source(source, instrument), geometry, material)
+    image = reduced_source(source, instrument)
+    with Product(image) as product:
+        if product.kind != "stokes" and (geometry or material):
+            typer.echo(f"warning: {image} is no Stokes image: --geometry and --material are not looked at", err=True)
+    step = Xi0(image, geometry, material)
     with progress_bar("xi0", "rows") as tick:
-        product = step.make(out, overwrite, tick)
-    summary(product)
-    draw(product, figure, no_figure)
+        made = step.make(out, overwrite, tick)
+    summary(made)
+    draw(made, figure, no_figure)

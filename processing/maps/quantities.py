@@ -118,9 +118,7 @@ def quantities_of_mueller(
     ProductError : the source holds no whole Mueller matrices.
     ProcessError : an extra decomposition is unknown.
     """
-    unknown = sorted(set(extra) - set(EXTRA))
-    if unknown:
-        raise ProcessError(f"unknown decomposition {unknown[0]!r}; there are: {', '.join(EXTRA)}")
+    require_decompositions(extra)
     with Product(source) as product:
         product.require("mueller", EXTRAPOLATED)
         maps = _planes(extra, pairs)
@@ -143,6 +141,13 @@ def quantities_of_mueller(
             facts = partial_facts(writer, partial) if partial else _facts(writer, maps)
             writer.seal(facts)
     return facts
+
+
+def require_decompositions(extra: Sequence[str]) -> None:
+    """Raise ProcessError for a name that is not in `EXTRA`."""
+    unknown = sorted(set(extra) - set(EXTRA))
+    if unknown:
+        raise ProcessError(f"unknown decomposition {unknown[0]!r}; there are: {', '.join(EXTRA)}")
 
 
 def _determined(product: Product, extra: Sequence[str], pairs: Pairs) -> list[str]:

@@ -1,0 +1,64 @@
+"""Slips of a user: a device that is not plugged in, names and files that are not meant so. One clear message each."""
+
+import pytest
+from ruamel.yaml import YAML
+
+from processing.commands.application import main as process
+
+
+@pytest.fixture
+def unplugged(small_rig):
+    """A rig file whose arm is at a port that is not there."""
+    path = small_rig()
+    yaml = YAML()
+    rig = yaml.load(path)
+    rig["axes"]["arm"]["port"] = "/dev/ttyUSB_none"
+    with path.open("w") as file:
+        yaml.dump(rig, file)
+    return path
+
+
+@pytest.mark.parametrize("command", [("--omega", 35), ("home",), ("move", "psg", 10)])
+def test_a_device_that_is_not_plugged_in_is_named(command, unplugged, acquire):
+    code, _, err = acquire(*command, "--rig", unplugged)
+    assert code == 1
+    assert "axis arm, open port /dev/ttyUSB_none: there is no such port" in err
+    assert "n/a" not in err
+
+
+def test_doctor_goes_on_with_the_others(unplugged, acquire):
+    code, out, _ = acquire("doctor", "--rig", unplugged)
+    assert code == 1
+    assert "BAD  axis arm  open port /dev/ttyUSB_none" in out
+    assert "ok  axis psa" in out
+    assert "NOT homed, no limits" in out
+
+
+@pytest.fixture
+def run(capfd):
+    """Runs `process`; returns exit code and standard error."""
+
+    def done(*arguments):
+        with pytest.raises(SystemExit) as end:
+            process([str(argument) for argument in arguments])
+        return end.value.code or 0, capfd.readouterr().err
+
+    return done
+
+
+@pytest.fixture
+def capture(acquire, small_rig, tmp_path):
+    acquire("--omega", 35, "--rig", small_rig(), "--out", tmp_path)
+    (path,) = tmp_path.glob("*omega35.h5")
+    return path
+
+
+def test_options_that_do_not_fit_are_told_before_the_work_and_not_passed_over(run, capture):
+    code, err = run("quantities", capture, "--also", "symetric")
+    assert code == 2
+    assert "unknown decomposition 'symetric'; there are: symmetric, differential" in err
+    # Nothing was reduced for nothing.
+    assert not list(capture.parent.glob("*.mueller.h5"))
+    code, err = run("xi0", capture, "--geometry", "no_such_file.yaml", "--no-figure")
+    assert code == 0
+    assert "is no Stokes image: --geometry and --material are not looked at" in err
