@@ -52,7 +52,15 @@ def assert_horizontal(path: Path) -> None:
     assert np.max(np.abs(np.rad2deg(np.arctan2(s2, s1)) / 2)) < 3.0
 
 
-@pytest.mark.parametrize(("offset_x", "offset_y"), [(0, 0), (1, 0), (0, 1), (1, 1)])
+@pytest.mark.parametrize(
+    ("offset_x", "offset_y", "pixel_format"),
+    [
+        *[(x, y, "PolarizeMono12p") for x, y in ((0, 0), (1, 0), (0, 1), (1, 1))],
+        (1, 0, "PolarizeMono12"),
+        (0, 1, "PolarizeMono12Packed"),
+        (1, 1, "PolarizeMono16"),
+    ],
+)
 def test_horizontal_light_reads_zero_degrees_wherever_the_region_begins(
     acquire: Acquire,
     small_rig: Rig,
@@ -60,8 +68,9 @@ def test_horizontal_light_reads_zero_degrees_wherever_the_region_begins(
     tmp_path: Path,
     offset_x: int,
     offset_y: int,
+    pixel_format: str,
 ) -> None:
-    region = {"width": 40, "height": 24, "offset_x": offset_x, "offset_y": offset_y, "pixel_format": "PolarizeMono12p"}
+    region = {"width": 40, "height": 24, "offset_x": offset_x, "offset_y": offset_y, "pixel_format": pixel_format}
     rig = small_rig(top={"camera": CAMERA | {"settings": region}})
     out = tmp_path / "captures"
     code, _, err = acquire("--rig", rig, "--plan", short_plan("stokes"), *THROUGH, "--out", out)
