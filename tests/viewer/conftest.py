@@ -1,6 +1,12 @@
 """Fixtures of the room: a folder with captures, and the application in front of it."""
 
-from collections.abc import Callable
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -58,3 +64,22 @@ def drr_capture(lab: Path, configs: Path, synthetic_capture: Callable[..., Path]
         )
 
     return make
+
+
+@pytest.fixture
+def address(lab: Path) -> Iterator[str]:
+    """Address of the application, served by its own command."""
+    child = subprocess.Popen(
+        [sys.executable, "-m", "viewer.command", lab], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    assert child.stdout is not None
+    line = child.stdout.readline()
+    found = re.search(r"http://127\.0\.0\.1:\d+/\S+/", line)
+    assert found, line
+    yield found[0].rstrip("/")
+    child.send_signal(signal.SIGINT)
+    child.wait()
+    child.stdout.close()
+    for job in lab.glob(".umov-view/jobs/*/job.json"):
+        if not (job.parent / "code").exists():
+            os.kill(json.loads(job.read_text())["pid"], signal.SIGKILL)

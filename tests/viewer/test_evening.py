@@ -7,9 +7,6 @@ import json
 import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
 import urllib.parse
 from pathlib import Path
 
@@ -52,24 +49,6 @@ def lab(small_rig, configs, tmp_path) -> Path:
         YAML().dump(campaign, file)
     (folder / "broken.h5").write_bytes(b"\x89HDF\r\n\x1a\n and nothing more")
     return folder
-
-
-@pytest.fixture
-def address(lab):
-    """Address of the application, served by its own command."""
-    child = subprocess.Popen(
-        [sys.executable, "-m", "viewer.command", lab], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    )
-    line = child.stdout.readline()
-    found = re.search(r"http://127\.0\.0\.1:\d+/\S+/", line)
-    assert found, line
-    yield found[0].rstrip("/")
-    child.send_signal(signal.SIGINT)
-    child.wait()
-    child.stdout.close()
-    for job in lab.glob(".umov-view/jobs/*/job.json"):
-        if not (job.parent / "code").exists():
-            os.kill(json.loads(job.read_text())["pid"], signal.SIGKILL)
 
 
 @pytest.fixture

@@ -1,0 +1,60 @@
+"""A capture that is being written is shown as far as it is done, and who looks keeps no run from its file."""
+
+import contextlib
+import json
+import urllib.error
+import urllib.request
+
+import h5py
+import numpy as np
+import pytest
+
+from acquisition.capture.layout import put_layout
+from acquisition.capture.state_file import StateFile
+from acquisition.errors import AcquisitionError
+from processing.storage.capture_schema import CaptureHeader, create_layout
+
+
+def asked(address, what):
+    with urllib.request.urlopen(f"{address}/{what}") as answer:
+        return answer.read()
+
+
+def test_states_appear_as_they_are_written(lab, address):
+    partial = lab / "now.h5.partial"
+    header = CaptureHeader(title="now", simulated=True, mode="drr", wavelength_nm=662)
+    angles = {"psg": np.arange(5.0)}
+    put_layout(
+        partial,
+        1 << 20,
+        lambda h5: create_layout(h5, header, angles, ("sample",) * 5, (6, 8), np.uint16, "2026-01-01T00:00:00"),
+    )
+    # Open as a run has it: locked against every other program.
+    with contextlib.closing(StateFile(partial)) as file:
+        with pytest.raises(AcquisitionError, match="another program has it open"):
+            StateFile(partial)
+        for state in range(3):
+            frame = np.full((1, 6, 8), 700 + state, np.uint16)
+            file.write_state(state, frame, {"psg": (state, state)}, {"exposure_s": 0.01})
+            told = json.loads(asked(address, "states?file=now.h5.partial"))
+            assert (len(told["number"]), told["planned"], told["status"]) == (state + 1, 5, "running")
+            counts = np.frombuffer(asked(address, "frame?file=now.h5.partial&state=-1"), "<f4")[:48]
+            assert np.all(counts == 700 + state)
+        assert 'data-writing="yes"' in asked(address, "capture?file=now.h5.partial").decode()
+        curve = json.loads(asked(address, "curve?file=now.h5.partial&x0=1&y0=1"))
+        assert curve["counts"] == [700, 701, 702]
+        assert "the fit comes when it is complete" in curve["told"]
+    # The run may take its file again although the page has just looked.
+    StateFile(partial).close()
+
+
+def test_a_capture_without_a_state_says_so(lab, address, drr_capture):
+    path = drr_capture("now.h5", shape=(6, 8))
+    with h5py.File(path, "r+") as h5:
+        h5["entry/states/done"][...] = 0
+    assert b"0 of 44" in asked(address, "capture?file=now.h5")
+    with pytest.raises(urllib.error.HTTPError) as refused:
+        asked(address, "frame?file=now.h5&state=-1")
+    assert refused.value.code == 422
+    assert b"0 states done" in refused.value.read()
+    refused.value.close()
