@@ -281,10 +281,16 @@ def write_status(h5: h5py.File, status: Status) -> None:
 
 
 def fitted_json(closing: Mapping[str, Any], room: int) -> bytes:
-    """JSON in at most `room` bytes; `left_out` tells entries of lists, characters of texts and whole values cut."""
+    """JSON in at most `room` bytes; `left_out` tells entries of lists, characters of texts and whole values cut.
+
+    Where not even that fits it is an empty record.
+    """
     record, left_out = dict(closing), dict[str, int]()
     while len(raw := json_bytes(record)) > room:
-        longest = max(set(record) - {"left_out"}, key=lambda name: len(json_bytes(record[name])))
+        rest = set(record) - {"left_out"}
+        if not rest:
+            return b"{}"
+        longest = max(rest, key=lambda name: len(json_bytes(record[name])))
         value = record.pop(longest)
         cut = 1
         if isinstance(value, (list, str)) and len(value) > 1:

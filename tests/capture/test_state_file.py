@@ -1,0 +1,138 @@
+"""The file of a capture that is being taken: states, columns, journal, closing record, each at its place."""
+
+import os
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from acquisition.capture.state_file import LINE_BYTES, StateFile
+from acquisition.capture.writer import CaptureWriter
+from acquisition.errors import AcquisitionError
+from processing.instrument.states import StateTable
+from processing.storage.capture import Capture
+from processing.storage.capture_schema import CaptureHeader
+
+SHAPE, STATES = (4, 5), 3
+HEADER = CaptureHeader(title="three states", simulated=True, mode="drr", wavelength_nm=662)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """A layout that no program has open."""
+    table = StateTable(
+        angles_deg={"psg": np.arange(STATES) * 9.0, "psa": np.arange(STATES) * 5.0},
+        exposure_s=np.full(STATES, 0.02),
+        role=("sample",) * STATES,
+        repeats=np.full(STATES, 2),
+    )
+    CaptureWriter.create(tmp_path / "c.h5", HEADER, table, SHAPE, "2026-01-01T00:00:00").abandon()
+    (left,) = tmp_path.iterdir()
+    return left
+
+
+@pytest.fixture
+def file(path: Path):
+    opened = StateFile(path)
+    yield opened
+    opened.close()
+
+
+def test_a_state_is_written_at_its_own_place(path, file):
+    for k in (2, 0):
+        pixels = np.arange(20).reshape(1, *SHAPE) + 100 * k
+        file.write_state(k, pixels, {"psg": (9.5 + k, 9500 + k), "psa": (-k, -1000 * k)}, {"exposure_s": 0.03 + k})
+    file.close()
+    with Capture(path) as there:
+        assert there.done.tolist() == [0, 2]
+        assert there.damaged_states() == []
+        assert there.angles_deg["psg"].tolist() == [9.5, 11.5]
+        assert there.angles_deg["psa"].tolist() == [0.0, -2.0]
+        assert there.column("exposure_s").tolist() == [0.03, 2.03]
+        assert there.planned_column("exposure_s")[1] == 0.02
+        np.testing.assert_array_equal(there.frames(1), np.arange(20).reshape(1, *SHAPE) + 200)
+    with h5py.File(path) as h5:
+        assert h5["entry/instrument/psg/raw_value"][...].tolist()[0::2] == [9500, 9502]
+
+
+def test_columns_are_read_and_replaced_whole(path, file):
+    assert file.read_column("exposure_s").tolist() == [0.02] * STATES
+    file.write_column("exposure_s", [0.1, 0.2, 0.3])
+    assert file.read_column("exposure_s").tolist() == [0.1, 0.2, 0.3]
+    assert file.read_column("repeats").tolist() == [2] * STATES
+    # A copy: what is done to it is not done to the file.
+    file.read_column("repeats")[:] = 0
+    assert file.read_column("repeats").tolist() == [2] * STATES
+
+
+def test_journal_keeps_its_lines_and_takes_over_what_was_cut_off(path, file):
+    assert file.segment_records() == []
+    file.add_segment_record({"event": "begin", "n": 1})
+    file.add_segment_record({"event": "end"}, part=0.5)
+    assert file.segment_records() == [{"event": "begin", "n": 1}, {"event": "end"}]
+    # A line whose end never reached the disc is not there, and the next one covers all of it.
+    end = file._journal()[1]
+    file._write(file._segments.offset + end, np.frombuffer(b"12345678 {" + 300 * b"x", np.uint8))
+    file.add_segment_record({"event": "begin", "n": 2})
+    assert [r.get("n") for r in file.segment_records()] == [1, None, 2]
+    rest = os.pread(file._file, file._segments.step, file._segments.offset)[file._journal()[1] :]
+    assert not rest.strip(b"\0")
+
+
+def test_a_record_is_cut_to_its_part_of_the_room_and_a_full_journal_is_told(path, file):
+    room = file._segments.step
+    file.add_segment_record({"event": "end", "messages": ["m" * 100] * (room // 50)}, part=0.5)
+    (record,) = file.segment_records()
+    assert record["left_out"]["messages"] > 0
+    used = file._journal()[1]
+    assert 0.4 * room < used <= 0.5 * room
+    # A line as long as the room takes all of it, one byte more does not fit, and nothing is written then.
+    left = room - used - LINE_BYTES - len('{"t": ""}')
+    with pytest.raises(AcquisitionError, match="its journal is full"):
+        file.add_segment_record({"t": "x" * (left + 1)})
+    assert file._journal()[1] == used
+    file.add_segment_record({"t": "x" * left})
+    assert file._journal()[1] == room
+    with pytest.raises(AcquisitionError, match="its journal is full"):
+        file.add_segment_record({}, part=0.5)
+
+
+def test_closing_record_and_status_are_replaced(path, file):
+    file.write_closing({"end_time": "a long time after it began", "messages": []})
+    file.write_closing({"end_time": "now"})
+    file.write_status("aborted")
+    file.write_status("failed")
+    file.close()
+    with Capture(path) as there:
+        assert there.closing == {"end_time": "now"}
+        assert there.status == "failed"
+
+
+def test_a_closing_record_that_is_too_long_says_what_it_lost(path, file):
+    file.write_closing({"end_time": "now", "messages": ["m" * 1000] * 5000})
+    file.close()
+    with Capture(path) as there:
+        assert there.closing["left_out"]["messages"] > 0
+
+
+def test_it_knows_whether_it_is_still_the_file_of_its_name(path, file):
+    assert file.is_at(path)
+    assert not file.is_at(path.with_name("other"))
+    path.rename(path.with_name("moved"))
+    assert not file.is_at(path)
+    path.write_bytes(b"")
+    assert not file.is_at(path)
+
+
+def test_one_program_at_a_time_and_nothing_but_whole_captures(path, file, tmp_path):
+    with pytest.raises(AcquisitionError, match="another program has it open"):
+        StateFile(path)
+    file.close()
+    file.close()
+    StateFile(path).close()
+    with pytest.raises(AcquisitionError, match=r"cannot be opened to go on \(No such file"):
+        StateFile(tmp_path / "nowhere.h5")
+    (tmp_path / "text.h5").write_text("no HDF5")
+    with pytest.raises(AcquisitionError, match="begin a new capture"):
+        StateFile(tmp_path / "text.h5")
