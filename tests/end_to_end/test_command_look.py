@@ -1,4 +1,4 @@
-"""One look of the four commands: -h and --help everywhere, --version, completion."""
+"""One look of the five commands: -h and --help everywhere, --version, completion."""
 
 from importlib.metadata import version
 
@@ -9,8 +9,9 @@ from acquisition.commands.application import app as acquire
 from processing.commands.application import app as process
 from processing.commands.diagnose import app as diagnose
 from simulators.cli import app as simulate
+from viewer.command import app as view
 
-COMMANDS = {"acquire": acquire, "process": process, "diagnose": diagnose, "simulate": simulate}
+COMMANDS = {"acquire": acquire, "process": process, "diagnose": diagnose, "simulate": simulate, "view": view}
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -30,7 +31,7 @@ def test_version_and_help(name):
         (name, command.name or command.callback.__name__)
         for name, app in COMMANDS.items()
         for command in app.registered_commands
-        if name != "diagnose"
+        if name not in ("diagnose", "view")
     ],
 )
 def test_every_command_has_short_help(name, command):

@@ -30,11 +30,18 @@ from processing.commands.diagnose import app as diagnose_app
 from processing.commands.diagnose import main as diagnose
 from processing.geometry.viewing import ViewingGeometry
 from simulators.cli import app as simulate_app
+from viewer.command import app as view_app
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
 RUNS = {"acquire": acquire, "process": process, "diagnose": diagnose}
-APPS = {"acquire": acquire_app, "process": process_app, "diagnose": diagnose_app, "simulate": simulate_app}
+APPS = {
+    "acquire": acquire_app,
+    "process": process_app,
+    "diagnose": diagnose_app,
+    "simulate": simulate_app,
+    "view": view_app,
+}
 FIRST_CAPTURE = ["./lab", "acquire", "--omega", "35"]
 LANGUAGES = {"bash", "python", "console", "yaml", "text"}
 
