@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from acquisition.rig.config import load_rig as load_rig
     from acquisition.rig.rig import Rig as Rig
     from acquisition.taking import take_capture as take_capture
+    from simulators.bench.bench import SimulatedBench as SimulatedBench
+    from simulators.bench.scene import Scene as Scene
+    from simulators.bench.virtual_capture import write_virtual_capture as write_virtual_capture
 
 _PUBLIC = {
     "MeasurementPlan": "acquisition.capture.plan",
@@ -34,6 +37,9 @@ _PUBLIC = {
     "CONFIGS": "acquisition.commands.defaults",
     "DEFAULT_RIG": "acquisition.commands.defaults",
     "AcquisitionError": "acquisition.errors",
+    "SimulatedBench": "simulators.bench.bench",
+    "Scene": "simulators.bench.scene",
+    "write_virtual_capture": "simulators.bench.virtual_capture",
 }
 
 __all__ = sorted(_PUBLIC)

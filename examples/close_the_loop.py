@@ -8,12 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from acquisition import CONFIGS
+from acquisition import CONFIGS, Scene, SimulatedBench, write_virtual_capture
 from processing import InstrumentModel, diagnose_captures, reduce_to_dataset, write_instrument
-from simulators.bench.bench import SimulatedBench
 from simulators.bench.effects.motion import AngleOffset
-from simulators.bench.scene import Scene
-from simulators.bench.virtual_capture import write_virtual_capture
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 instrument = InstrumentModel.load(CONFIGS / "instruments/rgb950.yaml")

@@ -6,11 +6,8 @@ Run: .venv/bin/python examples/from_simulated_bench.py [FOLDER]
 import sys
 from pathlib import Path
 
-from acquisition import CONFIGS
+from acquisition import CONFIGS, Scene, SimulatedBench, write_virtual_capture
 from processing import InstrumentModel, Reduction, Xi0, open_dataset
-from simulators.bench.bench import SimulatedBench
-from simulators.bench.scene import Scene
-from simulators.bench.virtual_capture import write_virtual_capture
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 instrument = InstrumentModel.load(CONFIGS / "instruments/rgb950.yaml")

@@ -78,6 +78,12 @@ def test_a_citation_that_leads_outside_is_seen():
     assert not cited_outside('docs/conventions.md, "Frames"')
 
 
+def test_a_page_that_speaks_of_the_paper_names_it():
+    pages = [page for page in (ROOT / "docs").glob("*.md") if re.search(r"\b[Tt]he paper\b", page.read_text("utf-8"))]
+    assert pages
+    assert [page.name for page in pages if "Jarecki" not in page.read_text("utf-8")] == []
+
+
 def test_every_page_of_the_docs_is_in_the_site():
     named = set(re.findall(r"[\w-]+\.md", (ROOT / "mkdocs.yml").read_text(encoding="utf-8")))
     assert named == {page.name for page in (ROOT / "docs").glob("*.md")}
