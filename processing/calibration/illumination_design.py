@@ -16,7 +16,7 @@ from processing.polarization.xi0 import Xi0Estimate, estimate
 from processing.reduction.mueller import Progress
 from processing.reflectance.base import ReflectanceModel
 
-#: The paper's fifteen arm angles.
+#: Jarecki and Kupinski's fifteen arm angles.
 PAPER_OMEGA_DEG = tuple(float(v) for v in range(20, 91, 5))
 
 

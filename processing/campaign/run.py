@@ -1,8 +1,8 @@
 """A campaign: captures of one object at many arm angles, by a Mueller polarimeter and a linear Stokes camera.
 
-As in the paper's Sec. V: the Mueller captures give psi and |D| of the dominant process, compared with the model at
-the same pixels; xi0 of both instruments goes into tables over scattering geometry, which are compared on a virtual
-sphere as the Stokes camera sees it.
+As in Sec. V of Jarecki and Kupinski: the Mueller captures give psi and |D| of the dominant process, compared with
+the model at the same pixels; xi0 of both instruments goes into tables over scattering geometry, which are compared
+on a virtual sphere as the Stokes camera sees it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ BORDER_PX = 4
 
 @dataclass(frozen=True)
 class PaperAverages:
-    """The paper's averages over fifteen arm angles (its conclusions; see docs/conventions.md)."""
+    """Jarecki and Kupinski's averages over fifteen arm angles (their conclusions; see docs/conventions.md)."""
 
     psi_deg: float
     magnitude_percent: float
@@ -302,7 +302,8 @@ def compare_on_sphere(
     omega_deg: float,
     shape: tuple[int, int],
 ) -> dict[str, float]:
-    """Deviation of two xi0 tables on a virtual object (paper Sec. V-B): `xi0_percent`, its noise part, `common`.
+    """Deviation of two xi0 tables on a virtual object (Jarecki and Kupinski, Sec. V-B): `xi0_percent`, its noise
+    part, `common`.
 
     Both tables hold (xi0, variance of xi0). Raises NotDetermined when the object is not in the frame.
     """

@@ -1,4 +1,4 @@
-"""`process campaign`: everything of a folder of captures, beside the paper's averages."""
+"""`process campaign`: everything of a folder of captures, beside Jarecki and Kupinski's averages."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ COLUMNS = (
 
 
 def lines(result: CampaignResult) -> list[str]:
-    """The table for people: a block a wavelength, its averages, and the paper's."""
+    """The table for people: a block a wavelength, its averages, and Jarecki and Kupinski's."""
     from processing.campaign.run import PAPER
 
     def row(head: str, values: Sequence[float | None]) -> str:

@@ -27,7 +27,9 @@ def quantities_command(
     also: Annotated[list[str] | None, typer.Option(help="More decompositions: symmetric, differential.")] = None,
     pair: Annotated[
         list[str] | None,
-        typer.Option(help="GENERATOR,ANALYZER: light between two polarizers, e.g. 45,right, beside the paper's three."),
+        typer.Option(
+            help="GENERATOR,ANALYZER: light between two polarizers, e.g. 45,right, beside the three of the bunny."
+        ),
     ] = None,
     instrument: Annotated[Path | None, typer.Option(help="Instrument file, where a capture is reduced here.")] = None,
     out: Annotated[Path | None, typer.Option(help="Product file; default: beside the source.")] = None,

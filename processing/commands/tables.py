@@ -51,7 +51,7 @@ def compare_command(
     size: Annotated[int, typer.Option(min=16, help="Rows and columns of the virtual image.")] = 600,
     figure: Annotated[Path, typer.Option(help="Figure of the first angle (PNG).")] = Path("compare_tables.png"),
 ) -> None:
-    """Evaluate two tables of xi0 on a virtual object and compare them, as in the paper's Sec. V-B."""
+    """Evaluate two tables of xi0 on a virtual object and compare them, as in Jarecki and Kupinski's Sec. V-B."""
     from processing.campaign.run import compare_on_sphere
     from processing.errors import ProcessError
     from processing.geometry.viewing import ViewingGeometry

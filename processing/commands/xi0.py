@@ -1,4 +1,4 @@
-"""`process xi0`: the paper's xi0 with its standard error and validity mask."""
+"""`process xi0`: Jarecki and Kupinski's xi0 with its standard error and validity mask."""
 
 from __future__ import annotations
 

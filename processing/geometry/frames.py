@@ -2,7 +2,7 @@
 
 World frame: origin at the centre of rotation, y up, camera on +z (docs/conventions.md, "Frames"). Each beam has
 x = unit(up cross k) and y = k cross x, k being its propagation. With up = y these are the instrument frames
-that a measured Mueller image is in; with up = n they are the paper's normal-based ones, which turn with the
+that a measured Mueller image is in; with up = n they are Jarecki and Kupinski's normal-based ones, which turn with the
 surface (docs/conventions.md); with up = h, x is the axis s of the facet for both beams, as in a renderer's table.
 """
 

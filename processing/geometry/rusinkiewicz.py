@@ -1,4 +1,4 @@
-"""Rusinkiewicz angles of a scattering geometry (paper Sec. III-A; docs/conventions.md, "Frames")."""
+"""Rusinkiewicz angles of a scattering geometry (Jarecki and Kupinski, Sec. III-A; docs/conventions.md, "Frames")."""
 
 from __future__ import annotations
 

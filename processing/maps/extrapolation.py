@@ -1,4 +1,7 @@
-"""A full Mueller image from a linear Stokes capture: the TD model with the estimated xi0 and M00 (paper Sec. V-C)."""
+"""A full Mueller image from a linear Stokes capture: the TD model with the estimated xi0 and M00.
+
+Jarecki and Kupinski, Sec. V-C.
+"""
 
 from __future__ import annotations
 

@@ -95,7 +95,7 @@ _RETARDER_PERIOD = (np.inf, np.inf, 180.0, np.inf)
 
 
 def dominant(m: RealArray) -> dict[str, Derived]:
-    """The dominant Mueller-Jones matrix m0 (4, 4, ...), its diattenuation and polarizance (the paper's |D| and psi)."""
+    """The dominant Mueller-Jones matrix m0 (4, 4, ...), its diattenuation and polarizance (|D| and psi)."""
 
     def values(mueller: RealArray) -> RealArray:
         m0 = xi0_and_dominant(mueller)[1]

@@ -1,4 +1,4 @@
-"""How far two polarization images differ: orientation, magnitude, xi0 (paper Sec. V-A, V-B)."""
+"""How far two polarization images differ: orientation, magnitude, xi0 (Jarecki and Kupinski, Secs. V-A, V-B)."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def linear_diattenuation(m: ArrayLike) -> Array:
 def orientation_difference(d_a: ArrayLike, d_b: ArrayLike) -> Array:
     """psi_a - psi_b, radians in -pi/2..pi/2, of linear diattenuations (..., 2).
 
-    Half the wrapped difference of the doubled angles: the paper's arc cosine loses half its digits near zero,
-    and needs the linear magnitude to be divided by.
+    Half the wrapped difference of the doubled angles: an arc cosine, as Jarecki and Kupinski have it, loses half its
+    digits near zero, and needs the linear magnitude to be divided by.
     """
     a, b = np.asarray(d_a, dtype=float), np.asarray(d_b, dtype=float)
     sine = a[..., 1] * b[..., 0] - a[..., 0] * b[..., 1]

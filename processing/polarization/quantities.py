@@ -26,7 +26,7 @@ POLARIZATIONS: dict[str, NDArray[np.float64]] = {
     "left": np.array([1.0, 0, 0, -1]),
 }
 
-#: The pairs of the paper's bunny figure: (generator, analyzer).
+#: The pairs of Jarecki and Kupinski's bunny figure: (generator, analyzer).
 PAPER_PAIRS: dict[str, tuple[NamedStokes, NamedStokes]] = {
     "crossed_linear": ("vertical", "horizontal"),
     "aligned_linear": ("vertical", "vertical"),
@@ -89,7 +89,7 @@ def magnitude(vector: RealArray) -> RealArray:
 
 
 def linear_magnitude(vector: RealArray) -> RealArray:
-    """Linear part sqrt(v1^2 + v2^2) of a vector (..., 3): |D| in the paper."""
+    """Linear part sqrt(v1^2 + v2^2) of a vector (..., 3): |D| in Jarecki and Kupinski."""
     v = np.asarray(vector)
     return np.asarray(np.hypot(v[..., 0], v[..., 1]))
 

@@ -1,4 +1,7 @@
-"""The triply degenerate (TD) Mueller matrix: a Mueller-Jones matrix and an ideal depolarizer (paper Eq. 1)."""
+"""The triply degenerate (TD) Mueller matrix: a Mueller-Jones matrix and an ideal depolarizer.
+
+Q. Jarecki and M. Kupinski, *Efficient Modeling of Depolarizing Mueller BRDFs*, Eq. 1.
+"""
 
 from __future__ import annotations
 

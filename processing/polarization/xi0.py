@@ -1,9 +1,9 @@
-"""xi0 and M00 from intensities and a known dominant process: the two-coefficient estimate (paper Sec. IV).
+"""xi0 and M00 from intensities and a known dominant process: the two-coefficient estimate.
 
-With Phi = W [m0 mID], P = Phi alpha is linear in alpha = (alpha_0, alpha_ID), and
-xi0 = (alpha_0 + alpha_ID/4)/(alpha_0 + alpha_ID), M00 = alpha_0 + alpha_ID, which has none of the
-singularities of the paper's ratio form (docs/conventions.md). Nothing is clipped: a value outside [1/4, 1] speaks
-against the model m0 and is flagged. Standard errors hold the noise of the intensities, not errors of m0.
+With Phi = W [m0 mID], P = Phi alpha is linear in alpha = (alpha_0, alpha_ID), and xi0 = (alpha_0 +
+alpha_ID/4)/(alpha_0 + alpha_ID), M00 = alpha_0 + alpha_ID, which has none of the singularities of the ratio form of
+Jarecki and Kupinski (Sec. IV; docs/conventions.md). Nothing is clipped: a value outside [1/4, 1] speaks against the
+model m0 and is flagged. Standard errors hold the noise of the intensities, not errors of m0.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def estimate(
     variance : (K, ...) or None, of the intensities (shot and read noise), same unit squared.
     w : (K, 16), measurement matrix, rows kron(a, g). For a mosaic under one generator state, its 4 channels.
     m0 : (..., 4, 4), dominant Mueller-Jones matrix with element 00 equal to 1; NaN outside the object.
-    weighted : weigh by 1/variance; else equal weights as in the paper, with the variance propagated.
+    weighted : weigh by 1/variance; else equal weights as in Jarecki and Kupinski, with the variance propagated.
     max_condition, max_stderr : limits of the validity mask.
 
     Raises

@@ -1,4 +1,4 @@
-"""What effects change in the paper's model of the dominant process, for a set of scattering geometries."""
+"""What effects change in Jarecki and Kupinski's model of the dominant process, for a set of scattering geometries."""
 
 from __future__ import annotations
 

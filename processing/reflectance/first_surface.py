@@ -1,4 +1,7 @@
-"""First-surface reflection alone: Fresnel at the facet halfway between source and camera (paper Sec. III-B)."""
+"""First-surface reflection alone: Fresnel at the facet halfway between source and camera.
+
+Jarecki and Kupinski, Sec. III-B.
+"""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def basis(geometry: ScatteringGeometry) -> tuple[Array, Array]:
 
 
 def jones(geometry: ScatteringGeometry, index: complex) -> ComplexArray:
-    """Jones matrices (..., 2, 2) of reflection at the facet whose normal is h (paper Eq. for F)."""
+    """Jones matrices (..., 2, 2) of reflection at the facet whose normal is h (F of Jarecki and Kupinski)."""
     rs, rp = amplitudes(index, geometry.angles.theta_d)
     via_s, via_p = basis(geometry)
     return np.asarray(rs[..., None, None] * via_s + rp[..., None, None] * via_p)

@@ -1,4 +1,4 @@
-"""Tables to and from the renderer Mitsuba's `.pbsdf`, the format in which the paper's lab publishes.
+"""Tables to and from the renderer Mitsuba's `.pbsdf`, the format in which the lab of Jarecki and Kupinski publishes.
 
 A `.pbsdf` holds M[phi_d, theta_d, theta_h, wavelength, 4, 4], theta_h quadratic, as a BRDF in 1/sr:
 the cosine of the angle of incidence is divided out. Each matrix refers to the axis s of the facet for both beams

@@ -1,4 +1,4 @@
-"""First surface plus polarized diffuse reflection, added as Jones matrices (paper Secs. III-B to III-D)."""
+"""First surface plus polarized diffuse reflection, added as Jones matrices (Jarecki and Kupinski, III-B to D)."""
 
 from __future__ import annotations
 

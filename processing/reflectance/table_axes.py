@@ -20,7 +20,7 @@ SHAPE = (91, 91, 361)
 class TableAxes:
     """Axis values of a layout.
 
-    "degree" has steps of 1 degree on every axis, as the paper says; "renderer" has theta_h = 90 (i/90)^2
+    "degree" has steps of 1 degree on every axis, as Jarecki and Kupinski say; "renderer" has theta_h = 90 (i/90)^2
     degrees, i = 0..90, dense near specular, as the renderer's file and the lab's published script.
     The last phi_d is the first one again: both are stored as the first.
     """

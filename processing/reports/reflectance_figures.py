@@ -16,13 +16,13 @@ from processing.reports.colours import SIGNED
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: As in the paper: blue squares at 451 nm, red triangles at 662 nm.
+#: As in Jarecki and Kupinski: blue squares at 451 nm, red triangles at 662 nm.
 STYLES = {451: ("tab:blue", "s"), 662: ("tab:red", "^")}
 _OTHERS = ("tab:green", "tab:purple", "tab:orange", "tab:brown")
 
 
 def campaign_figure(result: CampaignResult, title: str) -> Figure:
-    """RMSD of psi, |D| and xi0 against arm angle, with the paper's averages dashed and the part of the noise dotted."""
+    """RMSD of psi, |D| and xi0 against arm angle; dashed: averages of Jarecki and Kupinski, dotted: noise."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 4.2), layout="constrained")

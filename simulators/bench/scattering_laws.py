@@ -1,6 +1,6 @@
 """How depolarization and throughput of a simulated surface depend on its scattering geometry.
 
-These are statements about an invented surface, not results: the paper gives no law for xi0 or M00.
+These are statements about an invented surface, not results: Jarecki and Kupinski give no law for xi0 or M00.
 """
 
 from __future__ import annotations

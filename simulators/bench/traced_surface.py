@@ -1,6 +1,6 @@
 """The true dominant process of a simulated surface, traced with electric fields in three dimensions.
 
-The same physics as `processing.reflectance` (paper Secs. III-B to III-D) by another way, so that what is processed is
+The same physics as `processing.reflectance` (Jarecki and Kupinski) by another way, so that what is processed is
 not what was simulated: boundary conditions for the tangential field in place of r_s and r_p, transversality in place of
 the axes p, vectors in place of phi_d, and a Mueller matrix put together from the Stokes vectors of four beams.
 """

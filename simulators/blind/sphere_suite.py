@@ -68,7 +68,7 @@ def drawn(kind: str, random: np.random.Generator, scene: Scene, instrument: Inst
 
 
 def first_surface_of(material: Any) -> first_surface.Model:
-    """The material without its diffuse term: what the paper's story starts with."""
+    """The material without its diffuse term: what Jarecki and Kupinski's story starts with."""
     plain = {nm: first_surface.Constants(n=c.n, k=c.k) for nm, c in material.constants.items()}
     return first_surface.Model(name="first surface alone", constants=plain)
 
