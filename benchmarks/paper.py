@@ -20,7 +20,7 @@ from pathlib import Path
 # Before numpy: workers share the cores, threads of BLAS would fight for them.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from paper_study.acquire import QUICK, Size, parts, take_captures
+from paper_study.acquire import QUICK, SHOWN_DEG, Size, parts, take_captures
 from paper_study.page import write_page
 from paper_study.process import study_body, study_fault, study_sphere
 
@@ -61,11 +61,21 @@ def main() -> None:
     parser.add_argument("--work", type=Path, help="folder for captures and products; default: one that is deleted")
     parser.add_argument("--out", type=Path, default=Path("paper.html"), help="the page")
     parser.add_argument("--workers", type=int, default=2, help="processes that work on captures")
+    angles = list(Size().omega_deg)
+    parser.add_argument("--omega", type=float, nargs="+", default=angles, help="arm angles, 35 among them")
+    parser.add_argument("--pixels", type=int, default=Size().pixels, help="rows and columns of the camera")
+    parser.add_argument("--frames", type=int, default=Size().frames, help="of a Stokes capture")
     parser.add_argument("--quick", action="store_true", help="one wavelength, one angle, a small camera")
     given = parser.parse_args()
+    if SHOWN_DEG not in given.omega:
+        parser.error(f"--omega: the page shows images at {SHOWN_DEG:g} degrees, which must be among the angles")
+    fault_deg = tuple(omega for omega in Size().fault_deg if omega in given.omega)
+    size = Size(Size().wavelengths_nm, tuple(given.omega), fault_deg, given.pixels, given.frames)
+    if given.quick:
+        size = QUICK
     out = given.out.resolve()
     with tempfile.TemporaryDirectory() as temporary, executor(1 if given.quick else given.workers) as pool:
-        run((given.work or Path(temporary)).resolve(), out, QUICK if given.quick else Size(), pool)
+        run((given.work or Path(temporary)).resolve(), out, size, pool)
 
 
 if __name__ == "__main__":
