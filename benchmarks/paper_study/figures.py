@@ -142,7 +142,7 @@ def deviations(study: SphereStudy) -> Shown:
         panel.set_ylabel(f"RMSD of {label}")
         panel.set_ylim(bottom=0)
         panel.legend(fontsize=8)
-    entitle(figure, "model against measurement, 15 arm angles" if len(omega) > 2 else "model against measurement", True)
+    entitle(figure, "model against measurement", True)
     return Shown(figure, "RMSD over the sphere against the angle of the arm (paper, Figs. 9 and 11).")
 
 
