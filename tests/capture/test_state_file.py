@@ -1,5 +1,6 @@
 """The file of a capture that is being taken: states, columns, journal, closing record, each at its place."""
 
+import errno
 import os
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
+from acquisition.capture import state_file
 from acquisition.capture.state_file import LINE_BYTES, StateFile
 from acquisition.capture.writer import CaptureWriter
 from acquisition.errors import AcquisitionError
@@ -60,6 +62,8 @@ def test_columns_are_read_and_replaced_whole(path, file):
     assert file.read_column("exposure_s").tolist() == [0.02] * STATES
     file.write_column("exposure_s", [0.1, 0.2, 0.3])
     assert file.read_column("exposure_s").tolist() == [0.1, 0.2, 0.3]
+    file.write_column("exposure_s", [1, 2, 3])
+    assert file.read_column("exposure_s").tolist() == [1.0, 2.0, 3.0]
     assert file.read_column("repeats").tolist() == [2] * STATES
     # A copy: what is done to it is not done to the file.
     file.read_column("repeats")[:] = 0
@@ -67,6 +71,7 @@ def test_columns_are_read_and_replaced_whole(path, file):
 
 
 def test_journal_keeps_its_lines_and_takes_over_what_was_cut_off(path, file):
+    beyond = os.pread(file._file, 256, file._segments.offset + file._segments.step)
     assert file.segment_records() == []
     file.add_segment_record({"event": "begin", "n": 1})
     file.add_segment_record({"event": "end"}, part=0.5)
@@ -78,6 +83,8 @@ def test_journal_keeps_its_lines_and_takes_over_what_was_cut_off(path, file):
     assert [r.get("n") for r in file.segment_records()] == [1, None, 2]
     rest = os.pread(file._file, file._segments.step, file._segments.offset)[file._journal()[1] :]
     assert not rest.strip(b"\0")
+    # What comes after the journal in the file is not touched.
+    assert os.pread(file._file, 256, file._segments.offset + file._segments.step) == beyond
 
 
 def test_a_record_is_cut_to_its_part_of_the_room_and_a_full_journal_is_told(path, file):
@@ -123,6 +130,22 @@ def test_it_knows_whether_it_is_still_the_file_of_its_name(path, file):
     assert not file.is_at(path)
     path.write_bytes(b"")
     assert not file.is_at(path)
+
+
+def test_a_file_system_without_locks_is_good_enough_and_a_broken_one_is_not(path, monkeypatch):
+    def refuse(number: int) -> None:
+        def flock(*args: object) -> None:
+            raise OSError(number, os.strerror(number))
+
+        monkeypatch.setattr(state_file.fcntl, "flock", flock)
+
+    refuse(errno.ENOLCK)
+    opened = StateFile(path)
+    assert (opened.states, opened.frame_shape) == (STATES, SHAPE)
+    opened.close()
+    refuse(errno.EIO)
+    with pytest.raises(AcquisitionError, match="cannot be opened to go on"):
+        StateFile(path)
 
 
 def test_one_program_at_a_time_and_nothing_but_whole_captures(path, file, tmp_path):

@@ -40,3 +40,13 @@ def test_pseudo_inverse_with_two_retardance_maps(configs: Path) -> None:
 def test_a_matrix_that_changes_too_fast_is_refused() -> None:
     with pytest.raises(NotDetermined, match="W changes so fast"):
         FieldMatrix.of(lambda y, x: np.array([[np.cos(60 * x * y), np.sin(50 * x)]]), "W changes")
+
+
+def test_units_do_not_matter_and_what_does_not_change_needs_one_matrix() -> None:
+    def matrix(y: float, x: float) -> np.ndarray:
+        return np.array([[np.cos(y + 0.5 * x), 2.0], [np.sin(x), y]])
+
+    plain, large = FieldMatrix.of(matrix, "W changes"), FieldMatrix.of(lambda y, x: 1e4 * matrix(y, x), "W changes")
+    assert len(plain.polynomials) == len(large.polynomials) < 16
+    assert plain.stack.dtype == plain.weights(np.zeros(1), np.zeros(1)).dtype == np.float32
+    assert len(FieldMatrix.of(lambda y, x: np.eye(3), "W changes").polynomials) == 1
