@@ -2,7 +2,7 @@
 
 import "./start.js";
 import { ImageView, place, readPlane, saturated } from "./images.js";
-import { accent, at, bad, byId, draw, embedded, getJson, ink, narrow, say } from "./plots.js";
+import { accent, at, bad, byId, draw, embedded, getJson, ink, narrow, newestJson, say } from "./plots.js";
 import { drawCurve, showProbe } from "./probe.js";
 
 const file = byId("look").dataset.file;
@@ -24,17 +24,20 @@ const view = new ImageView(byId("frame"), {
   chosen: region => probe(region),
 });
 
+const curveOf = newestJson(), matrixOf = newestJson();
 const run = action => action().then(() => problem.replaceChildren(), error => say(problem, error));
 
 async function probe(region) {
   await run(async () => {
-    const found = await getJson("curve", { file, ...region, channel: channel.value || 0 });
+    const found = await curveOf("curve", { file, ...region, channel: channel.value || 0 });
+    if (!found) return;
     byId("pixel").textContent = found.where;
     byId("fit").textContent = found.told;
     drawCurve(byId("curve"), found, Number(slider.value));
     history.replaceState(null, "", `#x=${region.x0}&y=${region.y0}`);
     byId("probe").hidden = !found.fit;
-    if (found.fit) showProbe(byId("probe"), { ...found, ...await getJson("matrix", { file, ...region }) });
+    const matrix = found.fit && await matrixOf("matrix", { file, ...region });
+    if (matrix) showProbe(byId("probe"), { ...found, ...matrix });
   });
 }
 

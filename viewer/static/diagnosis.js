@@ -3,10 +3,11 @@
 import "./start.js";
 import { ImageView, readPlane } from "./images.js";
 import { mapTraces } from "./maps.js";
-import { accent, byId, draw, embedded, getJson, post, quiet, say } from "./plots.js";
+import { accent, byId, draw, embedded, newestJson, post, quiet, say } from "./plots.js";
 
 const spec = embedded("spec"), MOMENTS = ["before", "after"];
 const colourOf = moment => (moment === "before" ? quiet() : accent());
+const curveOf = newestJson();
 let state = null, views = [];
 const name = byId("decision").dataset.name;
 const number = () => Number(byId("capture").value);
@@ -50,7 +51,8 @@ function drawStates() {
 
 async function pixel(region, k) {
   views[1 - k].choose(region, false);
-  const found = await getJson("residual-curve", { name, capture: number(), ...region });
+  const found = await curveOf("residual-curve", { name, capture: number(), ...region });
+  if (!found) return;
   byId("pixel").textContent = found.where;
   byId("curve").hidden = false;
   draw(byId("curve"), () => MOMENTS.map(moment => ({ y: found[moment], mode: "markers", name: moment, marker: { size: 6, color: colourOf(moment), symbol: moment === "before" ? "circle-open" : "circle" } })),

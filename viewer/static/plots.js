@@ -14,6 +14,16 @@ export async function getJson(what, query) {
   return answer.json();
 }
 
+/** Makes a function that reads JSON for the newest question alone: an older answer that comes later gives null. */
+export function newestJson() {
+  let newest = 0;
+  return async (what, query) => {
+    const mine = ++newest;
+    const found = await getJson(what, query);
+    return mine === newest ? found : null;
+  };
+}
+
 export async function post(what, fields) {
   const answer = await fetch(`${root}/${what}`, { method: "POST", body: JSON.stringify(fields) });
   if (!answer.ok) throw new Error(await answer.text());

@@ -2,7 +2,7 @@
 
 import "./start.js";
 import { mapView, matrixView } from "./maps.js";
-import { byId, embedded, getJson, say } from "./plots.js";
+import { byId, embedded, newestJson, say } from "./plots.js";
 import { drawCurve, showProbe } from "./probe.js";
 
 const file = byId("look").dataset.file, spec = embedded("spec"), problem = byId("problem");
@@ -10,6 +10,7 @@ const map = byId("map"), errors = byId("errors"), normalized = byId("normalized"
 if (spec.matrices) map.append(new Option("Mueller matrix", "mueller"));
 spec.maps.forEach((m, k) => map.append(new Option(m.label, k)));
 const chosenMap = () => (map.value === "mueller" ? null : spec.maps[Number(map.value)]);
+const probeOf = newestJson();
 const run = action => action().then(() => problem.replaceChildren(), error => say(problem, error));
 const flag = box => (box.checked ? "1" : null);
 const node = byId("plot");
@@ -42,7 +43,8 @@ const number = v => (v === null ? "-" : Math.abs(v) >= 1e4 || (v && Math.abs(v) 
 async function probe(chosen) {
   region = chosen;
   await run(async () => {
-    const found = await getJson("probe", { file, ...chosen });
+    const found = await probeOf("probe", { file, ...chosen });
+    if (!found) return;
     byId("values").hidden = false;
     byId("pixel").textContent = found.where + (found.mask ? ` (${found.mask})` : "");
     byId("fit").textContent = found.told;
