@@ -13,6 +13,8 @@ SOURCE = ROOT / "processing/diagnosis/search/rules.py"
 PAGE = ROOT / "docs/diagnosis-rules.md"
 HEAD = """# Rules of the diagnosis
 
+"The paper" is Q. Jarecki and M. Kupinski, *Efficient Modeling of Depolarizing Mueller BRDFs*.
+
 Every constant by which `diagnose` decides, with its unit and its reason. This page is made of
 `processing/diagnosis/search/rules.py` by `python benchmarks/rules_page.py`. A test changes each by a fifth (a whole
 number by one) and holds that a decision is another one then (`tests/physics/test_diagnosis_rules.py`). Steps and
