@@ -16,6 +16,9 @@ from processing.diagnosis.search.rules import BOUND, ONE_PATTERN, TESTABLE, TIME
 from processing.diagnosis.search.solution import Solution
 from processing.instrument.effects.base import FieldEffect, GeneralEffect, PointwiseEffect, SourceEffect, ValuePerState
 
+#: The reason for which values for each state are not used either, where an unknown sample takes up a part of them: what
+#: it takes up is then not like the rest, as it is with random values.
+PATTERN = "its values follow one wave or jump over the states, as a beat or a fringe does: they are not random"
 #: The one reason that leaves a name likely.
 PART_OF_LEFT = "it may be a part of what is left unexplained"
 
@@ -33,9 +36,7 @@ def doubts(
         elif isinstance(first.effect, ValuePerState) and not testable(problem, solved, cause, causes):
             out[cause] = "as many values as the data have"
         elif isinstance(first.effect, ValuePerState) and _one_pattern(found, cause):
-            out[cause] = (
-                "its values follow one wave or jump over the states, as a beat or a fringe does: they are not random"
-            )
+            out[cause] = PATTERN
             patterned |= {c.capture for c in cause.candidates if isinstance(c.effect, SourceEffect)}
         elif isinstance(first.effect, SourceEffect) and any(
             _uneven(problem, solved, c, cause) for c in cause.candidates

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.instrument.doubts import doubts, testable
+from processing.diagnosis.instrument.doubts import PATTERN, doubts, testable
 from processing.diagnosis.instrument.empirical import empirical
 from processing.diagnosis.instrument.evidence import wanted_for_evidence, would_be_seen
 from processing.diagnosis.instrument.guard import checks, refusal
@@ -31,6 +31,7 @@ from processing.diagnosis.instrument.telling import (
 )
 from processing.diagnosis.instrument.whole_bench import WholeBench, predicts, solution
 from processing.diagnosis.instrument.wiring import miswired, miswired_train
+from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause, causes
 from processing.diagnosis.search.posterior import Posterior, Say
 from processing.diagnosis.search.result import Diagnosis, Unexplained, Verdict
@@ -82,8 +83,6 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
         after = tuple(residual(asked, k, solved.space, solved.fit) for k in captures)
     else:
         units = np.ones(len(after))
-    guard = checks(asked, found, solved)
-    refused = f"change this first: {wiring.told}" if wiring is not None else refusal(guard)
     structure = _structure(problem, after)
     left = float(sum(r.left / u for r, u in zip(after, units, strict=True))) if structure else 0.0
     named = _told(found, left)
@@ -94,6 +93,14 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
     # What as many values as the data have took away may be any structure.
     left += sum(2 * c.log_odds * found.samples.best.unit for c in untold)
     doubt = doubts(asked, found, solved, named, left)
+    # Values that are not random, or may be any structure, are wrong where an unknown sample takes up a part of them.
+    patterned = (*untold, *(cause for cause, reason in doubt.items() if reason == PATTERN))
+    unfit = [c for cause in patterned for c in cause.candidates if _unknown(problem, c)]
+    if unfit:
+        solved = solution(bench, found, unfit)
+        after = tuple(residual(asked, k, solved.space, solved.fit) for k in captures)
+    guard = checks(asked, found, solved)
+    refused = f"change this first: {wiring.told}" if wiring is not None else refusal(guard)
     sure = [c for c in named if c.answer != "unknown" and c not in doubt]
     switched = told_switches(asked, solved)
     verdict = _verdict((*named, *switched), (*sure, *switched), structure or bool(untold))
@@ -142,6 +149,11 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
 
 def _grown(units: Array, unit: float) -> bool:
     return bool(units.max() > GROWTH * unit)
+
+
+def _unknown(problem: InstrumentProblem, candidate: Candidate) -> bool:
+    """Whether the candidate acts on a capture of an unknown sample."""
+    return any(c.sample is None and candidate.acts(k, c.wavelength_nm) for k, c in enumerate(problem.captures))
 
 
 def directions(problem: InstrumentProblem, k: int) -> float:

@@ -159,7 +159,7 @@ class WholeBench:
         return self._posterior([*kept, *fields], fixed)
 
 
-def applied(found: Posterior, base: Space) -> tuple[Space, Array]:
+def applied(found: Posterior, base: Space, unfit: Sequence[Candidate] = ()) -> tuple[Space, Array]:
     """Space and values of the correction: the mean of the posterior, of what is likely enough to take part."""
     keep = set(base.candidates)
     by_label = {found.label(g): g for g in range(len(found.members))}
@@ -171,18 +171,19 @@ def applied(found: Posterior, base: Space) -> tuple[Space, Array]:
     for g, probability in enumerate(found.samples.probability):
         if probability > TAKES_PART:
             keep |= {found.space.candidates[m] for m in found.members[g]}
+    keep -= set(unfit)
     order = [*base.candidates, *(c for c in found.space.candidates if c in keep and c not in base.candidates)]
     part = dict(zip(found.space.candidates, found.space.slices, strict=True))
     values = [found.values[part[c]] for c in order]
     return Space(tuple(order)), np.concatenate([np.zeros(0), *values])
 
 
-def solution(bench: WholeBench, found: Posterior) -> Solution:
-    """The correction of a posterior, and how well it predicts what it did not see."""
+def solution(bench: WholeBench, found: Posterior, unfit: Sequence[Candidate] = ()) -> Solution:
+    """The correction of a posterior without what is `unfit` for it, and how well it predicts what it did not see."""
     asked = predicts(bench.problem)
     base_fit = minimize(asked, bench.base, _values_of(bench, bench.base))
     before = held_out(asked, bench.base, base_fit)
-    space, values = applied(found, bench.base)
+    space, values = applied(found, bench.base, unfit)
     asked.relinearize(space, values)
     sums = asked.sums(space, values)
     fit = Fit(values, sums, float(sums.excess.sum()))
