@@ -34,11 +34,12 @@ def scatter_prefers(problem: InstrumentProblem, space: Space, values: Array, new
         light = (still.signal.reshape(rest.shape) - rest).reshape(still.signal.shape)
         mean = replace(still, signal=light.astype(np.float32))
         good = data.usable & ~data.clipped
-        share = (free * near.moments[k].left)[:, None]
+        use = near.moments[k].counts
+        share = (free * near.moments[k].left)[use, None]
         of = []
         for undone in (new, old):
-            variance = mean.with_noise_of(*undone_signal(mean, undone)).variance().reshape(rest.shape)[:, good]
-            of.append(float(np.sum(rest[:, good] ** 2 / variance + share * np.log(variance))))
+            variance = mean.with_noise_of(*undone_signal(mean, undone)).variance().reshape(rest.shape)[use][:, good]
+            of.append(float(np.sum(rest[use][:, good] ** 2 / variance + share * np.log(variance))))
         gain += 0.5 * (of[1] - of[0])
     return gain
 
@@ -47,7 +48,7 @@ def _rest(problem: InstrumentProblem, k: int, space: Space, values: Array) -> tu
     """Residual (L, rows, columns) of a capture in counts over full scale, and the share (L,) of noise in it."""
     data, level = problem.captures[k], problem.moments[k].sigma
     changes = problem.changes(k, space, values)
-    a = problem.columns(k, changes)
+    a = problem.columns(k, changes) * problem.moments[k].counts[:, None]
     counts = data.signal.reshape(data.values_per_pixel, *data.signal.shape[2:]).astype(np.float64)
     y = add_response(counts, problem.coefficients(k, changes), a)
     u, size, _ = np.linalg.svd(a, full_matrices=False)

@@ -62,11 +62,7 @@ class WholeBench:
         plain = [c for c in self.pool if self._offered(c)]
         fixed = [*self.base.candidates, *self._clipped()]
         found = self._posterior([*fixed, *plain], fixed)
-        refuted = self._refuted_by_noise(found)
-        if refuted:
-            self.say(f"the noise speaks against {', '.join(c.label for c in refuted)}")
-            rest = [c for c in found.space.candidates if c not in refuted]
-            found = self._posterior(rest, fixed, found)
+        found = self._with_what_scatters_so(found, fixed)
         fields = [c for c in self.pool if isinstance(c.effect, FieldEffect)]
         if fields and not self.whole.holds_out_states:
             found = self._with_fields(found, fixed, fields)
@@ -78,17 +74,25 @@ class WholeBench:
             found = self._posterior(list(found.space.candidates), fixed, found)
         return found
 
-    def _refuted_by_noise(self, found: Posterior) -> list[Candidate]:
-        """Corrections of the counts whose light would scatter otherwise than the counts do."""
+    def _with_what_scatters_so(self, found: Posterior, fixed: Sequence[Candidate]) -> Posterior:
+        """Without corrections of the counts whose light would scatter otherwise than the counts do.
+
+        Unless nothing else explains the counts: then it is the noise that is not what is declared.
+        """
         space, values = applied(found, self.base)
-        if not self.whole.noise_known or any(c.noise_estimated for c in self.whole.captures):
-            return []
-        far = {
-            c: v
-            for c, v in exactly_undone(space, values, pointwise=True).items()
-            if np.any(np.abs(v) > EXACT * c.typical)
-        }
-        return [c for c, v in far.items() if scatter_prefers(self.whole, space, values, {c: v}, {}) < -REFUTED]
+        # Noise that was taken from the counts has what an offset lacks or adds in it already.
+        if not self.whole.noise_known or any(c.noise_estimated or c.noise_told for c in self.whole.captures):
+            return found
+        undone = exactly_undone(space, values, pointwise=True)
+        far = {c: v for c, v in undone.items() if np.any(np.abs(v) > EXACT * c.typical)}
+        gains = {c: scatter_prefers(self.whole, space, values, {c: v}, {}) for c, v in far.items()}
+        against = {c: gain for c, gain in gains.items() if gain < -REFUTED}
+        if not against:
+            return found
+        self.say(f"the noise speaks against {', '.join(c.label for c in against)}")
+        rest = [c for c in found.space.candidates if c not in against]
+        other = self._posterior(rest, fixed, found)
+        return other if other.score > found.score + sum(against.values()) else found
 
     def _unknowns(self, k: int) -> int:
         return int(np.linalg.matrix_rank(self.whole.columns(k, self.whole.changes(k, Space(()), np.zeros(0)))))

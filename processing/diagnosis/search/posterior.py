@@ -59,6 +59,11 @@ class Posterior:
     values: Array
     covariance: Array
 
+    @property
+    def score(self) -> float:
+        """Log probability of the likeliest set, a constant left out."""
+        return self.sets.fitted(self.samples.best).score
+
     def label(self, group: int) -> Candidate:
         """A candidate that stands for a group."""
         return self.space.candidates[self.members[group][0]]
