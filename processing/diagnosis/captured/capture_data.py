@@ -75,7 +75,7 @@ class CaptureData:
         That averages the noise of neighbours, and adds no information.
     usable : (rows, columns) True where every state has a number and the pixel is not dark.
     dark_fraction : part of the pixels that are too dark, or too close to dark ones, to be used.
-    steep_fraction : part of the pixels that are left out because they lie at sharp edges.
+    steep : (rows, columns) True where a pixel is left out because it lies at a sharp edge; None: nowhere.
     cut_off : numbers of states that do not count because their counts are cut off at zero.
     shared : what pixels have of their noise in common; slope and floor are those of wide patterns.
     noise_told : sentences about the noise where it is not what is declared.
@@ -101,7 +101,7 @@ class CaptureData:
     binned: int = 1
     pitch: int = 1
     dark_fraction: float = 0.0
-    steep_fraction: float = 0.0
+    steep: NDArray[np.bool_] | None = None
     cut_off: tuple[int, ...] = ()
     noise_estimated: bool = False
     true_variance: NDArray[np.float32] | None = None

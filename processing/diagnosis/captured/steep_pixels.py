@@ -33,4 +33,4 @@ def without_steep_pixels(data: CaptureData) -> CaptureData:
     steep = data.usable & ndimage.binary_dilation(edge, structure=np.ones((3, 3), dtype=bool), iterations=AROUND)
     if steep.sum() > MOST_STEEP * data.usable.sum():
         return data
-    return replace(data, usable=data.usable & ~steep, steep_fraction=float(steep.mean()))
+    return replace(data, usable=data.usable & ~steep, steep=steep)

@@ -17,6 +17,7 @@ from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.rules import LIMIT
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import FIELD_TERMS, Changes, field_terms
+from processing.instrument.effects.base import ImageShift
 from processing.reduction.move_image import neighbour_noise
 
 HARMONICS = 4
@@ -81,7 +82,11 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     a = problem.columns(capture, changes) * moments.sigma[:, None]
     rows = a.shape[0]
     height, width = data.signal.shape[2:]
-    used = (data.usable & ~data.clipped if changes.drop_clipped else data.usable) & inside(height, width)
+    usable = data.usable
+    if data.steep is not None and not any(isinstance(c.effect, ImageShift) for c in space.candidates):
+        # Where nothing is said to move, edges must fit as well: a focus that changes shows nowhere else.
+        usable = usable | data.steep
+    used = (usable & ~data.clipped if changes.drop_clipped else usable) & inside(height, width)
     counts = data.signal.reshape(rows, height, width).astype(np.float64)
     y = add_response(counts, problem.coefficients(capture, changes), problem.columns(capture, changes))
     variance = data.variance().reshape(rows, height, width)

@@ -259,7 +259,7 @@ def capture_report(
         binned=data.binned,
         clipped_fraction=float(np.mean(data.clipped)),
         dark_fraction=data.dark_fraction,
-        steep_fraction=data.steep_fraction,
+        steep_fraction=0.0 if data.steep is None else float(data.steep.mean()),
         cut_off=data.cut_off,
         wavelength_nm=data.wavelength_nm,
         rms_before_percent=100 * solved.before.rms_of(k),
