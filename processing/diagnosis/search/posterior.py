@@ -41,6 +41,10 @@ EXPANSIONS = 8
 LEAST_GAIN, LEAST_RELATIVE = 0.05, 1e-7
 
 
+#: Rounds where the noise is not known: every one makes what is left smaller, which is then taken for the noise.
+FEWER_ROUNDS = 4
+
+
 @dataclass(frozen=True)
 class Posterior:
     """Posterior of the parameters of all candidates.
@@ -80,12 +84,13 @@ def posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start:
     members, groups = grouped(space, fixed)
     x = start
     typical, lower, upper = (space.joined(name) for name in ("typical", "lower", "upper"))
-    for left in reversed(range(ROUNDS)):
+    rounds = ROUNDS if problem.noise_known else FEWER_ROUNDS
+    for left in reversed(range(rounds)):
         problem.relinearize(space, x)
         sums = problem.sums(space, x)
         sets = Sets(quadratic(problem, space, x, sums), groups, noise_of(problem, sums))
         state = likely_set(sets)
-        if left == ROUNDS - 1 and (state.unit > BENT or not problem.noise_known):
+        if left == rounds - 1 and (state.unit > BENT or not problem.noise_known):
             # Several large causes, none of which explains much alone, or far from linear: all of them at once first.
             x = _everything(problem, space, fixed, x, sets.noise)
             continue

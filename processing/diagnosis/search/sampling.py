@@ -100,7 +100,8 @@ def sample(sets: Sets, state: State, visits: int, seed: int = 0) -> Samples:
         k = int(random.choice(rate.size, p=rate / rate.sum()))
         there = random.random() < 0.5
         state.tau[k] = TAU[int(random.choice(TAU.size, p=c.tau_weights[k]))] if there else 0.0
-    for other in _swapped(sets, average.best):
+    # Where what is left is the noise, a set that leaves less has a smaller unit, and must be passed to step by step.
+    for other in _swapped(sets, average.best) if sets.noise.known else ():
         c = sets.conditional(other)
         average.add(c, other, _chance(sets, c))
     return average.samples()
