@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.arrays import Array
+from processing.arrays import Array, BoolArray
 from processing.diagnosis.search.problem import Problem
 from processing.diagnosis.search.space import Space, Sums
 from processing.instrument.effects.base import ValuePerState
@@ -164,8 +164,9 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
     """Predict every fold from a fit to the other folds.
 
     Values that belong to one state alone cannot come from other states: where states are held out they are fitted to
-    the state itself, and each takes away a degree of freedom (and counts one more, as fitted noise would gain). Where
-    the data have a single part nothing is held out, and each fitted value takes a degree of freedom away.
+    the state itself, and take away as many degrees of freedom as the data determine of them (and count as many more, as
+    fitted noise would gain): several values of one state that share its few data, shrunk to their prior, are not one
+    each. Where the data have a single part nothing is held out, and fitted values take degrees of freedom away.
 
     `weak` (K,) is the curvature of the prior; default: `prior`.
     """
@@ -177,6 +178,7 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
     for candidate, part in zip(space.candidates, space.slices, strict=True):
         local[part] = isinstance(candidate.effect, ValuePerState) and by_state
     total, shares = np.zeros(4), np.zeros((full.sums.shares.shape[0], 2))
+    spent = np.zeros(space.size)
     for fold in range(problem.folds):
         others = [f for f in range(problem.folds) if f != fold]
         if problem.far_from_linear:
@@ -186,25 +188,35 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
         if local.any():
             start = np.where(local, full.values, values)
             fit = minimize(problem, space, start, [fold], free=local, steps=3)
-            total[3] -= local.sum() / problem.folds
+            determined = _determined(fit.sums.curvature[fold], weak, local)
+            spent += determined
+            total[3] -= determined.sum()
             if problem.noise_known:
-                total[0] += 2 * local.sum() / problem.folds
+                total[0] += 2 * determined.sum()
             sums = fit.sums
         else:
             sums = problem.sums(space, values, derivatives=False)
         total += (sums.excess[fold], sums.freedom[fold], sums.square[fold], sums.count[fold])
         shares += sums.shares[:, :, fold]
     if by_state:
-        _count_values(space, shares)
+        _count_values(space, spent, shares)
     excess, freedom, square, count = map(float, total)
     return HeldOut(excess, freedom, square, count, shares)
 
 
-def _count_values(space: Space, shares: Array) -> None:
-    """Each value of a single state takes a degree of freedom of its capture away."""
-    for candidate in space.candidates:
+def _determined(curvature: Array, weak: Array, local: BoolArray) -> Array:
+    """What share of each local value the data determine, against the prior and the other local values; 0 elsewhere."""
+    h = curvature[np.ix_(local, local)]
+    shares = np.zeros(local.size)
+    shares[local] = np.diag(np.linalg.lstsq(h + np.diag(weak[local]), h, rcond=None)[0])
+    return shares
+
+
+def _count_values(space: Space, spent: Array, shares: Array) -> None:
+    """Values of single states take degrees of freedom of their capture away."""
+    for candidate, part in zip(space.candidates, space.slices, strict=True):
         if isinstance(candidate.effect, ValuePerState) and candidate.capture is not None:
-            shares[candidate.capture, 1] -= candidate.size
+            shares[candidate.capture, 1] -= spent[part].sum()
 
 
 def _in_sample(space: Space, full: Fit, weak: Array) -> HeldOut:
