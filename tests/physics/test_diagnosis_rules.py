@@ -154,9 +154,9 @@ def _(m: Patch) -> bool:
     m.setattr(whole_bench, "applied", lambda found, base: (Space(()), np.zeros(0)))
     m.setattr(whole_bench, "exactly_undone", lambda *a, **k: {c: np.ones(1) for c in candidates})
     m.setattr(whole_bench, "scatter_prefers", lambda problem, space, values, new, old: odds[next(iter(new))])
-    asked = bench(whole=Some(noise_known=True, captures=[]), say=lambda told: None)
+    asked = bench(whole=Some(noise_known=True, captures=[]))
     m.setattr(asked, "_posterior", lambda rest, fixed, found: Some(score=0.0, rest=rest))
-    found = Some(score=0.0, space=Some(candidates=candidates))
+    found = Some(score=0.0, space=Some(candidates=candidates), rest=candidates)
     return asked._with_what_scatters_so(found, []).rest == candidates[:1]
 
 
