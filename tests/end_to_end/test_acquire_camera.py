@@ -57,6 +57,7 @@ def assert_horizontal(path: Path) -> None:
     [
         *[(x, y, "PolarizeMono12p") for x, y in ((0, 0), (1, 0), (0, 1), (1, 1))],
         (1, 0, "PolarizeMono12"),
+        (1, 0, "PolarizeMono8"),
         (0, 1, "PolarizeMono12Packed"),
         (1, 1, "PolarizeMono16"),
     ],
@@ -71,7 +72,8 @@ def test_horizontal_light_reads_zero_degrees_wherever_the_region_begins(
     pixel_format: str,
 ) -> None:
     region = {"width": 40, "height": 24, "offset_x": offset_x, "offset_y": offset_y, "pixel_format": pixel_format}
-    rig = small_rig(top={"camera": CAMERA | {"settings": region}})
+    bits = 8 if pixel_format == "PolarizeMono8" else 12
+    rig = small_rig(top={"camera": CAMERA | {"bits": bits, "settings": region}})
     out = tmp_path / "captures"
     code, _, err = acquire("--rig", rig, "--plan", short_plan("stokes"), *THROUGH, "--out", out)
     assert code == 0, err
