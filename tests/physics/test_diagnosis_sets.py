@@ -1,15 +1,20 @@
 """The fast posterior over sets of groups against all sets, one by one; and what a prior must do."""
 
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from processing.diagnosis.instrument.doubts import ONE_PATTERN, patterned_share
+from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.likely_set import likely_set
+from processing.diagnosis.search.posterior import descend
 from processing.diagnosis.search.rules import TAU
 from processing.diagnosis.search.sampling import sample
 from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets, State
+from processing.diagnosis.search.space import Space
+from processing.effect import Parameter
 
 #: Nothing but noise, whose unit is one.
 QUIET = Noise(known=True, directions=30.0, slack=1e9)
@@ -102,3 +107,18 @@ def test_values_of_a_jump_beside_a_slope_are_not_random():
     assert patterned_share(np.where(k > 15, 0.5, -0.3) - 0.02 * k, information) > ONE_PATTERN
     assert patterned_share(np.cos(0.7 * k), information) > ONE_PATTERN
     assert patterned_share(np.random.default_rng(2).standard_normal(40), information) < ONE_PATTERN
+
+
+def test_a_descent_stays_where_the_model_has_numbers():
+    """A step to where there are no intensities is no gain, though nan is not larger than anything."""
+    space = Space((Candidate(type("E", (), {"kind": "it"})(), "", (Parameter("p", "1", -9.0, 9.0, 1.0),)),))
+
+    def sums(space, x, derivatives=True):
+        excess = 25.0 if x[0] == 0 else np.nan
+        one = np.ones((1, 1))
+        return SimpleNamespace(
+            excess=np.array([excess]), freedom=np.array([10.0]), gradient=-5 * one, curvature=one[None], stretch=0 * one
+        )
+
+    problem = SimpleNamespace(relinearize=lambda space, x: False, sums=sums)
+    assert descend(problem, space, np.zeros(1), np.zeros(1)) == 0.0

@@ -98,7 +98,7 @@ def _descend(
             if new_cost <= cost or damping > 1e6:
                 break
             damping = max(damping * 10, 1e-4)
-        if new_cost > cost:
+        if not new_cost <= cost:
             break
         gain = cost - new_cost
         x, sums, cost = tried, new, new_cost

@@ -82,13 +82,19 @@ def posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start:
     start : (K,) values to begin with.
     """
     members, groups = grouped(space, fixed)
-    x = start
+    x = about = start
     typical, lower, upper = (space.joined(name) for name in ("typical", "lower", "upper"))
     rounds = ROUNDS if problem.noise_known else FEWER_ROUNDS
     for left in reversed(range(rounds)):
         problem.relinearize(space, x)
         sums = problem.sums(space, x)
-        sets = Sets(quadratic(problem, space, x, sums), groups, noise_of(problem, sums))
+        form = quadratic(problem, space, x, sums)
+        if not (np.isfinite(form.excess) and np.all(np.isfinite(form.curvature))):
+            # The step went where the model has no intensities: what was found before it stays.
+            problem.relinearize(space, about)
+            break
+        about = x
+        sets = Sets(form, groups, noise_of(problem, sums))
         state = likely_set(sets)
         if left == rounds - 1 and (state.unit > BENT or not problem.noise_known):
             # Several large causes, none of which explains much alone, or far from linear: all of them at once first.
@@ -240,7 +246,8 @@ def descend(problem: Problem, space: Space, x: Array, weak: Array, steps: int = 
             if now <= least:
                 break
             damping = max(10 * damping, 1e-3)
-        if now > least:
+        # Also where the sum is no number: so far away that the model has no intensities.
+        if not now <= least:
             break
         gain, x, sums, least, damping = least - now, tried, new, now, damping / 10
         if gain < LEAST_GAIN + LEAST_RELATIVE * abs(least):
