@@ -45,9 +45,8 @@ def text_of(name: str) -> str:
 
 
 def _told(section: dict[str, Any], key: str) -> str:
-    """What a key means: told for its section, or wherever it stands, or what its section is."""
-    about = str(section.get("description", section.get("title", ""))).split("\n")[0]
-    return OF_SECTION.get(f"{section.get('title')}.{key}") or OF_KEY.get(key) or f"{key.replace('_', ' ')}, of: {about}"
+    """What a key means in its section, or wherever it stands; nothing if nobody has said it."""
+    return OF_SECTION.get(f"{section.get('title')}.{key}") or OF_KEY.get(key, "")
 
 
 def path_of(name: str) -> Path:
