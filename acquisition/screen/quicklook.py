@@ -23,11 +23,13 @@ def draw(path: Path) -> Path:
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     with Capture(path) as capture:
-        mean, modulation, levels, angles = _maps(capture)
+        mean, modulation, levels, states = _maps(capture)
         header, simulated = capture.header, capture.simulated
-    figure = Figure(figsize=(12, 4.2), layout="constrained")
+    # The number at the top of a colour bar must not meet the label of the next panel.
+    figure = Figure(figsize=(12, 4.2), layout=ConstrainedLayoutEngine(wspace=0.06))
     FigureCanvasAgg(figure)
     left, middle, right = figure.subplots(1, 3)
     for axes, image, title, limits in (
@@ -39,8 +41,8 @@ def draw(path: Path) -> Path:
         axes.set_xticks([])
         axes.set_yticks([])
         figure.colorbar(shown, ax=axes, shrink=0.8)
-    right.plot(angles[1], levels, "o-", markersize=3)
-    right.set_xlabel(angles[0])
+    right.plot(states, levels, "o-", markersize=3, linewidth=0.8)
+    right.set_xlabel("state")
     right.set_ylabel("frame mean, counts above dark")
     right.set_title("each state")
     title = header.title
@@ -55,7 +57,7 @@ def draw(path: Path) -> Path:
 
 def _maps(
     capture: Capture,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], list[float], tuple[str, NDArray[np.float64]]]:
+) -> tuple[NDArray[np.float32], NDArray[np.float32], list[float], list[int]]:
     light = _best_exposure(capture)
     mosaic = capture.header.mosaic is not None
     step = max(1, -(-max(capture.frame_shape) // LARGEST))
@@ -73,15 +75,13 @@ def _maps(
             high = thin if high is None else np.maximum(high, thin)
     if total is None or low is None or high is None:
         empty = np.zeros((1, 1), dtype=np.float32)
-        return empty, empty, [], ("state", np.zeros(0))
+        return empty, empty, [], []
     mean = total / (len(light) * (4 if mosaic else 1))
     # Where there is hardly any light, noise alone would look like full modulation.
     lit = mean > 0.02 * float(np.percentile(mean, 99.5))
     sum_ = np.where(lit, high + low, 1.0)
     modulation = np.where(lit, np.clip((high - low) / np.where(sum_ > 0, sum_, 1.0), 0, 1), np.nan)
-    turning = [(name, column[light]) for name, column in capture.angles_deg.items() if np.ptp(column[light]) > 1]
-    angles = (f"{turning[0][0]}, degrees", turning[0][1]) if turning else ("frame", np.arange(len(light), dtype=float))
-    return mean.astype(np.float32), modulation.astype(np.float32), levels, angles
+    return mean.astype(np.float32), modulation.astype(np.float32), levels, light
 
 
 def _best_exposure(capture: Capture) -> list[int]:
