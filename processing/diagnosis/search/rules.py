@@ -1,7 +1,7 @@
 """Constants by which the diagnosis decides, shared by instrument and surface; each with its unit and its reason.
 
 docs/diagnosis-rules.md is made of this file (`python benchmarks/rules_page.py`). Every one of them has a decision in
-tests/physics/test_diagnosis_rules.py that is another one when it is changed by a fifth.
+tests/physics/diagnosis_rules that is another one when it is changed by a fifth.
 """
 
 from __future__ import annotations

@@ -1,0 +1,72 @@
+"""Constants of the prior and of the noise."""
+
+from types import SimpleNamespace as Some
+
+import numpy as np
+from rule_decisions import QUIET, Patch, bench, decides, made, one
+
+from processing.diagnosis.instrument import systematic, whole_bench
+from processing.diagnosis.search import likely_set, posterior
+from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets, State
+from processing.diagnosis.search.space import Space, Sums
+
+
+@decides
+def test_tau(m: Patch) -> bool:
+    s, state = one(1.0, -5.0), State(np.ones(1))
+    likely_set.retune(s, state)
+    return abs(s.fitted(state).mean[0] - 4.5) < 0.05
+
+
+@decides
+def test_tau_weight(m: Patch) -> bool:
+    return abs(one(0.0, 0.0).conditional(State(np.zeros(1))).log_odds[0] - np.log(1 / 0.5)) < 0.05
+
+
+@decides
+def test_few_causes(m: Patch) -> bool:
+    return abs(one(0.0, 0.0, groups=10).conditional(State(np.zeros(10))).log_odds[0] + np.log(14)) < 0.02
+
+
+@decides
+def test_nominal_tau(m: Patch) -> bool:
+    candidate = made()
+    (group,) = posterior.grouped(Space((candidate,)), [candidate])[1]
+    s = Sets(Quadratic(0.0, np.array([-1.0, 0.0]), 0.01 * np.eye(2)), [group, Group(np.array([1]))], QUIET)
+    return abs(s.fitted(s.empty()).mean[0] - 50) < 5
+
+
+@decides
+def test_unseen(m: Patch) -> bool:
+    found = Some(space=Space((made(),)), sets=one(0.0, 0.0), samples=Some(best=State(np.zeros(1)), probability=[0.0]))
+    return abs(systematic._unseen(found)[0, 0] - 0.3) < 0.01
+
+
+def noise(known: bool, excess: float, freedom: float) -> Noise:
+    sums = Sums.empty(1, 0)
+    sums.excess[0], sums.freedom[0], sums.square[0], sums.count[0] = excess, freedom, 1.0, 1.0
+    return posterior.noise_of(Some(noise_known=known, spread=1.0, powers=lambda: [(10, np.ones(1))]), sums)
+
+
+@decides
+def test_slack(m: Patch) -> bool:
+    n = noise(True, 0.0, 50.0)
+    return n.unit(18.0) == 1.0 < n.unit(22.0)
+
+
+@decides
+def test_least_noise(m: Patch) -> bool:
+    return abs(noise(False, 0.0, 100.0).unit(0.0) - 1e-8) < 1e-9
+
+
+@decides
+def test_refuted(m: Patch) -> bool:
+    candidates = [made(place="a"), made(place="b")]
+    odds = {candidates[0]: -11.0, candidates[1]: -13.0}
+    m.setattr(whole_bench, "applied", lambda found, base: (Space(()), np.zeros(0)))
+    m.setattr(whole_bench, "exactly_undone", lambda *a, **k: {c: np.ones(1) for c in candidates})
+    m.setattr(whole_bench, "scatter_prefers", lambda problem, space, values, new, old: odds[next(iter(new))])
+    asked = bench(whole=Some(noise_known=True, captures=[]))
+    m.setattr(asked, "_posterior", lambda rest, fixed, found: Some(score=0.0, rest=rest))
+    found = Some(score=0.0, space=Some(candidates=candidates), rest=candidates)
+    return asked._with_what_scatters_so(found, []).rest == candidates[:1]

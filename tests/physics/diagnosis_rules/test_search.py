@@ -1,0 +1,127 @@
+"""Constants of the search, and what it may cost."""
+
+from types import SimpleNamespace as Some
+
+import numpy as np
+from rule_decisions import QUIET, Asked, Patch, bench, decides, made
+
+from processing.diagnosis.instrument import judge, starts, whole_bench
+from processing.diagnosis.search import likely_set, posterior
+from processing.diagnosis.search.sets import Quadratic, Sets, State
+from processing.diagnosis.search.space import Space, Sums
+
+
+@decides
+def test_far_off(m: Patch) -> bool:
+    m.setattr(starts, "minimize", lambda *a: Some(values=np.zeros(0)))
+    m.setattr(starts, "_far", lambda *a: "far")
+    said = []
+    for rms in (0.045, 0.055):
+        m.setattr(starts, "rms", lambda fit, r=rms: r)
+        said.append(starts.first_values(None, Space(()), (), lambda line: None))
+    return said == [{}, "far"]
+
+
+def rounds(m: Patch, unit: float = 1.0, moves: float = 9.0) -> tuple[list[int], bool]:
+    """Sets visited in each round of `posterior` of a value that moves by so many deviations, and whether all began."""
+    visits: list[int] = []
+    all_first = False
+
+    def visit(sets: Sets, state: State, count: int) -> Some:
+        visits.append(count)
+        return Some(mean=np.zeros(1), covariance=np.eye(1), probability=np.zeros(1))
+
+    def everything(problem: object, space: object, fixed: object, x: np.ndarray, noise: object) -> np.ndarray:
+        nonlocal all_first
+        all_first = True
+        return x
+
+    m.setattr(posterior, "quadratic", lambda *a: Quadratic(0.0, np.zeros(1), np.eye(1)))
+    m.setattr(posterior, "noise_of", lambda *a: QUIET)
+    m.setattr(posterior, "likely_set", lambda s: State(np.zeros(1), unit))
+    m.setattr(posterior, "sample", visit)
+    m.setattr(posterior, "_everything", everything)
+    m.setattr(posterior, "_improved", lambda problem, space, groups, samples, x: np.full(1, moves * len(visits)))
+    m.setattr(posterior, "_posterior_of", lambda *a: None)
+    problem = Some(noise_known=True, relinearize=lambda *a: False, sums=lambda *a: Sums.empty(1, 1))
+    posterior.posterior(problem, Space((made(),)), (), np.zeros(1), lambda line: None)
+    return visits, all_first
+
+
+@decides
+def test_near_enough(m: Patch) -> bool:
+    m.setattr(starts, "rms", lambda fit: fit.rms)
+    tried = []
+    for rms in (0.009, 0.011):
+        fits = iter(Some(excess=-float(k), values=np.zeros(0), rms=rms if k else 1.0) for k in range(99))
+        m.setattr(starts, "minimize", lambda *a, f=fits, **k: next(f))
+        tried.append(starts.best_of_starts(None, Space(()), 5).excess)
+    # The first good one, or the last of all.
+    return tried == [-2.0, -7.0]
+
+
+@decides
+def test_bent(m: Patch) -> bool:
+    return not rounds(m, unit=1.9)[1] and rounds(m, unit=2.1)[1]
+
+
+@decides
+def test_rounds(m: Patch) -> bool:
+    return len(rounds(m)[0]) == 7
+
+
+@decides
+def test_settled(m: Patch) -> bool:
+    return len(rounds(m, moves=0.27)[0]) == 2 and len(rounds(m, moves=0.33)[0]) > 2
+
+
+@decides
+def test_samples(m: Patch) -> bool:
+    return rounds(m)[0][-1] == 300
+
+
+@decides
+def test_samples_before(m: Patch) -> bool:
+    return rounds(m)[0][0] == 80
+
+
+@decides
+def test_hope(m: Patch) -> bool:
+    s = Asked([-5.5, -6.5])
+    likely_set.climb(s, s.empty())
+    return s.fits == 2
+
+
+@decides
+def test_patience(m: Patch) -> bool:
+    s = Asked([1.0] * 30)
+    likely_set.climb(s, s.empty())
+    return s.fits == 1 + 9
+
+
+@decides
+def test_needed(m: Patch) -> bool:
+    kept, tried = Asked([13.0]), Asked([11.0])
+    likely_set.thinned(kept)
+    likely_set.thinned(tried)
+    return kept.conditionals == 1 < tried.conditionals
+
+
+@decides
+def test_beside_field(m: Patch) -> bool:
+    space = Space(tuple(made(place=str(k)) for k in range(200)))
+    found = Some(
+        space=space,
+        members=[(k,) for k in range(200)],
+        samples=Some(best=Some(unit=1.0)),
+        sets=Some(conditional=lambda best: Some(log_odds=np.zeros(200))),
+    )
+    m.setattr(whole_bench, "applied", lambda found, base: (Space(()), np.zeros(0)))
+    m.setattr(whole_bench, "score", lambda *a: (1e6, None))
+    asked = bench(whole=Some(sums=lambda *a: None), _posterior=lambda candidates, fixed: candidates)
+    return len(asked._with_fields(found, [], [made(kind="field")])) == 90 + 1
+
+
+@decides
+def test_growth(m: Patch) -> bool:
+    return judge._grown(np.array([1.06]), 1.0) and not judge._grown(np.array([1.04]), 1.0)

@@ -1,0 +1,94 @@
+"""Constants by which a mistake of wiring, and a correction, are told."""
+
+from types import SimpleNamespace as Some
+
+import numpy as np
+from rule_decisions import Patch, cause, decides, made
+
+from processing.diagnosis.instrument import empirical, guard, whole_bench, wiring
+from processing.diagnosis.search import causes
+from processing.diagnosis.search.result import Empirical
+from processing.diagnosis.search.space import Space
+from processing.instrument.effects.base import GeneralEffect
+
+
+def miswired(m: Patch, start: float, without: float) -> bool:
+    m.setattr(wiring, "_other_wavelengths", lambda *a: [])
+    m.setattr(wiring, "_mistakes", lambda problem: iter([Some(problem="mended")]))
+    m.setattr(wiring, "_left", lambda problem, *at: without if problem == "mended" else start)
+    return wiring.miswired(Some(nominal=lambda: ())) is not None
+
+
+@decides
+def test_wiring(m: Patch) -> bool:
+    return miswired(m, 1000.0, 190.0) and not miswired(m, 1000.0, 210.0)
+
+
+@decides
+def test_decisive(m: Patch) -> bool:
+    return miswired(m, 28.0, 0.5) and not miswired(m, 23.0, 0.5)
+
+
+def takes_part(m: Patch, probabilities: list[float], told: causes.Cause | None = None) -> list[str]:
+    space = Space(tuple(made(place=str(k)) for k in range(len(probabilities))))
+    found = Some(
+        space=space,
+        members=[(k,) for k in range(len(probabilities))],
+        label=lambda g: space.candidates[g],
+        samples=Some(probability=np.array(probabilities)),
+        values=np.zeros(space.size),
+    )
+    names = ()
+    if told is not None:
+        names = (Some(probability=1.0, candidates=space.candidates[:1], alternatives=space.candidates[1:]),)
+    m.setattr(whole_bench, "causes", lambda found, left: names)
+    return [c.place for c in whole_bench.applied(found, Space(()))[0].candidates]
+
+
+@decides
+def test_takes_part(m: Patch) -> bool:
+    return takes_part(m, [0.23, 0.27]) == ["1"]
+
+
+@decides
+def test_shares(m: Patch) -> bool:
+    return takes_part(m, [0.5, 0.009, 0.011], cause()) == ["0", "2"]
+
+
+def guarded(m: Patch, rms: float, condition: float) -> bool:
+    solved = Some(before=Some(rms=1.0), after=Some(rms=rms), base=None, before_fit=None, space="new", fit=None)
+    m.setattr(guard, "predicted_error", lambda problem, found, solved: (0.0, 0.0))
+    m.setattr(guard, "_stretch", lambda problem, solved: 1.0)
+    m.setattr(guard, "_of_rows", lambda problem, k, space, fit: (16, condition if space == "new" else 1.0))
+    return all(c.holds for c in guard.checks(Some(captures=[Some(name="a")]), None, solved))
+
+
+@decides
+def test_worse(m: Patch) -> bool:
+    return guarded(m, 1.0019, 1.0) and not guarded(m, 1.0021, 1.0)
+
+
+@decides
+def test_worse_condition(m: Patch) -> bool:
+    return guarded(m, 1.0, 1.4) and not guarded(m, 1.0, 1.6)
+
+
+def without_name(m: Patch, *left: float) -> Empirical | None:
+    """The empirical correction where nothing leaves 100 and each of some effects leaves so much."""
+    candidates = [made(GeneralEffect, kind=f"k{k}") for k in range(len(left))]
+    rest = iter((100.0, *left))
+    m.setattr(empirical, "_left", lambda found, index: (next(rest), np.zeros(index.size)))
+    found = Some(space=Space(tuple(candidates)), sets=Some(noise=Some(slack=0.0, known=True)))
+    solved = Some(space=Space(()), before=Some(excess=100.0, freedom=100.0, rms=0.01))
+    return empirical.empirical(found, solved)
+
+
+@decides
+def test_empirical_share(m: Patch) -> bool:
+    return without_name(m, 91.0) is None and without_name(m, 89.0) is not None
+
+
+@decides
+def test_also(m: Patch) -> bool:
+    told = without_name(m, 0.0, 2.7, 3.3)
+    return told is not None and told.would_also_fit == ("k0", "k1")
