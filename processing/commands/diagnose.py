@@ -45,7 +45,7 @@ def diagnose_command(
 
         diagnose_reflectance(captures, instrument, reflectance, geometry, write, json, report)
         return
-    from processing.commands.loaded_late.diagnose_summary import show
+    from processing.commands.loaded_late.diagnose_summary import show, write_result
     from processing.diagnosis.instrument.run import diagnose_captures
     from processing.instrument.model import InstrumentModel
 
@@ -56,8 +56,7 @@ def diagnose_command(
     judged, problem = diagnose_captures(captures, model, say)
     show(judged.diagnosis)
     if json is not None:
-        json.write_text(judged.diagnosis.model_dump_json(indent=2) + "\n", encoding="utf-8")
-        typer.echo(str(json))
+        write_result(json, judged.diagnosis)
     if report is not None:
         from processing.diagnosis.instrument.report import write_report
 

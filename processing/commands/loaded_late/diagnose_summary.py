@@ -1,6 +1,8 @@
-"""What `diagnose` prints."""
+"""What `diagnose` prints, and its result as a file."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import typer
 
@@ -12,6 +14,12 @@ from processing.diagnosis.search.result import (
     FoundEffect,
     Unexplained,
 )
+
+
+def write_result(path: Path, d: Diagnosis) -> None:
+    """Write the result as JSON, and print where."""
+    path.write_text(d.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    typer.echo(str(path))
 
 
 def show(d: Diagnosis) -> None:

@@ -23,7 +23,7 @@ def diagnose_reflectance(
     """Diagnose, print a summary and write what was asked for. Raises ProcessError."""
     if reflectance is None or geometry is None:
         raise ProcessError("a triply degenerate sample needs both --reflectance MATERIAL and --geometry GEOMETRY.")
-    from processing.commands.loaded_late.diagnose_summary import show
+    from processing.commands.loaded_late.diagnose_summary import show, write_result
     from processing.diagnosis.surface.run import diagnose_object
     from processing.diagnosis.surface.write import targets, write_surface
     from processing.geometry.viewing import ViewingGeometry
@@ -42,8 +42,7 @@ def diagnose_reflectance(
     show(judged.diagnosis)
     _show_surface(judged.diagnosis)
     if json is not None:
-        json.write_text(judged.diagnosis.model_dump_json(indent=2) + "\n", encoding="utf-8")
-        typer.echo(str(json))
+        write_result(json, judged.diagnosis)
     if report is not None:
         from processing.diagnosis.surface.report import write_surface_report
 
