@@ -1,0 +1,106 @@
+"""An axis and the camera of a rig as bluesky devices."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from acquisition.bluesky_devices.device import Device, Readings, data_key, readings
+from acquisition.bluesky_devices.status import Status, in_background
+from processing.instrument.model import InstrumentModel
+
+
+class AxisDevice(Device):
+    """An axis of the rig; `set` goes to an angle in degrees, `read` tells where it is at rest."""
+
+    @property
+    def hints(self) -> dict[str, Any]:
+        """What live tables show."""
+        return {"fields": [self.name]}
+
+    @property
+    def position(self) -> float:
+        """Angle as read back, degrees."""
+        return self.rig.axes[self.name].read_position().deg
+
+    def set(self, value: float) -> Status:
+        """Go to an angle, degrees. The status fails if it is forbidden, out of limits, or not reached."""
+
+        def move() -> None:
+            with self.turn:
+                self.rig.move({self.name: float(value)})
+
+        return in_background(move)
+
+    def stop(self, *, success: bool = False) -> None:
+        """Stop the axis where it is."""
+        self.rig.axes[self.name].stop()
+
+    def read(self) -> Readings:
+        """Angle as read back."""
+        return readings({self.name: self.position})
+
+    def describe(self) -> Readings:
+        """Unit and source of the angle."""
+        return {self.name: data_key(f"axis {self.name}, as read back", (), "degree")}
+
+
+class CameraDevice(Device):
+    """The camera; `trigger` takes a frame, `read` gives it with its mean. The light is on while it is staged.
+
+    Attributes
+    ----------
+    exposure_s : of the next frames; change it between plans.
+    sample : what an emulated rig shows.
+    """
+
+    _frame: np.ndarray[Any, np.dtype[np.uint16]]
+    exposure_s = 0.02
+    sample = "red_sphere"
+
+    def stage(self) -> list[Device]:
+        """Set the exposure, let light through."""
+        with self.turn:
+            config = self.rig.config
+            if self.rig.simulation is not None and config.simulator is not None:
+                mode, declared = next(iter(config.modes.items()))
+                model = InstrumentModel.load(config.simulator.truth.get(mode, declared.instrument))
+                self.rig.simulation.prepare(self.sample, model, config.wavelengths_nm[0])
+            self.rig.set_exposure(self.exposure_s, 1)
+            if self.rig.source is not None:
+                self.rig.source.set_light(True)
+        return [self]
+
+    def unstage(self) -> list[Device]:
+        """Shut the light."""
+        if self.rig.source is not None:
+            self.rig.source.set_light(False)
+        return [self]
+
+    @property
+    def hints(self) -> dict[str, Any]:
+        """What live tables show."""
+        return {"fields": [f"{self.name}_mean"]}
+
+    def trigger(self) -> Status:
+        """Take one frame."""
+
+        def expose() -> None:
+            with self.turn:
+                self._frame = self.rig.require_camera().capture(1)[0].pixels
+
+        return in_background(expose)
+
+    def read(self) -> Readings:
+        """The frame that was taken last, and its mean in counts."""
+        return readings({f"{self.name}_frame": self._frame, f"{self.name}_mean": float(self._frame.mean())})
+
+    def describe(self) -> Readings:
+        """Shapes and units."""
+        settings = self.rig.require_camera().settings
+        shape = (settings.height or 0, settings.width or 0)
+        return {
+            f"{self.name}_frame": data_key("camera, counts (row, column)", shape, "count"),
+            f"{self.name}_mean": data_key("camera, mean of the frame", (), "count"),
+        }

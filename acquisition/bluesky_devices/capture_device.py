@@ -1,0 +1,155 @@
+"""A whole capture as a bluesky device, with what a pause leaves and where its frames are."""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from acquisition.bluesky_devices.device import Device, Readings, data_key, readings
+from acquisition.bluesky_devices.status import Status, in_background
+from acquisition.capture import session
+from acquisition.capture.checks import refuse_failed
+from acquisition.capture.header import default_name
+from acquisition.capture.job import check_with_devices, job_of, prepare
+from acquisition.capture.plan import MeasurementPlan
+from acquisition.capture.writer import PARTIAL
+from acquisition.errors import AcquisitionError
+from acquisition.rig.rig import Rig
+from acquisition.stop_request import StopRequest
+from processing.storage.capture import Capture
+
+#: What a capture says of each of its states, beside the angles: column of the file, and its unit.
+COLUMNS = {"exposure_s": "s", "host_time_s": "s", "monitor": "count/s", "saturated_fraction": ""}
+
+
+class CaptureDevice(Device):
+    """A whole capture: one `trigger` takes all its states into a file, and seals it.
+
+    If the RunEngine pauses, the state that is being taken is finished and the light is shut; when it resumes, the same
+    file is gone on with, as `acquire --resume` does. `read` gives the file, and angles and columns of its states;
+    the frames stay in the file, which a stream document points to.
+
+    Parameters
+    ----------
+    plan : of every capture that this device takes.
+    folder : for the files, which are named as `acquire` names them.
+    home : home axes without a reference before the first move of a capture.
+    """
+
+    def __init__(
+        self, name: str, rig: Rig, turn: threading.Lock, plan: MeasurementPlan, folder: Path | str, home: bool
+    ) -> None:
+        super().__init__(name, rig, turn)
+        self.plan, self.folder = plan, Path(folder)
+        self._home = home
+        self._job = prepare(plan, rig.config)
+        self._stop = StopRequest()
+        self._half: Path | None = None
+        self._path: Path | None = None
+        self._taking: Status | None = None
+        self._documents: list[tuple[str, dict[str, Any]]] = []
+
+    def trigger(self) -> Status:
+        """Take the capture, or what is missing of one that a pause has interrupted."""
+        self._stop = StopRequest()
+        self._taking = in_background(self._take)
+        return self._taking
+
+    def _take(self) -> None:
+        with self.turn:
+            half = self._half
+            job = self._job if half is None else job_of(half, self.rig.config, self.plan)
+            path = self._free_name() if half is None else half
+            refuse_failed(check_with_devices(job, self.rig, path.parent))
+            run = session.take if half is None else session.resume
+            try:
+                result = run(job, self.rig, path, self._stop, (), self._home)
+            except BaseException:
+                # What is there already is gone on with, should the plan be run again.
+                partial = path if path.name.endswith(PARTIAL) else path.with_name(path.name + PARTIAL)
+                self._half = partial if partial.exists() else None
+                raise
+        if result.status == "complete":
+            self._half, self._path = None, result.path
+            self._documents = list(self._asset_documents(result.path))
+        else:
+            self._half = result.path
+
+    def _free_name(self) -> Path:
+        """A name that is not taken: several captures may begin in one second."""
+        first = self.folder / default_name(self.plan)
+        number, path = 1, first
+        while path.exists():
+            number += 1
+            path = first.with_stem(f"{first.stem}-{number}")
+        return path
+
+    def pause(self) -> None:
+        """Finish the state that is being taken; called by the RunEngine."""
+        if self._taking is not None and not self._taking.done:
+            self._stop.request()
+            self._taking.exception(timeout=None)
+
+    def resume(self) -> None:
+        """Nothing: the RunEngine triggers again, and the capture is gone on with then."""
+
+    def stop(self, *, success: bool = False) -> None:
+        """End after the state that is being taken; the file can be gone on with by `acquire --resume`."""
+        self._stop.request()
+
+    def _sealed(self) -> Path:
+        if self._path is None:
+            raise AcquisitionError(f"{self.name} has taken no capture yet; trigger it first.")
+        return self._path
+
+    def read(self) -> Readings:
+        """File, angles as read back and columns, of the capture that was taken last."""
+        with Capture(self._sealed()) as capture:
+            values: dict[str, Any] = {f"{self.name}_file": str(capture.path)}
+            values |= {f"{self.name}_{axis}_deg": angles for axis, angles in capture.angles_deg.items()}
+            values |= {f"{self.name}_{column}": capture.column(column) for column in COLUMNS}
+        return readings(values)
+
+    def describe(self) -> Readings:
+        """Shapes and units; the frames are (states, channels, rows, columns)."""
+        states = (len(self._job.table),)
+        keys = {f"{self.name}_file": {"source": "capture file", "dtype": "string", "shape": []}}
+        for axis in self._job.table.angles_deg:
+            keys[f"{self.name}_{axis}_deg"] = data_key(f"axis {axis}, as read back in each state", states, "degree")
+        keys |= {f"{self.name}_{column}": data_key(column, states, unit) for column, unit in COLUMNS.items()}
+        settings = self.rig.require_camera().settings
+        frames = data_key("counts", (*states, 1, settings.height or 0, settings.width or 0), "count")
+        return keys | {f"{self.name}_frames": frames | {"external": "STREAM:", "dtype_numpy": "<u2"}}
+
+    def collect_asset_docs(self, index: int | None = None) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Where the frames of the last capture are; each file once."""
+        documents, self._documents = self._documents, []
+        yield from documents
+
+    def _asset_documents(self, path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+        resource = str(uuid.uuid4())
+        with Capture(path) as capture:
+            chunk = (1, 1, *capture.stored_shape)
+        yield (
+            "stream_resource",
+            {
+                "uid": resource,
+                "data_key": f"{self.name}_frames",
+                "mimetype": "application/x-hdf5",
+                "uri": path.resolve().as_uri().replace("file:///", "file://localhost/"),
+                "parameters": {"dataset": "/entry/instrument/detector/data", "swmr": False, "chunk_shape": chunk},
+            },
+        )
+        yield (
+            "stream_datum",
+            {
+                "uid": f"{resource}/0",
+                "stream_resource": resource,
+                "descriptor": "",
+                "indices": {"start": 0, "stop": 1},
+                "seq_nums": {"start": 0, "stop": 0},
+            },
+        )

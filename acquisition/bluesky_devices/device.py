@@ -1,0 +1,42 @@
+"""What axes, camera and captures have in common as bluesky devices."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+from acquisition.rig.rig import Rig
+
+Readings = dict[str, dict[str, Any]]
+
+
+class Device:
+    """What all have: a name, no parent, and nothing to configure but what `read` tells."""
+
+    parent = None
+
+    def __init__(self, name: str, rig: Rig, turn: threading.Lock) -> None:
+        self.name = name
+        self.rig = rig
+        #: Held while something moves or is exposed: one thing at a time, as the rig's checks assume.
+        self.turn = turn
+
+    def read_configuration(self) -> Readings:
+        """Nothing that changes seldom."""
+        return {}
+
+    def describe_configuration(self) -> Readings:
+        """Nothing that changes seldom."""
+        return {}
+
+
+def readings(values: dict[str, Any]) -> Readings:
+    """Values by name as `read` gives them, with the time of now."""
+    now = time.time()
+    return {name: {"value": value, "timestamp": now} for name, value in values.items()}
+
+
+def data_key(source: str, shape: tuple[int, ...], units: str) -> dict[str, Any]:
+    """What `describe` says of one value: a number, or an array of a shape."""
+    return {"source": source, "dtype": "array" if shape else "number", "shape": list(shape), "units": units}
