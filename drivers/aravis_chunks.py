@@ -15,7 +15,7 @@ from drivers.genicam import Features
 
 log = logging.getLogger(__name__)
 
-_TICKS_PER_S = ("GevTimestampTickFrequency",)
+_TICK_FREQUENCY = ("GevTimestampTickFrequency",)
 
 
 class ChunkStamps:
@@ -26,6 +26,7 @@ class ChunkStamps:
     name : str
         Name of the camera in messages.
     camera : the open `Aravis.Camera`.
+    features : of that camera.
     glib_error : GLib's exception class.
     wanted : bool
         False leaves the camera as it is.
@@ -46,7 +47,7 @@ class ChunkStamps:
         except CameraError as error:
             log.warning("camera %s: no time stamps behind the images: %s", name, error)
             features.switch_off("ChunkModeActive")
-        self._ticks_per_s = features.number(_TICKS_PER_S) or 1e9
+        self._ticks_per_s = features.number(_TICK_FREQUENCY) or 1e9
 
     def time_ns(self, arrival: Arrival) -> int:
         """The camera's time of an exposure in nanoseconds: of the chunk, or of the transfer where there is none."""

@@ -56,7 +56,7 @@ class MMCoreAxis(SessionReferenceAxis):
         self.speed_deg_s, self.acceleration_deg_s2 = config.speed_deg_s, config.acceleration_deg_s2
         with asking(asked):
             self._identity = AxisIdentity(
-                kind="mmcore",
+                kind=config.kind,
                 model=f"{core.getDeviceLibrary(config.device)} {core.getDeviceName(config.device)}",
                 serial_number=NOT_TOLD,
                 firmware=core.getVersionInfo(),

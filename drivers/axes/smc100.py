@@ -123,10 +123,8 @@ class SMC100Line:
             behind = said.removeprefix(start).strip()
             return behind if said.startswith(start) and value.fullmatch(behind) else None
 
-        question, asked = (
-            f"{address}{command}\r\n".encode("ascii"),
-            f"SMC100 {self.link.port} address {address}, {command}",
-        )
+        question = f"{address}{command}\r\n".encode("ascii")
+        asked = f"SMC100 {self.link.port} address {address}, {command}"
         # Who sets a time asks again by itself.
         tries = 2 if reply_s is None else 1
         check = "Check power, cable, baud rate, address"

@@ -180,7 +180,7 @@ class StandaAxis(SessionReferenceAxis):
             )
         self._read_borders()
         self._identity = AxisIdentity(
-            kind="standa",
+            kind=config.kind,
             model=f"{product.rstrip(bytes(1)).decode('ascii', 'replace')} {'.'.join(map(str, hardware))}",
             serial_number=str(serial_number),
             firmware=".".join(map(str, line.ask(b"gfwv"))),

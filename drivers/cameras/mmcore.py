@@ -21,20 +21,14 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from drivers.camera import Camera, CameraIdentity, CameraSettings, Frame, StreamStatistics
 from drivers.clock import REAL, Clock
-from drivers.errors import (
-    CameraBusy,
-    CameraLost,
-    CameraNotFound,
-    FrameLost,
-    SettingRefused,
-)
+from drivers.errors import CameraBusy, CameraLost, CameraNotFound, FrameLost, SettingRefused
 from drivers.micromanager import NOT_TOLD, asking, loaded_devices, running_core
 
 # Ctrl-C gets through between two looks.
 _SLICE_S = 0.02
 # Rounding of an exposure that is no refusal, seconds.
 _EXPOSURE_FLOOR_S = 20e-6
-_NOT_HERE = ("gain_db", "black_level", "decimation", "reverse_x", "reverse_y", "packet_size")
+_WITHOUT_A_COMMON_NAME = ("gain_db", "black_level", "decimation", "reverse_x", "reverse_y", "packet_size")
 # Cameras that a driver of this process has: the core itself would give one to any number.
 _taken: set[str] = set()
 
@@ -148,7 +142,7 @@ class MMCoreCamera(Camera):
     def _do_configure(self, settings: CameraSettings) -> CameraSettings:
         self._discard_outstanding()
         settings = self._config.settings.model_copy(update=settings.model_dump(exclude_none=True))
-        for name in _NOT_HERE:
+        for name in _WITHOUT_A_COMMON_NAME:
             if getattr(settings, name):
                 raise self._refused(f"set {name}", "Micro-Manager has no common name for it: use `properties`")
         if settings.trigger == "hardware":
@@ -163,6 +157,7 @@ class MMCoreCamera(Camera):
         return self._read_back(settings.frame_average)
 
     def _set_property(self, name: str, value: str | int | None) -> None:
+        # A camera that cannot bin has a binning of 1.
         if value is None or (value == 1 and not self._core.hasProperty(self._config.device, name)):
             return
         with self._setting(f"set {name} to {value}"):

@@ -16,38 +16,38 @@ from drivers.errors import (
     WrongDevice,
 )
 from simulators.clock import patient_clock
-from simulators.conformance.axis_bench import ServedAxis
+from simulators.conformance.served_axes import AxisTests
 from simulators.serial.reply_faults import Fault
 
 
-class AxisFaults(ServedAxis):
+class AxisFaults(AxisTests):
     """Tests of an axis on an emulator that is stuck, slow, silent, disturbed, reset or another one."""
 
     def test_another_device_than_the_rig_file_names_is_refused(self, kind: str) -> None:
-        with self.served(kind) as bench:
-            field = type(bench.configs[0]).identified_by
-            is_text = "str" in str(type(bench.configs[0]).model_fields[field].annotation)
+        with self.served(kind) as served:
+            field = type(served.configs[0]).identified_by
+            is_text = "str" in str(type(served.configs[0]).model_fields[field].annotation)
             with pytest.raises(WrongDevice, match="rig file"):
-                bench.open(0, **{field: "00000099" if is_text else 99})
+                served.open(0, **{field: "00000099" if is_text else 99})
             # The line is free again.
-            bench.open()
+            served.open()
 
     def test_a_port_that_vanishes_and_one_that_is_not_there(self, kind: str) -> None:
-        with self.served(kind) as bench:
-            axis = bench.open()
+        with self.served(kind) as served:
+            axis = served.open()
             with pytest.raises(PortNotFound, match="no such port"):
-                bench.open(port="/dev/ttyUSB_none")
-            bench.port.close()
+                served.open(port="/dev/ttyUSB_none")
+            served.port.close()
             with pytest.raises(DeviceError, match="gone"):
                 axis.read_position()
             axis.close()
             axis.close()
 
     def test_a_stuck_axis_fails_in_bounded_time_and_is_named(self, kind: str) -> None:
-        with self.served(kind) as bench:
-            axis = bench.open(margin_s=0.1, stall_s=0.1)
+        with self.served(kind) as served:
+            axis = served.open(margin_s=0.1, stall_s=0.1)
             axis.start_move(10.0).wait()
-            bench.emulator.faults.add(Fault("stuck"))
+            served.emulator.faults.add(Fault("stuck"))
             motion = axis.start_move(20.0)
             with pytest.raises(MotionFailed, match=r"axis axis0, move to 20.0000 deg: .*allowed") as caught:
                 motion.wait()
@@ -59,36 +59,36 @@ class AxisFaults(ServedAxis):
                 motion.wait()
 
     def test_a_slow_axis_fails_at_the_deadline(self, kind: str) -> None:
-        with self.served(kind) as bench:
-            axis = bench.open(margin_s=0.05, stall_s=5.0)
-            bench.emulator.faults.add(Fault("slow", amount=1e-5))
+        with self.served(kind) as served:
+            axis = served.open(margin_s=0.05, stall_s=5.0)
+            served.emulator.faults.add(Fault("slow", amount=1e-5))
             motion = axis.start_move(20.0)
             with pytest.raises(MotionFailed, match="deadline"):
                 motion.wait()
 
     def test_a_silent_device_fails_with_the_reason(self, kind: str) -> None:
-        with self.served(kind, speed=2.0) as bench:
-            axis = bench.open(reply_s=0.15)
+        with self.served(kind, speed=2.0) as served:
+            axis = served.open(reply_s=0.15)
             motion = axis.start_move(90.0)
-            bench.emulator.faults.add(Fault("silent"))
+            served.emulator.faults.add(Fault("silent"))
             with pytest.raises(MotionFailed, match="nothing within") as caught:
                 motion.wait()
             assert isinstance(caught.value.__cause__, ReplyTimeout)
             with pytest.raises(ReplyTimeout, match="power"):
                 axis.read_position()
-            bench.emulator.faults.clear()
-            while bench.emulator.axes[0].is_moving():
+            served.emulator.faults.clear()
+            while served.emulator.axes[0].is_moving():
                 time.sleep(0.01)
-            assert axis.read_position().deg == pytest.approx(bench.emulator.true_deg(0), abs=0.01)
+            assert axis.read_position().deg == pytest.approx(served.emulator.true_deg(0), abs=0.01)
 
     @pytest.mark.parametrize("fault", ["garbled", "late", "foreign", "silent"])
     def test_a_passing_fault_never_gives_a_wrong_position(self, kind: str, fault: str) -> None:
         """One spoiled reply, at every place of the exchange: the move ends right, or with an error."""
         right = 0
-        with self.served(kind) as bench:
-            axis = bench.open(reply_s=0.1)
+        with self.served(kind) as served:
+            axis = served.open(reply_s=0.1)
             for place in range(1, 13) if fault == "garbled" else (1, 4, 7, 10):
-                bench.emulator.faults.add(Fault(fault, from_command=place, commands=1, amount=0.13))  # type: ignore[arg-type]
+                served.emulator.faults.add(Fault(fault, from_command=place, commands=1, amount=0.13))  # type: ignore[arg-type]
                 target_deg = 7.0 * place
                 try:
                     position = axis.start_move(target_deg).wait()
@@ -98,36 +98,36 @@ class AxisFaults(ServedAxis):
                         break
                     continue
                 finally:
-                    bench.emulator.faults.clear()
+                    served.emulator.faults.clear()
                 right += 1
                 assert position.deg == pytest.approx(target_deg, abs=0.05)
-                assert position.deg == pytest.approx(bench.emulator.true_deg(0), abs=1e-3)
+                assert position.deg == pytest.approx(served.emulator.true_deg(0), abs=1e-3)
         assert right >= 3
 
     @pytest.mark.parametrize("fault", ["garbled", "foreign"])
     def test_a_lasting_fault_ends_in_an_error(self, kind: str, fault: str) -> None:
-        with self.served(kind) as bench:
-            axis = bench.open(reply_s=0.1)
-            bench.emulator.faults.add(Fault(fault))  # type: ignore[arg-type]
+        with self.served(kind) as served:
+            axis = served.open(reply_s=0.1)
+            served.emulator.faults.add(Fault(fault))  # type: ignore[arg-type]
             with pytest.raises((ReplyError, ReplyTimeout, MotionFailed)):
                 axis.start_move(33.0).wait()
 
     def test_a_reset_in_mid_run_is_noticed(self, kind: str) -> None:
-        with self.served(kind) as bench:
-            axis = bench.open()
+        with self.served(kind) as served:
+            axis = served.open()
             axis.start_move(30.0).wait()
-            bench.emulator.faults.add(Fault("not_homed"))
+            served.emulator.faults.add(Fault("not_homed"))
             axis.read_position()
             with pytest.raises(NotHomedError):
                 axis.start_move(40.0)
-            assert bench.emulator.true_deg(0) == pytest.approx(30.0, abs=0.05)
+            assert served.emulator.true_deg(0) == pytest.approx(30.0, abs=0.05)
 
     def test_the_answer_to_a_stop_is_not_taken_for_that_of_the_next_question(self, kind: str) -> None:
-        with self.served(kind) as bench:
-            axis = bench.open()
+        with self.served(kind) as served:
+            axis = served.open()
             axis.start_move(30.0).wait()
             # Of the stop alone: the questions behind it are answered first.
-            bench.emulator.faults.add(Fault("late", commands=1, amount=0.1))
+            served.emulator.faults.add(Fault("late", commands=1, amount=0.1))
             axis.stop()
             assert not axis.is_moving()
             assert axis.is_homed()

@@ -20,7 +20,7 @@ from drivers.motion import MotionAxis
 from drivers.registry import open_axis
 from drivers.serial_link import LineRegistry
 from simulators.clock import Clock, patient_clock
-from simulators.conformance.axis_bench import ServedAxis
+from simulators.conformance.served_axes import AxisTests
 from simulators.rig.controller_kinds import axis_configs, served_kinds
 from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort
@@ -75,7 +75,7 @@ def seed_of(kind: str) -> int:
     return zlib.crc32(kind.encode())
 
 
-class DriverNoise(ServedAxis):
+class DriverNoise(AxisTests):
     """Of a driver on a serial line; TCP delivers what was sent."""
 
     def test_noise_on_the_line_never_gives_a_wrong_position(self, kind: str) -> None:
@@ -107,7 +107,7 @@ class DriverNoise(ServedAxis):
         assert min(reads, moves) >= ROUNDS // 4, f"{reads} readings, {moves} moves"
 
 
-class EmulatorNoise(ServedAxis):
+class EmulatorNoise(AxisTests):
     """Of an emulator: `pieces` of real commands get the noise past the first letter."""
 
     def test_an_emulator_swallows_anything_and_still_answers(self, kind: str) -> None:

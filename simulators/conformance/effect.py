@@ -20,7 +20,7 @@ from processing.instrument.effects.base import OfOneCapture, Switch
 from processing.instrument.model import InstrumentModel
 from processing.reflectance.changes import ReflectanceChanges
 from processing.reflectance.effects.base import ReflectanceEffect, reflectance_effects
-from simulators.conformance.reflectance import directions
+from simulators.conformance.reflectance import random_geometry
 
 UNITS = ("1", "degree", "pixel", "count")
 
@@ -110,7 +110,7 @@ class ReflectanceEffectConformance:
 
     def test_it_does_nothing_at_zero_and_something_elsewhere(self, kind: str) -> None:
         effect: ReflectanceEffect = reflectance_effects()[kind]
-        there, index = directions(300), 1.3 + 0.08j
+        there, index = random_geometry(300), 1.3 + 0.08j
         # With diffuse reflection, since registration acts through theta_h, which the first surface does not know.
         changes = ReflectanceChanges(diffuse_a=0.5)
         plain = changes.dominant(there, index)

@@ -34,7 +34,7 @@ class ReflectanceConformance:
         return loaded
 
     def test_it_gives_physical_mueller_jones_matrices(self, tmp_path: Path) -> None:
-        m = self.model(tmp_path).mueller_jones(directions(300), self.wavelength_nm)
+        m = self.model(tmp_path).mueller_jones(random_geometry(300), self.wavelength_nm)
         values = np.linalg.eigvalsh(mueller.coherency(m)) / 2
         np.testing.assert_allclose(m[:, 0, 0], 1)
         np.testing.assert_allclose(values[:, 3], 1, atol=1e-12)
@@ -43,18 +43,18 @@ class ReflectanceConformance:
     def test_it_is_reciprocal(self, tmp_path: Path) -> None:
         # Each beam runs backwards: its x turns round, y stays.
         flip = np.diag([1.0, 1.0, -1.0, 1.0])
-        model, there = self.model(tmp_path), directions(300)
+        model, there = self.model(tmp_path), random_geometry(300)
         forward = model.mueller_jones(there, self.wavelength_nm)
         backward = model.mueller_jones(there.reversed(), self.wavelength_nm)
         np.testing.assert_allclose(backward, flip @ np.swapaxes(forward, -1, -2) @ flip, atol=1e-11)
 
     def test_jones_and_mueller_agree(self, tmp_path: Path) -> None:
-        model, there = self.model(tmp_path), directions(50)
+        model, there = self.model(tmp_path), random_geometry(50)
         m = mueller.from_jones(model.jones(there, self.wavelength_nm))
         np.testing.assert_allclose(model.mueller_jones(there, self.wavelength_nm), m / m[:, :1, :1], atol=1e-12)
 
 
-def directions(count: int) -> ScatteringGeometry:
+def random_geometry(count: int) -> ScatteringGeometry:
     """Random normals with source and camera on their side; the same each time."""
     random = np.random.default_rng(0)
     normal = unit(random.normal(size=(count, 3)))

@@ -22,7 +22,7 @@ from simulators.serial.serve_options import ServeOptions
 
 
 @dataclass
-class SourceBench:
+class ServedSource:
     """A source behind its emulator, and the rig entry that opens it."""
 
     emulator: Emulator
@@ -70,67 +70,67 @@ class SourceConformance:
         return self.emulator
 
     @pytest.fixture
-    def bench(self, kind: str) -> Iterator[SourceBench]:
+    def served(self, kind: str) -> Iterator[ServedSource]:
         """The emulator behind a port, dark as it is when it is switched on."""
         emulator = served_kinds()[kind](ServeOptions(clock=Clock(50.0, base=patient_clock())))
         with PtyPort(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
             (config,) = source_configs(emulator, port.path)
-            yield SourceBench(emulator, port, lines, config, self.wavelength_nm)
+            yield ServedSource(emulator, port, lines, config, self.wavelength_nm)
 
-    def test_opening_and_closing_change_nothing(self, bench: SourceBench) -> None:
-        source = bench.open()
-        assert not bench.true_light()
+    def test_opening_and_closing_change_nothing(self, served: ServedSource) -> None:
+        source = served.open()
+        assert not served.true_light()
         source.set_light(True)
         source.close()
-        assert bench.true_light()
-        again = bench.open()
-        assert bench.true_light()
+        assert served.true_light()
+        again = served.open()
+        assert served.true_light()
         assert again.is_on()
 
-    def test_light_goes_on_and_off_and_is_read_back(self, bench: SourceBench) -> None:
-        source = bench.open()
+    def test_light_goes_on_and_off_and_is_read_back(self, served: ServedSource) -> None:
+        source = served.open()
         for on in (True, True, False, False, True):
             source.set_light(on)
             assert source.is_on() is on
-            assert bench.true_light() is on
+            assert served.true_light() is on
         assert source.interlock_open() is False
 
-    def test_it_says_what_it_is(self, bench: SourceBench) -> None:
-        described = bench.open().describe()
-        assert described["kind"] == bench.config.kind  # type: ignore[attr-defined]
-        assert described["port"] == bench.port.path
+    def test_it_says_what_it_is(self, served: ServedSource) -> None:
+        described = served.open().describe()
+        assert described["kind"] == served.config.kind  # type: ignore[attr-defined]
+        assert described["port"] == served.port.path
         assert described["model"]
 
-    def test_a_silent_device_is_an_error_in_bounded_time(self, bench: SourceBench) -> None:
-        source = bench.open()
-        bench.emulator.faults.add(parse_fault("silent"))
+    def test_a_silent_device_is_an_error_in_bounded_time(self, served: ServedSource) -> None:
+        source = served.open()
+        served.emulator.faults.add(parse_fault("silent"))
         start_s = patient_clock().now_s()
-        with pytest.raises(ReplyTimeout, match=bench.port.path):
+        with pytest.raises(ReplyTimeout, match=served.port.path):
             source.set_light(True)
         assert patient_clock().now_s() - start_s < 3
 
     @pytest.mark.parametrize("fault", ["silent", "garbled", "foreign"])
     @pytest.mark.parametrize("command", [1, 2, 3, 4])
-    def test_one_bad_reply_never_leads_to_a_wrong_state(self, bench: SourceBench, fault: str, command: int) -> None:
-        source = bench.open()
-        counted = bench.emulator.faults.commands
-        bench.emulator.faults.add(parse_fault(f"{fault}@{counted + command}x1"))
+    def test_one_bad_reply_never_leads_to_a_wrong_state(self, served: ServedSource, fault: str, command: int) -> None:
+        source = served.open()
+        counted = served.emulator.faults.commands
+        served.emulator.faults.add(parse_fault(f"{fault}@{counted + command}x1"))
         try:
             source.set_light(True)
         except DeviceError:
             return
-        assert bench.true_light()
+        assert served.true_light()
 
-    def test_another_device_on_the_port_is_named(self, bench: SourceBench) -> None:
-        bench.emulator.faults.add(parse_fault("foreign"))
-        with pytest.raises(DeviceError, match=bench.port.path):
-            bench.open()
+    def test_another_device_on_the_port_is_named(self, served: ServedSource) -> None:
+        served.emulator.faults.add(parse_fault("foreign"))
+        with pytest.raises(DeviceError, match=served.port.path):
+            served.open()
 
-    def test_a_port_in_use_by_another_protocol_is_refused(self, bench: SourceBench) -> None:
-        bench.open()
+    def test_a_port_in_use_by_another_protocol_is_refused(self, served: ServedSource) -> None:
+        served.open()
 
         class Other:
             def close(self) -> None: ...
 
         with pytest.raises(PortBusy):
-            bench.lines.take(bench.port.path, Other, lambda _: Other())
+            served.lines.take(served.port.path, Other, lambda _: Other())

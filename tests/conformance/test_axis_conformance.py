@@ -5,8 +5,8 @@ import pytest
 from drivers.motion import AxisConfig
 from drivers.registry import device_kinds
 from simulators.conformance import AxisConformance, SerialPortConformance, SharedLineConformance
-from simulators.conformance.axis_bench import motion_kinds, serial_kinds
 from simulators.conformance.axis_noise import ROUNDS
+from simulators.conformance.served_axes import motion_kinds, serial_kinds
 from simulators.rig.controller_kinds import axis_configs, served_kinds
 from simulators.serial.serve_options import ServeOptions
 

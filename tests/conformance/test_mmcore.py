@@ -14,9 +14,9 @@ from drivers.errors import CommandRejected, MotionFailed, PortNotFound, SettingR
 from drivers.serial_link import LineRegistry
 from simulators.clock import Clock, patient_clock
 from simulators.conformance import CameraConformance
-from simulators.conformance.axis_bench import FAST, Bench
 from simulators.conformance.axis_promises import AxisPromises
 from simulators.conformance.camera import CameraTwin, Show
+from simulators.conformance.served_axes import FAST, ServedAxes
 from simulators.serial.emulator import EmulatedAxis, Emulator
 from simulators.serial.reply_faults import Fault, FaultSchedule
 
@@ -90,8 +90,8 @@ class NoPort:
 
 
 @contextmanager
-def stage_in(core: Any, homed: bool = True, speed: float = FAST, **options: Any) -> Iterator[Bench]:
-    """A bench whose axis is a stage of the core."""
+def stage_in(core: Any, homed: bool = True, speed: float = FAST, **options: Any) -> Iterator[ServedAxes]:
+    """A stage of the core with the motor behind it."""
     clock = Clock(speed, base=patient_clock())
     low_deg, high_deg = options.get("limits_deg") or (None, None)
     axis = EmulatedAxis(clock, min_deg=low_deg, max_deg=high_deg, homed=homed, start_deg=0.0 if homed else 15.0)
@@ -101,7 +101,7 @@ def stage_in(core: Any, homed: bool = True, speed: float = FAST, **options: Any)
     config = mmcore_axis.Config(device="Rotator", speed_deg_s=300.0, assume_homed=homed)
     try:
         with LineRegistry(clock=patient_clock()) as lines:
-            yield Bench(motor, NoPort(), lines, [config])  # type: ignore[arg-type]
+            yield ServedAxes(motor, NoPort(), lines, [config])  # type: ignore[arg-type]
     finally:
         core.unloadDevice("Rotator")
 
@@ -118,34 +118,34 @@ class TestStageOfTheCore(AxisPromises):
 
 
 def test_a_stuck_stage_a_lost_one_and_an_error_of_its_adapter(core: Any) -> None:
-    with stage_in(core, limits_deg=(-90.0, 90.0)) as bench:
-        axis = bench.open()
+    with stage_in(core, limits_deg=(-90.0, 90.0)) as served:
+        axis = served.open()
         with pytest.raises(CommandRejected, match="out of the travel"):
             axis.start_move(100.0)
-        bench.emulator.faults.add(Fault("stuck"))
+        served.emulator.faults.add(Fault("stuck"))
         with pytest.raises(MotionFailed, match=r"no progress|deadline"):
             axis.start_move(20.0).wait()
-        bench.emulator.faults.clear()
-        bench.emulator.faults.add(Fault("silent"))
+        served.emulator.faults.clear()
+        served.emulator.faults.add(Fault("silent"))
         with pytest.raises(CommandRejected, match="timed out"):
             axis.read_position()
 
 
 def test_units_of_a_stage_are_those_of_the_rig_file(core: Any) -> None:
-    with stage_in(core) as bench:
-        axis = bench.open(units_per_deg=2.5)
+    with stage_in(core) as served:
+        axis = served.open(units_per_deg=2.5)
         assert axis.start_move(-10.0).wait().counts == -25.0
-        assert bench.emulator.true_deg(0) == -25.0
+        assert served.emulator.true_deg(0) == -25.0
 
 
 def test_a_device_that_is_not_there_or_no_stage_is_named(core: Any) -> None:
-    with stage_in(core) as bench:
+    with stage_in(core) as served:
         with pytest.raises(PortNotFound, match="the core holds Rotator"):
-            bench.open(device="Other")
+            served.open(device="Other")
         with pytest.raises(WrongDevice, match="type Core"):
-            bench.open(device="Core")
+            served.open(device="Core")
         with pytest.raises(CommandRejected, match="load /not/there"):
-            bench.open(device="Other", configuration="/not/there.cfg")
+            served.open(device="Other", configuration="/not/there.cfg")
 
 
 class PythonCamera(SimpleCameraDevice):

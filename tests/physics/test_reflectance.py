@@ -11,6 +11,7 @@ from processing.reflectance import fresnel, polarized_diffuse
 from processing.reflectance.base import kinds, load_reflectance, normalized_mueller
 from processing.yaml_file import ConfigError
 from simulators.conformance import ReflectanceConformance
+from simulators.conformance.reflectance import random_geometry
 
 CONSTANTS = {"n": 1.3, "k": 0.08, "a": 0.17, "b": 2.0}
 
@@ -18,16 +19,6 @@ CONSTANTS = {"n": 1.3, "k": 0.08, "a": 0.17, "b": 2.0}
 def model(kind: str):
     constants = CONSTANTS if kind == "polarized_diffuse" else {k: CONSTANTS[k] for k in ("n", "k")}
     return kinds()[kind].model_validate({"kind": kind, "name": "test", "constants": {662: constants}})
-
-
-def geometry(count: int = 300, seed: int = 0) -> ScatteringGeometry:
-    rng = np.random.default_rng(seed)
-    n = unit(rng.normal(size=(count, 3)))
-    sides = []
-    for _ in range(2):
-        v = unit(rng.normal(size=n.shape))
-        sides.append(v * np.sign(np.sum(v * n, axis=-1))[:, None])
-    return ScatteringGeometry(n, *sides)
 
 
 def flat_reflection(theta: float) -> ScatteringGeometry:
@@ -87,7 +78,7 @@ def test_every_model_passes_the_conformance_kit():
 
 
 def test_first_surface_does_not_know_the_normal():
-    g = geometry()
+    g = random_geometry(300)
     other = ScatteringGeometry(np.roll(g.normal, 1, axis=0), g.to_source, g.to_camera)
     np.testing.assert_array_equal(model("first_surface").jones(g, 662), model("first_surface").jones(other, 662))
 
@@ -115,4 +106,4 @@ def test_unknown_kind_key_and_wavelength_are_named(tmp_path: Path, configs: Path
         load_reflectance(bad)
     red = load_reflectance(configs / "materials/red_print.yaml")
     with pytest.raises(ConfigError, match="524"):
-        red.mueller_jones(geometry(2), 524)
+        red.mueller_jones(random_geometry(2), 524)

@@ -5,22 +5,13 @@ import struct
 import numpy as np
 import pytest
 
-from processing.geometry.frames import ScatteringGeometry, cross, unit
+from processing.geometry.frames import cross, unit
 from processing.geometry.rusinkiewicz import Angles, directions
 from processing.reflectance import fresnel, pbsdf
 from processing.reflectance.base import normalized_mueller
 from processing.reflectance.tables import ScatteringTable, TableError
 from processing.storage.tensor_file import TensorFileError, create_tensor_file, read_tensor_file
-
-
-def random_geometry(count: int, seed: int = 0) -> ScatteringGeometry:
-    rng = np.random.default_rng(seed)
-    n = unit(rng.normal(size=(count, 3)))
-    sides = []
-    for _ in range(2):
-        v = unit(rng.normal(size=n.shape))
-        sides.append(v * np.sign(np.sum(v * n, axis=-1))[:, None])
-    return ScatteringGeometry(n, *sides)
+from simulators.conformance.reflectance import random_geometry
 
 
 def test_in_renderer_frames_first_surface_reflection_is_a_plain_fresnel_matrix():

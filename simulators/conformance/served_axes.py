@@ -1,4 +1,4 @@
-"""An emulated axis for the conformance tests: a fast clock, short waits, a port of its own."""
+"""Emulated axes for the conformance tests: a fast clock, short waits, a port of its own."""
 
 from __future__ import annotations
 
@@ -24,10 +24,25 @@ WIDE = (-1000.0, 1000.0)
 FAST = 200.0
 
 
-Served = contextlib.AbstractContextManager["Bench"]
+@dataclass
+class ServedAxes:
+    """An emulator behind a port, and the rig entries that open it."""
+
+    emulator: Emulator
+    port: PtyPort | TcpPort
+    lines: LineRegistry
+    configs: list[AxisConfig]
+
+    def open(self, index: int = 0, **changes: object) -> MotionAxis:
+        """Open an axis with short waits, as the emulator is fast."""
+        config = self.configs[index]
+        short = {"poll_s": 0.002, "margin_s": 0.3, "stall_s": 0.3, "reply_s": 0.25, "pause_before_move_s": 0.0}
+        known = {name: value for name, value in short.items() if name in type(config).model_fields}
+        entry = type(config).model_validate(config.model_dump() | known | changes)
+        return open_axis(f"axis{index}", entry, self.lines)
 
 
-class ServedAxis:
+class AxisTests:
     """What every conformance class of an axis needs: the name under which its emulator is served.
 
     Attributes
@@ -43,36 +58,14 @@ class ServedAxis:
         """The emulator's name; a class for several kinds overrides this by a fixture with parameters."""
         return self.emulator
 
-    def served(self, kind: str, homed: bool = True, speed: float = FAST, **options: object) -> Served:
-        """The emulator, served; overridden where the axis has no wire."""
-        return served(kind, homed, speed, **options)
-
-
-@dataclass
-class Bench:
-    """An emulator behind a port, and the rig entries that open it."""
-
-    emulator: Emulator
-    port: PtyPort | TcpPort
-    lines: LineRegistry
-    configs: list[AxisConfig]
-
-    def open(self, index: int = 0, **changes: object) -> MotionAxis:
-        """Open an axis with short waits, as the emulator is fast."""
-        config = self.configs[index]
-        short = {"poll_s": 0.002, "margin_s": 0.3, "stall_s": 0.3, "reply_s": 0.25, "pause_before_move_s": 0.0}
-        known = {name: value for name, value in short.items() if name in type(config).model_fields}
-        config = config.model_copy(update=known | changes)
-        return open_axis(f"axis{index}", type(config).model_validate(config.model_dump()), self.lines)
-
-
-@contextlib.contextmanager
-def served(kind: str, homed: bool = True, speed: float = FAST, **options: object) -> Iterator[Bench]:
-    """Serve one kind; homed by default, so that a test need not wait for homing."""
-    options = {"limits_deg": WIDE, "faults": FaultSchedule(seed=7)} | options
-    emulator = served_kinds()[kind](ServeOptions(homed=homed, clock=Clock(speed, base=patient_clock()), **options))  # type: ignore[arg-type]
-    with port_for(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
-        yield Bench(emulator, port, lines, axis_configs(emulator, port.path, homed=homed))
+    @contextlib.contextmanager
+    def served(self, kind: str, homed: bool = True, speed: float = FAST, **options: object) -> Iterator[ServedAxes]:
+        """Serve one kind, homed so that a test need not wait for homing; overridden where the axis has no wire."""
+        options = {"limits_deg": WIDE, "faults": FaultSchedule(seed=7)} | options
+        clock = Clock(speed, base=patient_clock())
+        emulator = served_kinds()[kind](ServeOptions(homed=homed, clock=clock, **options))  # type: ignore[arg-type]
+        with port_for(emulator) as port, LineRegistry(clock=patient_clock()) as lines:
+            yield ServedAxes(emulator, port, lines, axis_configs(emulator, port.path, homed=homed))
 
 
 def motion_kinds(axes: int = 1) -> list[str]:
