@@ -61,9 +61,7 @@ def application(folder: Path, token: str) -> Starlette:
         middleware=[Middleware(Guard, token=token)],
         exception_handlers={ProcessError: _refused},
     )
-    library = Library(folder)
-    app.state.pages = Pages(library, f"/{token}", f"/{token}/plotly-{plotly.__version__}.js")
-
+    app.state.pages = Pages(Library(folder), f"/{token}", f"/{token}/plotly-{plotly.__version__}.js")
     return app
 
 

@@ -134,7 +134,7 @@ def read_campaign(folder: Path, library: Library, running: str | None = None) ->
 
 def _entry(path: Path, library: Library) -> Entry | None:
     for there in (path, path.with_name(path.name + PARTIAL)):
-        if there.exists():
+        if library.holds(there):
             return library.entry(library.name(there))
     return None
 

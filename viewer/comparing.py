@@ -19,7 +19,7 @@ from processing.storage.product import LIT_ERRORS, Product, is_product
 from viewer.frames import chosen
 from viewer.pages import Pages, file_of, pages_of
 from viewer.planes import Window, sent
-from viewer.products import MATRICES, maps_of, read_map, units_words
+from viewer.products import MATRICES, maps_of, named, read_map, units_words
 
 #: Errors at the ends of the scale of a difference over its error.
 ERRORS_SHOWN = 5.0
@@ -84,9 +84,9 @@ def _difference(a: Path, b: Path, query: Any) -> Response:
             _same_shape(first.shape, second.shape)
             window = Window.asked(query, first.shape, most=640)
             one, other = (_of_product(product, query, window) for product in (first, second))
-            name = str(query.get("name"))
+            name, index = named(first, query)
             units = "" if name == "mueller" else first.units(name)
-            scale = scale_of("m00" if name == "mueller" and query.get("index") == "0" else name, units, one[0])
+            scale = scale_of("m00" if name == "mueller" and index == 0 else name, units, one[0])
     else:
         with Capture(a) as early, Capture(b) as late:
             _same_shape(early.frame_shape, late.frame_shape)
@@ -118,7 +118,7 @@ def _ends(counts: NDArray[np.float32]) -> tuple[float, float]:
 
 
 def _of_product(product: Product, query: Any, window: Window) -> Measured:
-    name, index = str(query.get("name")), int(query.get("index", 0))
+    name, index = named(product, query)
     if name == "mueller":
         elements, errors = (
             window.every(product.get(dataset, window.rows)).reshape(16, *window.shape).astype(np.float32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import secrets
@@ -12,6 +13,8 @@ from datetime import datetime
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+
+from pydantic import ValidationError
 
 from processing.diagnosis.instrument.residual_file import StoredResidual, read_residuals
 from processing.diagnosis.instrument_file import write_instrument
@@ -88,18 +91,25 @@ class Diagnoses:
         folder = self.folder(name)
         about = read_json(folder / "about.json")
         decided = folder / "decision.json"
+        try:
+            diagnosis = Diagnosis.model_validate_json(read_text(folder / "diagnosis.json"))
+        except ValidationError as error:
+            raise ProcessError(f"diagnosis {name}: this version cannot read it; diagnose anew") from error
         return Story(
             name=name,
-            diagnosis=Diagnosis.model_validate_json(read_text(folder / "diagnosis.json")),
+            diagnosis=diagnosis,
             captures=tuple(about["captures"]),
             decision=read_json(decided) if decided.exists() else None,
             begun=about["begun"],
         )
 
     def of_capture(self, capture: str) -> list[Story]:
-        """Diagnoses that a capture took part in, the newest first."""
-        names = sorted((path.parent.name for path in self._folder.glob("*/diagnosis.json")), reverse=True)
-        return [story for story in map(self.story, names) if capture in story.captures]
+        """Diagnoses that a capture took part in, the newest first; without those that cannot be read."""
+        found = []
+        for path in sorted(self._folder.glob("*/diagnosis.json"), reverse=True):
+            with contextlib.suppress(ProcessError):
+                found.append(self.story(path.parent.name))
+        return [story for story in found if capture in story.captures]
 
     def residuals(self, name: str) -> list[StoredResidual]:
         """Residuals of its captures, before and after."""

@@ -73,7 +73,7 @@ def seen(folder: Path, library: Library) -> dict[str, Any]:
 def _taken(final: Path, library: Library) -> dict[str, Any]:
     """The capture that is being taken, or was just sealed: its file, states done, and the lamp."""
     for path in (final.with_name(final.name + PARTIAL), final):
-        if path.is_file():
+        if library.holds(path):
             with Capture(path) as capture:
                 return {"file": library.name(path), "states": len(capture.done), "lamp": lamp(capture)}
     return {}

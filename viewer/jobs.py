@@ -111,8 +111,12 @@ class Jobs:
 
     def all(self) -> list[Job]:
         """Every job, the newest first."""
-        names = sorted((path.parent.name for path in self._folder.glob("*/job.json")), reverse=True)
-        return [self.job(name) for name in names]
+        found = []
+        for path in sorted(self._folder.glob("*/job.json"), reverse=True):
+            # Just being written, or cut off by a full disc.
+            with contextlib.suppress(ProcessError):
+                found.append(self.job(path.parent.name))
+        return found
 
     def running(self, job: Job) -> bool:
         """Whether its process is still there."""

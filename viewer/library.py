@@ -85,25 +85,27 @@ class Library:
 
     def path(self, name: str) -> Path:
         """The file or folder of that name. Raises NotHere for what is not there, or not inside the folder."""
-        if "\0" in name:
-            raise NotHere("a name with a zero byte leads nowhere")
-        path = (self.root / name).resolve()
-        if not path.is_relative_to(self.root) or not path.exists():
-            raise NotHere(f"{name}: there is no such file in {self.root}")
-        return path
+        try:
+            path = (self.root / name).resolve()
+            if path.is_relative_to(self.root) and path.exists():
+                return path
+        except (OSError, RuntimeError, ValueError):
+            # Too long, a link to itself, a zero byte.
+            pass
+        raise NotHere(f"{name}: there is no such file in {self.root}")
 
     def name(self, path: Path) -> str:
         """Name of a file inside the folder."""
         return path.resolve().relative_to(self.root).as_posix()
 
-    def inside(self, path: Path) -> bool:
-        """Whether a file lies in the folder."""
-        return path.resolve().is_relative_to(self.root)
+    def holds(self, path: Path) -> bool:
+        """Whether there is a file of that path and it lies in the folder; a link is what it leads to."""
+        return path.is_file() and path.resolve().is_relative_to(self.root)
 
     def entries(self) -> list[Entry]:
         """Every HDF5 file, newest first."""
         with self._lock:
-            found = [self._entry(path) for path in self._files()]
+            found = [self._entry(path) for path in self._files(".h5", f".h5{PARTIAL}")]
         return sorted((e for e in found if e is not None), key=lambda e: (-e.changed_s, e.name))
 
     def entry(self, name: str) -> Entry:
@@ -123,11 +125,9 @@ class Library:
         """Configuration files that say they are of this kind."""
         mark = f"kind: {kind}"
         found = []
-        for folder, _, files in self._walk():
-            for name in sorted(files):
-                path = Path(folder) / name
-                if path.suffix == ".yaml" and path.stat().st_size < 1 << 20 and mark in _lines(path):
-                    found.append(path)
+        for path in self._files(".yaml"):
+            if path.stat().st_size < 1 << 20 and mark in _lines(path):
+                found.append(path)
         return found
 
     def _walk(self) -> Iterator[tuple[str, list[str], list[str]]]:
@@ -135,11 +135,11 @@ class Library:
             folders[:] = sorted(f for f in folders if not f.startswith("."))
             yield folder, folders, files
 
-    def _files(self) -> Iterator[Path]:
+    def _files(self, *endings: str) -> Iterator[Path]:
         for folder, _, files in self._walk():
-            for name in files:
-                if name.endswith((".h5", f".h5{PARTIAL}")):
-                    yield Path(folder) / name
+            for name in sorted(files):
+                if name.endswith(endings) and self.holds(path := Path(folder) / name):
+                    yield path
 
     def _entry(self, path: Path) -> Entry | None:
         try:
@@ -151,6 +151,8 @@ class Library:
             return self._known[path][1]
         common: dict[str, Any] = {"name": self.name(path), "changed_s": stat.st_mtime, "size": stat.st_size}
         try:
+            if not _is_utf8(common["name"]):
+                raise ProcessError("its name is not UTF-8, so no page can ask for it; give it another")
             entry = _read(path, common)
         except ProcessError as error:
             entry = Entry(**common, kind="unreadable", status="failed", flags=(str(error),))
@@ -222,6 +224,14 @@ def made_into(entry: Entry, entries: list[Entry], root: Path) -> list[Entry]:
 
 def _changed_s(folder: Path) -> float:
     return max((path.stat().st_mtime for path in folder.iterdir() if path.is_file()), default=0.0)
+
+
+def _is_utf8(name: str) -> bool:
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _lines(path: Path) -> set[str]:

@@ -47,11 +47,12 @@ class Pages:
     def draw(self, template: str, *, simulated: bool = False, code: int = 200, **values: Any) -> HTMLResponse:
         """A page; `simulated` puts the banner on it."""
         text = self._templates.get_template(template).render(simulated=simulated, **values)
-        return HTMLResponse(text, code)
+        # Bytes of file names that are not UTF-8 become question marks.
+        return HTMLResponse(text.encode(errors="replace"), code)
 
     def address(self, what: str, **query: object) -> str:
         """Address of a page or a picture, with what it is asked."""
-        asked = urlencode({key: value for key, value in query.items() if value is not None})
+        asked = urlencode({key: v for key, v in query.items() if v is not None}, errors="surrogateescape")
         return f"{self.root}/{what}" + (f"?{asked}" if asked else "")
 
     def shown_at(self, entry: Entry) -> str | None:

@@ -94,12 +94,3 @@ def sent(window: Window, image: NDArray[Any], **facts: Any) -> Response:
     }
     body = np.ascontiguousarray(image, dtype="<f4").tobytes()
     return Response(body, media_type="application/octet-stream", headers={"X-Plane": json.dumps(told)})
-
-
-def limits(values: NDArray[Any], percent: float = 99.5) -> tuple[float, float]:
-    """What a scale shows: from 100 - percent to percent of the finite values; 0 to 1 where there are none."""
-    finite = values[np.isfinite(values)]
-    if not finite.size:
-        return 0.0, 1.0
-    low, high = np.percentile(finite, [100 - percent, percent])
-    return float(low), float(high)

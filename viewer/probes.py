@@ -126,6 +126,6 @@ def capture_of(product: Product, library: Library) -> tuple[Path, Path | None] |
     inputs = {str(i.get("role")): Path(str(i.get("path"))) for i in reductions[0].inputs}
     path = inputs.get("capture")
     instrument = inputs.get("instrument")
-    if path is None or not path.exists() or not library.inside(path):
+    if path is None or not library.holds(path):
         return None
     return path, instrument if instrument is not None and instrument.exists() else None

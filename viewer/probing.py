@@ -72,8 +72,8 @@ def raw_curve(capture: Capture, region: Region, channel: int) -> dict[str, Any]:
         "where": str(region),
         "state": capture.done.tolist(),
         "role": list(capture.role),
-        "counts": [float(c.mean()) for c in counts],
-        "spread": [float(c.std()) for c in counts] if region.pixels > 1 else None,
+        "counts": finite([c.mean() for c in counts]),
+        "spread": finite([c.std() for c in counts]) if region.pixels > 1 else None,
         "saturated": [bool(top is not None and c.max() >= top) for c in counts],
     }
 

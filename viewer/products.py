@@ -85,7 +85,7 @@ async def plane(request: Request) -> Response:
 
 def _plane(path: Path, query: Any) -> Response:
     with Product(path) as opened:
-        name, index = _named(opened, query)
+        name, index = named(opened, query)
         window = Window.asked(query, opened.shape)
         values = read_map(opened, name, index, window)
         scale = scale_of(name, opened.units(name), values)
@@ -103,7 +103,8 @@ def read_map(opened: Product, name: str, index: int, window: Window) -> NDArray[
     return np.asarray(values)
 
 
-def _named(opened: Product, query: Any) -> tuple[str, int]:
+def named(opened: Product, query: Any) -> tuple[str, int]:
+    """Dataset and element of it that a request asks for. Raises ProcessError."""
     name = str(query.get("name", ""))
     if query.get("errors") and f"{name}_errors" in opened.names:
         name = f"{name}_errors"

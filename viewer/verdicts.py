@@ -10,9 +10,11 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response
 
 from processing.diagnosis.instrument.residual_file import MOMENTS, StoredResidual
+from processing.doors import require_file
 from processing.errors import ProcessError
 from processing.reports.colours import ALL, PLAIN, SIGNED, steps
 from viewer.diagnoses import VERDICTS, Diagnoses
+from viewer.library import NotHere
 from viewer.pages import fields_of, pages_of
 from viewer.planes import Window, sent
 from viewer.probing import Region, finite
@@ -123,4 +125,5 @@ async def decide(request: Request) -> JSONResponse:
 async def report(request: Request) -> Response:
     """The report of the diagnosis as `diagnose --report` writes it."""
     path = diagnoses_of(request).folder(request.query_params.get("name", "")) / "report.html"
+    require_file(path, NotHere)
     return FileResponse(path, media_type="text/html")

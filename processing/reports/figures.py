@@ -175,5 +175,5 @@ def _sent_figure(product: Product) -> Figure:
             shown = np.where(lit, stokes[k] / stokes[0], np.nan)
             if np.isfinite(shown).any():
                 limit = max(percentile(np.abs(shown), 99.5), 1e-6)
-                panels.append((f"$S_{k} / S_0$", shown, {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}))
+                panels.append((f"$S_{k} / S_0$", shown, {"cmap": SIGNED, "vmin": -limit, "vmax": limit}))
     return grid_figure(panels, _title(product), product.simulated)

@@ -84,6 +84,6 @@ def _partial_figure(product: Product, title: str) -> Figure:
             panels.append((name.replace("_", " "), shown, CYCLIC))
         else:
             signed = max(percentile(np.abs(shown), 99), 1e-6)
-            diverging = {"cmap": "RdBu_r", "vmin": -signed, "vmax": signed}
+            diverging = {"cmap": SIGNED, "vmin": -signed, "vmax": signed}
             panels.append((name.replace("_", " "), shown, diverging if name.endswith("circular") else {"vmin": 0}))
     return grid_figure(panels, title, product.simulated)

@@ -124,3 +124,12 @@ def test_a_probe_outside_the_image_is_refused(client, drr_capture):
     drr_capture("one.h5")
     for asked in ({"x0": 16, "y0": 0}, {"x0": 5, "y0": 3, "x1": 5, "y1": 9}, {"x0": 1}, {"x0": 0, "y0": -1}):
         assert client.get("/curve", params={"file": "one.h5", **asked}).status_code == 422
+
+
+def test_counts_that_are_none_are_told_as_unknown(client, synthetic_capture):
+    frames = np.full((2, 1, 6, 8), 100, np.float32)
+    frames[1, 0, 2, 3] = np.nan
+    synthetic_capture(frames, {}, name="lab/float.h5")
+    answer = client.get("/curve", params={"file": "float.h5", "x0": 3, "y0": 2})
+    assert answer.status_code == 200
+    assert answer.json()["counts"] == [100, None]

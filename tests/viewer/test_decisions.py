@@ -89,3 +89,14 @@ def test_a_diagnosis_begins_with_a_copy_of_its_model(lab, diagnosed, configs):
     assert json.loads((diagnoses.folder(diagnosed) / "about.json").read_text())["captures"] == ["one.h5"]
     with pytest.raises(NotHere):
         diagnoses.folder("../jobs")
+
+
+def test_a_diagnosis_that_cannot_be_read_takes_no_other_page_away(lab, client, diagnosed):
+    (Diagnoses(Library(lab)).folder(diagnosed) / "diagnosis.json").write_text('{"verdict": "of another version"}')
+    answer = client.get("/diagnosis", params={"name": diagnosed})
+    assert (answer.status_code, "diagnose anew" in answer.text) == (422, True)
+    assert client.get("/capture", params={"file": "one.h5"}).status_code == 200
+
+
+def test_a_report_that_is_not_there_is_said_to_be_missing(client, diagnosed):
+    assert client.get("/diagnosis-report", params={"name": diagnosed}).status_code == 404

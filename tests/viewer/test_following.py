@@ -206,6 +206,13 @@ def test_nothing_else_is_started(lab, client, drr_capture, asked):
     assert Jobs(lab).all() == []
 
 
+def test_a_job_that_was_cut_off_takes_no_page_away(lab, client):
+    folder = lab / ".umov-view" / "jobs" / "1"
+    folder.mkdir(parents=True)
+    (folder / "job.json").write_text('{"name": "1", "ti')
+    assert client.get("/").status_code == 200
+
+
 @pytest.mark.parametrize("name", ["", "..", "../../x", "nothing"])
 def test_a_job_or_a_diagnosis_that_is_not_there(client, name):
     for what in ("job", "diagnosis", "diagnosis-report", "residual-map"):

@@ -1,5 +1,8 @@
 """Only a browser on this machine that was given the whole address is answered, and no page of another site."""
 
+import os
+from pathlib import Path
+
 import pytest
 from starlette.testclient import TestClient
 
@@ -31,7 +34,7 @@ def test_this_machine_is_let_in_also_through_a_tunnel(lab, host):
     assert browser(lab).get(f"/{TOKEN}/", headers={"host": host}).status_code == 200
 
 
-@pytest.mark.parametrize("origin", [None, "http://evil.example", "http://127.0.0.1:9999", "null"])
+@pytest.mark.parametrize("origin", [None, "http://evil.example", "http://127.0.0.1:9999", "http://[", "null"])
 def test_no_other_page_changes_anything(lab, origin):
     headers = {} if origin is None else {"origin": origin}
     assert browser(lab).post(f"/{TOKEN}/stop", headers=headers).status_code == 403
@@ -52,11 +55,44 @@ def test_pages_take_nothing_from_elsewhere_and_tell_nobody_where_they_are(lab):
     assert headers["cache-control"] == "no-store"
 
 
-@pytest.mark.parametrize("name", ["../secret.h5", "/etc/passwd", "link.h5", "nothing.h5", "one.h5\0"])
+@pytest.mark.parametrize(
+    "name", ["../secret.h5", "/etc/passwd", "link.h5", "loop.h5", "nothing.h5", "one.h5\0", "x" * 300]
+)
 def test_nothing_outside_the_folder_is_read(lab, name):
     (lab.parent / "secret.h5").write_bytes(b"secret")
     (lab / "link.h5").symlink_to(lab.parent / "secret.h5")
+    (lab / "loop.h5").symlink_to("loop.h5")
     for what in ("capture", "frame", "histogram", "curve"):
         answer = browser(lab).get(f"/{TOKEN}/{what}", params={"file": name})
         assert answer.status_code == 404
         assert "HDF5" not in answer.text
+
+
+def test_links_that_lead_out_or_nowhere_are_not_listed(lab):
+    (lab.parent / "secret.h5").write_bytes(b"secret")
+    (lab.parent / "secret.yaml").write_text("kind: campaign\n")
+    for name, target in (("out.h5", "../secret.h5"), ("out.yaml", "../secret.yaml"), ("gone.yaml", "nothing.yaml")):
+        (lab / name).symlink_to(target)
+    answer = browser(lab).get(f"/{TOKEN}/")
+    assert answer.status_code == 200
+    assert "out." not in answer.text
+    assert "gone.yaml" not in answer.text
+
+
+def test_a_campaign_that_names_files_elsewhere_shows_none_of_them(lab):
+    (lab.parent / "secret.h5").write_bytes(b"secret")
+    (lab / "night").mkdir()
+    (lab / "night" / "identity.json").write_text('{"plan": {"../../secret.h5": {}}}')
+    answer = browser(lab).get(f"/{TOKEN}/campaign", params={"folder": "night"})
+    assert answer.status_code == 200
+    assert "0 of 1" in answer.text
+    assert "file=" not in answer.text
+
+
+def test_a_name_is_text_of_the_page_and_nothing_else(lab):
+    (lab / "<img src=x onerror=alert(1)>.h5").write_bytes(b"no HDF5")
+    (Path(os.fsdecode(os.fsencode(lab) + b"/m\xfcde.h5"))).write_bytes(b"no HDF5")
+    page = browser(lab).get(f"/{TOKEN}/")
+    assert page.status_code == 200
+    assert "<img src=x" not in page.text
+    assert "its name is not UTF-8" in page.text

@@ -91,13 +91,15 @@ def test_a_pixel_of_a_product_leads_back_to_its_intensities(client, products):
 
 def test_what_differs_by_noise_alone_is_one_error_apart(client, drr_capture):
     drr_capture("one.h5")
-    drr_capture("two.h5", seed_of_noise=2, mueller=np.diag([1.0, 0.6, 0.4, 0.3]))
+    drr_capture("two.h5", seed_of_noise=2)
     for name in ("one", "two"):
         assert client.get("/capture", params={"file": f"{name}.h5"}).status_code == 200
     dark = {"a": "one.h5", "b": "two.h5", "state": 0}
     (a, b, apart, _), told = plane(client.get("/difference", params=dark))
     np.testing.assert_allclose(apart, a - b)
     assert told["rms"] == 0
+    _, told = plane(client.get("/difference", params={**dark, "state": 10}))
+    assert told["rms_over"] == pytest.approx(1, abs=0.2)
 
 
 def test_two_products_of_the_same_scene_differ_by_their_errors(client, lab, drr_capture):
@@ -110,6 +112,12 @@ def test_two_products_of_the_same_scene_differ_by_their_errors(client, lab, drr_
     assert same["rms_over"] == pytest.approx(1, abs=0.2)
     assert np.median(apart) == pytest.approx(-0.1, abs=0.01)
     assert other["rms_over"] > 2
+
+
+@pytest.mark.parametrize("asked", [{"index": 16}, {"index": "x"}, {"name": "nothing"}, {"name": ""}])
+def test_a_map_that_is_not_there_is_not_compared(client, products, asked):
+    both = {"a": "one.mueller.h5", "b": "one.mueller.h5", "name": "mueller"}
+    assert client.get("/difference", params=both | asked).status_code == 422
 
 
 def test_a_capture_and_a_product_are_not_compared(client, products):
