@@ -90,7 +90,7 @@ class SimulatedBench:
         self.seed = seed
         self.effects = tuple(effects)
         self.state_period_s = state_period_s
-        self._scene_key: tuple[float, float, int] | None = None
+        self._scene_key: tuple[float, float] | None = None
         self.put(scene, instrument, wavelength_nm)
 
     def put(self, scene: SceneImage, instrument: InstrumentModel, wavelength_nm: float) -> None:
@@ -102,8 +102,7 @@ class SimulatedBench:
 
     def look(self, omega_deg: float) -> None:
         """Compute the scene for an arm angle ahead of the exposures there."""
-        beams = self.instrument.beams
-        self._planes(omega_deg, self.columns // len(beams) if beams else self.columns)
+        self._planes(omega_deg)
 
     def expose(
         self,
@@ -181,11 +180,10 @@ class SimulatedBench:
         return image, shot
 
     def _render(self, image: Image, weights: NDArray[np.float32], model: InstrumentModel, omega_deg: float) -> None:
-        columns = self.columns // len(model.beams) if model.beams else self.columns
-        planes = self._planes(omega_deg, columns)
+        planes = self._planes(omega_deg)
         if model.mosaic is None:
             # One camera, or beams side by side on one, are strips of its frame.
-            stack = image if image.ndim == 3 else np.hsplit(image, self.columns // columns)
+            stack = image if image.ndim == 3 else np.hsplit(image, self.columns // planes.shape[-1])
             for channel, row in zip(stack, weights, strict=True):
                 _add_product(channel, row, planes)
             return
@@ -196,9 +194,11 @@ class SimulatedBench:
                 pixels = (slice(r, None, height), slice(c, None, width))
                 _add_product(image[pixels], weights[names.index(name)], planes[(slice(None), *pixels)])
 
-    def _planes(self, omega_deg: float, columns: int) -> NDArray[np.float32]:
-        """Scene as (16, rows, columns), computed anew when the arm has moved by more than a hundredth of a degree."""
-        key = (round(omega_deg, 2), self.wavelength_nm, columns)
+    def _planes(self, omega_deg: float) -> NDArray[np.float32]:
+        """Scene as (16, rows, columns of a beam), computed anew when the arm has moved by more than 0.01 degrees."""
+        beams = self.instrument.beams
+        columns = self.columns // len(beams) if beams else self.columns
+        key = (round(omega_deg, 2), self.wavelength_nm)
         if key != self._scene_key:
             mueller = self.scene.mueller_image(key[0], self.wavelength_nm, self.rows, columns)
             flat = np.asarray(mueller, dtype=np.float32).reshape(self.rows, columns, 16)

@@ -29,7 +29,6 @@ PACKET_DELAY = 0x4054
 CHUNK_MODE, CHUNK_TIMESTAMP_ENABLE = 0x4058, 0x405C
 # Behind the image: its number and length, and a time stamp of 8 bytes with the same.
 CHUNK_BYTES = 8 + 8 + 8
-# Number of the chunk with the time stamp.
 TIMESTAMP_CHUNK = 0xFF5A0001
 # Texts of the GigE Vision bootstrap registers, 32 bytes each.
 VENDOR_NAME, MODEL_NAME = 0x48, 0x68

@@ -56,6 +56,11 @@ class CameraTwin(Protocol):
         """Lose this share of what it sends, 0 to 1, from the exposure on that starts now."""
 
 
+def pixel_source(show: Show) -> Callable[[ExposureInfo], NDArray[np.uint16]]:
+    """What a simulated GigE Vision camera takes its counts from."""
+    return lambda info: show(info.width, info.height, info.exposure_s)
+
+
 class GigeTwin:
     """The GigE Vision camera on loopback, for drivers that speak that protocol.
 
@@ -77,10 +82,7 @@ class GigeTwin:
         self.size = (128, 64)
         self.bits = 12
 
-        def source(info: ExposureInfo) -> NDArray[np.uint16]:
-            return show(info.width, info.height, info.exposure_s)
-
-        self._camera = GigeCamera("TWIN-1", *self.size, source, bits=self.bits, description=description)
+        self._camera = GigeCamera("TWIN-1", *self.size, pixel_source(show), bits=self.bits, description=description)
 
     def start(self) -> None:
         """Start the camera."""

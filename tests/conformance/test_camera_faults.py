@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -17,28 +17,11 @@ from drivers.camera import CameraSettings
 from drivers.cameras import aravis
 from drivers.errors import CameraError, FrameLost
 from simulators.camera.gige_camera import ExposureInfo, GigeCamera
-from simulators.camera.pixel_stamp import read_stamp, stamp
+from simulators.camera.pixel_stamp import read_stamp
 from simulators.clock import patient_clock
+from simulators.conformance.camera import Scene, pixel_source
 
 SIZE = (128, 64)
-
-
-class Scene:
-    """What the camera sees: its own exposure number, exposure time and an angle that the test turns."""
-
-    def __init__(self) -> None:
-        self.angle_deg = 0.0
-        self.exposures = 0
-        self.before: Callable[[int], None] = lambda _: None
-
-    def __call__(self, info: ExposureInfo) -> NDArray[np.uint16]:
-        number = self.exposures + 1
-        self.before(number)
-        # The rest of the picture changes too: memory that was not filled again would show the frame before.
-        pixels = np.full((info.height, info.width), 100 + number, np.uint16)
-        stamp(pixels, [self.angle_deg, info.exposure_s, number])
-        self.exposures = number
-        return pixels
 
 
 def expose_unasked(simulated: GigeCamera, scene: Scene) -> None:
@@ -57,7 +40,7 @@ def scene() -> Scene:
 
 @pytest.fixture
 def simulated(scene: Scene) -> Iterator[GigeCamera]:
-    with GigeCamera("FAULT1", *SIZE, scene) as camera:
+    with GigeCamera("FAULT1", *SIZE, pixel_source(scene)) as camera:
         yield camera
 
 
@@ -155,12 +138,12 @@ def test_ctrl_c_gets_through_a_long_wait(simulated: GigeCamera) -> None:
 
 def test_an_address_holds_one_simulated_camera(simulated: GigeCamera) -> None:
     with pytest.raises(CameraError, match="another camera had it"):
-        GigeCamera("FAULT4", *SIZE, Scene(), wait_s=0.1).start()
+        GigeCamera("FAULT4", *SIZE, pixel_source(Scene()), wait_s=0.1).start()
 
 
 def test_an_address_that_no_interface_has_is_named() -> None:
     with pytest.raises(CameraError, match=r"ip addr add 127\.9\.9\.9"):
-        GigeCamera("FAULT5", *SIZE, Scene(), address="127.9.9.9").start()
+        GigeCamera("FAULT5", *SIZE, pixel_source(Scene()), address="127.9.9.9").start()
 
 
 def test_an_error_of_the_pixel_source_is_raised_and_its_frame_not_sent() -> None:

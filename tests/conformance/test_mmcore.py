@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from drivers.axes import mmcore as mmcore_axis
 from drivers.camera import CameraSettings
-from drivers.errors import CommandRejected, MotionFailed, PortNotFound, SettingRefused, WrongDevice
+from drivers.errors import CommandRejected, FrameLost, MotionFailed, PortNotFound, SettingRefused, WrongDevice
 from drivers.serial_link import LineRegistry
 from simulators.clock import Clock, patient_clock
 from simulators.conformance import CameraConformance
@@ -233,5 +233,5 @@ class TestCameraOfTheCore(CameraConformance):
     def test_counts_beyond_the_bits_of_the_rig_file_are_no_frame(self, twin: CameraTwin) -> None:
         with self.open(twin.entry | {"bits": 8, "retakes": 0}) as camera:
             camera.configure(CameraSettings(exposure_s=1e-3))
-            with pytest.raises(Exception, match="more than 8 bits"):
+            with pytest.raises(FrameLost, match="more than 8 bits"):
                 camera.capture()

@@ -84,18 +84,16 @@ def test_zaber_exchange_sorts_out_what_is_not_its_reply() -> None:
         line.close()
 
 
+def elliptec_after(*pairs: tuple[bytes, bytes]) -> list[tuple[bytes, bytes]]:
+    """The exchanges of opening a module, whose identification was recorded from a real mount, then these."""
+    opening = (b"0in", b"0IN0E1140050920201501016800023000\r\n"), (b"0gv", b"0GV64\r\n")
+    return [*[pair for pair in opening for _ in range(2)], *pairs]
+
+
 def test_elliptec_real_captures() -> None:
-    # The identification and the position are captures of real mounts (fact sheet, cap1 and cap2).
-    pairs = [
-        (b"0in", b"0IN0E1140050920201501016800023000\r\n"),
-        (b"0in", b"0IN0E1140050920201501016800023000\r\n"),
-        (b"0gv", b"0GV64\r\n"),
-        (b"0gv", b"0GV64\r\n"),
-        (b"0gp", b"0POFFFFDA9C\r\n"),
-        (b"0gp", b"0POFFFFDA9C\r\n"),
-        (b"0gs", b"0GS09\r\n"),
-        (b"0gs", b"0GS0D\r\n"),
-    ]
+    # The position, too, is a recording of a real mount.
+    position = (b"0gp", b"0POFFFFDA9C\r\n")
+    pairs = elliptec_after(position, position, (b"0gs", b"0GS09\r\n"), (b"0gs", b"0GS0D\r\n"))
     with scripted(*pairs) as path, LineRegistry(clock=patient_clock()) as lines:
         axis = elliptec.open("psg", elliptec.Config(port=path, address="0", serial_number="11400509"), lines)
         assert axis.counts_per_deg == pytest.approx(398.22, abs=0.01)
@@ -116,16 +114,16 @@ def test_elliptec_move_bytes() -> None:
         line.close()
 
 
+def smc100_after(*pairs: tuple[bytes, bytes]) -> list[tuple[bytes, bytes]]:
+    """The exchanges of opening a CONEX, then these."""
+    values = (b"VA?", b"20"), (b"AC?", b"80"), (b"SL?", b"0"), (b"SR?", b"90")
+    constants = [(b"1%b\r\n" % name, b"1%b%b\r\n" % (name[:2], value)) for name, value in values]
+    opening = (b"1VE\r\n", b"1VE CONEX-CC 2.0.1\r\n"), (b"1ID?\r\n", b"1IDPR50CC\r\n")
+    return [*opening, *[pair for pair in constants for _ in range(2)], *pairs]
+
+
 def test_smc100_open_and_refusals() -> None:
-    opening = [
-        (b"1VE\r\n", b"1VE CONEX-CC 2.0.1\r\n"),
-        (b"1ID?\r\n", b"1IDPR50CC\r\n"),
-        *[(b"1VA?\r\n", b"1VA20\r\n")] * 2,
-        *[(b"1AC?\r\n", b"1AC80\r\n")] * 2,
-        *[(b"1SL?\r\n", b"1SL0\r\n")] * 2,
-        *[(b"1SR?\r\n", b"1SR90\r\n")] * 2,
-    ]
-    moving = [
+    pairs = smc100_after(
         (b"1TS\r\n", b"1TS000032\r\n"),
         (b"1TS\r\n", b"1TS000032\r\n"),
         (b"1TP\r\n", b"1TP12.34500\r\n"),
@@ -135,8 +133,8 @@ def test_smc100_open_and_refusals() -> None:
         (b"1TE\r\n", b"1TEH\r\n"),
         (b"1ST\r\n", b""),
         (b"1TS\r\n", b"1TS010033\r\n"),
-    ]
-    with scripted(*opening, *moving) as path, LineRegistry(clock=patient_clock()) as lines:
+    )
+    with scripted(*pairs) as path, LineRegistry(clock=patient_clock()) as lines:
         arm = smc100.open("arm", smc100.Config(port=path, stage_id="PR50"), lines)
         assert arm.describe().firmware == "2.0.1"
         assert (arm.speed_deg_s, arm.acceleration_deg_s2, arm.limits.max_deg) == (20.0, 80.0, 90.0)
@@ -148,26 +146,20 @@ def test_smc100_open_and_refusals() -> None:
             arm._do_check_fault()
 
 
-def smc100_after(*states: bytes) -> tuple[tuple[bytes, bytes], ...]:
-    """The exchanges of opening a CONEX, then one `TS` for each of these replies."""
-    values = (b"VA?", b"20"), (b"AC?", b"80"), (b"SL?", b"0"), (b"SR?", b"90")
-    constants = [(b"1%b\r\n" % name, b"1%b%b\r\n" % (name[:2], value)) for name, value in values]
-    return (
-        (b"1VE\r\n", b"1VE CONEX-CC 2.0.1\r\n"),
-        (b"1ID?\r\n", b"1IDPR50CC\r\n"),
-        *[pair for pair in constants for _ in range(2)],
-        *[(b"1TS\r\n", b"1TS%b\r\n" % state) for state in states],
-    )
-
-
 def test_smc100_asks_again_for_a_state_that_there_is_not() -> None:
     # 0x29 is no state: a reply of the right form with one digit changed.
-    with scripted(*smc100_after(b"000029", b"000028")) as path, LineRegistry(clock=patient_clock()) as lines:
+    with (
+        scripted(*smc100_after((b"1TS\r\n", b"1TS000029\r\n"), (b"1TS\r\n", b"1TS000028\r\n"))) as path,
+        LineRegistry(clock=patient_clock()) as lines,
+    ):
         assert smc100.open("arm", smc100.Config(port=path), lines).is_moving()
 
 
 def test_smc100_does_not_guess_a_state_that_stays_unknown() -> None:
-    with scripted(*smc100_after(b"000029", b"000029")) as path, LineRegistry(clock=patient_clock()) as lines:
+    with (
+        scripted(*smc100_after((b"1TS\r\n", b"1TS000029\r\n"), (b"1TS\r\n", b"1TS000029\r\n"))) as path,
+        LineRegistry(clock=patient_clock()) as lines,
+    ):
         arm = smc100.open("arm", smc100.Config(port=path), lines)
         with pytest.raises(ReplyError, match="unknown state 000029"):
             arm.is_moving()
@@ -289,27 +281,19 @@ def test_framers_take_any_bytes_and_keep_little(pieces: list[bytes]) -> None:
 
 def test_elliptec_end_message_just_before_the_status_still_proves_the_homing() -> None:
     # The module's end of homing arrives between the question for its status and the answer to it.
-    opening = [
-        *[(b"0in", b"0IN0E1140050920201501016800023000\r\n")] * 2,
-        *[(b"0gv", b"0GV64\r\n")] * 2,
+    pairs = elliptec_after(
         (b"0gs", b"0GS00\r\n"),
         (b"0ho0", b""),
         (b"0gs", b"0PO00000000\r\n0GS00\r\n"),
-        *[(b"0gs", b"0GS00\r\n")] * 1,
+        (b"0gs", b"0GS00\r\n"),
         *[(b"0gp", b"0PO00000000\r\n")] * 2,
         (b"0gs", b"0GS00\r\n"),
         *[(b"0gp", b"0PO00000000\r\n")] * 2,
-    ]
-    with scripted(*opening) as path, LineRegistry(clock=patient_clock()) as lines:
+    )
+    with scripted(*pairs) as path, LineRegistry(clock=patient_clock()) as lines:
         config = elliptec.Config(port=path, address="0", pause_before_move_s=0.0)
         axis = elliptec.open("psg", config, lines)
         assert axis.home().wait().counts == 0
-
-
-def elliptec_after(*pairs: tuple[bytes, bytes]) -> list[tuple[bytes, bytes]]:
-    """The exchanges of opening a module, then these."""
-    opening = (b"0in", b"0IN0E1140050920201501016800023000\r\n"), (b"0gv", b"0GV64\r\n")
-    return [*[pair for pair in opening for _ in range(2)], *pairs]
 
 
 def test_the_status_that_answers_a_stop_of_an_elliptec_is_no_answer_to_a_question() -> None:
