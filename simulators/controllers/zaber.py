@@ -1,6 +1,6 @@
 """Zaber ASCII devices on one daisy chain (firmware 6/7), as far as the public protocol sheet tells.
 
-The words of the rejections and the unit of speed and acceleration follow the fact sheet, which marks them unverified.
+Unverified on hardware: the words of the rejections, the unit of speed and acceleration.
 """
 
 from __future__ import annotations
