@@ -80,6 +80,20 @@ def small_rig(configs: Path, tmp_path: Path) -> Callable[..., Path]:
 
 
 @pytest.fixture
+def dim_instrument(configs: Path, tmp_path: Path) -> Path:
+    """The default rig's Mueller polarimeter with a tenth of the light: a truth that is not what is declared."""
+    from processing.instrument.model import InstrumentModel
+    from processing.yaml_file import dump_yaml
+
+    declared = InstrumentModel.load(configs / "instruments" / "rgb950.yaml")
+    (channel,) = declared.channels
+    path = tmp_path / "dim.yaml"
+    dim = channel.model_copy(update={"gain": 0.1 * channel.gain})
+    path.write_text(dump_yaml(declared.model_copy(update={"channels": (dim,)})))
+    return path
+
+
+@pytest.fixture
 def acquire(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., tuple[int, str, str]]:
     """Runs `acquire` in this process; returns exit code, standard output and standard error."""
     from acquisition.commands.application import main

@@ -8,7 +8,6 @@ import numpy as np
 
 from acquisition.bluesky_devices.device import Device, Readings, data_key, readings
 from acquisition.bluesky_devices.status import Status, in_background
-from processing.instrument.model import InstrumentModel
 
 
 class AxisDevice(Device):
@@ -62,11 +61,7 @@ class CameraDevice(Device):
     def stage(self) -> list[Device]:
         """Set the exposure, let light through."""
         with self.turn:
-            config = self.rig.config
-            if self.rig.simulation is not None and config.simulator is not None:
-                mode, declared = next(iter(config.modes.items()))
-                model = InstrumentModel.load(config.simulator.truth.get(mode, declared.instrument))
-                self.rig.simulation.prepare(self.sample, model, config.wavelengths_nm[0])
+            self.rig.show(self.sample)
             self.rig.set_exposure(self.exposure_s, 1)
             if self.rig.source is not None:
                 self.rig.source.set_light(True)

@@ -20,9 +20,10 @@ from acquisition.errors import AcquisitionError
 from acquisition.rig.rig import Rig
 from acquisition.stop_request import StopRequest
 from processing.storage.capture import Capture
+from processing.storage.capture_schema import COLUMN_UNITS
 
-#: What a capture says of each of its states, beside the angles: column of the file, and its unit.
-COLUMNS = {"exposure_s": "s", "host_time_s": "s", "monitor": "count/s", "saturated_fraction": ""}
+#: Columns of the file that tell of each state, beside the angles.
+COLUMNS = ("exposure_s", "host_time_s", "monitor", "saturated_fraction")
 
 
 class CaptureDevice(Device):
@@ -119,7 +120,7 @@ class CaptureDevice(Device):
         keys = {f"{self.name}_file": {"source": "capture file", "dtype": "string", "shape": []}}
         for axis in self._job.table.angles_deg:
             keys[f"{self.name}_{axis}_deg"] = data_key(f"axis {axis}, as read back in each state", states, "degree")
-        keys |= {f"{self.name}_{column}": data_key(column, states, unit) for column, unit in COLUMNS.items()}
+        keys |= {f"{self.name}_{c}": data_key(c, states, COLUMN_UNITS.get(c, "")) for c in COLUMNS}
         settings = self.rig.require_camera().settings
         frames = data_key("counts", (*states, 1, settings.height or 0, settings.width or 0), "count")
         return keys | {f"{self.name}_frames": frames | {"external": "STREAM:", "dtype_numpy": "<u2"}}

@@ -13,7 +13,6 @@ from acquisition.errors import AcquisitionError
 from acquisition.rig.config import RigConfig
 from acquisition.rig.rig import Rig
 from drivers.camera import CameraSettings
-from processing.instrument.model import InstrumentModel
 from processing.yaml_file import ConfigError
 
 #: Kinds of files: one to look at, and those that hold the counts.
@@ -46,9 +45,7 @@ def take_frame(
     if config.simulated:
         out = out.with_name(f"{out.stem}.simulated{out.suffix}")
     with Rig(config, ask=typer.confirm) as rig:
-        if rig.simulation is not None:
-            model = InstrumentModel.load(next(iter(config.modes.values())).instrument)
-            rig.simulation.prepare(sample, model, wavelength_nm or config.wavelengths_nm[0])
+        rig.show(sample, wavelength_nm)
         before = rig.source.is_on() if rig.source is not None else None
         camera = rig.require_camera()
         # By software, whatever triggers a capture: nobody fires a hardware trigger for this.

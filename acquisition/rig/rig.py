@@ -20,6 +20,7 @@ from drivers.registry import open_axis, open_camera, open_source
 from drivers.serial_link import LineRegistry
 from drivers.source import LightSource
 from drivers.sources.manual import Ask, ManualSource
+from processing.instrument.model import InstrumentModel
 from simulators.clock import patient_clock
 from simulators.rig.model import SCHEME
 from simulators.rig.rig import SimulatedRig
@@ -121,6 +122,19 @@ class Rig:
         self.simulation = SimulatedRig(self.config.simulator, with_camera=self._with_camera)
         self.simulation.start()
         return ", ".join(self.config.simulator.ports)
+
+    def show(self, sample: str, wavelength_nm: float | None = None) -> None:
+        """On a simulated rig, put a sample before the optics of the first mode, as they truly are.
+
+        Parameters
+        ----------
+        wavelength_nm : of the light; None: the first of the rig.
+        """
+        if self.simulation is None or self.config.simulator is None:
+            return
+        mode, declared = next(iter(self.config.modes.items()))
+        model = InstrumentModel.load(self.config.simulator.truth.get(mode, declared.instrument))
+        self.simulation.prepare(sample, model, wavelength_nm or self.config.wavelengths_nm[0])
 
     def open_axis(self, name: str) -> MotionAxis:
         """Open one axis of the rig file; moves nothing."""

@@ -19,6 +19,7 @@ from processing.reflectance.base import load_reflectance
 from processing.reflectance.tables import ScatteringTable
 from processing.reports.figure_style import png
 from processing.reports.template import Figure, Section, render
+from processing.storage.product import Product
 
 LABELS = {"psi_deg": "psi / degrees", "magnitude_percent": "|D| / %", "xi0_percent": "xi0 / %"}
 #: Largest deviations from triple degeneracy that the paper tells, of the light.
@@ -202,8 +203,6 @@ def _fault(fault: FaultStudy, wavelengths: Sequence[float]) -> Section:
 
 def _shown(folder: Path, nm: float) -> Path:
     """The Mueller product of a folder at the wavelength and the angle that the paper shows."""
-    from processing.storage.product import Product
-
     for path in sorted(folder.glob("*.mueller.h5")):
         with Product(path) as product:
             header = product.header

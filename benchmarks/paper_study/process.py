@@ -21,6 +21,7 @@ from processing.steps.maps import Extrapolation, Quantities, Xi0
 from processing.steps.material import FittedMaterial, MaterialFitting
 from processing.steps.reduction import reduced
 from processing.storage.capture import Capture
+from processing.storage.product import Product
 from processing.yaml_file import dump_yaml
 
 SPHERE, BODY = CONFIGS / "geometries/one_inch_sphere.yaml", Path(__file__).parent / "body_geometry.yaml"
@@ -153,8 +154,6 @@ def _xi0(faulty: CampaignResult, healthy: SphereStudy) -> dict[tuple[float, floa
 
 
 def _shape(folder: Path) -> tuple[int, int]:
-    from processing.storage.product import Product
-
     with Product(next(folder.glob("*.stokes.h5"))) as product:
         return product.shape
 

@@ -3,10 +3,13 @@
 import re
 
 import cv2
+import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
 from simulators.rig.served_rig import serve
+
+BLACK_LEVEL = 64
 
 
 @pytest.fixture
@@ -116,6 +119,16 @@ def test_snap_writes_counts_and_leaves_the_light_as_it_was(acquire, served, tmp_
     assert frame.dtype == "uint16"
     assert frame.shape == (64, 80)
     assert not simulation.light()
+
+
+def test_snap_sees_the_bench_as_it_is_not_as_it_was_declared(acquire, small_rig, dim_instrument, tmp_path):
+    means = []
+    for name, simulator in (("declared", {}), ("true", {"truth": {"drr": str(dim_instrument)}})):
+        rig = small_rig(f"{name}.yaml", rows=24, columns=32, **simulator)
+        code, _, err = acquire("snap", "--rig", rig, "--out", tmp_path / f"{name}.npy", "--exposure", 0.1, "--light")
+        assert code == 0, err
+        means.append(np.load(tmp_path / f"{name}.simulated.npy").mean() - BLACK_LEVEL)
+    assert means[1] == pytest.approx(0.1 * means[0], rel=0.05)
 
 
 def test_a_wire_log_holds_every_byte_of_every_line(acquire, served, tmp_path):

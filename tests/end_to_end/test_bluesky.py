@@ -14,9 +14,7 @@ from bluesky.utils import FailedStatus, RunEngineInterrupted
 
 from acquisition.bluesky_devices import open_bench
 from acquisition.capture.plan import MeasurementPlan
-from processing.instrument.model import InstrumentModel
 from processing.storage.capture import Capture
-from processing.yaml_file import dump_yaml
 
 PLAN = MeasurementPlan(omega_deg=35.0)
 BLACK_LEVEL = 64
@@ -55,15 +53,10 @@ def test_a_scan_of_an_axis_reads_where_it_is(bench, engine):
     assert not np.array_equal(frames[0], frames[2])
 
 
-def test_a_scan_sees_the_bench_as_it_is_not_as_it_was_declared(small_rig, configs, tmp_path, engine):
+def test_a_scan_sees_the_bench_as_it_is_not_as_it_was_declared(small_rig, dim_instrument, engine):
     run, documents = engine
-    declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
-    (channel,) = declared.channels
-    dim = declared.model_copy(update={"channels": (channel.model_copy(update={"gain": 0.1}),)})
-    truth = tmp_path / "dim.yaml"
-    truth.write_text(dump_yaml(dim))
     means = []
-    for name, simulator in (("as_declared.yaml", {}), ("dim.rig.yaml", {"truth": {"drr": str(truth)}})):
+    for name, simulator in (("declared.yaml", {}), ("true.yaml", {"truth": {"drr": str(dim_instrument)}})):
         with open_bench(small_rig(name, rows=24, columns=32, **simulator)) as bench:
             run(count([bench.camera]))
         means.append(_events(documents)[-1]["camera_mean"] - BLACK_LEVEL)
