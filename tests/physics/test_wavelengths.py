@@ -5,7 +5,7 @@ import pytest
 
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.starts import along_wavelengths, rms
+from processing.diagnosis.instrument.starts import along_wavelengths
 from processing.diagnosis.instrument_file import extended
 from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.result import Correction, Diagnosis, Error
@@ -81,7 +81,7 @@ def test_a_train_far_off_is_found_wavelength_by_wavelength(problem):
     base = Space(problem.nominal())
     found = along_wavelengths(problem, base, lambda line: None)
     values = np.concatenate([found[c] for c in base.candidates])
-    assert rms(minimize(problem, base, values)) < 1e-4
+    assert minimize(problem, base, values).rms < 1e-4
     # A plate seen from its slow axis, or half a turn on, is the same plate.
     at = {(c.place, c.wavelength_nm): float(found[c][0]) for c in base.candidates}
     for wavelength, truth in RETARDANCES.items():

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from processing.arrays import Array
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.posterior import Posterior
@@ -11,15 +13,21 @@ from processing.diagnosis.search.rules import NOMINAL_TAU, VISIBLE_FAULT
 from processing.instrument.effects.base import CountsEffect, FieldEffect, Switch, ValuePerState
 
 
-def would_be_seen(found: Posterior) -> tuple[Candidate, ...]:
-    """Effects of the optics or the source that at a typical size would stand out of the noise, or of what is left."""
-    form, groups = found.sets.form, found.sets.groups
-    told = np.diag(form.curvature).copy()
+def information(found: Posterior) -> tuple[Array, NDArray[np.int64]]:
+    """Information (K,) about each value at its typical size, and which values are nominal ones, which are free."""
+    curvature, groups = found.sets.form.curvature, found.sets.groups
+    told = np.diag(curvature).copy()
     always = np.concatenate([np.zeros(0, dtype=np.int64), *(g.index for g in groups if g.fixed_tau is not None)])
     if always.size:
-        across = form.curvature[always]
+        across = curvature[always]
         own = across[:, always] + np.eye(always.size) / NOMINAL_TAU**2
         told -= np.einsum("ij,ij->j", across, np.linalg.solve(own, across))
+    return told, always
+
+
+def would_be_seen(found: Posterior) -> tuple[Candidate, ...]:
+    """Effects of the optics or the source that at a typical size would stand out of the noise, or of what is left."""
+    told, always = information(found)
     told /= found.samples.best.unit
     return tuple(
         candidate

@@ -26,7 +26,7 @@ Values = dict[Candidate, Array]
 def first_values(problem: InstrumentProblem, base: Space, pool: Sequence[Candidate], say: Say) -> Values:
     """Values to begin with, of the nominal values and of what else was found beside them."""
     fit = minimize(problem, base, np.zeros(base.size))
-    if rms(fit) < FAR_OFF:
+    if fit.rms < FAR_OFF:
         return _by_candidate(base, fit.values)
     say("far off: searching from many starts")
     if not base.size:
@@ -34,11 +34,6 @@ def first_values(problem: InstrumentProblem, base: Space, pool: Sequence[Candida
     if len(set(problem.wavelengths_nm)) == 1:
         return _searched(problem, base, pool, fit)
     return along_wavelengths(problem, base, say)
-
-
-def rms(fit: Fit) -> float:
-    """Residual of a fit relative to the mean signal."""
-    return float(np.sqrt(fit.sums.square.sum() / max(fit.sums.count.sum(), 1.0)))
 
 
 def _searched(problem: InstrumentProblem, base: Space, pool: Sequence[Candidate], fit: Fit) -> Values:
@@ -56,7 +51,7 @@ def _searched(problem: InstrumentProblem, base: Space, pool: Sequence[Candidate]
 def best_of_starts(problem: InstrumentProblem, space: Space, starts: int, begin: Array | None = None) -> Fit:
     """The best fit of nominal values alone, from `begin` (K,) and, where that is far off, so many places about it."""
     fit = minimize(problem, space, np.zeros(space.size) if begin is None else begin)
-    if rms(fit) < FAR_OFF or not starts:
+    if fit.rms < FAR_OFF or not starts:
         return fit
     return minimize(
         problem, space, _best_start(problem, space, fit.values, fit.excess, starts, NEAR_ENOUGH), expansions=0
@@ -77,7 +72,7 @@ def _best_start(
         tried = minimize(problem, space, here, expansions=0)
         if tried.excess < best:
             values, best = tried.values, tried.excess
-            if rms(tried) < enough:
+            if tried.rms < enough:
                 break
     return values
 
@@ -115,10 +110,10 @@ def along_wavelengths(problem: InstrumentProblem, base: Space, say: Say) -> Valu
             neighbour = wavelengths[k - 1 if k > first else k + 1] if k != first else None
             found |= _beside(problem.at(at), base, found, at, neighbour)
         fit = minimize(problem, base, np.concatenate([found[c] for c in base.candidates]))
-        say(f"beginning at {wavelengths[first]:g} nm: {100 * rms(fit):.3g} %")
+        say(f"beginning at {wavelengths[first]:g} nm: {100 * fit.rms:.3g} %")
         if best is None or fit.excess < best.excess:
             best = fit
-        if rms(best) < FAR_OFF:
+        if best.rms < FAR_OFF:
             break
     else:
         say("no mounts fit all wavelengths: were they homed anew in between? Then give each run by itself")
@@ -133,7 +128,7 @@ def _beside(problem: InstrumentProblem, base: Space, found: Values, at: float, n
     if neighbour is None:
         start = minimize(problem, space, np.zeros(space.size))
         values = start.values
-        if rms(start) > FAR_OFF:
+        if start.rms > FAR_OFF:
             values = _best_start(problem, space, values, start.excess)
         return {c: values[p] for c, p in zip(space.candidates, space.slices, strict=True) if c not in gains}
     before = {(c.place, c.wavelength_nm): v for c, v in found.items()}

@@ -7,6 +7,7 @@ import numpy as np
 from processing.diagnosis.instrument.closure import closure
 from processing.diagnosis.instrument.combinations import combinations
 from processing.diagnosis.instrument.doubts import PART_OF_LEFT
+from processing.diagnosis.instrument.evidence import information
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.structure import Residual
 from processing.diagnosis.instrument.systematic import systematic_error
@@ -24,7 +25,7 @@ from processing.diagnosis.search.result import (
     NotMeasured,
     Ranked,
 )
-from processing.diagnosis.search.rules import DECISIVE, DOUBTED, LIKELY, NOISE_ERROR, NOMINAL_TAU, SEEN, SURE
+from processing.diagnosis.search.rules import DECISIVE, DOUBTED, LIKELY, NOISE_ERROR, SEEN, SURE
 from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.search.stored import parameters_of, scope_of
@@ -216,19 +217,10 @@ def ranking(found: Posterior, before: HeldOut) -> tuple[Ranked, ...]:
 
 def unobservable(problem: InstrumentProblem, found: Posterior) -> list[Candidate]:
     """Candidates about which the captures say nothing, the nominal values being free."""
-    h = found.sets.form.curvature
-    always = np.concatenate([np.zeros(0, dtype=np.int64)] + [g.index for g in found.sets.groups if g.fixed_tau])
-    told = np.diag(h).copy()
-    if always.size:
-        prior = np.eye(always.size) / NOMINAL_TAU**2
-        told -= np.einsum("ij,ij->j", h[always], np.linalg.solve(h[np.ix_(always, always)] + prior, h[always]))
+    told, always = information(found)
     out = []
     for candidate, part in zip(found.space.candidates, found.space.slices, strict=True):
-        if (
-            candidate.state_chosen
-            or isinstance(candidate.effect, Switch)
-            or set(range(part.start, part.stop)) & set(always)
-        ):
+        if candidate.state_chosen or isinstance(candidate.effect, Switch) or np.isin(part.start, always):
             continue
         least = np.full(candidate.size, SEEN)
         if isinstance(candidate.effect, ImageShift):

@@ -10,7 +10,7 @@ from processing.arrays import Array
 from processing.diagnosis.instrument.moments import MARGIN
 from processing.diagnosis.instrument.noise_of_light import scatter_prefers
 from processing.diagnosis.instrument.problem import EXACT, InstrumentProblem
-from processing.diagnosis.instrument.starts import best_of_starts, first_values, rms
+from processing.diagnosis.instrument.starts import best_of_starts, first_values
 from processing.diagnosis.instrument.undone import exactly_undone
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
@@ -55,7 +55,7 @@ class WholeBench:
         space, values = Space(tuple(start)), np.concatenate([np.zeros(0), *start.values()])
         if not beside:
             values = best_of_starts(self.whole, space, 0, values).values
-        return rms(Fit(values, self.whole.sums(space, values, derivatives=False), 0.0)) > FAR_OFF
+        return Fit(values, self.whole.sums(space, values, derivatives=False), 0.0).rms > FAR_OFF
 
     def run(self) -> Posterior:
         """The posterior; again with the noise that its light tells, and with what varies over the image."""

@@ -31,6 +31,11 @@ class Fit:
     sums: Sums
     excess: float
 
+    @property
+    def rms(self) -> float:
+        """Residual relative to the mean signal, root mean square."""
+        return float(np.sqrt(self.sums.square.sum() / max(self.sums.count.sum(), 1.0)))
+
 
 def prior(space: Space) -> Array:
     """Curvature (K,) of the weak prior about zero."""

@@ -45,11 +45,6 @@ class Visited:
     state: State
 
     @property
-    def rms(self) -> float:
-        """Residual relative to the mean signal."""
-        return float(np.sqrt(self.fit.sums.square.sum() / max(self.fit.sums.count.sum(), 1.0)))
-
-    @property
     def at_bound(self) -> bool:
         """A value stands at a bound: the data ask for something else."""
         lower, upper = self.space.joined("lower"), self.space.joined("upper")
@@ -143,7 +138,7 @@ class OwnMinima:
             if not worth:
                 break
             here = likelier(worth[0], worth)
-            self.say(f"{', '.join(c.label for c in here.space.candidates)}: {100 * here.rms:.4g} % left")
+            self.say(f"{', '.join(c.label for c in here.space.candidates)}: {100 * here.fit.rms:.4g} % left")
         while True:
             less = [self.at(here.groups - {g}, here) for g in here.groups]
             less = [v for v in less if log_odds(here, v) < IMITATES]

@@ -195,7 +195,7 @@ def _ranking(search: OwnMinima) -> tuple[Ranked, ...]:
     start = nothing.score_at(unit)
     alone = [(v.score_at(unit) - start, v) for v in search.visited.values() if len(v.groups) == 1]
     return tuple(
-        Ranked(candidate=v.space.candidates[0].label, evidence=round(2 * odds, 1), rms_percent=100 * v.rms)
+        Ranked(candidate=v.space.candidates[0].label, evidence=round(2 * odds, 1), rms_percent=100 * v.fit.rms)
         for odds, v in sorted(alone, key=lambda item: -item[0])[:10]
     )
 

@@ -13,11 +13,10 @@ from processing.diagnosis.search.space import Space, Sums
 
 @decides
 def test_far_off(m: Patch) -> bool:
-    m.setattr(starts, "minimize", lambda *a: Some(values=np.zeros(0)))
     m.setattr(starts, "_far", lambda *a: "far")
     said = []
     for rms in (0.045, 0.055):
-        m.setattr(starts, "rms", lambda fit, r=rms: r)
+        m.setattr(starts, "minimize", lambda *a, r=rms: Some(values=np.zeros(0), rms=r))
         said.append(starts.first_values(None, Space(()), (), lambda line: None))
     return said == [{}, "far"]
 
@@ -50,7 +49,6 @@ def rounds(m: Patch, unit: float = 1.0, moves: float = 9.0) -> tuple[list[int], 
 
 @decides
 def test_near_enough(m: Patch) -> bool:
-    m.setattr(starts, "rms", lambda fit: fit.rms)
     tried = []
     for rms in (0.009, 0.011):
         fits = iter(Some(excess=-float(k), values=np.zeros(0), rms=rms if k else 1.0) for k in range(99))
