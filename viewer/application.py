@@ -24,7 +24,10 @@ PLOTLY = Path(plotly.__file__).parent / "package_data" / "plotly.min.js"
 
 
 def application(folder: Path, token: str) -> Starlette:
-    """The application for one folder; every address begins with the token."""
+    """The application for one folder; every address begins with the token.
+
+    Starlette runs endpoints that are plain functions in threads: a large read holds up nobody else.
+    """
     routes = [
         Route("/", browsing.browse),
         Route("/campaign", browsing.campaign),

@@ -5,27 +5,23 @@ from __future__ import annotations
 from dataclasses import asdict
 from pathlib import Path
 
-from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import HTMLResponse
 
 from acquisition.screen.run_file import running_in
 from viewer.campaigns import STATUS, CampaignView, read_campaign
 from viewer.jobs import Jobs
-from viewer.library import Entry, NotHere, made_from
-from viewer.pages import Pages, pages_of
+from viewer.library import Entry, Library, NotHere, made_from
+from viewer.pages import file_of, pages_of
 from viewer.starting import campaign_files
 
 #: Files on one page of a list; more are found by searching.
 MOST = 300
 
 
-async def browse(request: Request) -> HTMLResponse:
+def browse(request: Request) -> HTMLResponse:
     """Campaigns, captures and products of the folder; `q` searches."""
-    return await run_in_threadpool(_browse, pages_of(request), request.query_params.get("q", ""))
-
-
-def _browse(pages: Pages, query: str) -> HTMLResponse:
+    pages, query = pages_of(request), request.query_params.get("q", "")
     library = pages.library
     jobs = Jobs(library.root)
     entries = library.entries()
@@ -56,10 +52,10 @@ def _all_simulated(entries: list[Entry]) -> bool:
     return bool(readable) and all(e.simulated for e in readable)
 
 
-async def campaign(request: Request) -> HTMLResponse:
+def campaign(request: Request) -> HTMLResponse:
     """One campaign: grid, timeline, log, and what its run does now."""
     pages = pages_of(request)
-    view = await run_in_threadpool(_campaign, pages, pages.library.path(request.query_params.get("folder", "")))
+    view = _campaign(pages.library, file_of(request, "folder"))
     return pages.draw(
         "campaign.html",
         simulated=view.simulated,
@@ -69,9 +65,9 @@ async def campaign(request: Request) -> HTMLResponse:
     )
 
 
-def _campaign(pages: Pages, folder: Path) -> CampaignView:
+def _campaign(library: Library, folder: Path) -> CampaignView:
     run = running_in(folder)
-    view = read_campaign(folder, pages.library, None if run is None else run.get("capture"))
+    view = read_campaign(folder, library, None if run is None else run.get("capture"))
     if view is None:
-        raise NotHere(f"{pages.library.name(folder)}: no campaign was begun in this folder")
+        raise NotHere(f"{library.name(folder)}: no campaign was begun in this folder")
     return view

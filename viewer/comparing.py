@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response
 
@@ -17,7 +16,7 @@ from processing.reports.colours import ALL, CYCLIC, LIGHT, SIGNED, Scale, scale_
 from processing.storage.capture import Capture
 from processing.storage.product import LIT_ERRORS, Product, is_product
 from viewer.frames import chosen
-from viewer.pages import Pages, file_of, pages_of
+from viewer.pages import file_of, pages_of
 from viewer.planes import Window, sent
 from viewer.products import MATRICES, maps_of, named, read_map, units_words
 
@@ -28,12 +27,9 @@ ERRORS_SHOWN = 5.0
 Measured = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
-async def compare(request: Request) -> HTMLResponse:
+def compare(request: Request) -> HTMLResponse:
     """The page that holds two files against each other."""
-    return await run_in_threadpool(_compare, pages_of(request), file_of(request, "a"), file_of(request, "b"))
-
-
-def _compare(pages: Pages, a: Path, b: Path) -> HTMLResponse:
+    pages, a, b = pages_of(request), file_of(request, "a"), file_of(request, "b")
     library = pages.library
     entries = [library.entry(library.name(path)) for path in (a, b)]
     choices, shape = _choices(a, b)
@@ -73,12 +69,9 @@ def _same_shape(a: tuple[int, int], b: tuple[int, int]) -> None:
         raise ProcessError(f"images of {a[1]} x {a[0]} and {b[1]} x {b[0]} pixels cannot be compared pixel by pixel")
 
 
-async def difference(request: Request) -> Response:
+def difference(request: Request) -> Response:
     """Four pictures of one window: a, b, a - b, and that over its standard error."""
-    return await run_in_threadpool(_difference, file_of(request, "a"), file_of(request, "b"), request.query_params)
-
-
-def _difference(a: Path, b: Path, query: Any) -> Response:
+    a, b, query = file_of(request, "a"), file_of(request, "b"), request.query_params
     if is_product(a):
         with Product(a) as first, Product(b) as second:
             _same_shape(first.shape, second.shape)

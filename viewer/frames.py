@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse, Response
 
@@ -16,7 +14,7 @@ from processing.reduction.counts_to_signal import saturation
 from processing.storage.capture import Capture
 from viewer.diagnoses import Diagnoses
 from viewer.library import Entry, made_into
-from viewer.pages import Pages, file_of, pages_of
+from viewer.pages import file_of, pages_of
 from viewer.planes import Window, sent
 from viewer.starting import instrument_files
 
@@ -27,12 +25,9 @@ PREVIEW = 480
 RED_BGR = (45, 18, 227)
 
 
-async def capture(request: Request) -> HTMLResponse:
+def capture(request: Request) -> HTMLResponse:
     """The page of a capture."""
-    return await run_in_threadpool(_capture, pages_of(request), file_of(request))
-
-
-def _capture(pages: Pages, path: Path) -> HTMLResponse:
+    pages, path = pages_of(request), file_of(request)
     library = pages.library
     entry = library.entry(library.name(path))
     with Capture(path) as opened:
@@ -106,22 +101,15 @@ def _plain(values: Any) -> list[float | None]:
     return [round(float(v), 6) if np.isfinite(v) else None for v in values]
 
 
-async def states(request: Request) -> JSONResponse:
+def states(request: Request) -> JSONResponse:
     """The states done by now, for a capture that is being written."""
-
-    def read() -> dict[str, Any]:
-        with Capture(file_of(request)) as opened:
-            return states_of(opened) | {"status": opened.status, "planned": opened.planned_states}
-
-    return JSONResponse(await run_in_threadpool(read))
+    with Capture(file_of(request)) as opened:
+        return JSONResponse(states_of(opened) | {"status": opened.status, "planned": opened.planned_states})
 
 
-async def frame(request: Request) -> Response:
+def frame(request: Request) -> Response:
     """Part of a frame: two pictures, mean counts and where a pixel is saturated (1, else 0)."""
-    return await run_in_threadpool(_frame, file_of(request), request.query_params)
-
-
-def _frame(path: Path, query: Any) -> Response:
+    path, query = file_of(request), request.query_params
     with Capture(path) as opened:
         state, channel = chosen(opened, query)
         window = Window.asked(query, opened.frame_shape)
@@ -132,12 +120,9 @@ def _frame(path: Path, query: Any) -> Response:
     return sent(window, np.stack([mean, red.astype(np.float32)]), state=state)
 
 
-async def preview(request: Request) -> Response:
+def preview(request: Request) -> Response:
     """A frame as a small picture (PNG): what is seen until the page's script has drawn the one that can be zoomed."""
-    return Response(await run_in_threadpool(_preview, file_of(request), request.query_params), media_type="image/png")
-
-
-def _preview(path: Path, query: Any) -> bytes:
+    path, query = file_of(request), request.query_params
     with Capture(path) as opened:
         state, channel = chosen(opened, query)
         window = Window.asked({}, opened.frame_shape, most=PREVIEW)
@@ -149,7 +134,8 @@ def _preview(path: Path, query: Any) -> bytes:
     picture = np.repeat(grey.astype(np.uint8)[..., np.newaxis], 3, axis=2)
     if top is not None:
         picture[window.largest(counts) >= top] = RED_BGR
-    return cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+    png = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+    return Response(png, media_type="image/png")
 
 
 def chosen(opened: Capture, query: Any) -> tuple[int, int]:
@@ -165,12 +151,9 @@ def chosen(opened: Capture, query: Any) -> tuple[int, int]:
     return state, channel
 
 
-async def histogram(request: Request) -> JSONResponse:
+def histogram(request: Request) -> JSONResponse:
     """Pixels of a frame by their counts: edges of the bars, pixels in each, and where the range ends."""
-    return JSONResponse(await run_in_threadpool(_histogram, file_of(request), request.query_params))
-
-
-def _histogram(path: Path, query: Any) -> dict[str, Any]:
+    path, query = file_of(request), request.query_params
     with Capture(path) as opened:
         state, channel = chosen(opened, query)
         counts = opened.frames(state)[channel]
@@ -185,11 +168,13 @@ def _histogram(path: Path, query: Any) -> dict[str, Any]:
         edges = np.linspace(low, high if high > low else low + 1, BARS + 1)
     pixels, _ = np.histogram(finite, edges)
     saturated = 0 if top is None else int(np.count_nonzero(counts >= top))
-    return {
-        "edges": edges.tolist(),
-        "pixels": pixels.tolist(),
-        "black": black,
-        "saturation": top,
-        "saturated": saturated,
-        "of": int(counts.size),
-    }
+    return JSONResponse(
+        {
+            "edges": edges.tolist(),
+            "pixels": pixels.tolist(),
+            "black": black,
+            "saturation": top,
+            "saturated": saturated,
+            "of": int(counts.size),
+        }
+    )

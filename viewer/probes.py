@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import JSONResponse
 
@@ -21,9 +20,9 @@ from viewer.pages import file_of, pages_of
 from viewer.probing import PixelReducer, Region, curve, finite, mask_words, matrix, raw_curve
 
 
-async def curve_of(request: Request) -> JSONResponse:
+def curve_of(request: Request) -> JSONResponse:
     """Intensities of a pixel or a region of a capture, with the fitted curve where there can be one."""
-    return JSONResponse(await run_in_threadpool(_curve_of, file_of(request), request.query_params))
+    return JSONResponse(_curve_of(file_of(request), request.query_params))
 
 
 def _curve_of(path: Path, query: Any) -> dict[str, Any]:
@@ -36,17 +35,14 @@ def _curve_of(path: Path, query: Any) -> dict[str, Any]:
     return found | _fit(path, region, channels, None)
 
 
-async def matrix_of(request: Request) -> JSONResponse:
+def matrix_of(request: Request) -> JSONResponse:
     """Mueller matrix of a pixel or a region of a capture, and what it decomposes into."""
-    return JSONResponse(await run_in_threadpool(_matrix_of, file_of(request), request.query_params))
-
-
-def _matrix_of(path: Path, query: Any) -> dict[str, Any]:
+    path = file_of(request)
     with Capture(path) as capture:
-        region = Region.asked(query, capture.frame_shape)
+        region = Region.asked(request.query_params, capture.frame_shape)
         if capture.status == "running":
             raise ProcessError("the capture is being taken")
-    return {"where": str(region), "matrix": matrix(reducer_of(path, None).image(region)[0])}
+    return JSONResponse({"where": str(region), "matrix": matrix(reducer_of(path, None).image(region)[0])})
 
 
 def _fit(path: Path, region: Region, channels: int, instrument: Path | None) -> dict[str, Any]:
@@ -69,10 +65,9 @@ def _kept(path: Path, instrument: Path | None, changed: tuple[int, ...]) -> Pixe
     return PixelReducer(path, instrument)
 
 
-async def of_product(request: Request) -> JSONResponse:
+def of_product(request: Request) -> JSONResponse:
     """What a product says of a pixel or a region, and the intensities behind it where the capture is at hand."""
-    library = pages_of(request).library
-    return JSONResponse(await run_in_threadpool(_of_product, file_of(request), request.query_params, library))
+    return JSONResponse(_of_product(file_of(request), request.query_params, pages_of(request).library))
 
 
 def _of_product(path: Path, query: Any, library: Library) -> dict[str, Any]:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response
 
@@ -17,19 +15,16 @@ from processing.storage.product import LIT_ERRORS, Product
 from processing.storage.provenance import steps_text
 from viewer.frames import others
 from viewer.library import made_from, made_into
-from viewer.pages import Pages, file_of, pages_of
+from viewer.pages import file_of, pages_of
 from viewer.planes import Window, sent
 
 #: Kinds that hold Mueller matrices.
 MATRICES = ("mueller", "extrapolated")
 
 
-async def product(request: Request) -> HTMLResponse:
+def product(request: Request) -> HTMLResponse:
     """The page of a product."""
-    return await run_in_threadpool(_product, pages_of(request), file_of(request))
-
-
-def _product(pages: Pages, path: Path) -> HTMLResponse:
+    pages, path = pages_of(request), file_of(request)
     library = pages.library
     entry, entries = library.entry(library.name(path)), library.entries()
     with Product(path) as opened:
@@ -78,12 +73,9 @@ def maps_of(opened: Product) -> list[dict[str, Any]]:
     return found
 
 
-async def plane(request: Request) -> Response:
+def plane(request: Request) -> Response:
     """Part of one map of a product, or of its standard errors (`errors`); where it is not valid it has no value."""
-    return await run_in_threadpool(_plane, file_of(request), request.query_params)
-
-
-def _plane(path: Path, query: Any) -> Response:
+    path, query = file_of(request), request.query_params
     with Product(path) as opened:
         name, index = named(opened, query)
         window = Window.asked(query, opened.shape)
@@ -122,12 +114,9 @@ def told(scale: Scale, units: str) -> dict[str, Any]:
     return {"colours": scale.colours, "low": scale.low, "high": scale.high, "units": units_words(units)}
 
 
-async def mueller(request: Request) -> Response:
+def mueller(request: Request) -> Response:
     """Sixteen pictures, the elements over m00 or in counts, on one scale; `errors`: their standard errors."""
-    return await run_in_threadpool(_mueller, file_of(request), request.query_params)
-
-
-def _mueller(path: Path, query: Any) -> Response:
+    path, query = file_of(request), request.query_params
     with Product(path) as opened:
         opened.require(*MATRICES)
         window = Window.asked(query, opened.shape, most=320)

@@ -121,7 +121,7 @@ KINDS: dict[str, Callable[[Library, Jobs, dict[str, str]], Job]] = {
 }
 
 
-async def job(request: Request) -> HTMLResponse:
+def job(request: Request) -> HTMLResponse:
     """The page of a job."""
     pages, jobs = pages_of(request), jobs_of(request)
     found = jobs.job(request.query_params.get("name", ""))

@@ -25,12 +25,12 @@ def diagnoses_of(request: Request) -> Diagnoses:
     return Diagnoses(pages_of(request).library)
 
 
-async def diagnosis(request: Request) -> HTMLResponse:
+def diagnosis(request: Request) -> HTMLResponse:
     """The page of a diagnosis."""
     pages, diagnoses = pages_of(request), diagnoses_of(request)
     name = request.query_params.get("name", "")
-    story = await run_in_threadpool(diagnoses.story, name)
-    residuals = await run_in_threadpool(diagnoses.residuals, name)
+    story = diagnoses.story(name)
+    residuals = diagnoses.residuals(name)
     found = story.diagnosis
     writes = bool(found.applied() or found.calibrated)
     return pages.draw(
@@ -73,9 +73,9 @@ def _rms(residual: StoredResidual, moment: str) -> Any:
     return np.sqrt(np.mean(np.square(residual.images[moment].astype(np.float32)), axis=0))
 
 
-async def residual_map(request: Request) -> Response:
+def residual_map(request: Request) -> Response:
     """Two pictures, before and after: the rms over the states, or one of them (`state`)."""
-    residual = await run_in_threadpool(_chosen, request)
+    residual = _chosen(request)
     query = request.query_params
     window = Window.asked(query, residual.images["before"].shape[-2:])
     state = query.get("state")
@@ -90,9 +90,9 @@ async def residual_map(request: Request) -> Response:
     return sent(window, pictures, colours=colours, units="noise of one intensity")
 
 
-async def residual_curve(request: Request) -> JSONResponse:
+def residual_curve(request: Request) -> JSONResponse:
     """Residual of each state, before and after, mean over a pixel or a region in units of the noise of that mean."""
-    residual = await run_in_threadpool(_chosen, request)
+    residual = _chosen(request)
     region = Region.asked(request.query_params, residual.images["before"].shape[-2:])
     told: dict[str, Any] = {"where": str(region)}
     for moment in MOMENTS:
@@ -122,7 +122,7 @@ async def decide(request: Request) -> JSONResponse:
     return JSONResponse({"file": None})
 
 
-async def report(request: Request) -> Response:
+def report(request: Request) -> Response:
     """The report of the diagnosis as `diagnose --report` writes it."""
     path = diagnoses_of(request).folder(request.query_params.get("name", "")) / "report.html"
     require_file(path, NotHere)
