@@ -59,7 +59,8 @@ class Frame:
     frame_id : int
         The camera's number of the frame; of the last one where several were averaged.
     camera_time_ns : int
-        The camera's own clock, in nanoseconds from its own zero.
+        The camera's own clock, in nanoseconds from its own zero: at the exposure where it tells that, else at the
+        transfer; 0 for a camera without a clock.
     host_time_s : float
         Unix time at which the software trigger was sent; with a hardware trigger, at which the first packet came.
     complete : bool

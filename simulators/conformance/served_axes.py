@@ -15,10 +15,10 @@ from drivers.serial_link import LineRegistry
 from simulators.clock import Clock, patient_clock
 from simulators.rig.controller_kinds import axis_configs, served_kinds
 from simulators.serial.emulator import Emulator
-from simulators.serial.pty_port import PtyPort
 from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
-from simulators.serial.tcp_port import TcpPort, port_for
+from simulators.serial.served_port import ServedPort
+from simulators.serial.tcp_port import port_for
 
 WIDE = (-1000.0, 1000.0)
 FAST = 200.0
@@ -29,7 +29,7 @@ class ServedAxes:
     """An emulator behind a port, and the rig entries that open it."""
 
     emulator: Emulator
-    port: PtyPort | TcpPort
+    port: ServedPort
     lines: LineRegistry
     configs: list[AxisConfig]
 

@@ -25,10 +25,10 @@ from simulators.clock import Clock, patient_clock
 from simulators.rig.controller_kinds import served_kinds
 from simulators.rig.model import SimulatorConfig
 from simulators.serial.emulator import Emulator
-from simulators.serial.pty_port import PtyPort
 from simulators.serial.reply_faults import FaultSchedule, parse_fault
 from simulators.serial.serve_options import ServeOptions
-from simulators.serial.tcp_port import TcpPort, port_for
+from simulators.serial.served_port import ServedPort
+from simulators.serial.tcp_port import port_for
 
 #: Exposure indices of one state: tries of it come this far apart.
 RETAKE_STRIDE = 1_000_000
@@ -50,7 +50,7 @@ class SimulatedRig:
         #: What the operator does with a source that has no cable: False while it is covered.
         self.uncovered: Callable[[], bool] = lambda: True
         self._with_camera = with_camera
-        self._ports: dict[str, PtyPort | TcpPort] = {}
+        self._ports: dict[str, ServedPort] = {}
         self._user_angle: dict[str, Callable[[float], float]] = {}
         self._next_index = 0
         self._lock = threading.Lock()

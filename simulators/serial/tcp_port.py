@@ -71,6 +71,6 @@ class TcpPort(ServedPort):
             ready.close()
 
 
-def port_for(emulator: Emulator) -> PtyPort | TcpPort:
+def port_for(emulator: Emulator) -> ServedPort:
     """A port of the kind that the controller has: TCP where it holds conversations, else a serial line."""
     return TcpPort(emulator) if hasattr(emulator, "connect") else PtyPort(emulator)
