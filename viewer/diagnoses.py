@@ -121,11 +121,11 @@ class Diagnoses:
 
         Raises
         ------
-        ProcessError : the name is none or taken, or there is nothing to write.
+        ProcessError : the name is none or taken, there is nothing to write, or it is decided already.
         """
         if not re.fullmatch(r"[\w. -]+\.yaml", file) or file.startswith("."):
             raise ProcessError(f"{file!r}: give a plain file name that ends in .yaml")
-        story = self.story(name)
+        story = self._undecided(name)
         model = InstrumentModel.load(self.folder(name) / "instrument.yaml")
         path = self._library.root / file
         write_instrument(path, model, story.diagnosis, note)
@@ -133,8 +133,15 @@ class Diagnoses:
         return path
 
     def reject(self, name: str, note: str) -> None:
-        """Note that the model is not believed, and why."""
+        """Note that the model is not believed, and why. Raises ProcessError where it is decided already."""
+        self._undecided(name)
         self._decide(name, {"accepted": False, "note": note})
+
+    def _undecided(self, name: str) -> Story:
+        story = self.story(name)
+        if story.decision is not None:
+            raise ProcessError("this diagnosis was decided already; load the page anew")
+        return story
 
     def _decide(self, name: str, decision: dict[str, Any]) -> None:
         when = {"time": datetime.now().astimezone().isoformat(timespec="seconds")}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -47,7 +48,7 @@ def diagnosis(request: Request) -> HTMLResponse:
     )
 
 
-def _free_name(folder: Any, instrument: str) -> str:
+def _free_name(folder: Path, instrument: str) -> str:
     stem = "".join(c if c.isalnum() else "_" for c in instrument).strip("_") or "instrument"
     number = 2
     while (folder / f"{stem}_{number}.yaml").exists():

@@ -24,27 +24,25 @@ class ConsoleProgress(Observer):
         self._bar: Progress | None = None
         self._task: Any = None
         self._done = self._pending = 0
-        self._total = 0
         # Real time, as everything that a person reads.
         self._start_s = self._line_s = time.monotonic()
         self._warned: set[str] = set()
         self._campaign_s: float | None = None
-        self._first = self._current = 0
-        self._captures = ""
+        # Captures of a campaign; none is told of outside one.
+        self._first = self._current = self._captures = 0
 
     def campaign_progress(self, number: int, total: int, name: str) -> None:
-        self._current = number
-        self._captures = f"capture {number + 1} of {total}"
+        self._current, self._captures = number, total
 
     def run_started(self, title: str, table: StateTable, pending: int, mosaic: Mosaic | None) -> None:
-        self._done, self._total, self._pending = 0, len(table), pending
+        self._done, self._pending = 0, pending
         self._start_s = time.monotonic()
         text = f"{title}: {pending} states" + (f" of {len(table)}" if pending < len(table) else "")
         self._print(f"{self._place_in_campaign()}{text}")
         if self._console.is_terminal:
             self._bar = Progress(
                 # What must be seen first; the words give way where the terminal is narrow.
-                *([TextColumn(self._captures.removeprefix("capture "), markup=False)] if self._captures else []),
+                *([TextColumn(f"{self._current + 1} of {self._captures}")] if self._captures else []),
                 BarColumn(bar_width=16),
                 MofNCompleteColumn(),
                 TimeRemainingColumn(compact=True),
@@ -62,12 +60,12 @@ class ConsoleProgress(Observer):
         if not self._captures:
             return ""
         now_s = time.monotonic()
+        place = f"capture {self._current + 1} of {self._captures}"
         if self._campaign_s is None:
             self._campaign_s, self._first = now_s, self._current
-            return f"{self._captures}, "
+            return f"{place}, "
         each_s = (now_s - self._campaign_s) / max(self._current - self._first, 1)
-        total = int(self._captures.rsplit(" ", 1)[1])
-        return f"{self._captures}, about {_duration(each_s * (total - self._current))} left, "
+        return f"{place}, about {_duration(each_s * (self._captures - self._current))} left, "
 
     def activity(self, text: str) -> None:
         if self._bar is not None:

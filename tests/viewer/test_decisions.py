@@ -53,16 +53,26 @@ def test_the_page_tells_the_verdict_and_proposes_a_free_name(lab, client, diagno
 
 
 def test_an_accepted_model_is_a_new_file_with_its_note(lab, client, diagnosed):
-    asked = {"name": diagnosed, "accept": "yes", "file": "new.yaml", "note": "seen\nat the bench"}
+    (lab / "taken.yaml").write_text("mine")
+    asked = {"name": diagnosed, "accept": "yes", "file": "taken.yaml", "note": "seen\nat the bench"}
+    taken = client.post("/decide", json=asked, headers=ORIGIN)
+    assert (taken.status_code, "never replaces a file" in taken.text) == (422, True)
+    assert (lab / "taken.yaml").read_text() == "mine"
+    asked["file"] = "new.yaml"
     assert client.post("/decide", json=asked, headers=ORIGIN).json() == {"file": "new.yaml"}
     text = (lab / "new.yaml").read_text()
     assert "# seen\n# at the bench\n" in text
     assert [effect.kind for effect in InstrumentModel.load(lab / "new.yaml").effects] == ["psa_azimuth"]
     assert "Accepted on" in client.get("/diagnosis", params={"name": diagnosed}).text
-    again = client.post("/decide", json=asked, headers=ORIGIN)
-    assert again.status_code == 422
-    assert "never replaces a file" in again.text
-    assert (lab / "new.yaml").read_text() == text
+
+
+@pytest.mark.parametrize("later", [{"accept": "yes", "file": "other.yaml"}, {}])
+def test_what_one_tab_has_decided_no_other_changes(lab, client, diagnosed, later):
+    client.post("/decide", json={"name": diagnosed, "accept": "yes", "file": "new.yaml"}, headers=ORIGIN)
+    again = client.post("/decide", json={"name": diagnosed} | later, headers=ORIGIN)
+    assert (again.status_code, "decided already" in again.text) == (422, True)
+    assert not (lab / "other.yaml").exists()
+    assert "as <code>new.yaml" in client.get("/diagnosis", params={"name": diagnosed}).text
 
 
 def test_a_rejected_model_leaves_its_note_and_no_file(lab, client, diagnosed):

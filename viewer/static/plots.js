@@ -1,6 +1,6 @@
 // What the plots of all pages share: colours of the page, scales as in print, and pictures read from the server.
 
-export const root = document.documentElement.dataset.root;
+const root = document.documentElement.dataset.root;
 export const at = (what, query = {}) => {
   const given = Object.entries(query).filter(([, value]) => value !== null && value !== undefined);
   return `${root}/${what}?${new URLSearchParams(given)}`;
@@ -55,23 +55,23 @@ export function layout(more = {}) {
   };
 }
 
-export const settings = {
-  responsive: true, displaylogo: false, scrollZoom: false,
+const settings = node => ({
+  responsive: true, displaylogo: false, scrollZoom: Boolean(node.dataset.wheel),
   modeBarButtonsToRemove: ["lasso2d", "select2d", "autoScale2d"],
-};
+});
 
 const drawn = new Map();
 /** Draw a plot; it is drawn again with the colours of the page when those change. */
 export function draw(node, traces, more) {
   drawn.set(node, [traces, more]);
-  return Plotly.react(node, traces(), layout(more()), node.dataset.wheel ? { ...settings, scrollZoom: true } : settings);
+  return Plotly.react(node, traces(), layout(more()), settings(node));
 }
 dark.addEventListener("change", () => drawn.forEach(([traces, more], node) => {
   const kept = ["xaxis", "yaxis"].map(name => node.layout?.[name]?.range);
   const fresh = more();
   fresh.xaxis = { ...fresh.xaxis, range: kept[0] };
   fresh.yaxis = { ...fresh.yaxis, range: kept[1] };
-  Plotly.react(node, traces(), layout(fresh), settings);
+  Plotly.react(node, traces(), layout(fresh), settings(node));
 }));
 
 export const ink = () => colour("--ink");
