@@ -106,7 +106,9 @@ class Library:
         """Every HDF5 file, newest first."""
         with self._lock:
             found = [self._entry(path) for path in self._files(".h5", f".h5{PARTIAL}")]
-        return sorted((e for e in found if e is not None), key=lambda e: (-e.changed_s, e.name))
+        # A link has the name of the file that it leads to, which is listed once.
+        by_name = {e.name: e for e in found if e is not None}
+        return sorted(by_name.values(), key=lambda e: (-e.changed_s, e.name))
 
     def entry(self, name: str) -> Entry:
         """One file. Raises NotHere."""
