@@ -83,7 +83,11 @@ def closures(folder: Path) -> list[tuple[str, float]]:
         for when, used in (("before", model.at(550)), ("after", better.at(550))):
             with Capture(path) as capture:
                 problem = InstrumentProblem(used, [read_capture(capture, used)])
-            out.append((f"{name}\n{when}", closure(problem, 0, Space(()), np.zeros(0)) or 0.0))
+            percent = closure(problem, 0, Space(()), np.zeros(0)) or 0.0
+            sums = problem.sums(Space(()), np.zeros(0), derivatives=False)
+            rms, chi2 = np.sqrt(sums.square.sum() / sums.count.sum()), 1 + sums.excess.sum() / sums.freedom.sum()
+            print(f"{name} {when}: closure {percent:.3f} %, {100 * rms:.2f} % left, chi2/dof {chi2:.2f}", flush=True)
+            out.append((f"{name}\n{when}", percent))
     return out
 
 
@@ -163,7 +167,6 @@ def main() -> None:
             print(f"{title}: {named}, {judged.diagnosis.error_after.rms_percent:.3f} %", flush=True)
             panel(axis, judged, title)
         bars = closures(folder / "mosaic")
-    print(bars)
     axes[1, 0].bar([b[0] for b in bars], [b[1] for b in bars], color=["C0", "C1"] * 2)
     axes[1, 0].axhline(0, color="0.5", lw=0.8)
     for k, (_, value) in enumerate(bars):
