@@ -13,7 +13,6 @@ import threading
 import time
 from collections import deque
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from acquisition.screen.observer import Mosaic, Observer, StateReport
@@ -58,9 +57,7 @@ class RunFile(Observer):
         self._show()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._ended.set()
         self._changed.set()
         self._writing.join(timeout=1)

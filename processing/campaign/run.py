@@ -104,7 +104,7 @@ def find_captures(
         try:
             with Capture(path) as capture:
                 header, simulated, flat = capture.header, capture.simulated, FlatCapture.of(capture)
-                stokes = capture.header.mosaic is not None and not capture.turned_mosaic
+                kind: str = capture.reduces_to
                 done, planned, status = len(capture.done), capture.planned_states, capture.status
         except CaptureError as error:
             left_out.append(f"{path}: {error}")
@@ -118,7 +118,6 @@ def find_captures(
             left_out.append(f"{path}: no arm angle" if header.omega_deg is None else f"{path}: {header.sample.kind}")
             continue
         kinds[path] = simulated
-        kind = "stokes" if stokes else "mueller"
         found.append((path, kind, float(header.wavelength_nm), float(header.omega_deg)))
     left_out += _unfinished(folder, out)
     if not found:

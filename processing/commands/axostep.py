@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from processing.commands.product_options import Overwrite, ProductFile
+
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
@@ -20,8 +22,8 @@ def from_axostep_command(
     ],
     wavelength_nm: Annotated[float | None, typer.Option(help="Where the file does not say.")] = None,
     omega_deg: Annotated[float | None, typer.Option(help="Angle of the source arm.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Product file; default: beside the source.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
+    out: ProductFile = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Make a Mueller product out of a calibrated AxoStep image. It has no standard errors: the file holds none."""
     from processing.storage.axostep_product import product_of_axostep

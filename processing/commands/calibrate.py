@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from processing.commands.product_options import Overwrite, ProductFile
+
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
@@ -52,8 +54,8 @@ def calibrate_command(
 def calibrate_mosaic_command(
     capture: Annotated[Path, typer.Argument(help="Mosaic capture of an even field behind a turning polarizer.")],
     instrument: Annotated[Path | None, typer.Option(help="Instrument file; default: the one in the capture.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Product file; default: beside the capture.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
+    out: ProductFile = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Fit the analysis vector of every pixel of a polarization sensor (Powell and Gruev)."""
     from processing.calibration.mosaic import fit_response

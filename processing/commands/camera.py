@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from processing.commands.drawing import FigureFile, NoFigure, draw
+from processing.commands.product_options import Overwrite
 
 
 def register(app: typer.Typer) -> None:
@@ -20,7 +21,7 @@ def camera_command(
     out: Annotated[Path | None, typer.Option(help="Product file; default: beside the first capture.")] = None,
     figure: FigureFile = None,
     no_figure: NoFigure = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Photon transfer: gain and read noise from states that repeat each other, bad pixels from dark states."""
     from processing.calibration.photon_transfer import write_camera

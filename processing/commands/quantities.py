@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from processing.commands.drawing import FigureFile, NoFigure, draw
+from processing.commands.product_options import Overwrite, ProductFile
 from processing.commands.progress_bar import progress_bar
 from processing.commands.reduce import reduced_source
 from processing.commands.summary import summary
@@ -32,10 +33,10 @@ def quantities_command(
         ),
     ] = None,
     instrument: Annotated[Path | None, typer.Option(help="Instrument file, where a capture is reduced here.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Product file; default: beside the source.")] = None,
+    out: ProductFile = None,
     figure: FigureFile = None,
     no_figure: NoFigure = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Eigenvalues, depolarization, diattenuation, polarizance, retardance and their standard errors."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from processing.commands.drawing import FigureFile, NoFigure, draw
+from processing.commands.product_options import Overwrite, ProductFile
 from processing.commands.progress_bar import progress_bar
 from processing.commands.summary import summary
 
@@ -23,7 +24,7 @@ def reduce_command(
     instrument: Annotated[
         Path | None, typer.Option(help="Instrument file to use instead of the one in the capture.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Product file; default: beside the capture.")] = None,
+    out: ProductFile = None,
     weighted: Annotated[bool, typer.Option("--weighted", help="Weigh each intensity by its noise.")] = False,
     covariance: Annotated[
         bool, typer.Option("--covariance", help="Store the 16 x 16 covariance of each pixel (with --weighted).")
@@ -47,7 +48,7 @@ def reduce_command(
     ] = None,
     figure: FigureFile = None,
     no_figure: NoFigure = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Invert W per pixel: Mueller image, or Stokes image of a polarization mosaic, with standard errors."""
     # Tiles are spread over our own threads; a second pool inside BLAS would only fight with them.

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from processing.commands.drawing import FigureFile, NoFigure, draw
+from processing.commands.product_options import Overwrite, ProductFile
 from processing.commands.reduce import reduced_source
 from processing.commands.summary import summary
 
@@ -91,10 +92,10 @@ def extrapolate_command(
     source: Annotated[Path, typer.Argument(help="Stokes capture, or its product of `process reduce`.")],
     geometry: Annotated[Path, typer.Option(help="Geometry file: camera, source, shape.")],
     material: Annotated[Path, typer.Option(help="Material file: the dominant process.")],
-    out: Annotated[Path | None, typer.Option(help="Product file; default: beside the source.")] = None,
+    out: ProductFile = None,
     figure: FigureFile = None,
     no_figure: NoFigure = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """A full Mueller image from a linear Stokes capture: TD model with the estimated xi0 and M00."""
     from processing.steps.maps import Extrapolation

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from processing.commands.drawing import FigureFile, NoFigure, draw
+from processing.commands.product_options import Overwrite, ProductFile
 from processing.commands.progress_bar import progress_bar
 from processing.commands.reduce import reduced_source
 from processing.commands.summary import summary
@@ -28,10 +29,10 @@ def xi0_command(
         Path | None, typer.Option(help="Material file: the dominant process (needed for a Stokes capture).")
     ] = None,
     instrument: Annotated[Path | None, typer.Option(help="Instrument file, where the capture is reduced here.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Product file; default: beside the source.")] = None,
+    out: ProductFile = None,
     figure: FigureFile = None,
     no_figure: NoFigure = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a product of that name.")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """xi0 from a Mueller capture (coherency eigenvalues) or a linear Stokes capture (two coefficients)."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -59,7 +59,7 @@ class Reduction(FileStep):
     def kind(self) -> str:
         """Of the product: "mueller" or "stokes"."""
         with Capture(self.capture) as capture:
-            return "stokes" if capture.header.mosaic and not capture.turned_mosaic else "mueller"
+            return capture.reduces_to
 
     @property
     def usual_path(self) -> Path:
@@ -70,15 +70,14 @@ class Reduction(FileStep):
         """Options and contents; the capture's name is among the options, for effects of single captures go by it."""
         with Capture(self.capture) as capture:
             flats = [_flat_file(path, capture) for path in self.flat]
-        if self.kind == "stokes":
+            kind, mosaic = capture.reduces_to, capture.header.mosaic is not None
+        if kind == "stokes":
             self._refuse(
                 ("weighted", "covariance", "physical"), "a mosaic capture; its product holds the covariance of S always"
             )
             self._refuse(("leave_out",), "a mosaic capture; bad pixels come from --camera, and states are images each")
             options: dict[str, Any] = {"demosaic": self.demosaic or _default_method()}
         else:
-            with Capture(self.capture) as capture:
-                mosaic = capture.header.mosaic is not None
             self._refuse(
                 ("demosaic", "analyzers"),
                 "reduced super-pixel by super-pixel, for something turns before its mosaic"

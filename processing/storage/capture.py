@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any, Literal
 
 import h5py
 import numpy as np
@@ -20,7 +19,7 @@ from processing.storage.capture_door import check_capture
 from processing.storage.capture_schema import SCHEMA_VERSION, CaptureHeader
 from processing.storage.checksums import NONE, row_crc32, state_crc32, summed_values
 from processing.storage.frame_layout import Beams, Cells, FrameLayout
-from processing.storage.h5_door import closed_if_damaged, damage_as, open_h5, text_attribute
+from processing.storage.h5_door import OpenH5, closed_if_damaged, damage_as, open_h5, text_attribute
 from processing.storage.segments import Segment, decode_lines, segments_of
 from processing.yaml_file import parse_yaml
 
@@ -29,7 +28,7 @@ class CaptureError(ProcessError):
     """A capture cannot be used; the message says what was expected, what was found and what to do."""
 
 
-class Capture:
+class Capture(OpenH5):
     """One capture file, open for reading. States not marked done do not exist for a reader.
 
     Every state read is held against its checksum; CaptureError names one that was changed on the disc.
@@ -133,17 +132,19 @@ class Capture:
         return self.planned_column(name)[self.done]
 
     @property
-    def turned_mosaic(self) -> bool:
-        """Whether a polarization mosaic looks through, or into light of, elements that turn between the states.
+    def reduces_to(self) -> Literal["mueller", "stokes"]:
+        """What a reduction makes of it: a Stokes image of a mosaic, if nothing turns between the states.
 
-        Each super-pixel then determines a part of the Mueller matrix; if nothing turns, one linear Stokes vector.
+        If an element before the mosaic or in the source turns, each super-pixel determines a part of the matrix.
         """
-        if self.header.mosaic is None or self.instrument is None:
-            return False
+        if self.header.mosaic is None:
+            return "mueller"
+        if self.instrument is None:
+            return "stokes"
         light = np.array([role not in ("dark", "flat") for role in self.role], dtype=bool)
         targets = self.planned_targets_deg()
         turned = [targets[axis][self.done][light] for axis in self.instrument.axes if axis in targets]
-        return any(np.ptp(angles) > 0 for angles in turned if angles.size)
+        return "mueller" if any(np.ptp(angles) > 0 for angles in turned if angles.size) else "stokes"
 
     def seen(self, model: InstrumentModel) -> InstrumentModel:
         """The model with the mosaic as this capture's frames have it: an odd offset of the region shifts it."""
@@ -279,16 +280,6 @@ class Capture:
 
     def _damage(self) -> AbstractContextManager[None]:
         return damage_as(CaptureError, f"{self.path} is damaged")
-
-    def close(self) -> None:
-        """Close the file."""
-        self._h5.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, tb: TracebackType | None) -> None:
-        self.close()
 
 
 def _open(path: Path) -> h5py.File:

@@ -6,7 +6,7 @@ import tokenize
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import h5py
 import numpy as np
@@ -33,6 +33,22 @@ def open_h5(path: Path, error: type[ProcessError], hint: str = "") -> h5py.File:
     except DAMAGE as why:
         text = f"{path} cannot be opened as HDF5 ({one_line(why)}). It is truncated or of another kind. {hint}"
         raise error(text.strip()) from why
+
+
+class OpenH5:
+    """A file that is open until `close` or the end of a `with` block."""
+
+    _h5: h5py.File
+
+    def close(self) -> None:
+        """Close the file."""
+        self._h5.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 def mark_of(path: Path, name: str) -> Any:

@@ -12,8 +12,7 @@ import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import h5py
 import numpy as np
@@ -21,7 +20,15 @@ from numpy.typing import NDArray
 
 from processing.errors import ProcessError
 from processing.storage.capture_schema import CaptureHeader
-from processing.storage.h5_door import closed_if_damaged, damage_as, mark_of, open_h5, require_dataset, text_attribute
+from processing.storage.h5_door import (
+    OpenH5,
+    closed_if_damaged,
+    damage_as,
+    mark_of,
+    open_h5,
+    require_dataset,
+    text_attribute,
+)
 from processing.storage.nexus import PIXEL_AXES, add_group, add_scales, attach, declare, default_plot, describe_light
 from processing.storage.packed import create_packed, pack, shrinks_to
 from processing.storage.provenance import Step as Step
@@ -52,10 +59,11 @@ class Plane:
     dtype: Any = np.float32
 
 
-class ProductWriter:
+class ProductWriter(OpenH5):
     """Writes a product row block by row block; an interrupted one goes on where it stopped.
 
-    The file is `<path>.partial`, all space allocated at the start, until `seal` renames it.
+    The file is `<path>.partial`, all space allocated at the start, until `seal` renames it. Closed before that it can
+    be resumed.
 
     Parameters
     ----------
@@ -217,18 +225,8 @@ class ProductWriter:
             entry.attrs["facts_json"] = whole.attrs["facts_json"]
         return path
 
-    def close(self) -> None:
-        """Close without sealing; the partial file can be resumed."""
-        self._h5.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, tb: TracebackType | None) -> None:
-        self.close()
-
-
-class Product:
+class Product(OpenH5):
     """One product file, open for reading.
 
     Attributes
@@ -307,16 +305,6 @@ class Product:
         """Row slices of about `pixels` pixels."""
         step = max(1, pixels // max(self.shape[1], 1))
         return [slice(k, min(k + step, self.shape[0])) for k in range(0, self.shape[0], step)]
-
-    def close(self) -> None:
-        """Close the file."""
-        self._h5.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, tb: TracebackType | None) -> None:
-        self.close()
 
 
 def _is_beside(name: str, dataset: h5py.Dataset) -> bool:
