@@ -2,6 +2,7 @@
 
 import ast
 import re
+import tomllib
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -45,6 +46,15 @@ def test_a_circle_would_be_seen(tmp_path):
     (folder / "two.py").write_text("def late():\n    from processing.one import thing\n")
     with pytest.raises(CycleError):
         TopologicalSorter(imports(tmp_path)).prepare()
+
+
+def test_the_floors_on_the_page_are_those_of_the_contracts():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    contracts = project["tool"]["importlinter"]["contracts"]
+    kept = {contract["containers"][0]: " > ".join(contract["layers"]) for contract in contracts[1:]}
+    page = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    shown = re.findall(r"^([\w.]+):  +(.+?)(?=^[\w.]+: |^```)", page, re.M | re.S)
+    assert {room: " ".join(floors.split()) for room, floors in shown} == kept
 
 
 def cited_outside(text: str) -> list[str]:

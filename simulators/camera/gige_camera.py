@@ -141,6 +141,8 @@ class GigeCamera:
         self._camera: Any = None
         self._memory: CameraMemory | None = None
         self._loopback = LoopbackAddress(address, elsewhere)
+        # First, because its message says what is missing.
+        load_aravis()
         self._library = ctypes.CDLL("libaravis-0.8.so.0")
         self._library.arv_buffer_get_data.restype = ctypes.c_void_p
         self._library.arv_buffer_get_data.argtypes = [ctypes.c_void_p, ctypes.c_void_p]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -139,6 +140,16 @@ def test_ctrl_c_gets_through_a_long_wait(simulated: GigeCamera) -> None:
 def test_an_address_holds_one_simulated_camera(simulated: GigeCamera) -> None:
     with pytest.raises(CameraError, match="another camera had it"):
         GigeCamera("FAULT4", *SIZE, pixel_source(Scene()), wait_s=0.1).start()
+
+
+def test_without_aravis_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> None:
+        raise OSError(f"{name}: cannot open shared object file")
+
+    monkeypatch.setitem(sys.modules, "gi", None)
+    monkeypatch.setattr("simulators.camera.gige_camera.ctypes.CDLL", missing)
+    with pytest.raises(CameraError, match=r"gir1\.2-aravis-0\.8"):
+        GigeCamera("FAULT6", *SIZE, pixel_source(Scene()))
 
 
 def test_an_address_that_no_interface_has_is_named() -> None:

@@ -1,21 +1,28 @@
-"""Every code block of README and docs: what is shown runs, or says why it does not run here.
+"""Every code block of README and docs runs as it stands.
 
-A block is a fence with a language. `bash` and `python` run as they stand, page by page, in a folder that looks like the
-checkout; a capture of the tutorial lies in `captures/` where a page takes none of itself. `console` has a title that
-says what it needs (minutes, hardware, files of yours): its commands, options and scripts must exist. `yaml` has a
+A block is a fence with a language. `bash` and `python` run page by page, in a folder that looks like the checkout; a
+capture of the tutorial lies in `captures/` where a page takes none of itself. A title that begins with "with" names
+files of the reader's, which `own_files` makes; `until Ctrl-C` is a server, which has to answer and to end. `yaml` has a
 title that says what it is: `NAME.yaml` is written for the commands that follow, a part of a file is put into that file.
+`console` takes minutes and runs with UMOV_SLOW=1 alone; without it its commands, options and scripts must exist.
 """
 
+import contextlib
 import glob
 import os
 import re
 import shlex
-from collections import Counter
+import signal
+import subprocess
+import sys
+import urllib.request
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
+import serial
 import typer
 from markdown_it import MarkdownIt
 from ruamel.yaml import YAML
@@ -42,8 +49,20 @@ APPS = {
     "simulate": simulate_app,
     "view": view_app,
 }
+MODULES = {"simulate": "simulators.cli", "view": "viewer.command"}
 FIRST_CAPTURE = ["./lab", "acquire", "--omega", "35"]
 LANGUAGES = {"bash", "python", "console", "yaml", "text"}
+SHOWN_FOLDERS = ("configs", "examples", "benchmarks")
+SMALLER = {
+    "configs/rigs/simulated.yaml": {
+        "clock_speed: 10": "clock_speed: 50",
+        "rows: 600": "rows: 160",
+        "columns: 600": "columns: 160",
+    },
+    "configs/campaigns/red_sphere.yaml": {"stop: 90": "stop: 20", "[451, 662]": "[662]"},
+}
+UNTIL_CTRL_C = "until Ctrl-C"
+SLOW = "UMOV_SLOW"
 
 
 @dataclass(frozen=True)
@@ -80,6 +99,14 @@ def blocks_of(page: Path) -> list[Block]:
 
 
 BLOCKS = [block for page in PAGES for block in blocks_of(page)]
+
+
+def run_by_ci(block: Block) -> bool:
+    """Whether CI's script says the same: the tests do not run themselves."""
+    said = (ROOT / ".ci/run").read_text(encoding="utf-8").splitlines()
+    return all(shlex.join(words) in said for words in block.commands())
+
+
 WITH_CODE = [page for page in PAGES if any(b.page == page and b.language in ("bash", "python") for b in BLOCKS)]
 
 
@@ -92,29 +119,23 @@ def test_every_block_says_what_it_is() -> None:
     assert wrong == []
 
 
-def test_most_blocks_run() -> None:
-    counted = Counter(b.language for b in BLOCKS)
-    assert counted["bash"] + counted["python"] + counted["yaml"] > counted["console"], counted
-
-
 @pytest.fixture(scope="session")
 def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with the files that pages name; the simulated rig has fewer pixels and a faster clock."""
+    """Folder with the files that pages name; the simulated rig is smaller and faster, the campaign shorter."""
     folder = tmp_path_factory.mktemp("checkout")
-    for name in ("configs", "examples", "benchmarks"):
+    for name in SHOWN_FOLDERS:
         target = folder / name
         for path in (ROOT / name).rglob("*"):
             if path.is_file() and "__pycache__" not in path.parts:
                 copy = target / path.relative_to(ROOT / name)
                 copy.parent.mkdir(parents=True, exist_ok=True)
                 copy.write_bytes(path.read_bytes())
-    rig = folder / "configs/rigs/simulated.yaml"
-    text = rig.read_text()
-    smaller = {"clock_speed: 10": "clock_speed: 50", "rows: 600": "rows: 160", "columns: 600": "columns: 160"}
-    for old, new in smaller.items():
-        assert old in text
-        text = text.replace(old, new)
-    rig.write_text(text)
+    for name, changes in SMALLER.items():
+        text = (folder / name).read_text()
+        for old, new in changes.items():
+            assert old in text
+            text = text.replace(old, new)
+        (folder / name).write_text(text)
     return folder
 
 
@@ -133,7 +154,7 @@ def first_capture(checkout: Path) -> Path:
 @pytest.fixture
 def desk(checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where a page's commands run: links to the files of the checkout, nothing else."""
-    for name in ("configs", "examples", "benchmarks"):
+    for name in SHOWN_FOLDERS:
         (tmp_path / name).symlink_to(checkout / name)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")
@@ -143,7 +164,6 @@ def desk(checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pat
 
 def run(words: list[str]) -> None:
     """Run a line of a shell block in this process, patterns of file names filled in as a shell does."""
-    assert words[0] == "./lab", f"{shlex.join(words)}: shown commands begin with ./lab"
     arguments = [name for word in words[2:] for name in (sorted(glob.glob(word)) if "*" in word else [word])]
     with pytest.raises(SystemExit) as end:
         RUNS[words[1]](arguments)
@@ -151,7 +171,9 @@ def run(words: list[str]) -> None:
 
 
 @pytest.mark.parametrize("page", WITH_CODE, ids=lambda page: page.stem)
-def test_commands_and_python_run_as_they_stand(page: Path, desk: Path, request: pytest.FixtureRequest) -> None:
+def test_commands_and_python_run_as_they_stand(
+    page: Path, desk: Path, own_files: dict[str, Callable[[], object]], request: pytest.FixtureRequest
+) -> None:
     blocks = [b for b in BLOCKS if b.page == page]
     if not any(words[:4] == FIRST_CAPTURE and "--mode" not in words for b in blocks for words in shown(b)):
         (desk / "captures").mkdir()
@@ -162,20 +184,66 @@ def test_commands_and_python_run_as_they_stand(page: Path, desk: Path, request: 
         if block.language == "yaml" and block.title.endswith(".yaml"):
             (desk / block.title).write_text(block.text)
         elif block.language == "bash":
+            if block.title.startswith("with "):
+                own_files[block.title]()
             for words in shown(block):
-                run(words)
+                assert words[0] == "./lab", f"{shlex.join(words)}: shown commands begin with ./lab"
+                (serve if block.title == UNTIL_CTRL_C else run)(words)
         elif block.language == "python":
             exec(compile(block.text, f"{page.name}:{block.line}", "exec"), scope)
 
 
-@pytest.mark.parametrize(
-    "block", [b for b in BLOCKS if b.language == "console"], ids=lambda b: f"{b.page.stem}-{b.line}"
-)
-def test_what_is_not_run_here_exists(block: Block) -> None:
+def serve(words: list[str]) -> None:
+    """Start a server by a line of a shell block, ask it something, and end it as a user does."""
+    begin = [sys.executable, "-c", f"from {MODULES[words[1]]} import main; main()", *words[2:]]
+    with subprocess.Popen(begin, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            assert server.stdout is not None
+            address = server.stdout.readline().split()[-1]
+            if address.startswith("http"):
+                with urllib.request.urlopen(address) as page:
+                    assert page.status == 200
+            else:
+                # A controller's pseudo-terminal; the line is the question for everybody's state on a Zaber chain.
+                with serial.Serial(address, 115200) as port:
+                    port.write(b"/\n")
+                    assert port.readline().startswith(b"@01 0 OK")
+        finally:
+            server.send_signal(signal.SIGINT)
+    assert server.returncode in (0, 130), shlex.join(words)
+
+
+SLOW_BLOCKS = [
+    pytest.param(b, id=f"{b.page.stem}-{b.line}") for b in BLOCKS if b.language == "console" and not run_by_ci(b)
+]
+
+
+@pytest.mark.skipif(not os.environ.get(SLOW), reason=f"takes minutes each; {SLOW}=1 runs them")
+@pytest.mark.timeout(0)
+@pytest.mark.parametrize("block", SLOW_BLOCKS)
+def test_what_takes_minutes_runs_as_it_stands(block: Block, desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, target in {"lab": ROOT / "lab", "tests": ROOT / "tests", ".venv": Path(sys.prefix)}.items():
+        (desk / name).symlink_to(target)
+    monkeypatch.delenv(SLOW)
+    # A group of its own: what a line leaves in the background ends with it.
+    with subprocess.Popen(["bash", "-ec", block.text], start_new_session=True) as shell:
+        try:
+            assert shell.wait() == 0
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(shell.pid, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("block", SLOW_BLOCKS)
+def test_what_takes_minutes_exists(block: Block) -> None:
     for words in block.commands():
-        for word in words:
+        script = ""
+        for word in (word.rstrip(";") for word in words):
             if word.startswith(("benchmarks/", "examples/", "tests/", "configs/")):
                 assert (ROOT / word).exists(), word
+                script = (ROOT / word).read_text() if word.endswith(".py") else script
+            elif word.startswith("--") and "benchmarks/" in shlex.join(words):
+                assert f'"{word}"' in script, word
         if words[0] == "./lab" and words[1] in APPS:
             require_options(words[1], words[2:])
 
