@@ -1,4 +1,4 @@
-"""Material constants n + i k, a, b of the polarized diffuse model from Mueller elements, Stokes vectors, intensities.
+"""Material constants n + i k, a, b of the polarized diffuse model from Mueller elements or Stokes vectors.
 
 At each pixel P = alpha_0 W m0 + alpha_ID W mID, so the right constants make the measured and the modelled values most
 linearly related (paper, conclusion); the two coefficients of each pixel are projected out, with alpha_0 >= 0: a
@@ -106,36 +106,6 @@ def fit_values(
     whiten = np.linalg.inv(np.linalg.cholesky(c[keep] + ridge))
     data = np.einsum("nij,jn->ni", whiten, x[:, keep])
     return _fit(geometry[keep], data, whiten @ np.asarray(rows, dtype=float))
-
-
-def fit_intensities(
-    geometry: ScatteringGeometry,
-    intensities: ArrayLike,
-    w: ArrayLike,
-    variance: ArrayLike | None = None,
-    max_pixels: int = 5000,
-) -> MaterialFit:
-    """Constants from intensities (K, N) under W (K, 16), by maximum linear correlation.
-
-    Parameters
-    ----------
-    variance : (K, N), of the intensities; pixels are weighed by it. None: by their own modulation, which is the
-        plain correlation coefficient and suits noise in proportion to the signal.
-
-    Raises
-    ------
-    NotDetermined : fewer than 10 pixels are finite.
-    """
-    p = np.asarray(intensities, dtype=float)
-    rows = np.asarray(w, dtype=float).reshape(-1, 16)
-    keep = _some(np.isfinite(p).all(axis=0), max_pixels)
-    p = p[:, keep].T
-    if variance is None:
-        off = p - p.mean(axis=1, keepdims=True)
-        scale = np.broadcast_to(1 / np.maximum(np.linalg.norm(off, axis=1, keepdims=True), 1e-12), p.shape)
-    else:
-        scale = 1 / np.sqrt(np.asarray(variance, dtype=float)[:, keep].T)
-    return _fit(geometry[keep], p * scale, rows * scale[:, :, None])
 
 
 def _fit(geometry: ScatteringGeometry, data: Array, rows: Array) -> MaterialFit:

@@ -1,4 +1,4 @@
-"""Material constants from Mueller images and from intensities: recovery, error bars, identifiability."""
+"""Material constants from Mueller images and from light behind polarizers: recovery, error bars, identifiability."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
 from processing.maps.material_fit import covariance_by_light
 from processing.polarization.cloude import xi0_and_dominant
-from processing.reflectance.material_fit import NAMES, MaterialFit, fit_intensities, fit_values
+from processing.reflectance.material_fit import NAMES, MaterialFit, fit_values
 from simulators.bench.scene import Scene
 
 TRUE = np.array([1.3, 0.08, 0.17, 2.0])
@@ -45,17 +45,21 @@ def fit_matrices(geometry: ScatteringGeometry, m: np.ndarray) -> MaterialFit:
     return fit_values(geometry, m.reshape(-1, 16).T, np.eye(16), np.tile(np.eye(16), (len(m), 1, 1)))
 
 
+def fit_intensities(geometry: ScatteringGeometry, p: np.ndarray, w: np.ndarray, variance: np.ndarray) -> MaterialFit:
+    """To intensities (K, N) under W (K, 16), of variance (K, N) each."""
+    return fit_values(geometry, p, w, variance.T[:, :, None] * np.eye(len(w)))
+
+
 def test_exact_data_give_the_constants(sphere, w40):
     geometry, m = sphere
     fit = fit_matrices(geometry, m)
     np.testing.assert_allclose(fit.constants, TRUE, rtol=1e-4)
     for w in (stokes(VERTICAL), w40):
         p = w @ m.reshape(-1, 16).T
-        for variance in (None, np.ones_like(p)):
-            fit = fit_intensities(geometry, p, w, variance)
-            np.testing.assert_allclose(fit.constants, TRUE, rtol=2e-3)
-            assert fit.correlation == pytest.approx(1, abs=1e-6)
-            assert all(fit.identified.values())
+        fit = fit_intensities(geometry, p, w, np.ones_like(p))
+        np.testing.assert_allclose(fit.constants, TRUE, rtol=2e-3)
+        assert fit.correlation == pytest.approx(1, abs=1e-6)
+        assert all(fit.identified.values())
 
 
 def noisy(m: np.ndarray, w: np.ndarray, seed: int, electrons: float) -> tuple[np.ndarray, np.ndarray]:
@@ -120,9 +124,9 @@ def test_a_turned_geometry_lowers_the_correlation(sphere):
     geometry, m = sphere
     w = stokes(VERTICAL)
     p = w @ m.reshape(-1, 16).T
-    right = fit_intensities(geometry, p, w).correlation
+    right = fit_intensities(geometry, p, w, np.ones_like(p)).correlation
     wrong = ScatteringGeometry(np.roll(geometry.normal, 40, axis=0), geometry.to_source, geometry.to_camera)
-    fit = fit_intensities(wrong, p, w)
+    fit = fit_intensities(wrong, p, w, np.ones_like(p))
     assert fit.correlation < right - 0.02
     assert not all(fit.identified.values())
 
