@@ -39,10 +39,23 @@ def require_file(path: Path, error: type[ProcessError] = ProcessError, most_byte
     except (OSError, ValueError) as why:
         raise error(f"{one_line(path)}: cannot be read ({getattr(why, 'strerror', why)})") from why
     if not stat.S_ISREG(found.st_mode):
-        raise error(f"{path}: is a folder" if stat.S_ISDIR(found.st_mode) else f"{path}: is no regular file")
+        what = "a folder, and a file is asked for" if stat.S_ISDIR(found.st_mode) else "no regular file"
+        raise error(f"{path}: is {what}")
     if most_bytes is not None and found.st_size > most_bytes:
-        raise error(f"{path}: has {found.st_size:,} bytes; such a file has at most {most_bytes:,}")
+        raise error(
+            f"{path}: has {found.st_size:,} bytes, a file of this kind at most {most_bytes:,}. Is it the right one?"
+        )
     return found.st_size
+
+
+def require_place(path: Path, overwrite: bool = False) -> None:
+    """Raise ProcessError unless a file can be made there: the folder is there, the name is free or may be replaced."""
+    if path.is_dir():
+        raise ProcessError(f"{path} is a folder. --out takes the name of a file.")
+    if path.exists() and not overwrite:
+        raise ProcessError(f"{path} exists. Give another --out, or --overwrite to replace it.")
+    if not path.parent.is_dir():
+        raise ProcessError(f"{path}: there is no folder {path.parent}. Make it, or give another --out.")
 
 
 def require_picture(path: Path, error: type[ProcessError] = ProcessError) -> None:

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.doors import require_place
 from processing.errors import ProcessError
 from processing.labelled import open_dataset
-from processing.storage.product import Product, is_product, refuse_existing
+from processing.storage.product import Product, is_product
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -45,7 +46,7 @@ def export(source: Path, to: str, out: Path, planes: Sequence[str] = (), overwri
         raise ProcessError(f"unknown format {to!r}; there are: {', '.join((*FORMATS, *FIGURES))}")
     if to in FIGURES:
         path = out.with_name(f"{out.name}.{to}")
-        refuse_existing(path, overwrite)
+        require_place(path, overwrite)
         _figure(source, path, planes)
         return [path]
     dataset = open_dataset(source)
@@ -76,7 +77,7 @@ def _to_tiff(dataset: xr.Dataset, names: list[str], out: Path, overwrite: bool) 
 
     paths = [out.with_name(f"{out.name}.{name}.tif") for name in names]
     for path in paths:
-        refuse_existing(path, overwrite)
+        require_place(path, overwrite)
     for name, path in zip(names, paths, strict=True):
         pages = list(_pages(dataset, name))
         whole = np.iinfo(dataset[name].dtype).bits <= 16 if dataset[name].dtype.kind in "ui" else False
@@ -93,7 +94,7 @@ def _to_tiff(dataset: xr.Dataset, names: list[str], out: Path, overwrite: bool) 
 def _to_csv(dataset: xr.Dataset, names: list[str], out: Path, overwrite: bool) -> list[Path]:
     """A row for each state of a capture, or for each pixel of a product; comments tell units."""
     path = out.with_name(f"{out.name}.csv")
-    refuse_existing(path, overwrite)
+    require_place(path, overwrite)
     columns: dict[str, NDArray[Any]] = {}
     if "state" in dataset.dims:
         columns = {str(name): array.values for name, array in dataset.coords.items() if array.dims == ("state",)} | {
@@ -130,7 +131,7 @@ def _to_fits(dataset: xr.Dataset, names: list[str], out: Path, overwrite: bool) 
     except ImportError as error:
         raise ProcessError("FITS needs astropy: pip install 'umov[export]'") from error
     path = out.with_name(f"{out.name}.fits")
-    refuse_existing(path, overwrite)
+    require_place(path, overwrite)
     first = fits.PrimaryHDU()
     for key, value in _facts(dataset).items():
         first.header.add_comment(f"{key}: {value}".encode("ascii", "replace").decode().replace("\n", " "))
@@ -156,7 +157,7 @@ def _to_matlab(dataset: xr.Dataset, names: list[str], out: Path, overwrite: bool
     from scipy.io import savemat
 
     path = out.with_name(f"{out.name}.mat")
-    refuse_existing(path, overwrite)
+    require_place(path, overwrite)
     large = [name for name in names if dataset[name].nbytes > MATLAB_BYTES]
     if large:
         raise ProcessError(

@@ -16,7 +16,7 @@ from ruamel.yaml.events import AliasEvent
 
 from processing.doors import MOST_DEPTH, one_line, read_text
 from processing.errors import ProcessError
-from processing.yaml_words import words_of
+from processing.yaml_words import names_in, words_of
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -86,7 +86,7 @@ def parse_yaml(text: str, model: type[Model], source: str = "text") -> Model:
     try:
         value = model.model_validate(_plain(tree))
     except ValidationError as error:
-        lines = [_describe(source, tree, entry) for entry in error.errors()]
+        lines = _described(source, tree, model, error.errors())
         told = {line.split(" ", 1)[0] for line in lines}
         more = [line for line in _not_finite(source, tree, tree) if line.split(" ", 1)[0] not in told]
         raise _refusal(source, lines + more) from error
@@ -187,10 +187,28 @@ def _plain(node: Any) -> Any:
     return node
 
 
-def _describe(source: str, tree: CommentedMap, entry: Any) -> str:
-    location: Sequence[int | str] = entry["loc"]
-    where = ".".join(str(part) for part in location)
-    return ": ".join(filter(None, (f"{source}:{_line(tree, location)}", one_line(where), one_line(words_of(entry)))))
+def _described(source: str, tree: CommentedMap, model: type[BaseModel], entries: Sequence[Any]) -> list[str]:
+    """A line for each place with a mistake; for a file of another kind only that."""
+    kind = [entry for entry in entries if entry["loc"] == ("kind",)]
+    names = names_in(model) if any(entry["type"] == "extra_forbidden" for entry in entries) else ()
+    found: dict[str, list[str]] = {}
+    for entry in kind or entries:
+        where = one_line(".".join(_keys(tree, entry["loc"])))
+        place = ": ".join(filter(None, (f"{source}:{_line(tree, entry['loc'])}", where)))
+        found.setdefault(place, []).append(one_line(words_of(entry, names)))
+    after = "; is it the right file?" if kind else ""
+    return [f"{place}: {', or '.join(dict.fromkeys(texts))}{after}" for place, texts in found.items()]
+
+
+def _keys(tree: Any, location: Sequence[int | str]) -> Iterator[str]:
+    """The keys of a location, without the types that pydantic names where a value could be of several."""
+    node = tree
+    for part in location:
+        if not isinstance(node, (CommentedMap, CommentedSeq)):
+            return
+        node = node[part] if _has(node, part) else node
+        if "[" not in str(part):
+            yield str(part)
 
 
 def _line(tree: Any, location: Sequence[int | str]) -> int:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
 from typing import Any
+
+from pydantic import BaseModel, PydanticUserError
 
 #: By the library's name of the mistake; `{...}` are what it tells beside the name.
 WORDS = {
@@ -45,14 +49,38 @@ TYPES = {
 SHOWN = 40
 
 
-def words_of(entry: Any) -> str:
+def names_in(model: type[BaseModel]) -> tuple[str, ...]:
+    """Every key that a file of the model may have, at any depth; none where the model has no schema."""
+    try:
+        return tuple(dict.fromkeys(_properties(model.model_json_schema())))
+    except PydanticUserError:
+        return ()
+
+
+def _properties(schema: Any) -> Iterator[str]:
+    if isinstance(schema, list):
+        for part in schema:
+            yield from _properties(part)
+    elif isinstance(schema, dict):
+        yield from schema.get("properties", ())
+        for word, part in schema.items():
+            # A model may have a key of the name of one of the schema's own words.
+            yield from _properties(list(part.values()) if word in ("properties", "$defs") else part)
+
+
+def words_of(entry: Any, names: Sequence[str] = ()) -> str:
     """What one entry of a ValidationError says.
 
     Parameters
     ----------
     entry : of `ValidationError.errors()`.
+    names : keys that a file may have; the nearest one is named beside one that it may not have.
     """
     kind = str(entry["type"])
+    if kind == "extra_forbidden":
+        key = str(entry["loc"][-1])
+        meant = get_close_matches(key, [name for name in names if name != key], 1, cutoff=0.75)
+        return WORDS[kind] + (f"; is {meant[0]!r} meant?" if meant else "")
     if kind in WORDS:
         return WORDS[kind].format_map(entry.get("ctx", {})) + _found(kind, entry)
     stem, _, rest = kind.partition("_")

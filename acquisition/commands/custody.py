@@ -11,9 +11,11 @@ from acquisition.capture.writer import NEW, PARTIAL, mark_not_taken, seal_whole
 from acquisition.commands.doctor import Finding
 from acquisition.errors import AcquisitionError
 from processing.errors import ProcessError
+from processing.reflectance.tables import is_table
 from processing.storage.capture import Capture, CaptureError
 from processing.storage.h5_door import mark_of
 from processing.storage.packed_capture import pack_capture
+from processing.storage.product import is_product
 from processing.yaml_file import load_yaml
 
 
@@ -25,10 +27,15 @@ def verify(folder: Path) -> Iterator[Finding]:
     for path in sorted(folder.iterdir()):
         if path.name.endswith(NEW):
             yield Finding(path.name, None, "left by a program that was killed while it made a file; repair removes it")
-        elif path.name.endswith((".h5", PARTIAL)):
+        elif _is_capture(path):
             yield _capture(path)
     if (folder / PLAN).exists():
         yield from _index(folder)
+
+
+def _is_capture(path: Path) -> bool:
+    """Whether a file is a capture, or named like one and nothing else: products and tables lie beside captures."""
+    return path.name.endswith((".h5", PARTIAL)) and not is_product(path) and not is_table(path)
 
 
 def _capture(path: Path) -> Finding:
@@ -74,7 +81,9 @@ def _index(folder: Path) -> Iterator[Finding]:
         if told.get("status") == "complete" and not path.exists():
             yield Finding(capture.name, False, f"{INDEX} has it as complete, but the file is not there")
     for path in sorted(folder.glob("*.h5*")):
-        if path.name.removesuffix(NEW).removesuffix(PARTIAL) not in names:
+        if path.name.removesuffix(NEW).removesuffix(PARTIAL) not in names and (
+            path.name.endswith(NEW) or _is_capture(path)
+        ):
             yield Finding(path.name, None, "is no capture of this campaign")
     yield Finding(INDEX, not wrong, "as the files are" if not wrong else f"differs for {', '.join(wrong)}; repair")
 
@@ -97,7 +106,7 @@ def repair(folder: Path) -> Iterator[Finding]:
             if path.name.endswith(NEW):
                 path.unlink()
                 yield Finding(path.name, True, "removed")
-            elif path.name.endswith((".h5", PARTIAL)):
+            elif _is_capture(path):
                 yield _mended(path)
         if held is not None:
             yield from _rebuilt(held)

@@ -25,14 +25,14 @@ def verify(folder: Folder) -> None:
     """Read every capture of a folder and name what is damaged or half done. Exit code 1 if anything is damaged."""
     from acquisition.commands.custody import verify as look
 
-    _show(look(folder))
+    _show(folder, look(folder))
 
 
 def repair(folder: Folder) -> None:
     """Finish what a kill left half done: seal whole captures, remove strays, make the index anew. Removes no state."""
     from acquisition.commands.custody import repair as mend
 
-    _show(mend(folder))
+    _show(folder, mend(folder))
 
 
 def compress(folder: Folder) -> None:
@@ -42,13 +42,16 @@ def compress(folder: Folder) -> None:
     """
     from acquisition.commands.custody import compressed
 
-    _show(compressed(folder))
+    _show(folder, compressed(folder))
 
 
-def _show(findings: Iterable[Finding]) -> None:
+def _show(folder: Path, findings: Iterable[Finding]) -> None:
     from acquisition.screen.rows import print_rows
+    from processing.errors import ProcessError
 
     there = list(findings)
+    if not there:
+        raise ProcessError(f"{folder}: there is no capture in this folder. Name the one that holds the .h5 files.")
     print_rows(finding.row for finding in there)
     if any(finding.well is False for finding in there):
         raise typer.Exit(1)

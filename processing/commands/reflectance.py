@@ -66,11 +66,11 @@ def fit_material_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file of that name.")] = False,
 ) -> None:
     """Fit n + i k, a and b to Mueller images, or to linear Stokes images by maximum linear correlation."""
+    from processing.doors import require_place
     from processing.reflectance.material_fit import NAMES
     from processing.steps.material import MaterialFitting
-    from processing.storage.product import refuse_existing
 
-    refuse_existing(out, overwrite)
+    require_place(out, overwrite)
     found = MaterialFitting(tuple(sources), geometry, name).fitted()
     fit = found.fit
     if found.simulated:

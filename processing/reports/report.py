@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.doors import read_text, require_file
+from processing.doors import read_text, require_file, require_place
 from processing.errors import ProcessError
 from processing.reflectance.tables import ScatteringTable, is_table
 from processing.reports.figure_style import map_figure, png, thin
@@ -89,8 +89,7 @@ def write_report(
     ------
     ProcessError : nothing to report, `out` exists, or simulated and measured data are mixed.
     """
-    if out.exists() and not overwrite:
-        raise ProcessError(f"{out} exists. Give another --out, or --overwrite to replace it.")
+    require_place(out, overwrite)
     files = [f for f in collect(sources) if f.resolve() != out.resolve()]
     simulated = _kind_of_data(files)
     sections: list[Section] = []

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from processing.storage.product import refuse_existing
+from processing.doors import require_place
 from processing.storage.provenance import Step, made_of
 
 #: Called with (parts done, parts in all).
@@ -42,10 +42,10 @@ class FileStep(ABC):
 
         Raises
         ------
-        ProductError : the file exists and `overwrite` is false.
+        ProcessError : the file exists and `overwrite` is false, or its folder is not there.
         """
         out = out or self.usual_path
-        refuse_existing(out, overwrite)
+        require_place(out, overwrite)
         self._write(out, self.record(), overwrite, progress)
         return out
 
@@ -62,7 +62,7 @@ class FileStep(ABC):
             if made_of(candidate) == wanted:
                 return Found(candidate, True)
         out = own if path.exists() else path
-        refuse_existing(out, overwrite=False)
+        require_place(out, overwrite=False)
         self._write(out, record, False, progress)
         return Found(out, False)
 

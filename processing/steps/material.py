@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from processing.doors import require_place
 from processing.maps.material_fit import fit_products
 from processing.reflectance.material_fit import MaterialFit
 from processing.steps.maps import geometry_identities
-from processing.storage.product import refuse_existing
 from processing.storage.provenance import Step, file_identity, input_text
 from processing.yaml_file import dump_yaml
 
@@ -25,7 +25,7 @@ class FittedMaterial:
 
     def save(self, out: Path, overwrite: bool = False) -> None:
         """Write a material file (YAML); errors, correlations and provenance are comments at its top."""
-        refuse_existing(out, overwrite)
+        require_place(out, overwrite)
         sources = [Path(i["path"]).name for i in self.record.inputs if i["role"] == "source"]
         notes = [*self.fit.notes(sources), *map(input_text, self.record.inputs), f"made of {self.record.made_of}"]
         header = "".join(f"# {note}\n" for note in notes)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from processing.doors import require_place
 from processing.storage.axostep import AxoStepError, MuellerFile, read_mueller_file, write_mueller_file
 from processing.storage.capture_schema import CaptureHeader
 from processing.storage.images import require_all_elements
@@ -80,13 +81,12 @@ def axostep_of_product(source: Path, out: Path, overwrite: bool) -> None:
 
     Raises
     ------
-    AxoStepError : the target exists, or has another ending.
+    ProcessError : the target exists, or has another ending.
     ProductError : the source is no Mueller product.
     """
     if out.suffix.lower() not in (".cmmi", ".bmmi"):
         raise AxoStepError(f"{out}: AxoStep's Mueller images end in .cmmi or .bmmi")
-    if out.exists() and not overwrite:
-        raise AxoStepError(f"{out} exists. Give another --out, or --overwrite to replace it.")
+    require_place(out, overwrite)
     with Product(source) as product:
         require_all_elements(product)
         values, nm = product.get("mueller").astype(np.float32), product.header.wavelength_nm

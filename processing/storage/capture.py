@@ -23,6 +23,9 @@ from processing.storage.h5_door import OpenH5, closed_if_damaged, damage_as, ope
 from processing.storage.segments import Segment, decode_lines, segments_of
 from processing.yaml_file import parse_yaml
 
+#: What else a file can be, by its mark.
+MADE_OF_CAPTURES = {"umov_product": "a product of `process`", "umov_table": "a scattering table"}
+
 
 class CaptureError(ProcessError):
     """A capture cannot be used; the message says what was expected, what was found and what to do."""
@@ -57,8 +60,11 @@ class Capture(OpenH5):
 
     def _read(self) -> None:
         if "umov_schema" not in self._h5.attrs:
+            made = next((what for mark, what in MADE_OF_CAPTURES.items() if mark in self._h5.attrs), None)
             raise CaptureError(
                 f"{self.path} is HDF5 but no umov capture. If it comes from elsewhere, use `process import`."
+                if made is None
+                else f"{self.path} is {made}, and a capture is asked for: the file that it was made from."
             )
         version = int(self._h5.attrs["umov_schema"])
         if version > SCHEMA_VERSION:

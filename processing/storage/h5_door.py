@@ -31,7 +31,9 @@ def open_h5(path: Path, error: type[ProcessError], hint: str = "") -> h5py.File:
     try:
         return h5py.File(path, "r")
     except DAMAGE as why:
-        text = f"{path} cannot be opened as HDF5 ({one_line(why)}). It is truncated or of another kind. {hint}"
+        if not h5py.is_hdf5(path):
+            raise error(f"{path} cannot be opened as HDF5: it is of another kind, or its beginning is damaged") from why
+        text = f"{path} cannot be opened as HDF5 ({one_line(why)}). It is truncated or damaged. {hint}"
         raise error(text.strip()) from why
 
 

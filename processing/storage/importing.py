@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.computing.threads import thread_count
-from processing.doors import one_line, read_text
+from processing.doors import one_line, read_text, require_place
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture_schema import CaptureHeader, Detector, Sample, create_layout, write_closing
 from processing.storage.checksums import row_crc32, write_checksums
@@ -66,11 +66,10 @@ def import_capture(request: ImportRequest, progress: Progress | None = None) -> 
 
     Raises
     ------
-    ImportFailed : the states file, a frame or the stack cannot be used, or the capture exists already.
+    ProcessError : the states file, a frame or the stack cannot be used, or the capture exists already.
     ConfigError, WavelengthError : the instrument file cannot be used.
     """
-    if request.out.exists() and not request.overwrite:
-        raise ImportFailed(f"{request.out} exists. Give another --out, or --overwrite to replace it.")
+    require_place(request.out, request.overwrite)
     model = None
     if request.instrument is not None:
         model = InstrumentModel.load(request.instrument)

@@ -18,6 +18,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.doors import require_place
 from processing.errors import ProcessError
 from processing.storage.capture_schema import CaptureHeader
 from processing.storage.h5_door import (
@@ -83,8 +84,8 @@ class ProductWriter(OpenH5):
 
     Raises
     ------
-    ProductError
-        The product exists and `overwrite` is false, or the space cannot be had.
+    ProcessError
+        The product exists and `overwrite` is false, its folder is not there, or the space cannot be had.
     """
 
     def __init__(
@@ -98,7 +99,7 @@ class ProductWriter(OpenH5):
         overwrite: bool = False,
     ) -> None:
         self.path = path
-        refuse_existing(path, overwrite)
+        require_place(path, overwrite)
         self._partial = path.with_name(path.name + ".partial")
         self._kind, self._header, self._shape, self._planes, self._steps = kind, header, shape, planes, tuple(steps)
         #: Equal in two runs exactly if they would write the same values.
@@ -317,12 +318,6 @@ def leading_dimensions(name: str, leading: tuple[int, ...]) -> tuple[str, ...]:
     if leading == (4, 4):
         return ("row", "column")
     return tuple(f"{name.removesuffix('_errors')}_{k}" for k in range(len(leading)))
-
-
-def refuse_existing(path: Path, overwrite: bool) -> None:
-    """Raise ProductError if a file of that name is there and may not be replaced."""
-    if path.exists() and not overwrite:
-        raise ProductError(f"{path} exists. Give another --out, or --overwrite to replace it.")
 
 
 def is_product(path: Path) -> bool:

@@ -62,3 +62,32 @@ def test_options_that_do_not_fit_are_told_before_the_work_and_not_passed_over(ru
     code, err = run("xi0", capture, "--geometry", "no_such_file.yaml", "--no-figure")
     assert code == 0
     assert "is no Stokes image: --geometry and --material are not looked at" in err
+
+
+def test_a_file_that_is_not_meant_is_called_what_it_is(run, acquire, capture, configs, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text, folder, product = tmp_path / "notes.txt", tmp_path / "empty", tmp_path / "näme with blanks.h5"
+    text.write_text("notes")
+    folder.mkdir()
+    assert run("reduce", capture, "--out", product, "--no-figure") == (0, "")
+    rig = configs / "rigs/simulated.yaml"
+    for arguments, words in (
+        (("reduce", product), "is a product of `process`, and a capture is asked for"),
+        (("reduce", text), "cannot be opened as HDF5: it is of another kind"),
+        (("reduce", folder), "is a folder, and a file is asked for"),
+        (("reduce", capture, "--instrument", rig), "kind: must be 'instrument', not 'rig'; is it the right file?"),
+        (("reduce", capture, "--instrument", capture), "a file of this kind at most"),
+        (("reduce", capture, "--out", folder), "is a folder. --out takes the name of a file"),
+        (("export", product, "--to", "png", "--out", "no/where"), "there is no folder no. Make it"),
+        (("xi0", product, "--out", "no/where.h5"), "there is no folder no. Make it"),
+    ):
+        code, err = run(*arguments)
+        assert (code, words in err) == (2, True), err
+        assert err.count("\n") == 1
+    # Products lie beside captures; none is a damaged capture.
+    for command in ("verify", "repair"):
+        code, out, err = acquire(command, tmp_path)
+        assert (code, err) == (0, "")
+        assert product.name not in out
+        code, _, err = acquire(command, folder)
+        assert (code, "there is no capture in this folder" in err) == (2, True)

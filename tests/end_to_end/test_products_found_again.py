@@ -18,7 +18,7 @@ from processing.reflectance.tables import ScatteringTable, table_steps
 from processing.steps.maps import Quantities, Xi0, geometry_identities
 from processing.steps.reduction import Reduction, reduced
 from processing.storage import provenance
-from processing.storage.product import Product, ProductError
+from processing.storage.product import Product
 from processing.storage.provenance import made_of
 from simulators.bench.bench import SimulatedBench
 from simulators.bench.scene import Scene
@@ -173,7 +173,7 @@ def test_the_mesh_of_a_geometry_file_is_an_input(capture, configs, tmp_path):
 def test_names_that_are_taken_are_refused(capture, configs, tmp_path):
     step = Reduction(capture)
     step.make()
-    with pytest.raises(ProductError, match="exists"):
+    with pytest.raises(ProcessError, match="exists"):
         step.make()
     with pytest.raises(ProcessError, match="is reduced already"):
         reduced(step.usual_path, configs / "instruments/rgb950.yaml")

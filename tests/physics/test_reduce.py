@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
-from processing.errors import NotDetermined
+from processing.errors import NotDetermined, ProcessError
 from processing.instrument.model import InstrumentModel
 from processing.polarization import mueller
 from processing.reduction.counts_to_signal import Correction
@@ -16,7 +16,7 @@ from processing.reduction.mueller import reduce_mueller
 from processing.storage.capture import Capture, CaptureError
 from processing.storage.images import MuellerImage
 from processing.storage.pixel_mask import Mask
-from processing.storage.product import Product, ProductError, Step
+from processing.storage.product import Product, Step
 
 GAIN, READ_NOISE, BLACK = 2.5, 4.0, 64.0
 STEP = Step("reduce", {"capture": "capture.h5"})
@@ -282,7 +282,7 @@ def test_product_keeps_origin_and_says_simulated(rgb950: InstrumentModel, synthe
         assert [s.name for s in product.steps] == ["reduce"]
         assert product.steps[0].arguments == STEP.arguments
         assert product.facts["condition_number"] == pytest.approx(7.14, abs=0.01)
-    with Capture(path) as capture, pytest.raises(ProductError, match="exists"):
+    with Capture(path) as capture, pytest.raises(ProcessError, match="exists"):
         reduce_mueller(capture, rgb950, out, (STEP,))
 
 

@@ -22,7 +22,7 @@ def diagnose_reflectance(
 ) -> None:
     """Diagnose, print a summary and write what was asked for. Raises ProcessError."""
     if reflectance is None or geometry is None:
-        raise ProcessError("a triply degenerate sample needs both --reflectance MATERIAL and --geometry GEOMETRY.")
+        raise ProcessError("--reflectance MATERIAL and --geometry GEOMETRY go together: give both, or none.")
     from processing.commands.loaded_late.diagnose_summary import show, write_result
     from processing.diagnosis.surface.run import diagnose_object
     from processing.diagnosis.surface.write import targets, write_surface
