@@ -1,13 +1,14 @@
-"""What the four commands share: their look, `--version`, and errors of the user as one message, never a traceback."""
+"""What the five commands share: their look, `--version`, and errors of the user as one message, never a traceback."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
-from typing import Annotated
+from typing import Annotated, Any, NoReturn
 
 import typer
+from typer.exceptions import TyperException
 
 from processing.errors import ProcessError
 
@@ -26,9 +27,37 @@ Version = Annotated[
 ]
 
 
-def application(name: str, text: str) -> typer.Typer:
-    """An application with the look that all four share: plain help, also by -h, and shell completion."""
-    return typer.Typer(
+class Application(typer.Typer):
+    """Commands that tell a mistake of usage as every other one: what was given, and what is wanted."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> NoReturn:
+        """Run on the process's own arguments, or on `args`; always ends in SystemExit."""
+        try:
+            ended = super().__call__(*args, standalone_mode=False, **kwargs)
+        except TyperException as error:
+            typer.echo(_in_our_words(error), err=True)
+            sys.exit(error.exit_code)
+        sys.exit(ended if isinstance(ended, int) else 0)
+
+
+def _in_our_words(error: TyperException) -> str:
+    said, context = error.format_message().rstrip("."), getattr(error, "ctx", None)
+    if said.startswith("Usage:"):
+        # A command without arguments: its help is the answer.
+        return said
+    parameter, cause = getattr(error, "param", None), error.__cause__
+    if parameter is not None and isinstance(cause, ValueError) and hasattr(cause, "errors"):
+        wrong = cause.errors()[0]
+        name = parameter.opts[0] if parameter.opts else parameter.name
+        wanted = wrong["msg"].removeprefix("Input should be ").partition(", unable")[0]
+        explained = f" ({parameter.help})" if getattr(parameter, "help", None) else ""
+        said = f"{name} {wrong['input']}: must be {wanted}{explained}"
+    return f"error: {said}" + ("" if context is None else f"; {context.command_path} -h tells more")
+
+
+def application(name: str, text: str) -> Application:
+    """An application with the look that all five share: plain help, also by -h, and shell completion."""
+    return Application(
         name=name,
         help=text,
         pretty_exceptions_enable=False,

@@ -38,3 +38,29 @@ def test_every_command_has_short_help(name, command):
     done = CliRunner().invoke(COMMANDS[name], [command, "-h"], prog_name=name)
     assert done.exit_code == 0
     assert f"Usage: {name} {command}" in done.output
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "message"),
+    [
+        ("acquire", "--omega 35deg", "--omega 35deg: must be a valid number (angle between source and camera, "),
+        ("acquire", "move psg ten", "degrees ten: must be a valid number"),
+        ("process", "design rig.yaml --wavelength red", "--wavelength red: must be a valid number"),
+        ("simulate", "serve zaber --axes two", "--axes two: must be a valid integer"),
+        ("simulate", "serve zaber --limits 7", "'7' is not MIN:MAX in degrees"),
+        ("view", "--port eighty", "--port eighty: must be a valid integer"),
+        ("diagnose", "", "Missing argument 'captures'"),
+        ("process", "reduce a.h5 --wieghted", "No such option: --wieghted (Possible options: "),
+        ("acquire", "fly", "No such command 'fly'"),
+    ],
+)
+def test_a_wrong_option_is_told_as_every_mistake(name, words, message, capsys):
+    with pytest.raises(SystemExit) as end:
+        COMMANDS[name](words.split())
+    assert end.value.code == 2
+    said = capsys.readouterr()
+    assert not said.out
+    assert said.err.startswith("error: ")
+    assert message in said.err
+    assert "-h tells more" in said.err
+    assert "Input should" not in said.err
