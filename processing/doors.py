@@ -50,12 +50,17 @@ def require_file(path: Path, error: type[ProcessError] = ProcessError, most_byte
 
 def require_place(path: Path, overwrite: bool = False) -> None:
     """Raise ProcessError unless a file can be made there: the folder is there, the name is free or may be replaced."""
-    if path.is_dir():
-        raise ProcessError(f"{path} is a folder. --out takes the name of a file.")
-    if path.exists() and not overwrite:
+    if path.exists() and not path.is_dir() and not overwrite:
         raise ProcessError(f"{path} exists. Give another --out, or --overwrite to replace it.")
+    require_folder(path)
+
+
+def require_folder(path: Path) -> None:
+    """Raise ProcessError unless `path` could be the name of a file: in a folder that is there, and no folder itself."""
+    if path.is_dir():
+        raise ProcessError(f"{path} is a folder. Give the name of a file.")
     if not path.parent.is_dir():
-        raise ProcessError(f"{path}: there is no folder {path.parent}. Make it, or give another --out.")
+        raise ProcessError(f"{path}: there is no folder {path.parent}. Make it, or give another name.")
 
 
 def require_picture(path: Path, error: type[ProcessError] = ProcessError) -> None:

@@ -18,7 +18,8 @@ from viewer.application import application
 def serve(folder: Path, port: int, browser: bool) -> None:
     """Serve a folder until Ctrl-C; prints the address. Raises ProcessError where folder or port cannot be had."""
     if not folder.is_dir():
-        raise ProcessError(f"{folder}: no such folder. `view FOLDER` shows what is in it.")
+        why = "is a file, and no folder" if folder.exists() else "no such folder"
+        raise ProcessError(f"{folder}: {why}. `view FOLDER` shows what is in it.")
     token = secrets.token_urlsafe(18)
     try:
         listener = socket.create_server(("127.0.0.1", port), backlog=64)

@@ -64,7 +64,9 @@ def bytes_needed(states: int, channels: int, frame_shape: tuple[int, int], items
 
 
 def check_space(folder: Path, needed: int) -> None:
-    """Refuse a disc that is too small. Raises AcquisitionError with the bytes needed and free."""
+    """Refuse a disc that is too small. Raises AcquisitionError with the bytes needed and free, or for no folder."""
+    if not folder.is_dir():
+        raise AcquisitionError(f"{folder} is a file, and captures need a folder. Choose another with --out.")
     free = shutil.disk_usage(folder).free
     if needed > free:
         raise AcquisitionError(

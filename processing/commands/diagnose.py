@@ -10,6 +10,8 @@ from typing import Annotated
 import typer
 
 from processing.commands.command_line import Version, application, run
+from processing.doors import require_folder
+from processing.errors import ProcessError
 
 app = application("diagnose", "Compare captures with an instrument model and find the effect that the model lacks.")
 
@@ -35,10 +37,9 @@ def diagnose_command(
     """Trace the residual between intensities and model to the effects that explain it; say so if none does."""
     # The problems are many and small: BLAS threads would only wait for one another.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    for target in (write, json, report, residuals):
-        if target is not None and target.exists():
-            from processing.errors import ProcessError
-
+    for target in filter(None, (write, json, report, residuals)):
+        require_folder(target)
+        if target.exists():
             raise ProcessError(f"{target} exists and is not replaced. Give another name.")
     if reflectance is not None or geometry is not None:
         from processing.commands.loaded_late.diagnose_surface import diagnose_reflectance

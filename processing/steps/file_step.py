@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from processing.doors import require_place
+from processing.errors import ProcessError
 from processing.storage.provenance import Step, made_of
 
 #: Called with (parts done, parts in all).
@@ -42,10 +43,13 @@ class FileStep(ABC):
 
         Raises
         ------
-        ProcessError : the file exists and `overwrite` is false, or its folder is not there.
+        ProcessError : the file exists and `overwrite` is false, its folder is not there, or its name is that of no HDF5
+            file of ours: reports, campaigns and the browser find files by it.
         """
         out = out or self.usual_path
         require_place(out, overwrite)
+        if out.suffix != ".h5":
+            raise ProcessError(f"{out}: what this makes is an HDF5 file; give a name that ends in .h5.")
         self._write(out, self.record(), overwrite, progress)
         return out
 

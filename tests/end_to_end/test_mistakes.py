@@ -4,6 +4,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from processing.commands.application import main as process
+from processing.commands.diagnose import main as diagnose
 
 
 @pytest.fixture
@@ -64,6 +65,15 @@ def test_options_that_do_not_fit_are_told_before_the_work_and_not_passed_over(ru
     assert "is no Stokes image: --geometry and --material are not looked at" in err
 
 
+def test_a_place_for_no_file_is_refused_before_the_work(acquire, small_rig, capture, configs, capfd):
+    code, _, err = acquire("--omega", 35, "--rig", small_rig(), "--out", capture)
+    assert (code, f"{capture} is a file, and captures need a folder" in err) == (2, True)
+    with pytest.raises(SystemExit) as end:
+        diagnose([str(capture), "--instrument", str(configs / "instruments/rgb950.yaml"), "--write", "no/where.yaml"])
+    assert end.value.code == 2
+    assert capfd.readouterr() == ("", "error: no/where.yaml: there is no folder no. Make it, or give another name.\n")
+
+
 def test_a_file_that_is_not_meant_is_called_what_it_is(run, acquire, capture, configs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     text, folder, product = tmp_path / "notes.txt", tmp_path / "empty", tmp_path / "näme with blanks.h5"
@@ -77,9 +87,10 @@ def test_a_file_that_is_not_meant_is_called_what_it_is(run, acquire, capture, co
         (("reduce", folder), "is a folder, and a file is asked for"),
         (("reduce", capture, "--instrument", rig), "kind: must be 'instrument', not 'rig'; is it the right file?"),
         (("reduce", capture, "--instrument", capture), "a file of this kind at most"),
-        (("reduce", capture, "--out", folder), "is a folder. --out takes the name of a file"),
+        (("reduce", capture, "--out", folder), "is a folder. Give the name of a file"),
         (("export", product, "--to", "png", "--out", "no/where"), "there is no folder no. Make it"),
         (("xi0", product, "--out", "no/where.h5"), "there is no folder no. Make it"),
+        (("xi0", product, "--out", "xi0.png"), "what this makes is an HDF5 file; give a name that ends in .h5"),
     ):
         code, err = run(*arguments)
         assert (code, words in err) == (2, True), err
