@@ -10,7 +10,7 @@ import logging
 from typing import Any
 
 from drivers.aravis_stream import Arrival
-from drivers.errors import CameraError, CameraLost
+from drivers.errors import CameraError, CameraLost, FrameLost
 from drivers.genicam import Features
 
 log = logging.getLogger(__name__)
@@ -33,7 +33,7 @@ class ChunkStamps:
     """
 
     def __init__(self, name: str, camera: Any, features: Features, glib_error: Any, *, wanted: bool) -> None:
-        self._glib_error = glib_error
+        self._name, self._glib_error = name, glib_error
         self._parser: Any = None
         if not wanted or "Timestamp" not in features.choices("ChunkSelector"):
             return
@@ -50,11 +50,21 @@ class ChunkStamps:
         self._ticks_per_s = features.number(_TICK_FREQUENCY) or 1e9
 
     def time_ns(self, arrival: Arrival) -> int:
-        """The camera's time of an exposure in nanoseconds: of the chunk, or of the transfer where there is none."""
+        """The camera's time of an exposure in nanoseconds: of the chunk, or of the transfer where none is asked for.
+
+        Raises
+        ------
+        FrameLost
+            The chunk did not come. The time of the transfer is another instant than that of the other frames.
+        """
         if self._parser is None:
             return arrival.camera_time_ns
         try:
             ticks = int(self._parser.get_integer_value(arrival.buffer, "ChunkTimestamp"))
-        except self._glib_error:
-            return arrival.camera_time_ns
+        except self._glib_error as error:
+            raise FrameLost(
+                f"camera {self._name}, take a frame",
+                f"frame {arrival.frame_id} has no time behind its image",
+                "If it stays so, `chunk_timestamp: false` at the camera in the rig file does without",
+            ) from error
         return ticks if self._ticks_per_s == 1e9 else round(ticks * 1e9 / self._ticks_per_s)

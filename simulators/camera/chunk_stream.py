@@ -25,21 +25,24 @@ IMAGE_CHUNK = 1
 
 @dataclass(frozen=True, slots=True)
 class ChunkFrame:
-    """One frame: its number, when its exposure began (ns of the camera's clock), format code, region and image."""
+    """One frame: its number, when its exposure began (ns of the camera's clock), format code, region and image.
+
+    `tells_time` False leaves the time's chunk out, as a camera does that has lost it.
+    """
 
     frame_id: int
     time_ns: int
     code: int
     region: tuple[int, int, int, int]
     image: bytes
+    tells_time: bool = True
 
     def payload(self) -> bytes:
         """Image and chunks, each followed by its number and length."""
-        stamp = struct.pack(">Q", self.time_ns)
-        return b"".join(
-            data + struct.pack(">II", number, len(data))
-            for number, data in ((IMAGE_CHUNK, self.image), (TIMESTAMP_CHUNK, stamp))
-        )
+        chunks = {IMAGE_CHUNK: self.image}
+        if self.tells_time:
+            chunks[TIMESTAMP_CHUNK] = struct.pack(">Q", self.time_ns)
+        return b"".join(data + struct.pack(">II", number, len(data)) for number, data in chunks.items())
 
     def packets(self, packet_bytes: int) -> Iterator[bytes]:
         """The packets, without their IP and UDP headers."""

@@ -134,6 +134,8 @@ class GigeCamera:
         self.ignored_triggers = 0
         #: Camera times that were sent behind the images.
         self.chunk_times_ns: list[int] = []
+        #: So many frames to come are sent without that time.
+        self.timeless_frames = 0
         # Holds frames of exposures that start from now on back, as a busy host or a full link does.
         self.delivery_delay_s = 0.0
         self._error: BaseException | None = None
@@ -265,7 +267,10 @@ class GigeCamera:
             data = fmt.encode(self._checked(self._source(info), info, fmt))
             if self._sends_chunks():
                 region = (info.offset_x, info.offset_y, info.width, info.height)
-                chunked = ChunkFrame(info.frame_id, time.time_ns(), code & 0xFFFFFFFF, region, data.tobytes())
+                chunked = ChunkFrame(
+                    info.frame_id, time.time_ns(), code & 0xFFFFFFFF, region, data.tobytes(), self.timeless_frames <= 0
+                )
+                self.timeless_frames -= 1
             else:
                 ctypes.memmove(self._library.arv_buffer_get_data(buffer, None), data.ctypes.data, data.nbytes)
             if camera is not None and not self._gone.is_set():

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drivers.camera import CameraSettings
 from drivers.cameras import aravis
-from drivers.errors import SettingRefused
+from drivers.errors import FrameLost, SettingRefused
 from drivers.pixel_formats import pixel_format
 from simulators.camera.gige_camera import ExposureInfo, GigeCamera
 from simulators.camera.node_map import NodeMap, node_map, node_maps
@@ -139,6 +139,20 @@ def test_the_time_of_an_exposure_comes_from_behind_the_image_where_the_camera_se
         camera.configure(CameraSettings(exposure_s=1e-3))
         assert camera.node_map()["ChunkModeActive"] == "false"
         camera.capture()
+
+
+def test_a_frame_without_its_time_behind_the_image_is_lost_and_not_given_the_time_of_its_transfer() -> None:
+    with ExitStack() as stack:
+        maker = MakersCamera("flir_bfs_pge_51s5p", stack)
+        camera = maker.open(bits=8)
+        camera.configure(CameraSettings(exposure_s=0.02, pixel_format="Mono8"))
+        maker.simulated.timeless_frames = 1
+        (frame,) = camera.capture()
+        assert camera.statistics().retakes == 1
+        assert maker.simulated.chunk_times_ns.index(frame.camera_time_ns) == 1
+        maker.simulated.timeless_frames = 100
+        with pytest.raises(FrameLost, match=r"no time behind its image.*chunk_timestamp: false"):
+            camera.capture()
 
 
 @pytest.mark.parametrize(
