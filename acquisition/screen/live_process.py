@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acquisition.screen.live_images import dolp_png, histogram, last_frame_png, modulation_png, thinned
+from processing.reports.design import style
 
 Frame = NDArray[np.uint16]
 Drawn = TypeVar("Drawn")
@@ -66,7 +67,7 @@ class Shown:
             view = dict(self._view)
             frame = self._frame
         quick = "modulation" if view.pop("mosaic", None) is None else "DoLP"
-        view |= {"simulated": self._simulated, "quick": quick}
+        view |= {"simulated": self._simulated, "quick": quick, "full_scale": self._full_scale}
         if frame is not None:
             view["histogram"] = self._once("histogram", lambda: histogram(frame, self._full_scale))
         return view
@@ -144,8 +145,8 @@ class Handler(BaseHTTPRequestHandler):
         if path is None:
             return
         if path == "/":
-            page = files("acquisition.screen").joinpath("live_view.html").read_bytes()
-            self._send(200, "text/html; charset=utf-8", page)
+            page = files("acquisition.screen").joinpath("live_view.html").read_text(encoding="utf-8")
+            self._send(200, "text/html; charset=utf-8", page.replace("/* design */", style()).encode())
         elif path == "/state":
             self._send(200, "application/json", json.dumps(self.shown.snapshot()).encode())
         elif path in ("/frame.png", "/quick.png"):

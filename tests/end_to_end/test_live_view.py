@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from processing.reports.design import style
 from processing.storage.capture import Capture
 
 STATES = 1000
@@ -161,6 +162,8 @@ def test_page_shows_the_capture_and_its_button_stops_it(running, browser):
     browser.wait_for("document.getElementById('quick').naturalWidth == 320")
     # Readable on a phone: nothing is wider than the screen.
     assert browser.evaluate("document.documentElement.scrollWidth <= 390")
+    # The look of the application and the reports.
+    assert style() in browser.evaluate("document.querySelector('style').textContent")
     # Nothing came from elsewhere.
     resources = browser.evaluate("performance.getEntriesByType('resource').map(e => e.name).join(' ')")
     assert all(name.startswith("http://127.0.0.1:") for name in resources.split())
