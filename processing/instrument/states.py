@@ -66,7 +66,19 @@ def rotating_retarders(
     repeats: int = 1,
     axes: tuple[str, str] = ("psg", "psa"),
 ) -> StateTable:
-    """Equal steps of the generator retarder, the analyzer retarder turning `ratio` times as far."""
+    """Sample states at equal steps of the generator's axis, the analyzer's turning `ratio` times as far.
+
+    Parameters
+    ----------
+    exposure_s
+        Of every state, seconds.
+    step_deg
+        Between two states of the first axis, which begins at 0 degrees; the defaults are RGB950's table.
+    repeats
+        Frames averaged for each state.
+    axes
+        Names of the generator's and the analyzer's axis.
+    """
     sample: Role = "sample"
     psg = step_deg * np.arange(states, dtype=float)
     return StateTable(

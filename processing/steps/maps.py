@@ -15,7 +15,19 @@ from processing.storage.provenance import Step, file_identity
 
 @dataclass(frozen=True)
 class Quantities(FileStep):
-    """`process quantities`: every derived map of a Mueller product, see `processing.maps.quantities`."""
+    """`process quantities`: every derived map (rows, columns) of a Mueller image, with standard errors.
+
+    What each is, its unit and where it does not exist: docs/quantities.md.
+
+    Attributes
+    ----------
+    source
+        Product of `Reduction` or `Extrapolation`.
+    also
+        Decompositions besides: "symmetric", "differential".
+    pairs
+        Name of a map to the states of two polarizers: light that passes both, over m00.
+    """
 
     source: Path
     also: tuple[str, ...] = ()
@@ -39,7 +51,15 @@ class Quantities(FileStep):
 
 @dataclass(frozen=True)
 class Xi0(FileStep):
-    """`process xi0` of a Mueller product, or of a Stokes product with a geometry and a material file."""
+    """`process xi0`: depolarization xi0 (rows, columns) with its standard error and intervals.
+
+    Attributes
+    ----------
+    source
+        Mueller or Stokes product.
+    geometry, material
+        Files of camera, source and shape, and of the dominant process: for a source with less than whole matrices.
+    """
 
     source: Path
     geometry: Path | None = None
@@ -87,7 +107,15 @@ class Xi0(FileStep):
 
 @dataclass(frozen=True)
 class Extrapolation(FileStep):
-    """`process extrapolate`: a Mueller image from a Stokes product and a model of the dominant process."""
+    """`process extrapolate`: a Mueller image (4, 4, rows, columns) in counts from a Stokes image and a model.
+
+    Attributes
+    ----------
+    source
+        Stokes product.
+    geometry, material
+        Files of camera, source and shape, and of the dominant process.
+    """
 
     source: Path
     geometry: Path

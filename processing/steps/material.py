@@ -34,7 +34,17 @@ class FittedMaterial:
 
 @dataclass(frozen=True)
 class MaterialFitting:
-    """`process fit-material`: n + i k, a and b from products of one kind and one wavelength."""
+    """`process fit-material`: n + i k, a and b of the polarized diffuse model.
+
+    Attributes
+    ----------
+    sources
+        Mueller or Stokes products, all of one kind and one wavelength.
+    geometry
+        File of camera, source and shape.
+    name
+        Of the material, for its file.
+    """
 
     sources: tuple[Path, ...]
     geometry: Path

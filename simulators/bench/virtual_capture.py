@@ -31,6 +31,10 @@ def write_virtual_capture(
     ----------
     bench : with its scene, true optics and wavelength.
     instrument : the model declared in the file, all wavelengths; with a mosaic, every state is alike.
+
+    Raises
+    ------
+    ValueError : the instrument turns other axes than psg and psa.
     """
     axes = instrument.axes
     psg = RGB950_STEP_DEG * np.arange(states)
