@@ -11,6 +11,7 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 
 from processing.errors import ProcessError
 from processing.reduction.counts_to_signal import saturation
+from processing.reports.capture_facts import facts_of, papers_of
 from processing.storage.capture import Capture
 from viewer.diagnoses import Diagnoses
 from viewer.library import Entry, made_into
@@ -31,30 +32,16 @@ def capture(request: Request) -> HTMLResponse:
     library = pages.library
     entry = library.entry(library.name(path))
     with Capture(path) as opened:
-        header, closing = opened.header, opened.closing
         facts = [
-            ("sample", f"{header.sample.name or header.sample.kind} ({header.sample.kind})"),
-            ("mode", header.mode),
-            ("wavelength", f"{header.wavelength_nm:g} nm"),
-            ("Omega", "not stated" if header.omega_deg is None else f"{header.omega_deg:g} degrees"),
-            ("states", f"{len(opened.done)} of {opened.planned_states}, {opened.status}"),
-            ("frame", f"{opened.frame_shape[1]} x {opened.frame_shape[0]}, {opened.channels} channel(s)"),
+            *facts_of(opened),
             ("begun", opened.start_time),
             ("checksums", "every state is held against them" if opened.checked else "none in the file"),
         ]
         if segments := len(opened.segments) - 1:
-            facts.append(("interrupted", f"{segments} times, and gone on with"))
-        notes = [
-            (name, text)
-            for name, text in (
-                ("plan", header.plan_yaml),
-                ("rig", header.rig_yaml),
-                ("instrument model", header.instrument_yaml),
-            )
-            if text.strip()
-        ]
+            facts.append(("interrupted", f"{segments} time(s), and gone on with"))
+        notes = papers_of(opened.header)
         states = states_of(opened)
-        warnings = [str(message) for message in closing.get("messages", [])]
+        warnings = [str(message) for message in opened.closing.get("messages", [])]
     entries = library.entries()
     return pages.draw(
         "capture.html",

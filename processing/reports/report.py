@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from processing.doors import read_text, require_file, require_place
 from processing.errors import ProcessError
 from processing.reflectance.tables import ScatteringTable, is_table
+from processing.reports.capture_facts import facts_of, papers_of
 from processing.reports.figure_style import map_figure, png, thin
 from processing.reports.figures import product_figure
 from processing.reports.mueller_maps import mueller_maps
@@ -166,29 +167,15 @@ def _capture(path: Path) -> Section:
             warnings.append(f"up to {100 * np.nanmax(saturated):.2f} % of the pixels of a state are saturated")
         summary = [
             ("title", header.title),
-            ("kind", f"capture, {header.mode}, {'simulated' if capture.simulated else 'measured'}"),
-            ("wavelength", f"{header.wavelength_nm:g} nm"),
-            ("Omega", "not stated" if header.omega_deg is None else f"{header.omega_deg:g} degrees"),
-            ("sample", f"{header.sample.name or header.sample.kind} ({header.sample.kind})"),
-            ("states", f"{len(capture.role)} of {capture.planned_states} done; {_roles(capture)}"),
-            (
-                "frame",
-                f"{capture.frame_shape[1]} x {capture.frame_shape[0]}, {capture.channels} channel(s), {capture.dtype}",
-            ),
+            ("kind", f"capture, {'simulated' if capture.simulated else 'measured'}"),
+            *facts_of(capture),
         ]
         records = (("time ledger", "ledger"), ("stream statistics", "stream"))
         named = [(heading, _pairs(closing[name])) for heading, name in records if closing.get(name)]
-        notes = [
-            (name, text)
-            for name, text in (
-                ("plan", header.plan_yaml),
-                ("rig", header.rig_yaml),
-                ("instrument model", header.instrument_yaml),
-                ("camera settings as read back", header.camera_settings_json),
-                ("versions", "\n".join(f"{k} {v}" for k, v in header.versions.items())),
-            )
-            if text.strip() not in ("", "{}")
-        ]
+        versions = "\n".join(f"{name} {version}" for name, version in header.versions.items())
+        read_back = ("camera settings as read back", header.camera_settings_json)
+        notes = papers_of(header)
+        notes += [(name, text) for name, text in (read_back, ("versions", versions)) if text.strip() not in ("", "{}")]
         figures = []
         if len(capture.role):
             state = int(capture.states_with("sample")[0]) if capture.states_with("sample").size else 0
@@ -257,10 +244,6 @@ def _shown(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.5g}"
     return "not known" if value is None else str(value)
-
-
-def _roles(capture: Capture) -> str:
-    return ", ".join(f"{capture.role.count(r)} {r}" for r in dict.fromkeys(capture.role))
 
 
 def _media_type(path: Path) -> str:

@@ -1,0 +1,27 @@
+"""What a capture is, in words: for its section of a report and for its page in the browser."""
+
+from __future__ import annotations
+
+from processing.storage.capture import Capture
+from processing.storage.capture_schema import CaptureHeader
+
+
+def facts_of(capture: Capture) -> list[tuple[str, str]]:
+    """Names and texts: sample, mode, wavelength, Omega, states, frame."""
+    header, (rows, columns) = capture.header, capture.frame_shape
+    roles = ", ".join(f"{capture.role.count(role)} {role}" for role in dict.fromkeys(capture.role))
+    done = f"{len(capture.role)} of {capture.planned_states}, {capture.status}"
+    return [
+        ("sample", f"{header.sample.name or header.sample.kind} ({header.sample.kind})"),
+        ("mode", header.mode),
+        ("wavelength", f"{header.wavelength_nm:g} nm"),
+        ("Omega", "not stated" if header.omega_deg is None else f"{header.omega_deg:g} degrees"),
+        ("states", f"{done}: {roles}" if roles else done),
+        ("frame", f"{columns} x {rows}, {capture.channels} channel(s), {capture.dtype}"),
+    ]
+
+
+def papers_of(header: CaptureHeader) -> list[tuple[str, str]]:
+    """Names and texts of the files that the capture was made from, those that it holds."""
+    papers = (("plan", header.plan_yaml), ("rig", header.rig_yaml), ("instrument model", header.instrument_yaml))
+    return [(name, text) for name, text in papers if text.strip()]
