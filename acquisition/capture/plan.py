@@ -41,8 +41,8 @@ class RotatingRetarders(_Part):
 
     kind: Literal["rotating_retarders"] = "rotating_retarders"
     states: int = Field(default=RGB950_STATES, gt=0, le=10_000)
-    step_deg: float = Field(default=RGB950_STEP_DEG, allow_inf_nan=False)
-    ratio: float = Field(default=RGB950_RATIO, allow_inf_nan=False)
+    step_deg: float = Field(default=RGB950_STEP_DEG, ge=-360, le=360)
+    ratio: float = Field(default=RGB950_RATIO, ge=-1000, le=1000)
     axes: tuple[str, str] = ("psg", "psa")
 
     def angles_deg(self) -> dict[str, NDArray[np.float64]]:

@@ -85,6 +85,7 @@ YAML_FILES = {
     "not a number": ("omega_deg: .nan\n", "finite"),
     "infinite": ("exposure_s: 1e999\n", "finite"),
     "infinite in a merge": ("states: {kind: table, angles: {<<: {psg: [.inf]}}}\n", "finite"),
+    "steps of more than a turn": ("states: {kind: rotating_retarders, step_deg: 1.0e+308}\n", "step_deg: must be 360"),
     "matrix of three": ("sample: {kind: mueller, mueller: [1, 2, 3]}\n", "mueller"),
     "matrix not a number": ("sample: {kind: mueller, mueller: [" + "1, " * 15 + ".nan]}\n", "finite"),
     "matrix missing": ("sample: {kind: mueller}\n", "mueller"),
