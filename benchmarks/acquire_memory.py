@@ -10,11 +10,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from ruamel.yaml import YAML
+from simulated_rig import write_rig
 
 from simulators.rig.served_rig import serve
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 def main() -> None:
@@ -22,16 +20,8 @@ def main() -> None:
     for states in (16, 40, 80):
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
-            yaml = YAML()
-            rig = yaml.load(ROOT / "configs" / "rigs" / "simulated.yaml")
-            rig["simulator"].update({"rows": rows, "columns": columns})
-            for mode in rig["modes"].values():
-                mode["instrument"] = str((ROOT / "configs" / "rigs" / mode["instrument"]).resolve())
-            samples = rig["simulator"]["samples"]
-            samples.update({key: str((ROOT / "configs" / "rigs" / path).resolve()) for key, path in samples.items()})
-            with (folder / "behind.yaml").open("w") as file:
-                yaml.dump(rig, file)
-            with serve(folder / "behind.yaml", folder / "rig.yaml", "red_sphere"):
+            behind = write_rig(folder / "behind.yaml", {"rows": rows, "columns": columns})
+            with serve(behind, folder / "rig.yaml", "red_sphere"):
                 (folder / "plan.yaml").write_text(
                     f"kind: plan\nstates: {{kind: rotating_retarders, states: {states}, step_deg: {360 / states}}}\n"
                 )

@@ -15,28 +15,14 @@ import time
 from pathlib import Path
 
 import numpy as np
-from ruamel.yaml import YAML
+from simulated_rig import write_rig
 
 from simulators.rig.served_rig import serve
 
-ROOT = Path(__file__).resolve().parents[1]
-
-
-def _rig_file(folder: Path) -> Path:
-    yaml, source = YAML(), ROOT / "configs" / "rigs" / "simulated.yaml"
-    rig = yaml.load(source)
-    rig["simulator"].update({"rows": 64, "columns": 80, "clock_speed": 2})
-    for mode in rig["modes"].values():
-        mode["instrument"] = str((source.parent / mode["instrument"]).resolve())
-    samples = rig["simulator"]["samples"]
-    samples.update({key: str((source.parent / path).resolve()) for key, path in samples.items()})
-    with (folder / "rig.yaml").open("w") as file:
-        yaml.dump(rig, file)
-    return folder / "rig.yaml"
-
 
 def _once(folder: Path, kind: signal.Signals) -> tuple[float, float]:
-    with serve(_rig_file(folder), folder / "served.yaml", "red_sphere") as simulation:
+    rig = write_rig(folder / "rig.yaml", {"rows": 64, "columns": 80, "clock_speed": 2})
+    with serve(rig, folder / "served.yaml", "red_sphere") as simulation:
         command = ["-m", "acquisition.commands.application", "--omega", "35", "--rig", str(folder / "served.yaml")]
         child = subprocess.Popen([sys.executable, *command, "--out", str(folder)], stderr=subprocess.DEVNULL)
 

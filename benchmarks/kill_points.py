@@ -25,7 +25,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from ruamel.yaml import YAML
+from simulated_rig import write_rig
 
 # Imported once here, not anew in each child:
 import acquisition.commands.campaign
@@ -47,16 +47,8 @@ TIMES = ("host_time_s", "camera_time_ns", "frame_id", "start_time", "closing/jso
 
 def write_files(folder: Path, captures: int, states: int = 3) -> list[str]:
     """Rig, plan and campaign of small captures; returns the options of `acquire`."""
-    yaml, source = YAML(), ROOT / "configs" / "rigs" / "simulated.yaml"
-    rig = yaml.load(source)
-    rig["settle_s"] = 0.0
-    rig["simulator"].update({"rows": 16, "columns": 20, "clock_speed": 200, "camera_wait_s": 60})
-    for mode in rig["modes"].values():
-        mode["instrument"] = str((source.parent / mode["instrument"]).resolve())
-    samples = rig["simulator"]["samples"]
-    samples.update({key: str((source.parent / path).resolve()) for key, path in samples.items()})
-    with (folder / "rig.yaml").open("w") as file:
-        yaml.dump(rig, file)
+    quick = {"rows": 16, "columns": 20, "clock_speed": 200, "camera_wait_s": 60}
+    write_rig(folder / "rig.yaml", quick, settle_s=0.0)
     (folder / "plan.yaml").write_text(
         "kind: plan\nmode: stokes\nwavelength_nm: 662\nomega_deg: 35\nsample: {name: red_sphere}\n"
         f"states: {{kind: fixed, states: {states}}}\nexposure_s: 0.001\ndarks: 1\n"

@@ -15,26 +15,9 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from ruamel.yaml import YAML
+from simulated_rig import write_rig
 
 from processing.storage.capture import Capture
-
-ROOT = Path(__file__).resolve().parents[1]
-
-
-def real_time_rig(folder: Path) -> Path:
-    """The default rig file with a clock that runs as ours."""
-    yaml, source = YAML(), ROOT / "configs" / "rigs" / "simulated.yaml"
-    rig = yaml.load(source)
-    rig["simulator"]["clock_speed"] = 1
-    for mode in rig["modes"].values():
-        mode["instrument"] = str((source.parent / mode["instrument"]).resolve())
-    samples = rig["simulator"]["samples"]
-    samples.update({name: str((source.parent / path).resolve()) for name, path in samples.items()})
-    path = folder / "rig.yaml"
-    with path.open("w") as file:
-        yaml.dump(rig, file)
-    return path
 
 
 def main() -> None:
@@ -48,7 +31,7 @@ def main() -> None:
     )
     excess = []
     with tempfile.TemporaryDirectory() as name:
-        rig = real_time_rig(Path(name))
+        rig = write_rig(Path(name) / "rig.yaml", {"clock_speed": 1})
         for run in range(given.runs):
             out = Path(name) / str(run)
             arguments = ["--rig", rig, "--omega", "35", "--exposure", str(given.exposure), "--out", out]
