@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +23,20 @@ class Found(NamedTuple):
     was_there: bool
 
 
-class FileStep(ABC):
+class OfFiles:
+    """A frozen dataclass of input files and options; file names may come as text."""
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):  # type: ignore[arg-type]  # its subclasses are dataclasses
+            value = getattr(self, entry.name)
+            if "tuple[Path" in str(entry.type):
+                value = tuple(map(Path, [value] if isinstance(value, str | Path) else value))
+            elif "Path" in str(entry.type) and value is not None:
+                value = Path(value)
+            object.__setattr__(self, entry.name, value)
+
+
+class FileStep(OfFiles, ABC):
     """A step as a value: subclasses are frozen dataclasses of input files and options."""
 
     @abstractmethod
@@ -38,7 +52,7 @@ class FileStep(ABC):
     def _write(self, out: Path, record: Step, overwrite: bool, progress: Progress | None) -> None:
         """Write the product that `record` asks for."""
 
-    def make(self, out: Path | None = None, overwrite: bool = False, progress: Progress | None = None) -> Path:
+    def make(self, out: Path | str | None = None, overwrite: bool = False, progress: Progress | None = None) -> Path:
         """Make the product, whatever is there; `overwrite` replaces a file of that name.
 
         Raises
@@ -46,20 +60,20 @@ class FileStep(ABC):
         ProcessError : the file exists and `overwrite` is false, its folder is not there, or its name is that of no HDF5
             file of ours: reports, campaigns and the browser find files by it.
         """
-        out = out or self.usual_path
+        out = Path(out) if out else self.usual_path
         require_place(out, overwrite)
         if out.suffix != ".h5":
             raise ProcessError(f"{out}: what this makes is an HDF5 file; give a name that ends in .h5.")
         self._write(out, self.record(), overwrite, progress)
         return out
 
-    def found_or_made(self, path: Path | None = None, progress: Progress | None = None) -> Found:
+    def found_or_made(self, path: Path | str | None = None, progress: Progress | None = None) -> Found:
         """The product, made now unless `path` (default: the usual one) holds exactly it.
 
         No file is ever replaced: where the name is taken by anything else, the product gets one of its own that ends
         in the first digits of what it is made of.
         """
-        path, record = path or self.usual_path, self.record()
+        path, record = Path(path) if path else self.usual_path, self.record()
         wanted = record.made_of
         own = path.with_name(f"{path.stem}-{wanted[:8]}{path.suffix}")
         for candidate in (path, own):

@@ -8,6 +8,7 @@ from pathlib import Path
 from processing.doors import require_place
 from processing.maps.material_fit import fit_products
 from processing.reflectance.material_fit import MaterialFit
+from processing.steps.file_step import OfFiles
 from processing.steps.maps import geometry_identities
 from processing.storage.provenance import Step, file_identity, input_text
 from processing.yaml_file import dump_yaml
@@ -33,7 +34,7 @@ class FittedMaterial:
 
 
 @dataclass(frozen=True)
-class MaterialFitting:
+class MaterialFitting(OfFiles):
     """`process fit-material`: n + i k, a and b of the polarized diffuse model.
 
     Attributes

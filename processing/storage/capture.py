@@ -179,7 +179,9 @@ class Capture(OpenH5):
             return dict(nodes)
 
     def planned_column(self, name: str) -> NDArray[Any]:
-        """A column of the state table for all planned states, done or not."""
+        """A column of the state table for all planned states, done or not. Raises CaptureError for an unknown name."""
+        if name not in self._h5["entry/states"]:
+            raise CaptureError(f"{self.path} has no column {name!r}; it has: {', '.join(self._h5['entry/states'])}.")
         with self._damage():
             return np.asarray(self._h5[f"entry/states/{name}"][...])
 
@@ -223,10 +225,11 @@ class Capture(OpenH5):
         return np.flatnonzero([r == role for r in self.role])
 
     def frames(self, state: int, rows: slice = slice(None)) -> NDArray[Any]:
-        """Counts (channels, rows, columns) of one state done, as stored."""
+        """Counts (channels, rows, columns) of one state done, as stored. Raises IndexError where there are fewer."""
+        number = int(self.done[state])
         stored = rows if self.layout is None or rows == slice(None) else self.layout.stored_rows(rows)
         with self._damage():
-            counts = np.asarray(self._frames[int(self.done[state]), :, stored, :])
+            counts = np.asarray(self._frames[number, :, stored, :])
         self._verify(state, stored, counts)
         return counts if self.layout is None else self.layout.split(counts[0])
 

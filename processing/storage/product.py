@@ -278,23 +278,29 @@ class Product(OpenH5):
         if self.kind not in kinds:
             raise ProductError(f"{self.path} holds a {self.kind} image; this needs: {', '.join(kinds)}.")
 
-    def get(self, name: str, rows: slice = slice(None)) -> NDArray[Any]:
-        """Dataset (leading..., rows, columns)."""
+    def _dataset(self, name: str) -> h5py.Dataset:
         if name not in self.names:
             raise ProductError(f"{self.path} has no {name!r}; it has: {', '.join(self.names)}.")
+        return self._h5["entry/data"][name]
+
+    def get(self, name: str, rows: slice = slice(None)) -> NDArray[Any]:
+        """Dataset (leading..., rows, columns)."""
+        dataset = self._dataset(name)
         with damage_as(ProductError, f"{self.path} is damaged"):
-            return np.asarray(self._h5["entry/data"][name][..., rows, :])
+            return np.asarray(dataset[..., rows, :])
 
     def units(self, name: str) -> str:
         """Unit of a dataset."""
-        return str(self._h5["entry/data"][name].attrs["units"])
+        return str(self._dataset(name).attrs["units"])
 
     def long_name(self, name: str) -> str:
         """What a dataset is, in one line."""
-        return str(self._h5["entry/data"][name].attrs["long_name"])
+        return str(self._dataset(name).attrs["long_name"])
 
     def array(self, name: str) -> NDArray[Any]:
         """An array of /entry/reduction that is not per pixel, such as the measurement matrix."""
+        if not self.has_array(name):
+            raise ProductError(f"{self.path} has no array {name!r} beside its images.")
         with damage_as(ProductError, f"{self.path} is damaged"):
             return np.asarray(self._h5[f"entry/reduction/{name}"][...])
 

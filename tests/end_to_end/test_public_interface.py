@@ -52,13 +52,14 @@ def capture(small_rig, tmp_path):
 
 
 def test_from_capture_to_labelled_mueller_image_and_back(capture, tmp_path):
-    from processing import MuellerImage, Reduction, open_dataset, reduce_to_dataset, write_dataset
+    from processing import Capture, MuellerImage, Product, Reduction, open_dataset, reduce_to_dataset, write_dataset
 
     image = reduce_to_dataset(capture)
     assert image.mueller.dims == ("row", "column", "y", "x")
     assert image.mueller.units == image.mueller_errors.units == "count"
     assert (image.attrs["kind"], image.attrs["simulated"]) == ("mueller", 1)
-    file = MuellerImage.load(Reduction(capture).make(tmp_path / "m.h5"))
+    # File names may come as text, as glob gives them.
+    file = MuellerImage.load(Reduction(str(capture)).make(str(tmp_path / "m.h5")))
     np.testing.assert_array_equal(image.mueller.values, file.values)
     raw = open_dataset(capture)
     assert raw.counts.dims == ("state", "channel", "y", "x")
@@ -69,6 +70,12 @@ def test_from_capture_to_labelled_mueller_image_and_back(capture, tmp_path):
     np.testing.assert_array_equal(again.mueller.values, image.mueller.values)
     with pytest.raises(ProcessError, match="exists and is not replaced"):
         write_dataset(raw, copied)
+    with Capture(capture) as opened, Product(tmp_path / "m.h5") as product:
+        for ask in (opened.column, product.get, product.units, product.array):
+            with pytest.raises(ProcessError, match=r"has no .*'nonsense'"):
+                ask("nonsense")
+        with pytest.raises(IndexError):
+            opened.frames(99)
     with pytest.raises(ProcessError, match="dimensions"):
         write_dataset(raw.drop_vars("counts"), tmp_path / "none.h5")
 
