@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
-import json
 import os
 import signal
-from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
-from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import JSONResponse, StreamingResponse
 
@@ -19,36 +15,23 @@ from acquisition.screen.run_file import running_in
 from processing.errors import ProcessError
 from processing.storage.capture import Capture
 from viewer.campaigns import read_campaign, seconds_left
+from viewer.event_stream import event_stream
 from viewer.lamp import lamp
 from viewer.library import Library
 from viewer.pages import fields_of, file_of, pages_of
-
-#: Seconds between two looks at a run.
-EVERY_S = 0.5
-#: A line now and then, so that a page that has gone is noticed.
-ALIVE_EVERY = 20
 
 
 async def events(request: Request) -> StreamingResponse:
     """Server-sent events: what the run in a folder does, whenever that has changed."""
     folder, library = file_of(request, "folder"), pages_of(request).library
-    return StreamingResponse(_changes(request, folder, library), media_type="text/event-stream")
 
-
-async def _changes(request: Request, folder: Path, library: Library) -> AsyncIterator[str]:
-    last, looks = "", 0
-    while not await request.is_disconnected():
+    def look() -> dict[str, Any]:
         try:
-            text = json.dumps(await run_in_threadpool(seen, folder, library))
+            return seen(folder, library)
         except ProcessError as error:
-            text = json.dumps({"running": False, "error": str(error)})
-        if text != last:
-            yield f"data: {text}\n\n"
-            last = text
-        elif looks % ALIVE_EVERY == 0:
-            yield ": still here\n\n"
-        looks += 1
-        await asyncio.sleep(EVERY_S)
+            return {"running": False, "error": str(error)}
+
+    return event_stream(request, look)
 
 
 def seen(folder: Path, library: Library) -> dict[str, Any]:

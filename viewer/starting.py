@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
-import json
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +14,9 @@ from acquisition import CONFIGS, Campaign
 from acquisition.campaign.identity import read_identity
 from acquisition.campaign.log import PLAN
 from processing.errors import ProcessError
+from processing.storage.capture import Capture
 from viewer.diagnoses import Diagnoses
-from viewer.following import ALIVE_EVERY, EVERY_S
+from viewer.event_stream import event_stream
 from viewer.jobs import Job, Jobs
 from viewer.library import Library, NotHere
 from viewer.pages import Pages, fields_of, pages_of
@@ -74,7 +73,8 @@ def _reduce(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
     capture = library.path(asked.get("file", ""))
     command = ["process", "reduce", str(capture)]
     if (file := _instrument(library, asked)) is not None:
-        out = capture.with_name(f"{capture.stem}.{file.stem}.mueller.h5")
+        with Capture(capture) as opened:
+            out = capture.with_name(f"{capture.stem}.{file.stem}.{opened.reduces_to}.h5")
         command += ["--instrument", str(file), "--out", str(out)]
     return jobs.start(f"reduce {capture.name}", command, {"file": library.name(capture)}, library.root)
 
@@ -150,22 +150,9 @@ async def job_events(request: Request) -> StreamingResponse:
     """Server-sent events: output and status of a job, until it has ended."""
     pages, jobs = pages_of(request), jobs_of(request)
     found = jobs.job(request.query_params.get("name", ""))
-    return StreamingResponse(_changes(request, pages, jobs, found), media_type="text/event-stream")
-
-
-async def _changes(request: Request, pages: Pages, jobs: Jobs, found: Job) -> AsyncIterator[str]:
-    last, looks = "", 0
-    while not await request.is_disconnected():
-        now = await run_in_threadpool(told, pages, jobs, found)
-        if (text := json.dumps(now)) != last:
-            yield f"data: {text}\n\n"
-            last = text
-        elif looks % ALIVE_EVERY == 0:
-            yield ": still here\n\n"
-        if now["status"] not in ("running", "ended"):
-            return
-        looks += 1
-        await asyncio.sleep(EVERY_S)
+    return event_stream(
+        request, lambda: told(pages, jobs, found), lambda now: now["status"] not in ("running", "ended")
+    )
 
 
 async def stop_job(request: Request) -> JSONResponse:

@@ -20,6 +20,7 @@ from viewer.following import seen
 from viewer.jobs import Jobs
 from viewer.lamp import lamp
 from viewer.library import Library
+from viewer.starting import KINDS
 
 
 def until(condition):
@@ -204,6 +205,21 @@ def test_nothing_else_is_started(lab, client, drr_capture, asked):
     answer = client.post("/start", json=asked, headers={"origin": "http://127.0.0.1:8000"})
     assert answer.status_code in (404, 422)
     assert Jobs(lab).all() == []
+
+
+class Told:
+    """Takes a command in place of `Jobs`."""
+
+    def start(self, title, command, about, folder):
+        return command
+
+
+def test_a_product_of_another_instrument_file_is_called_what_it_is(lab, drr_capture):
+    mosaic = {"mosaic": (("90", "45"), ("135", "0")), "instrument_yaml": ""}
+    for name, header in (("mueller", {}), ("stokes", mosaic)):
+        drr_capture("one.h5", shape=(4, 4), **header)
+        asked = {"file": "one.h5", "instrument": "example: rgb950"}
+        assert KINDS["reduce"](Library(lab), Told(), asked)[-1] == str(lab / f"one.rgb950.{name}.h5")
 
 
 def test_a_job_that_was_cut_off_takes_no_page_away(lab, client):
