@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from processing.diagnosis.captured.capture_data import CaptureData
-from processing.diagnosis.instrument.moments import DERIVATIVES, FEATURES, moments_of
+from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
+from processing.diagnosis.instrument.moments import moments_of
 from processing.diagnosis.instrument.projection import add_block, noise_information
 from processing.diagnosis.search.space import Sums
 from processing.instrument.changes import Conditions

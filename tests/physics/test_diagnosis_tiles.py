@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from processing.diagnosis.captured.read_capture import read_capture
-from processing.diagnosis.instrument.moments import FEATURES, FOLDS_OF_TILES, moments_of
+from processing.diagnosis.instrument.features import FEATURES
+from processing.diagnosis.instrument.moments import FOLDS_OF_TILES, moments_of
 from processing.diagnosis.instrument.projection import add_block
 from processing.diagnosis.instrument.tile_sums import add_tiles, tile_columns
 from processing.diagnosis.search.space import Sums

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processing.diagnosis.instrument.moments import image_derivatives, shared_noise
+from processing.diagnosis.instrument.features import image_derivatives, shared_noise
 from processing.reduction.move_image import neighbour_noise, shifted_back
 
 

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
+from processing.computing.threads import for_ranges
 from processing.instrument.changes import Conditions
 from processing.reduction.move_image import shifted_back
+
+#: Corrected counts of signals (N, channels, rows, columns), and their slope over the old ones.
+Correct = Callable[[Array], tuple[Array, Array]]
+#: Rows of an image that are worked on together.
+STRIP_ROWS = 16
 
 
 @dataclass(frozen=True)
@@ -133,33 +140,67 @@ class CaptureData:
         moved = np.zeros((self.conditions.states, 2)) if self.moved_px is None else self.moved_px
         return np.repeat(moved, self.signal.shape[1], axis=0)
 
-    def variance(self) -> Array:
+    def variance(self, rows: slice = slice(None)) -> Array:
         """Variance (N, channels, rows, columns) in full scale squared; right on average over noisy signals.
 
         Cutting it off at zero signal would make it too large in dark states, so a single one may be negative.
         """
         if self.true_variance is not None:
-            return np.asarray(self.true_variance, dtype=float)
+            return np.asarray(self.true_variance[:, :, rows], dtype=float)
         shape = (-1, 1, 1, 1)
-        return np.asarray(self.slope.reshape(shape) * self.signal + self.floor.reshape(shape))
+        return np.asarray(self.slope.reshape(shape) * self.signal[:, :, rows] + self.floor.reshape(shape))
 
-    def undone(self, signal: Array, slope: Array) -> CaptureData:
-        """The capture with corrected counts, of the given slope over the old ones: the noise is stretched with them."""
-        # A bend weighs dark pixels by their slope: none may have a negative variance here.
-        variance = slope**2 * np.maximum(self.variance(), self.floor.reshape(-1, 1, 1, 1) / 2)
-        return replace(self, signal=signal.astype(np.float32), true_variance=variance.astype(np.float32))
+    def undone(self, correct: Correct) -> CaptureData:
+        """The capture with corrected counts, and noise that is stretched with them."""
+        signal, variance = np.empty((2, *self.signal.shape), dtype=np.float32)
+
+        def strip(rows: slice) -> None:
+            signal[:, :, rows], slope = correct(self.signal[:, :, rows].astype(float))
+            # A bend weighs dark pixels by their slope: none may have a negative variance here.
+            variance[:, :, rows] = slope**2 * np.maximum(self.variance(rows), self.floor.reshape(-1, 1, 1, 1) / 2)
+
+        for_strips(signal.shape[2], strip)
+        return replace(self, signal=signal, true_variance=variance)
 
     def moved_back(self, shift_px: Array) -> CaptureData:
         """The capture with every frame moved back by what it had moved to the right and down, (N, 2) pixels here."""
-        signal, variance = self.signal.copy(), self.variance().astype(np.float32)
-        for n, (x, y) in enumerate(shift_px):
-            for channel in range(signal.shape[1]):
-                signal[n, channel] = shifted_back(signal[n, channel], x, y)
-                variance[n, channel] = shifted_back(variance[n, channel], x, y)
-        return replace(self, signal=signal, true_variance=variance, moved_px=shift_px)
+        return replace(
+            self,
+            signal=_moved_back(self.signal, shift_px),
+            # What is a line in the counts stays one.
+            true_variance=None if self.true_variance is None else _moved_back(self.true_variance, shift_px),
+            moved_px=shift_px,
+        )
 
-    def with_noise_of(self, signal: Array, slope: Array) -> CaptureData:
+    def with_noise_of(self, correct: Correct) -> CaptureData:
         """The same counts with the noise that corrected counts tell: photon noise follows the light, not the counts."""
+        variance = np.empty_like(self.signal)
+
+        def strip(rows: slice) -> None:
+            variance[:, :, rows] = self.noise_of(*correct(self.signal[:, :, rows].astype(float)))
+
+        for_strips(variance.shape[2], strip)
+        return replace(self, true_variance=variance)
+
+    def noise_of(self, signal: Array, slope: Array) -> Array:
+        """Variance (N, channels, ...) of the counts by corrected ones, of the given slope over them."""
         shape = (-1, 1, 1, 1)
-        variance = self.slope.reshape(shape) * np.maximum(signal, 0) / slope**2 + self.floor.reshape(shape)
-        return replace(self, true_variance=variance.astype(np.float32))
+        return np.asarray(self.slope.reshape(shape) * np.maximum(signal, 0) / slope**2 + self.floor.reshape(shape))
+
+
+def _moved_back(frames: NDArray[np.float32], shift_px: Array) -> NDArray[np.float32]:
+    out = np.empty_like(frames)
+    for n, (x, y) in enumerate(shift_px):
+        for channel in range(frames.shape[1]):
+            out[n, channel] = shifted_back(frames[n, channel], x, y)
+    return out
+
+
+def for_strips(height: int, work: Callable[[slice], object]) -> None:
+    """Call `work` for all rows of an image, some at a time, spread over the cores."""
+
+    def several(first: int, last: int) -> None:
+        for row in range(first, last, STRIP_ROWS):
+            work(slice(row, min(row + STRIP_ROWS, last)))
+
+    for_ranges(height, several, align=STRIP_ROWS, smallest=2 * STRIP_ROWS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.instrument.moments import DERIVATIVES, FEATURES, features
+from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES, features
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.space import Space
 

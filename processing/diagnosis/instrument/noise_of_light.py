@@ -6,14 +6,15 @@ An offset and light that leaks through crossed polarizers can be the same in all
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from processing.arrays import Array
+from processing.arrays import Array, BoolArray
+from processing.diagnosis.captured.capture_data import CaptureData, Correct, for_strips
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import RANK, add_response
-from processing.diagnosis.instrument.undone import undone_signal
+from processing.diagnosis.instrument.undone import undoing
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.space import Space
 
@@ -31,28 +32,44 @@ def scatter_prefers(problem: InstrumentProblem, space: Space, values: Array, new
     gain = 0.0
     for k, (data, still) in enumerate(zip(near.captures, problem.still, strict=True)):
         rest, free = _rest(near, k, space, local)
-        light = (still.signal.reshape(rest.shape) - rest).reshape(still.signal.shape)
-        mean = replace(still, signal=light.astype(np.float32))
-        good = data.usable & ~data.clipped
-        use = near.moments[k].counts
-        share = (free * near.moments[k].left)[use, None]
-        of = []
-        for undone in (new, old):
-            variance = mean.with_noise_of(*undone_signal(mean, undone)).variance().reshape(rest.shape)[use][:, good]
-            of.append(float(np.sum(rest[use][:, good] ** 2 / variance + share * np.log(variance))))
-        gain += 0.5 * (of[1] - of[0])
+        share, good = free * near.moments[k].left, data.usable & ~data.clipped
+        before, after = (
+            _log_scatter(still, rest, share, near.moments[k].counts, good, undoing(still, undone))
+            for undone in (old, new)
+        )
+        gain += 0.5 * (before - after)
     return gain
 
 
-def _rest(problem: InstrumentProblem, k: int, space: Space, values: Array) -> tuple[Array, Array]:
+def _log_scatter(
+    still: CaptureData, rest: NDArray[np.float32], share: Array, use: BoolArray, good: BoolArray, correct: Correct
+) -> float:
+    """Minus twice the log likelihood of a residual (L, rows, columns) with the noise of corrected counts.
+
+    Of the rows to `use` (L,), of which `share` (L,) of the noise is in the residual, and of `good` pixels.
+    """
+    found = np.zeros(len(good))
+
+    def strip(rows: slice) -> None:
+        left = rest[:, rows].astype(float)
+        light = still.signal[:, :, rows] - left.reshape(still.signal[:, :, rows].shape)
+        variance = still.noise_of(*correct(light)).reshape(left.shape)[use]
+        scatter = np.sum(left[use] ** 2 / variance, axis=0) + np.tensordot(share[use], np.log(variance), 1)
+        found[rows.start] = scatter[good[rows]].sum()
+
+    for_strips(len(good), strip)
+    return float(found.sum())
+
+
+def _rest(problem: InstrumentProblem, k: int, space: Space, values: Array) -> tuple[NDArray[np.float32], Array]:
     """Residual (L, rows, columns) of a capture in counts over full scale, and the share (L,) of noise in it."""
     data, level = problem.captures[k], problem.moments[k].sigma
     changes = problem.changes(k, space, values)
     a = problem.columns(k, changes) * problem.moments[k].counts[:, None]
-    counts = data.signal.reshape(data.values_per_pixel, *data.signal.shape[2:]).astype(np.float64)
+    counts = data.signal.reshape(data.values_per_pixel, *data.signal.shape[2:])
     y = add_response(counts, problem.coefficients(k, changes), a)
     u, size, _ = np.linalg.svd(a, full_matrices=False)
     q = u[:, size > RANK * size[0]]
-    flat = y.reshape(y.shape[0], -1) / level[:, None]
-    rest = (flat - q @ (q.T @ flat)) * level[:, None]
+    outside = (np.eye(len(a)) - q @ q.T) * level[:, None] / level
+    rest = outside.astype(np.float32) @ y.reshape(len(a), -1)
     return rest.reshape(y.shape), 1 - np.sum(q * q, axis=1)

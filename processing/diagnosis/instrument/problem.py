@@ -17,9 +17,8 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
 from processing.diagnosis.instrument.moments import (
-    DERIVATIVES,
-    FEATURES,
     FOLDS_OF_STATES,
     FOLDS_OF_TILES,
     Moments,
@@ -29,7 +28,7 @@ from processing.diagnosis.instrument.moments import (
 from processing.diagnosis.instrument.projection import RANK, add_block, noise_information
 from processing.diagnosis.instrument.slopes import Columns, slopes_of_counts, slopes_of_rows
 from processing.diagnosis.instrument.tile_sums import add_tiles, tile_columns
-from processing.diagnosis.instrument.undone import distance, exactly_undone, movable, undone_signal
+from processing.diagnosis.instrument.undone import distance, exactly_undone, movable, undoing
 from processing.diagnosis.search.candidate import Candidate, nominal_values, pool
 from processing.diagnosis.search.space import Space, Sums
 from processing.instrument.applied_effects import apply_to, changes_of
@@ -44,6 +43,8 @@ from processing.instrument.model import InstrumentModel
 
 #: Distance, in typical sizes, from the point of expansion up to which a correction of counts is exact enough.
 EXACT = 0.3
+#: Points of expansion that are kept besides the first: each has counts of its own.
+MOST_POINTS = 3
 #: Element matrices that are kept for use in another evaluation.
 MOST_BUILT = 64
 
@@ -141,8 +142,9 @@ class InstrumentProblem:
         shifts = [own + self._shift_px(k, undone) for k, own in enumerate(self.own_px)]
         if not all(movable(s) for s in shifts):
             return False
-        still = [c.undone(*undone_signal(c, bent)) if bent else c for c in self.still]
+        still = [c.undone(undoing(c, bent)) if bent else c for c in self.still]
         self._others.append(InstrumentProblem(self.models, still, undone, self.folds, shifts))
+        del self._others[:-MOST_POINTS]
         return True
 
     def _moved_back(self) -> tuple[CaptureData, ...]:
@@ -178,7 +180,7 @@ class InstrumentProblem:
             return False
         self._noise_at = at
         self.still = tuple(
-            c.with_noise_of(*undone_signal(c, at)) if at else replace(c, true_variance=None) for c in self.still
+            c.with_noise_of(undoing(c, at)) if at else replace(c, true_variance=None) for c in self.still
         )
         self.captures = self._moved_back()
         self.moments = tuple(moments_of(c, self.folds) for c in self.captures)

@@ -2,30 +2,44 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from processing.arrays import Array
-from processing.diagnosis.instrument.moments import DERIVATIVES, Block, Moments, features, image_derivatives
+from processing.diagnosis.captured.capture_data import for_strips
+from processing.diagnosis.instrument.features import DERIVATIVES, derivatives_of_part, features
+from processing.diagnosis.instrument.moments import Block, Moments
 from processing.diagnosis.search.space import Sums
 
 #: Singular values below this, relative to the largest, are none.
 RANK = 1e-8
 
 
-def add_response(counts: Array, coefficients: Array, a: Array) -> Array:
-    """Corrected counts (L, rows, columns) from the coefficients of the features (F, L); a (L, K) in units of noise."""
+def add_response(counts: NDArray[Any], coefficients: Array, a: Array) -> NDArray[Any]:
+    """Corrected counts (L, rows, columns) from the coefficients of the features (F, L), as precise as the counts.
+
+    a (L, K) in units of noise.
+    """
     if not np.any(coefficients[1:]):
         return counts
-    out = coefficients[0][:, None, None] * counts
-    if np.any(coefficients[1:-DERIVATIVES]):
-        z, _ = features(counts)
-        out += np.einsum("fl,flhw->lhw", coefficients[1:-DERIVATIVES], z[1:])
-    if np.any(coefficients[-DERIVATIVES:]):
+    out = np.empty_like(counts)
+    plain, around = coefficients[:-DERIVATIVES], coefficients[-DERIVATIVES:]
+    fitted = None
+    if np.any(around):
         u, size, _ = np.linalg.svd(a, full_matrices=False)
-        q = u[:, size > RANK * size[0]]
+        q = u[:, size > RANK * size[0]].astype(counts.dtype)
         fitted = (q @ (q.T @ counts.reshape(counts.shape[0], -1))).reshape(counts.shape)
-        out += np.einsum("fl,flhw->lhw", coefficients[-DERIVATIVES:], image_derivatives(fitted))
-    return np.asarray(out)
+
+    def strip(rows: slice) -> None:
+        y = np.einsum("fl,flhw->lhw", plain, features(counts[:, rows].astype(float))[0])
+        if fitted is not None:
+            y += np.einsum("fl,flhw->lhw", around, derivatives_of_part(fitted, rows, slice(0, counts.shape[2])))
+        out[:, rows] = y
+
+    for_strips(counts.shape[1], strip)
+    return out
 
 
 def add_block(block: Block, a: Array, c: Array, da: Array, dc: Array | None, moments: Moments, out: Sums) -> None:

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
-from processing.diagnosis.instrument.moments import MARGIN, inside
+from processing.diagnosis.instrument.features import MARGIN, inside
+from processing.diagnosis.instrument.pixel_sums import Pixels
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import add_response
 from processing.diagnosis.instrument.tile_sums import tile_columns
@@ -87,25 +88,28 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
         # Where nothing is said to move, edges must fit as well: a focus that changes shows nowhere else.
         usable = usable | data.steep
     used = (usable & ~data.clipped if changes.drop_clipped else usable) & inside(height, width)
-    counts = data.signal.reshape(rows, height, width).astype(np.float64)
-    y = add_response(counts, problem.coefficients(capture, changes), problem.columns(capture, changes))
-    variance = data.variance().reshape(rows, height, width)
-    level, mean_variance = moments.sigma, variance.mean(axis=0)
+    coefficients, whitened = problem.coefficients(capture, changes), problem.columns(capture, changes)
+    y = add_response(data.signal.reshape(rows, height, width), coefficients, whitened)
+    level, pixels = moments.sigma, Pixels(data)
     free = np.zeros((rows, height, width), dtype=np.float32)
     signal = np.zeros((rows, height, width), dtype=np.float32)
-    for mask, columns in _parts(problem, capture, changes, a, np.ones_like(used)):
+    for here, columns in _parts(problem, capture, changes, a):
         q = _basis(columns / level[:, None] * moments.counts[:, None])
-        signal[:, mask] = (q @ (q.T @ (y[:, mask] / level[:, None]))) * level[:, None]
-        free[:, mask] = (1 - np.sum(q * q, axis=1))[:, None]
-    scale = level[:, None] * np.sqrt(mean_variance[used])
-    r = np.full((rows, height, width), np.nan, dtype=np.float32)
-    r[:, used] = (y - signal)[:, used] / scale
+        part = y[:, *here]
+        onto = (q * level[:, None]).astype(np.float32) @ (q.T / level).astype(np.float32)
+        signal[:, *here] = (onto @ part.reshape(rows, -1)).reshape(part.shape)
+        free[:, *here] = (1 - np.sum(q * q, axis=1))[:, None, None]
+    r = y - signal
+    with np.errstate(divide="ignore", invalid="ignore"):
+        r /= level[:, None, None].astype(np.float32) * np.sqrt(pixels.scale).astype(np.float32)
+    r[:, ~used] = np.nan
     # Of a row that does not count nothing is left, and no noise is expected.
     r[~moments.counts], free[~moments.counts] = np.where(used, 0.0, np.nan), 0.0
     around = _around(signal)
     signal[:, ~used], free[:, ~used] = 0.0, 0.0
-    noise = variance / level[:, None, None] ** 2 / np.maximum(mean_variance, 1e-300)
-    expected = (free * noise).astype(np.float32)
+    expected = free
+    for row, of_row in enumerate(expected):
+        of_row *= pixels.variance_of(row) / level[row] ** 2 / np.maximum(pixels.scale, 1e-300)
     good = np.asarray(np.isfinite(r).all(axis=0))
     images = Images(r, around, expected, good)
     alike = _alike(data)
@@ -155,16 +159,17 @@ def _around(signal: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _parts(
-    problem: InstrumentProblem, capture: int, changes: Changes, a: Array, used: NDArray[np.bool_]
-) -> list[tuple[NDArray[np.bool_], Array]]:
+    problem: InstrumentProblem, capture: int, changes: Changes, a: Array
+) -> list[tuple[tuple[slice, slice], Array]]:
+    """Parts of the image, each with its matrix (L, K)."""
     moments = problem.moments[capture]
     tiles = moments.tiles
     if not changes.field_retardance_rad or tiles is None:
-        return [(used, a)]
+        return [((slice(None), slice(None)), a)]
     columns = (
         tile_columns(problem.models[capture], problem.captures[capture], moments, changes) * moments.sigma[:, None]
     )
-    return [(used & (tiles.index == t), columns[t]) for t in range(tiles.x.size)]
+    return list(zip(tiles.boxes, columns, strict=True))
 
 
 def _basis(a: Array) -> Array:
@@ -189,28 +194,29 @@ def _tests(
     count = int(good.sum())
     if count == 0 or not noise_known:
         return {}, 0.0
-    flat, wanted = r[:, good].astype(np.float64), expected[:, good].astype(np.float64)
+    flat, wanted = r[:, good], expected[:, good]
     # Of smooth patterns moved frames keep all the noise, of single pixels only a part.
-    freedom = shown @ wanted.sum(axis=1)
+    freedom = shown @ wanted.sum(axis=1, dtype=float)
     # Name to chi-square beyond noise, and its standard deviation with nothing but noise.
-    found = {"sum of squares": (np.sum(flat**2) - freedom, np.sqrt(2 * max(freedom, 1e-300) * spread))}
+    found = {"sum of squares": (_square(flat) - freedom, np.sqrt(2 * max(freedom, 1e-300) * spread))}
     if count < FEWEST_PIXELS:
         # What goes with the signal, or with the place, needs an image.
         return _in_deviations(found)
     # Linear in the signal: every pixel's residual against the leading components of the fitted signal near by.
-    s = images.around[:, good].astype(np.float64)
-    _, size, vt = np.linalg.svd(s @ s.T)
+    s = images.around[:, good]
+    _, size, vt = np.linalg.svd((s @ s.T).astype(float))
     keep = min(columns, int(np.sum(size > 1e-10 * size[0])))
-    weights = (vt[:keep] @ s) / np.sqrt(np.maximum(size[:keep], 1e-300))[:, None]
+    turned = vt[:keep] / np.sqrt(np.maximum(size[:keep], 1e-300))[:, None]
+    weights = turned.astype(np.float32) @ s
     linear = flat @ weights.T
-    null = wanted @ (weights.T**2)
-    found["linear in the signal"] = (np.sum(linear**2) - null.sum(), np.sqrt(2 * null.sum() * spread))
+    null = (wanted @ (weights.T**2)).sum(dtype=float)
+    found["linear in the signal"] = (_square(linear) - null, np.sqrt(2 * null * spread))
     # Brightness: against the square of the signal, its linear part taken away.
-    square = s**2
-    square -= (square @ weights.T) @ weights
-    norm = np.sqrt(np.sum(square**2, axis=1, keepdims=True)) + 1e-300
-    along = np.sum(flat * square / norm, axis=1)
-    expectation = np.sum(wanted * (square / norm) ** 2, axis=1)
+    np.square(s, out=s)
+    s -= (s @ weights.T) @ weights
+    s /= np.sqrt(np.sum(s**2, axis=1, keepdims=True, dtype=float)).astype(np.float32) + np.float32(1e-30)
+    along = np.sum(flat * s, axis=1, dtype=float)
+    expectation = np.sum(wanted * s**2, axis=1, dtype=float)
     found["brightness"] = (
         np.sum(along**2) - expectation.sum(),
         np.sqrt(2 * np.sum(expectation**2) * spread + 1e-300),
@@ -218,15 +224,20 @@ def _tests(
     # Neighbours: noise of two pixels is independent, or as alike as moving the frames has made it.
     for k, name in enumerate(("neighbours, rows", "neighbours, columns")):
         if r.shape[k + 1] > 2:
-            first, second = np.delete(r, -1, k + 1), np.delete(r, 0, k + 1)
-            both = np.isfinite(first).all(axis=0) & np.isfinite(second).all(axis=0)
-            product = (first * second)[:, both].astype(np.float64)
-            if product.size > 100:
-                null = alike[:, k] @ np.delete(expected, -1, k + 1)[:, both].sum(axis=1, dtype=np.float64)
-                found[name] = (product.sum() - null, np.sqrt(np.sum(product**2)))
+            first, second = (slice(None),) * (k + 1) + (slice(-1),), (slice(None),) * (k + 1) + (slice(1, None),)
+            both = good[first[1:]] & good[second[1:]]
+            product = r[first] * r[second]
+            product[:, ~both] = 0.0
+            if both.sum() * len(r) > 100:
+                null = alike[:, k] @ np.sum(expected[first], axis=(1, 2), where=both, dtype=float)
+                found[name] = (np.sum(product, dtype=float) - null, np.sqrt(_square(product)))
     # Tiles: mean residual of every row over patches of the image.
     found["patches"] = _patches(r, expected, spread)
     return _in_deviations(found)
+
+
+def _square(x: NDArray[np.floating]) -> float:
+    return float(np.sum(x**2, dtype=float))
 
 
 def _in_deviations(found: dict[str, tuple[float, float]]) -> tuple[dict[str, float], float]:

@@ -10,13 +10,16 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
-from processing.diagnosis.instrument.moments import DERIVATIVES, FEATURES, Moments, Tiles, tile_products
+from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
+from processing.diagnosis.instrument.moments import Moments, Tiles, tile_products
 from processing.diagnosis.instrument.projection import RANK
 from processing.diagnosis.search.space import Sums
 from processing.instrument.changes import Changes
 from processing.instrument.model import InstrumentModel
 from processing.reduction.effects_of_capture import extra_retardance, with_extra
 
+#: Tiles that are reckoned with together: their products are copied for it.
+TOGETHER = 32
 #: A retarder's Mueller matrix is linear in 1, cosine and sine of its retardance: three values tell all.
 THIRDS = (0.0, 2 * np.pi / 3, 4 * np.pi / 3)
 
@@ -42,25 +45,43 @@ def add_tiles(
 ) -> None:
     """Add what tiles say of a (tiles, L, K) and coefficients c (F, L), with their derivatives by each value."""
     used = np.flatnonzero(np.any(c, axis=1) | np.any(dc, axis=(0, 2)))
-    s, noise = tile_products(data, tiles, used.tolist())
-    use = moments.counts
+    products = tile_products(data, tiles, used.tolist())
+    use = np.flatnonzero(moments.counts)
+    of_features = c[used][:, use], dc[:, used][:, :, use]
+    for first in range(0, tiles.x.size, TOGETHER):
+        some = slice(first, first + TOGETHER)
+        _add_some(moments, tiles, some, products, used, (a[some][:, use], da[:, some][:, :, use]), of_features, out)
+
+
+def _add_some(
+    moments: Moments,
+    tiles: Tiles,
+    some: slice,
+    products: tuple[Array, Array],
+    used: NDArray[np.int64],
+    of_rows: tuple[Array, Array],
+    of_features: tuple[Array, Array],
+    out: Sums,
+) -> None:
+    """Add `some` of the tiles: rows and coefficients of the features that are `used`, each with its derivatives."""
+    (a, da), (c, dc), (s, noise) = of_rows, of_features, (each[some] for each in products)
+    use, fold = moments.counts, tiles.fold[some]
     if not use.all():
         every = np.flatnonzero(np.tile(use, used.size))
         s, noise = s[:, every][:, :, every], noise[:, use]
-        a, c, da, dc = a[:, use], c[:, use], da[:, :, use], dc[:, :, use]
     sigma = moments.sigma[use]
     scale = np.tile(1 / sigma, used.size)
     around = used >= len(FEATURES) - DERIVATIVES
-    all_tiles = _Tiled(s * scale[:, None] * scale, noise / (sigma**2)[:, None, None], a, c[used], around)
+    all_tiles = _Tiled(s * scale[:, None] * scale, noise / (sigma**2)[:, None, None], a, c, around)
     squares = np.diagonal(all_tiles.ry @ all_tiles.outside, axis1=1, axis2=2)
     free = np.diagonal(all_tiles.outside, axis1=1, axis2=2)
-    np.add.at(out.excess, tiles.fold, squares.sum(axis=1) - all_tiles.expected)
-    np.add.at(out.freedom, tiles.fold, all_tiles.expected)
-    np.add.at(out.square, tiles.fold, squares @ sigma**2 * moments.relative)
-    np.add.at(out.count, tiles.fold, free @ moments.left[use] * tiles.pixels)
+    np.add.at(out.excess, fold, squares.sum(axis=1) - all_tiles.expected)
+    np.add.at(out.freedom, fold, all_tiles.expected)
+    np.add.at(out.square, fold, squares @ sigma**2 * moments.relative)
+    np.add.at(out.count, fold, free @ moments.left[use] * tiles.pixels[some])
     if len(da):
-        folds = [tiles.fold == f for f in range(len(out.excess))]
-        gradient, stretch, curvature = all_tiles.slopes(da, dc[:, used], folds)
+        folds = [fold == f for f in range(len(out.excess))]
+        gradient, stretch, curvature = all_tiles.slopes(da, dc, folds)
         out.gradient += gradient
         out.stretch += stretch
         out.curvature += curvature

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.captured.capture_data import CaptureData
-from processing.diagnosis.instrument.moments import MARGIN
+from processing.diagnosis.captured.capture_data import CaptureData, Correct
+from processing.diagnosis.instrument.features import MARGIN
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import ImageShift, PointwiseEffect
@@ -39,11 +39,15 @@ def exactly_undone(space: Space, values: Array, *, pointwise: bool = False) -> d
     return {c: values[p] for c, p in active if _exactly_undone(c, pointwise) and values[p].any()}
 
 
-def undone_signal(data: CaptureData, undone: Mapping[Candidate, Array]) -> tuple[Array, Array]:
-    """Signal with the effects undone exactly, and its slope over the old one."""
-    signal, slope = data.signal.astype(float), np.ones(())
-    for candidate, values in undone.items():
-        if isinstance(candidate.effect, PointwiseEffect):
-            signal, step = candidate.effect.undo(signal, data.conditions, values)
-            slope = slope * step
-    return signal, slope
+def undoing(data: CaptureData, undone: Mapping[Candidate, Array]) -> Correct:
+    """What undoes the effects exactly in signals of a capture, and gives the slope over the old ones."""
+
+    def correct(signal: Array) -> tuple[Array, Array]:
+        slope = np.ones(())
+        for candidate, values in undone.items():
+            if isinstance(candidate.effect, PointwiseEffect):
+                signal, step = candidate.effect.undo(signal, data.conditions, values)
+                slope = slope * step
+        return signal, slope
+
+    return correct

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.instrument.moments import MARGIN
+from processing.diagnosis.instrument.features import MARGIN
 from processing.diagnosis.instrument.noise_of_light import scatter_prefers
 from processing.diagnosis.instrument.problem import EXACT, InstrumentProblem
 from processing.diagnosis.instrument.starts import best_of_starts, first_values

@@ -1,0 +1,116 @@
+"""Features of the counts of a pixel, in which corrections of the counts are linear, and the noise they have in common.
+
+Powers and logarithms need the pixel alone, derivatives of the image the pixels around it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.arrays import Array
+from processing.diagnosis.captured.capture_data import SharedNoise
+from processing.reduction.move_image import noise_taps
+
+#: Features of a signal u (counts over full scale); corrected counts = u + sum of coefficient times feature.
+FEATURES = (
+    *("counts", "one", "square", "cube", "fourth", "log", "log_square", "log_cube"),
+    *("dx", "dy", "dxx", "dxy", "dyy"),
+)
+#: The last of them are derivatives of the image by position.
+DERIVATIVES = 5
+TINY = 1e-6
+NOTHING_SHARED = SharedNoise()
+#: Savitzky-Golay filters of seven points: value (third order), first and second derivative (fourth and fifth order).
+VALUE = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21
+FIRST = np.array([22.0, -67.0, -58.0, 0.0, 58.0, 67.0, -22.0]) / 252
+SECOND = np.array([-13.0, 67.0, -19.0, -70.0, -19.0, 67.0, -13.0]) / 132
+FILTERS = (VALUE, FIRST, SECOND)
+MARGIN = 3
+#: Order of each derivative down and across the image, as they stand in FEATURES.
+ORDERS = ((0, 1), (1, 0), (0, 2), (1, 1), (2, 0))
+#: Filters down and across the image of a pixel itself and of its derivatives.
+POINT = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+PATTERNS = ((POINT, POINT), *((FILTERS[down], FILTERS[across]) for down, across in ORDERS))
+
+
+def features(u: NDArray[np.floating[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Features of signals that need no neighbours, (F - 5, ...), and their derivatives by the signal, as exact as u."""
+    z, slope = np.empty((2, len(FEATURES) - DERIVATIVES, *u.shape), dtype=u.dtype)
+    # Products: numpy's powers beyond the second take ten times as long.
+    log, square = np.log(np.maximum(u, TINY)), u * u
+    cube, log_square = square * u, log * log
+    z[0], slope[0] = u, 1.0
+    z[1], slope[1] = 1.0, 0.0
+    z[2], slope[2] = square, 2 * u
+    z[3], slope[3] = cube, 3 * square
+    z[4], slope[4] = square * square, 4 * cube
+    z[5], slope[5] = u * log, log + 1
+    z[6], slope[6] = u * log_square, log_square + 2 * log
+    z[7], slope[7] = u * log_square * log, log_square * log + 3 * log_square
+    return z, slope
+
+
+def derivatives_known(height: int, width: int) -> bool:
+    """Whether an image is large enough for its derivatives; they are zero in a smaller one."""
+    return min(height, width) > 2 * MARGIN + 2
+
+
+def inside(height: int, width: int) -> NDArray[np.bool_]:
+    """Pixels whose derivatives need nothing beyond the edge; all of them where the image is too small for that."""
+    out = np.ones((height, width), dtype=bool)
+    if derivatives_known(height, width):
+        out[:MARGIN], out[-MARGIN:], out[:, :MARGIN], out[:, -MARGIN:] = False, False, False, False
+    return out
+
+
+def image_derivatives(u: NDArray[np.floating]) -> NDArray[np.float32]:
+    """dx, dy, dxx, dxy, dyy (5, L, rows, columns) of images (L, rows, columns); zero if the image is too small."""
+    height, width = u.shape[1:]
+    return derivatives_of_part(u, slice(0, height), slice(0, width))
+
+
+def derivatives_of_part(u: NDArray[np.floating], rows: slice, columns: slice) -> NDArray[np.float32]:
+    """The same of a rectangle of the images alone."""
+    from scipy.ndimage import correlate1d
+
+    height, width = rows.stop - rows.start, columns.stop - columns.start
+    out = np.zeros((DERIVATIVES, u.shape[0], height, width), dtype=np.float32)
+    if not derivatives_known(*u.shape[1:]):
+        return out
+    top, left = max(rows.start - MARGIN, 0), max(columns.start - MARGIN, 0)
+    around = u[:, top : rows.stop + MARGIN, left : columns.stop + MARGIN]
+    across = [correlate1d(around, kernel, axis=2) for kernel in FILTERS]
+    here = slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left)
+    for k, (down, right) in enumerate(ORDERS):
+        out[k] = correlate1d(across[right][:, :, here[1]], FILTERS[down], axis=1)[:, here[0]]
+    return out
+
+
+def shared_noise(x_px: float, y_px: float, mixed: SharedNoise = NOTHING_SHARED) -> Array:
+    """Covariance (6, 6) of the noise of a pixel and its derivatives in a frame that was moved back by so many pixels.
+
+    For unit noise of wide patterns, which moving the frame, and what was `mixed` before, make alike among neighbours.
+    """
+    across = np.stack([np.convolve(kernel, noise_taps(x_px, mixed.right)) for _, kernel in PATTERNS])
+    down = np.stack([np.convolve(kernel, noise_taps(y_px, mixed.down)) for kernel, _ in PATTERNS])
+    return np.asarray((across @ across.T) * (down @ down.T) / mixed.wide)
+
+
+def feature_noise(slopes: NDArray[Any], share: NDArray[Any], shared: Array) -> Array:
+    """Expected noise (L, F, F) of products of features, summed over pixels; neighbours count as noisy as the pixel.
+
+    Of slopes (F - 5, L, P) of the features by the signal, variances `share` (L, P), and `shared_noise` (L, 6, 6).
+    """
+    plain = len(slopes)
+    out = np.zeros((share.shape[0], len(FEATURES), len(FEATURES)))
+    by_row = slopes.transpose(1, 0, 2)
+    out[:, :plain, :plain] = (by_row * share[:, None]) @ by_row.transpose(0, 2, 1)
+    cross = out[:, :plain, 0].copy()
+    out[:, :plain, :plain] *= shared[:, :1, :1]
+    cross = cross[:, :, None] * shared[:, :1, 1:]
+    out[:, :plain, plain:], out[:, plain:, :plain] = cross, cross.transpose(0, 2, 1)
+    out[:, plain:, plain:] = share.sum(axis=1, dtype=float)[:, None, None] * shared[:, 1:, 1:]
+    return out
