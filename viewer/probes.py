@@ -74,8 +74,8 @@ def _of_product(path: Path, query: Any, library: Library) -> dict[str, Any]:
     with Product(path) as product:
         region = Region.asked(query, product.shape)
         found: dict[str, Any] = {"where": str(region), "planes": _planes(product, region), "told": ""}
-        if "pixel_mask" in product.names:
-            bits = product.get("pixel_mask", region.rows)[:, region.columns]
+        if "pixel_flags" in product.names:
+            bits = product.get("pixel_flags", region.rows)[:, region.columns]
             found["mask"] = mask_words(int(bits.max())) if bits.any() else "valid"
         if product.kind == "mueller" and region.pixels == 1:
             image = MuellerImage.of(product, region.rows)

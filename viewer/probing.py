@@ -122,7 +122,7 @@ class PixelReducer:
         def part(values: NDArray[Any]) -> NDArray[Any]:
             return values.reshape(*values.shape[:-1], *shape)[..., region.columns]
 
-        mask = part(found["pixel_mask"])
+        mask = part(found["pixel_flags"])
         good = mask & np.uint8(Mask.NOT_FINITE | Mask.BAD | Mask.NOT_DETERMINED) == 0
         count = int(good.sum())
         if not count:

@@ -88,7 +88,7 @@ def read_map(opened: Product, name: str, index: int, window: Window) -> NDArray[
     """One map of a product in a window; NaN where no valid mask of the product holds."""
     planes = opened.get(name, window.rows)
     values = window.every(planes.reshape(-1, *planes.shape[-2:])[index]).astype(np.float32)
-    if name not in ("lit", "valid", "pixel_mask"):
+    if name not in ("lit", "valid", "pixel_flags"):
         for mask in ("lit", "valid"):
             if mask in opened.names:
                 values[window.every(opened.get(mask, window.rows)) == 0] = np.nan

@@ -34,7 +34,7 @@ CLIPPING = 0.97
 
 PLANES = {
     "dark_mean": Plane((), "count", "mean of the dark frames of the shortest exposure"),
-    "pixel_mask": Plane((), "", f"0 = good; bits: {Mask.meaning()}", np.uint8),
+    "pixel_flags": Plane((), "", f"0 = good; bits: {Mask.meaning()}", np.uint8),
 }
 
 
@@ -211,7 +211,7 @@ def write_camera(
         with ProductWriter(out, "camera", first.header, first.frame_shape, PLANES, (step,), overwrite) as writer:
             mask = np.where(bad, np.uint8(Mask.BAD), np.uint8(0))
             mean = np.mean([d.mean(axis=0) for d in darks], axis=0).astype(np.float32)
-            writer.write(slice(0, first.frame_shape[0]), dark_mean=mean, pixel_mask=mask)
+            writer.write(slice(0, first.frame_shape[0]), dark_mean=mean, pixel_flags=mask)
             points = np.stack([line.signal, line.variance, line.stderr])
             writer.array("photon_transfer", points, "count", "signal (count), variance and its standard error (count2)")
             writer.seal(facts)
@@ -229,7 +229,7 @@ def read_camera(path: Path) -> tuple[NoiseModel, NDArray[np.bool_]]:
         rounding = QUANTIZATION if facts["integer"] else 0.0
         source = f"{path.name}: gain {facts['gain_e_per_count']:.4g} e/count, read noise {facts['read_noise_e']:.3g} e"
         noise = NoiseModel(facts["slope"], max(facts["floor"] - rounding, 0.0), rounding, source)
-        return noise, (product.get("pixel_mask") & np.uint8(Mask.BAD)) != 0
+        return noise, (product.get("pixel_flags") & np.uint8(Mask.BAD)) != 0
 
 
 def _warnings(line: PhotonTransfer, capture: Capture) -> list[str]:

@@ -114,7 +114,7 @@ def _sample(view: ViewingGeometry, product: Product) -> tuple[ScatteringGeometry
     image = view.at(float(product.header.omega_deg or 0.0), *product.shape)
     # Pixels on the outline mix object and background, in a mosaic most of all.
     inner = binary_erosion(image.mask, iterations=BORDER_PX)
-    good = np.flatnonzero(inner[image.mask] & (product.get("pixel_mask")[image.mask] == 0))
+    good = np.flatnonzero(inner[image.mask] & (product.get("pixel_flags")[image.mask] == 0))
     if good.size == 0:
         raise ProcessError(f"{product.path}: no good pixel sees the object; check the geometry file.")
     chosen = good[np.linspace(0, good.size - 1, min(good.size, PIXELS)).astype(np.int64)]

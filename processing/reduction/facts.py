@@ -35,13 +35,13 @@ def mueller_facts(
     ------
     CaptureError : not one pixel could be reduced.
     """
-    mask, warnings = product.get("pixel_mask"), list(correction.warnings)
+    mask, warnings = product.get("pixel_flags"), list(correction.warnings)
     good = (mask & ~np.uint8(Mask.PARTLY)) == 0
     counts = {flag.name.lower(): int(np.sum((mask & np.uint8(flag)) != 0)) for flag in Mask if flag.name}
     if not good.any():
         raise CaptureError(f"no pixel could be reduced: {in_words(counts)} of {mask.size} pixels. Nothing was written.")
     if any(counts.values()):
-        warnings.append(f"of {mask.size} pixels: {in_words(counts)} (pixel_mask says where)")
+        warnings.append(f"of {mask.size} pixels: {in_words(counts)} (pixel_flags says where)")
     # Medians from about 128 rows are plenty, and read little.
     some = slice(None, None, max(1, mask.shape[0] // 128))
     residual, elements = product.get("residual_rms", some), product.get("mueller", some)

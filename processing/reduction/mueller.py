@@ -327,7 +327,7 @@ def _block(
 ) -> dict[str, NDArray[Any]]:
     frames = solver.reader.read(rows)
     found = solver.solve(frames)
-    mask = found["pixel_mask"]
+    mask = found["pixel_flags"]
     lost = (mask & np.uint8(Mask.NOT_FINITE | Mask.BAD | Mask.NOT_DETERMINED)) != 0
     if sent is not None:
         found |= sent.planes(found["mueller"], found["residual_rms"], solver)
@@ -340,7 +340,7 @@ def _block(
     if systematic is not None:
         found["mueller_systematic"] = systematic.errors(found["mueller"])
     for name, values in found.items():
-        if lost.any() and name != "pixel_mask":
+        if lost.any() and name != "pixel_flags":
             values[..., lost] = np.nan
     shape = (rows.stop - rows.start, solver.reader.capture.frame_shape[1])
     if "mueller_physical" in planes and "mueller_physical" not in found:

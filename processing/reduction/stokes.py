@@ -45,7 +45,7 @@ PLANES = {
     "aolp_deg": Plane((), "degree", "angle of linear polarization, 0 to 180, from +x of the analyzer frame"),
     "aolp_deg_errors": Plane((), "degree", "standard errors of aolp_deg, first order; meaningless where dolp is noise"),
     "closure": Plane((), "count", "what the model cannot explain of the four channels: I0 + I90 - I45 - I135 if ideal"),
-    "pixel_mask": Plane((), "", f"0 = good; bits: {Mask.meaning()}", np.uint8),
+    "pixel_flags": Plane((), "", f"0 = good; bits: {Mask.meaning()}", np.uint8),
 }
 
 #: Without light there is no degree and no angle of polarization; S itself is a measurement all the same.
@@ -125,11 +125,11 @@ def reduce_stokes(
         frame = corrected_frame(frame, response, layout, analyzers)
     channels = demosaic(frame, layout, method)
     found = stokes(channels, analyzers, layout, method, merged, frame)
-    found["pixel_mask"] = _spread(merged.mask, channels.shape[1:])
-    lost = (found["pixel_mask"] & ~np.uint8(Mask.SATURATED)) != 0
+    found["pixel_flags"] = _spread(merged.mask, channels.shape[1:])
+    lost = (found["pixel_flags"] & ~np.uint8(Mask.SATURATED)) != 0
     dark = ~(found["s0"] > 0)
     for name, values in found.items():
-        if name != "pixel_mask":
+        if name != "pixel_flags":
             values[..., lost | dark if name in RATIOS else lost] = np.nan
     rows, columns = channels.shape[1:]
     facts = _facts(found, analyzers, noise, correction, method, len(states))
@@ -231,13 +231,13 @@ def _facts(
     method: str,
     states: int,
 ) -> dict[str, Any]:
-    mask, warnings = found["pixel_mask"], list(correction.warnings)
+    mask, warnings = found["pixel_flags"], list(correction.warnings)
     counts = {flag.name.lower(): int(np.sum((mask & np.uint8(flag)) != 0)) for flag in Mask if flag.name}
     good = (mask & ~np.uint8(Mask.SATURATED)) == 0
     if not good.any():
         raise CaptureError(f"no pixel could be reduced: {in_words(counts)} of {mask.size} pixels. Nothing was written.")
     if any(counts.values()):
-        warnings.append(f"of {mask.size} pixels: {in_words(counts)} (pixel_mask says where)")
+        warnings.append(f"of {mask.size} pixels: {in_words(counts)} (pixel_flags says where)")
     if noise is None:
         warnings.append("the gain is not known: one noise for the whole image, estimated from the channels' closure")
     # Medians of a ninth of the pixels are plenty.

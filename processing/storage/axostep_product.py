@@ -66,7 +66,7 @@ def product_of_axostep(
             mueller=image.mueller,
             mueller_errors=np.full((4, 4, rows, columns), np.nan, np.float32),
             residual_rms=nothing,
-            pixel_mask=np.where(finite, 0, np.uint8(Mask.NOT_FINITE)).astype(np.uint8),
+            pixel_flags=np.where(finite, 0, np.uint8(Mask.NOT_FINITE)).astype(np.uint8),
         )
         writer.seal(facts)
     date = f", {image.date:%Y-%m-%d %H:%M} GMT" if image.date else ""

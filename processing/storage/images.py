@@ -46,7 +46,7 @@ class MuellerImage:
     values : (4, 4, rows, columns) float32, counts, not normalized; NaN where nothing was determined.
     errors
         Same shape, standard errors; NaN where they are not known.
-    mask : (rows, columns) uint8, bits of `processing.reduction.counts_to_signal.Mask`.
+    mask : (rows, columns) uint8, bits of `processing.storage.pixel_mask.Mask`.
     residual_rms : (rows, columns), counts.
     w : (N, 16), measurement matrix, rows scaled with the exposure.
     noise_slope, noise_floor : (N,), variance of intensity n = slope * signal + floor; NaN where noise is not known.
@@ -81,7 +81,7 @@ class MuellerImage:
         return cls(
             values=product.get("mueller", rows),
             errors=product.get("mueller_errors", rows),
-            mask=product.get("pixel_mask", rows),
+            mask=product.get("pixel_flags", rows),
             residual_rms=product.get("residual_rms", rows),
             w=product.array("measurement_matrix").reshape(-1, 16),
             noise_slope=product.array("noise_slope"),
@@ -238,7 +238,7 @@ class StokesImage:
     values : (3, rows, columns) float32, S0, S1, S2 in counts; NaN where masked.
     covariance : (rows, columns, 3, 3), counts^2.
     w, analyzers : (channels, 16) and (channels, 3), from the Mueller matrix and from S to intensities.
-    mask : (rows, columns) uint8, bits of `processing.reduction.counts_to_signal.Mask`.
+    mask : (rows, columns) uint8, bits of `processing.storage.pixel_mask.Mask`.
     neighbour_correlation : (2 R + 1, 2 R + 1), of the noise of S1 and S2 between pixels, by rows and columns.
     """
 
@@ -262,7 +262,7 @@ class StokesImage:
             return cls(
                 values=np.stack([product.get(name, rows) for name in ("s0", "s1", "s2")]),
                 covariance=np.moveaxis(packed[[0, 3, 4, 3, 1, 5, 4, 5, 2]], 0, -1).reshape(*packed.shape[1:], 3, 3),
-                mask=product.get("pixel_mask", rows),
+                mask=product.get("pixel_flags", rows),
                 w=product.array("measurement_matrix"),
                 analyzers=product.array("analyzers"),
                 neighbour_correlation=neighbour_correlation(product),

@@ -11,5 +11,5 @@ MUELLER_PLANES = {
     "mueller": Plane((4, 4), "count", "Mueller matrix, row-major, not normalized"),
     "mueller_errors": Plane((4, 4), "count", "standard errors of mueller"),
     "residual_rms": Plane((), "count", "root mean square over the states of intensity minus fit"),
-    "pixel_mask": Plane((), "", f"0 = good; bits: {Mask.meaning()}", np.uint8),
+    "pixel_flags": Plane((), "", f"0 = good; bits: {Mask.meaning()}", np.uint8),
 }

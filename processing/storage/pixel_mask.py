@@ -6,7 +6,7 @@ from enum import IntFlag
 
 
 class Mask(IntFlag):
-    """Bits of `pixel_mask` in every product; 0 is a good pixel."""
+    """Bits of `pixel_flags` in every product; 0 is a good pixel."""
 
     SATURATED = 1  # some state was at the top of the range and was left out
     NOT_FINITE = 2  # some state has no number there

@@ -45,6 +45,9 @@ WORTH_SAVING = 0.2
 #: A pixel has light where its intensity is this many standard errors above zero; figures and summaries count those.
 LIT_ERRORS = 10.0
 
+#: Datasets by the name that they had in earlier versions. NeXus keeps the ending `_mask` for the mask of one field.
+FORMER_NAMES = {"pixel_mask": "pixel_flags"}
+
 
 class ProductError(ProcessError):
     """A product file cannot be read or written."""
@@ -266,10 +269,12 @@ class Product(OpenH5):
         self.facts: dict[str, Any] = dict(json.loads(text_attribute(entry, "facts_json")))
         self.steps = read_steps(entry)
         data = entry["data"]
-        self.names: tuple[str, ...] = tuple(name for name in data if not _is_beside(name, data[name]))
+        stored = [name for name in data if not _is_beside(name, data[name])]
+        self._stored = {FORMER_NAMES.get(name, name): name for name in stored}
+        self.names: tuple[str, ...] = tuple(self._stored)
         rows, columns = data[text_attribute(data, "signal")].shape[-2:]
         self.shape: tuple[int, int] = (int(rows), int(columns))
-        for name in self.names:
+        for name in stored:
             leading = (None,) * (data[name].ndim - 2)
             require_dataset(data, name, (*leading, *self.shape), "uif")
 
@@ -281,7 +286,7 @@ class Product(OpenH5):
     def _dataset(self, name: str) -> h5py.Dataset:
         if name not in self.names:
             raise ProductError(f"{self.path} has no {name!r}; it has: {', '.join(self.names)}.")
-        return self._h5["entry/data"][name]
+        return self._h5["entry/data"][self._stored[name]]
 
     def get(self, name: str, rows: slice = slice(None)) -> NDArray[Any]:
         """Dataset (leading..., rows, columns)."""

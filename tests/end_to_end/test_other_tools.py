@@ -59,6 +59,16 @@ def test_the_lines_in_the_docs_open_both_with_xarray(capture, product, monkeypat
         assert not [name for name in (*frames.dims, *image.dims) if name.startswith("phony")]
 
 
+def test_a_product_of_an_earlier_version_has_its_flags(product):
+    with h5py.File(product, "r+") as h5:
+        h5.move("entry/data/pixel_flags", "entry/data/pixel_mask")
+    with Product(product) as read:
+        assert "pixel_flags" in read.names
+        assert "bits" in read.long_name("pixel_flags")
+        assert read.units("pixel_flags") == ""
+    assert not MuellerImage.load(product).mask.any()
+
+
 def test_a_whole_capture_is_a_tree_for_xarray(capture):
     with xr.open_datatree(capture, engine="h5netcdf") as tree:
         assert tree["entry/states/exposure_s"].dims == tree["entry/instrument/psg/value"].dims == ("state",)

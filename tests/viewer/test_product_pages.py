@@ -35,7 +35,7 @@ def products(drr_capture):
         ("polarizance_orientation_deg_errors", "degree", "magma"),
         ("residual_rms", "count", "viridis"),
         ("s0", "count", "gray"),
-        ("pixel_mask", "", "gray"),
+        ("pixel_flags", "", "gray"),
     ],
 )
 def test_what_a_quantity_is_decides_its_colours(name, units, colours):

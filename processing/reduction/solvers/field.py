@@ -73,8 +73,8 @@ class FieldSolver:
         found = self.plain.estimate(frames)
         rows = frames.shape[2] // self.reader.capture.frame_shape[1]
         for_ranges(rows, lambda a, b: self._range(frames, a, b, found), align=1, smallest=16)
-        partly = (found["pixel_mask"] & np.uint8(Mask.PARTLY)) != 0
-        found["pixel_mask"][partly] |= np.uint8(Mask.NOT_DETERMINED)
+        partly = (found["pixel_flags"] & np.uint8(Mask.PARTLY)) != 0
+        found["pixel_flags"][partly] |= np.uint8(Mask.NOT_DETERMINED)
         return found
 
     def _range(self, frames: NDArray[Any], start: int, stop: int, found: dict[str, NDArray[Any]]) -> None:

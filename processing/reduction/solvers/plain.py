@@ -53,7 +53,7 @@ class MuellerSolver:
     def solve(self, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
         """Mueller elements, errors, residual and mask of frames (N, channels, pixels) that the reader just read."""
         found = self.estimate(frames)
-        repair = np.flatnonzero(found["pixel_mask"] & np.uint8(Mask.PARTLY))
+        repair = np.flatnonzero(found["pixel_flags"] & np.uint8(Mask.PARTLY))
         if repair.size:
             solve_with_the_sound(self, frames, repair, found)
         return found
@@ -65,7 +65,7 @@ class MuellerSolver:
             "mueller": np.empty((16, pixels), np.float32),
             "mueller_errors": np.empty((16, pixels), np.float32),
             "residual_rms": np.empty(pixels, np.float32),
-            "pixel_mask": np.zeros(pixels, np.uint8),
+            "pixel_flags": np.zeros(pixels, np.uint8),
             "reduced_chi_square": np.full(pixels, np.nan, np.float32),
         }
         for_ranges(pixels, lambda a, b: self._range(frames, a, b, out), align=TILE, smallest=TILE)
@@ -79,7 +79,7 @@ class MuellerSolver:
         for a in range(start, stop, TILE):
             b = min(a + TILE, stop)
             part, result = tile[..., : b - a], product[:, : b - a]
-            gain = self.reader.load(frames, a, b, part, out["pixel_mask"])
+            gain = self.reader.load(frames, a, b, part, out["pixel_flags"])
             np.matmul(self.stack, part.reshape(n, b - a), out=result)
             out["mueller"][:, a:b] = result[:16]
             rss = np.einsum("np,np->p", result[16:square], result[16:square])
@@ -148,7 +148,7 @@ def solve_with_the_sound(
                 found["reduced_chi_square"][part] = np.where(free > 0, rss / expected, np.nan)
         found["mueller"][:, part] = m.T
         found["residual_rms"][part] = np.sqrt(rss / keep.sum(axis=1))
-        found["pixel_mask"][part[ill]] |= np.uint8(Mask.NOT_DETERMINED)
+        found["pixel_flags"][part[ill]] |= np.uint8(Mask.NOT_DETERMINED)
 
 
 def _expected(

@@ -97,8 +97,8 @@ class WeightedSolver:
                 found["reduced_chi_square"][a:b] = np.where(kept > rank, chi_square / expected, np.nan)
                 found["residual_rms"][a:b] = np.sqrt(squares / kept)
             found["mueller_errors"][:, a:b] = np.sqrt(covariance[_DIAGONAL])
-            lost = np.isnan(step[0]) & ((found["pixel_mask"][a:b] & np.uint8(Mask.PARTLY)) != 0)
-            found["pixel_mask"][a:b][lost] |= np.uint8(Mask.NOT_DETERMINED)
+            lost = np.isnan(step[0]) & ((found["pixel_flags"][a:b] & np.uint8(Mask.PARTLY)) != 0)
+            found["pixel_flags"][a:b][lost] |= np.uint8(Mask.NOT_DETERMINED)
             if self.covariance:
                 found["mueller_covariance"][:, a:b] = covariance
             if self.likelihood:
@@ -141,7 +141,7 @@ class WeightedSolver:
         self, raw: NDArray[Any], signal: NDArray[np.float32], found: dict[str, NDArray[Any]], pixels: slice
     ) -> None:
         """Put the plain fit without saturated intensities into `found`, for the pixels that have any."""
-        some = np.flatnonzero(found["pixel_mask"][pixels] & np.uint8(Mask.PARTLY))
+        some = np.flatnonzero(found["pixel_flags"][pixels] & np.uint8(Mask.PARTLY))
         if not some.size:
             return
         n = self._w.shape[0]
