@@ -55,6 +55,13 @@ def require_place(path: Path, overwrite: bool = False) -> None:
     require_folder(path)
 
 
+def require_new(path: Path) -> None:
+    """Raise ProcessError unless `path` could be the name of a new file; nothing that is there is replaced."""
+    require_folder(path)
+    if path.exists():
+        raise ProcessError(f"{path} exists and is not replaced. Give another name.")
+
+
 def require_folder(path: Path) -> None:
     """Raise ProcessError unless `path` could be the name of a file: in a folder that is there, and no folder itself."""
     if path.is_dir():

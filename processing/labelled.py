@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from processing.doors import require_new
 from processing.errors import ProcessError
 from processing.steps.reduction import Reduction
 from processing.storage.capture import Capture
@@ -63,8 +64,7 @@ def write_dataset(dataset: xr.Dataset, path: Path | str) -> Path:
         The file exists, or something needed is missing.
     """
     path = Path(path)
-    if path.exists():
-        raise ProcessError(f"{path} exists and is not replaced. Give another name.")
+    require_new(path)
     if "counts" not in dataset or dataset["counts"].dims != ("state", "channel", "y", "x"):
         raise ProcessError("a capture needs a variable `counts` with the dimensions (state, channel, y, x)")
     counts = dataset["counts"].to_numpy()

@@ -11,7 +11,8 @@ from acquisition.commands.defaults import CONFIGS
 from acquisition.rig.config import RigConfig
 from drivers.errors import CameraError
 from drivers.registry import Family, device_kinds
-from processing.yaml_file import ConfigError, parse_yaml
+from processing.doors import require_new
+from processing.yaml_file import parse_yaml
 
 #: What is known to carry these USB numbers (vendor, product); a plain FTDI chip (0403:6001) may be anything.
 LIKELY = {
@@ -145,11 +146,10 @@ def write_rig(path: Path) -> str:
 
     Raises
     ------
-    ConfigError
-        A file of that name exists.
+    ProcessError
+        A file of that name exists, or there is no such folder.
     """
-    if path.exists():
-        raise ConfigError(f"{path} exists and is not replaced. Give another --out.")
+    require_new(path)
     (cameras, why), ports = found_cameras(), found_ports()
     text = rig_text(path.stem, cameras, ports, why)
     path.write_text(text, encoding="utf-8")

@@ -13,6 +13,7 @@ from acquisition.errors import AcquisitionError
 from acquisition.rig.config import RigConfig
 from acquisition.rig.rig import Rig
 from drivers.camera import CameraSettings
+from processing.doors import require_folder
 from processing.yaml_file import ConfigError
 
 #: Kinds of files: one to look at, and those that hold the counts.
@@ -32,8 +33,8 @@ def take_frame(
 
     Raises
     ------
-    ConfigError
-        Exposure or kind of file that there is not.
+    ProcessError
+        Exposure, kind of file or folder that there is not.
     AcquisitionError, DeviceError
         The file cannot be written, or a device failed.
     """
@@ -42,6 +43,7 @@ def take_frame(
         raise ConfigError(f"--exposure {exposure_s:g}: the rig allows {low:g} to {high:g} s")
     if out.suffix.lower() not in (PICTURE, *COUNTS):
         raise ConfigError(f"{out}: a frame is written as .png (8 bits, stretched), .tif or .npy (counts)")
+    require_folder(out)
     if config.simulated:
         out = out.with_name(f"{out.stem}.simulated{out.suffix}")
     with Rig(config, ask=typer.confirm) as rig:

@@ -10,8 +10,7 @@ from typing import Annotated
 import typer
 
 from processing.commands.command_line import Version, application, run
-from processing.doors import require_folder
-from processing.errors import ProcessError
+from processing.doors import require_new
 
 app = application("diagnose", "Compare captures with an instrument model and find the effect that the model lacks.")
 
@@ -38,9 +37,7 @@ def diagnose_command(
     # The problems are many and small: BLAS threads would only wait for one another.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     for target in filter(None, (write, json, report, residuals)):
-        require_folder(target)
-        if target.exists():
-            raise ProcessError(f"{target} exists and is not replaced. Give another name.")
+        require_new(target)
     if reflectance is not None or geometry is not None:
         from processing.commands.loaded_late.diagnose_surface import diagnose_reflectance
 

@@ -68,6 +68,9 @@ def test_options_that_do_not_fit_are_told_before_the_work_and_not_passed_over(ru
 def test_a_place_for_no_file_is_refused_before_the_work(acquire, small_rig, capture, configs, capfd):
     code, _, err = acquire("--omega", 35, "--rig", small_rig(), "--out", capture)
     assert (code, f"{capture} is a file, and captures need a folder" in err) == (2, True)
+    for command in (("snap", "--out", "no/frame.png"), ("init", "--out", "no/rig.yaml")):
+        code, _, err = acquire(*command)
+        assert (code, "there is no folder no. Make it" in err) == (2, True)
     with pytest.raises(SystemExit) as end:
         diagnose([str(capture), "--instrument", str(configs / "instruments/rgb950.yaml"), "--write", "no/where.yaml"])
     assert end.value.code == 2

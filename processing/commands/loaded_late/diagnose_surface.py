@@ -8,6 +8,7 @@ from pathlib import Path
 import typer
 
 from processing.diagnosis.surface.judge import SurfaceDiagnosis
+from processing.doors import require_new
 from processing.errors import ProcessError
 
 
@@ -31,8 +32,7 @@ def diagnose_reflectance(
     from processing.reflectance.base import load_reflectance
 
     for target in targets(write) if write is not None else ():
-        if target.exists():
-            raise ProcessError(f"{target} exists and is not replaced. Give another --write.")
+        require_new(target)
     model, material, view = (
         InstrumentModel.load(instrument),
         load_reflectance(reflectance),
