@@ -23,7 +23,7 @@ def diagnose_reflectance(
 ) -> None:
     """Diagnose, print a summary and write what was asked for. Raises ProcessError."""
     if reflectance is None or geometry is None:
-        raise ProcessError("--reflectance MATERIAL and --geometry GEOMETRY go together: give both, or none.")
+        raise ProcessError("a diagnosis of the reflectance needs both --reflectance MATERIAL and --geometry GEOMETRY.")
     from processing.commands.loaded_late.diagnose_summary import show, write_result
     from processing.diagnosis.surface.run import diagnose_object
     from processing.diagnosis.surface.write import targets, write_surface
