@@ -16,6 +16,7 @@ from processing.storage.images import MuellerImage
 from processing.storage.product import Product
 from viewer.frames import chosen
 from viewer.library import Library
+from viewer.mosaic_probing import SuperPixelReducer
 from viewer.pages import file_of, pages_of
 from viewer.probing import PixelReducer, Region, curve, finite, mask_words, matrix, raw_curve
 
@@ -42,27 +43,38 @@ def matrix_of(request: Request) -> JSONResponse:
         region = Region.asked(request.query_params, capture.frame_shape)
         if capture.status == "running":
             raise ProcessError("the capture is being taken")
-    return JSONResponse({"where": str(region), "matrix": matrix(reducer_of(path, None).image(region)[0])})
+    return JSONResponse({"where": str(region)} | _matrix(path, region, None))
+
+
+def _matrix(path: Path, region: Region, instrument: Path | None) -> dict[str, Any]:
+    """Nothing for a polarization camera, whose super-pixels have a Stokes vector."""
+    reducer = reducer_of(path, instrument)
+    return {} if isinstance(reducer, SuperPixelReducer) else {"matrix": matrix(reducer.image(region)[0])}
 
 
 def _fit(path: Path, region: Region, channels: int, instrument: Path | None) -> dict[str, Any]:
     try:
         reducer = reducer_of(path, instrument)
-        fit = curve(reducer, *reducer.image(region), channels)
+        if isinstance(reducer, SuperPixelReducer):
+            fit = reducer.curve(region)
+        else:
+            fit = curve(reducer, *reducer.image(region), channels)
     except ProcessError as error:
         return {"told": f"No fit: {error}"}
     return {"fit": fit, "told": fit["told"]}
 
 
-def reducer_of(path: Path, instrument: Path | None) -> PixelReducer:
-    """What reduces single pixels of a capture, kept while its files stay as they are."""
+def reducer_of(path: Path, instrument: Path | None) -> PixelReducer | SuperPixelReducer:
+    """What reduces single pixels of a capture, super-pixels of a mosaic; kept while its files stay as they are."""
     changed = [p.stat().st_mtime_ns for p in (path, instrument) if p is not None]
     return _kept(path, instrument, tuple(changed))
 
 
 @lru_cache(maxsize=4)
-def _kept(path: Path, instrument: Path | None, changed: tuple[int, ...]) -> PixelReducer:
-    return PixelReducer(path, instrument)
+def _kept(path: Path, instrument: Path | None, changed: tuple[int, ...]) -> PixelReducer | SuperPixelReducer:
+    with Capture(path) as capture:
+        mosaic = capture.header.mosaic is not None
+    return SuperPixelReducer(path, instrument) if mosaic else PixelReducer(path, instrument)
 
 
 def of_product(request: Request) -> JSONResponse:
@@ -72,7 +84,8 @@ def of_product(request: Request) -> JSONResponse:
 
 def _of_product(path: Path, query: Any, library: Library) -> dict[str, Any]:
     with Product(path) as product:
-        region = Region.asked(query, product.shape)
+        shape = product.shape
+        region = Region.asked(query, shape)
         found: dict[str, Any] = {"where": str(region), "planes": _planes(product, region), "told": ""}
         if "pixel_flags" in product.names:
             bits = product.get("pixel_flags", region.rows)[:, region.columns]
@@ -86,10 +99,12 @@ def _of_product(path: Path, query: Any, library: Library) -> dict[str, Any]:
     path, instrument = source
     with Capture(path) as capture:
         channels = capture.channels
-        found |= raw_curve(capture, region, 0)
+        # A Stokes image may have one pixel for each super-pixel.
+        region = region.enlarged(capture.frame_shape[0] // shape[0])
+        found |= raw_curve(capture, region, 0) | {"where": found["where"]}
     found |= _fit(path, region, channels, instrument)
     if "matrix" not in found and "fit" in found:
-        found["matrix"] = matrix(reducer_of(path, instrument).image(region)[0])
+        found |= _matrix(path, region, instrument)
     return found
 
 

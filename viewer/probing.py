@@ -48,6 +48,10 @@ class Region:
             raise ProcessError(f"columns {x0} to {x1}, rows {y0} to {y1} do not lie in {shape[1]} x {shape[0]} pixels")
         return cls(slice(y0, y1), slice(x0, x1))
 
+    def enlarged(self, times: int) -> Region:
+        """The same place in an image of so many times as many rows and columns."""
+        return Region(*(slice(times * part.start, times * part.stop) for part in (self.rows, self.columns)))
+
     @property
     def pixels(self) -> int:
         """How many."""
@@ -89,8 +93,6 @@ class PixelReducer:
     def __init__(self, path: Path, instrument: Path | None = None) -> None:
         self._path = path
         with Capture(path) as capture:
-            if capture.header.mosaic is not None:
-                raise ProcessError("a mosaic capture has no fitted curve of one pixel; its Stokes image is the product")
             self.model: InstrumentModel = choose_model(capture, instrument)
             self.states, _ = without_cut_off(capture, sample_states(capture))
             self._changes = capture_changes(capture, self.model, self.states)

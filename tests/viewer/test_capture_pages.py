@@ -126,6 +126,44 @@ def test_a_region_is_the_mean_of_its_pixels_with_a_smaller_error(client, drr_cap
     assert xi[0] == pytest.approx(0.55, abs=0.01)
 
 
+def test_a_super_pixel_has_a_curve_for_each_analyzer_and_a_stokes_vector(client, lab, configs, synthetic_capture):
+    mosaic = (("90", "45"), ("135", "0"))
+    s, shape, states = 1000 * np.array([1, 0.3, -0.2]), (8, 12), 12
+    names = np.tile(np.array(mosaic, dtype=float), (shape[0] // 2, shape[1] // 2))
+    light = 0.5 * (s[0] + s[1] * np.cos(np.deg2rad(2 * names)) + s[2] * np.sin(np.deg2rad(2 * names)))
+    signal = np.repeat(light[None], states, axis=0)
+    rng = np.random.default_rng(1)
+    noisy = signal + rng.normal(size=signal.shape) * np.sqrt(signal / 2.6 + (2.3 / 2.6) ** 2)
+    frames = np.round(np.concatenate([np.full((4, *shape), 64.0), 64 + noisy])).astype(np.uint16)
+    path = synthetic_capture(
+        frames[:, None],
+        {"psg": np.zeros(states + 4)},
+        role=("dark",) * 4 + ("sample",) * states,
+        mosaic=mosaic,
+        channels=("mosaic",),
+        instrument_yaml=(configs / "instruments/linear_stokes.yaml").read_text(),
+        detector={"black_level_counts": 64.0, "gain_e_per_count": 2.6, "read_noise_e": 2.3, "bits": 12},
+    )
+    path.rename(lab / "mosaic.h5")
+    asked = {"file": "mosaic.h5", "x0": 0, "y0": 0, "x1": 12, "y1": 8}
+    fit = client.get("/curve", params=asked).json()["fit"]
+    assert fit["series"] == ["0°", "45°", "90°", "135°"]
+    assert fit["chi_square"] == pytest.approx(1, abs=0.5)
+    np.testing.assert_allclose(fit["fitted"][:4], [650, 400, 350, 600], rtol=0.01)
+    for name, true in (("S0", 1000), ("S1/S0", 0.3), ("S2/S0", -0.2), ("AoLP / degrees", 163.15)):
+        found = fit["stokes"][name]
+        assert abs(found["value"] - true) < 4 * found["error"] < 0.03 * abs(true), name
+    # One pixel is widened to its super-pixel.
+    one = client.get("/curve", params={"file": "mosaic.h5", "x0": 5, "y0": 3}).json()["fit"]
+    assert "columns 4 to 5, rows 2 to 3" in one["told"]
+    assert one["stokes"]["S0"]["error"] == pytest.approx(fit["stokes"]["S0"]["error"] * np.sqrt(24), rel=0.05)
+    assert client.get("/matrix", params=asked).json().keys() == {"where"}
+    # Its product, where it is.
+    product = Reduction(lab / "mosaic.h5").make()
+    there = client.get("/probe", params={"file": product.name, "x0": 5, "y0": 3}).json()
+    assert there["fit"]["stokes"] == one["stokes"]
+
+
 def test_a_probe_outside_the_image_is_refused(client, drr_capture):
     drr_capture("one.h5")
     for asked in ({"x0": 16, "y0": 0}, {"x0": 5, "y0": 3, "x1": 5, "y1": 9}, {"x0": 1}, {"x0": 0, "y0": -1}):

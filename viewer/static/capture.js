@@ -36,7 +36,7 @@ async function probe(region) {
     drawCurve(byId("curve"), found, Number(slider.value));
     history.replaceState(null, "", `#x=${region.x0}&y=${region.y0}`);
     byId("probe").hidden = !found.fit;
-    const matrix = found.fit && await matrixOf("matrix", { file, ...region });
+    const matrix = found.fit && (found.fit.stokes ? {} : await matrixOf("matrix", { file, ...region }));
     if (matrix) showProbe(byId("probe"), { ...found, ...matrix });
   });
 }

@@ -2,6 +2,8 @@
 
 import { accent, draw, ink, quiet, warn } from "./plots.js";
 
+const SYMBOLS = ["circle", "square", "diamond", "cross"];
+
 /** Intensities of the states, the fitted curve, and below it residuals in units of the noise. */
 export function drawCurve(node, found, now = null) {
   const fit = found.fit;
@@ -9,9 +11,13 @@ export function drawCurve(node, found, now = null) {
   draw(node, () => {
     const traces = [];
     if (fit) {
-      traces.push({ x: fit.states, y: fit.fitted, mode: "lines", name: "fitted", line: { color: accent(), width: 1.5, shape: "linear" }, hovertemplate: "fitted %{y:.1f}<extra></extra>" });
-      traces.push({ x: fit.states, y: fit.signal, mode: "markers", name: "signal", marker: { color: ink(), size: 5 },
-        error_y: { type: "data", array: fit.noise, color: ink(), thickness: 1, width: 0 }, hovertemplate: "state %{x}: %{y:.1f} counts<extra></extra>" });
+      // The analyzers of a polarization camera have a curve each; their values take turns.
+      (fit.series ?? [""]).forEach((name, k, { length }) => {
+        const turn = values => values.filter((_, n) => n % length === k), said = name ? ` ${name}` : "", first = k === 0;
+        traces.push({ x: turn(fit.states), y: turn(fit.fitted), mode: "lines", name: "fitted", showlegend: first, line: { color: accent(), width: 1.5, shape: "linear" }, hovertemplate: `fitted${said} %{y:.1f}<extra></extra>` });
+        traces.push({ x: turn(fit.states), y: turn(fit.signal), mode: "markers", name: name || "signal", marker: { color: ink(), size: 6, symbol: SYMBOLS[k % SYMBOLS.length] },
+          error_y: { type: "data", array: turn(fit.noise), color: ink(), thickness: 1, width: 0 }, hovertemplate: `state %{x}${said}: %{y:.1f} counts<extra></extra>` });
+      });
       traces.push({ x: fit.states, y: fit.residual, mode: "markers", marker: { color: ink(), size: 5 }, yaxis: "y2", showlegend: false, hovertemplate: "state %{x}: %{y:.2f} noise<extra></extra>" });
     } else if (found.counts) {
       const pick = wanted => found.state.filter((_, k) => dark[k] === wanted);
@@ -98,10 +104,22 @@ function drawSimplex(node, values) {
   }));
 }
 
+function showStokes(node, found) {
+  const table = document.createElement("table");
+  table.className = "facts";
+  for (const [name, { value, error }] of Object.entries(found.fit.stokes)) {
+    table.append(row(cell(name, "th"), cell(pm(value, error, name === "S0" ? 1 : name.startsWith("AoLP") ? 2 : 4))));
+  }
+  node.replaceChildren(cell(`At ${found.where}`, "h2"), heading("Stokes vector of the super-pixels, with standard errors"), table, cell(chiSquare(found.fit), "p"));
+}
+
+const chiSquare = fit => `Chi-square of the fit over its degrees of freedom: ${number(fit.chi_square, 2)}${fit.noise_known ? "" : " (noise taken from the residual)"}`;
+
 /** Mueller matrix with error bars, decomposition, and place in the simplex. */
 export function showProbe(node, found) {
-  const matrix = found.matrix;
-  node.hidden = !matrix;
+  const matrix = found.matrix, stokes = found.fit?.stokes;
+  node.hidden = !matrix && !stokes;
+  if (stokes) showStokes(node, found);
   if (!matrix) return;
   const columns = document.createElement("div"), left = document.createElement("div"), right = document.createElement("div");
   columns.className = "columns";
@@ -113,7 +131,7 @@ export function showProbe(node, found) {
   plot.setAttribute("aria-label", "place of the eigenvalues in the simplex");
   if (xi && xi.value.every(v => v !== null)) left.append(heading("Where its eigenvalues lie; the thick edge is the triply degenerate model"), plot);
   right.append(heading("Decomposition"), scroll(quantityTable(matrix.quantities)));
-  if (found.fit) right.append(cell(`Chi-square of the fit over its degrees of freedom: ${number(found.fit.chi_square, 2)}${found.fit.noise_known ? "" : " (noise taken from the residual)"}`, "p"));
+  if (found.fit) right.append(cell(chiSquare(found.fit), "p"));
   columns.append(left, right);
   const title = cell(`At ${found.where}`, "h2");
   node.replaceChildren(title, columns);
