@@ -66,8 +66,8 @@ class Changes:
     """Sum of what all effects ask for; an empty one is the model as it stands.
 
     Light side, all by element name: `azimuth_rad`, `retardance_rad` (each () or (N,)), `extinction`, `diattenuation`,
-    `after` (a Mueller matrix (4, 4) that follows the element), `field_retardance_rad` (5,) coefficients of
-    `field_terms`.
+    `depolarization`, `after` (a Mueller matrix (4, 4) that follows the element), `field_retardance_rad` (5,)
+    coefficients of `field_terms`.
     Detector side: `gain` (N, channels), `stray` (fraction of the mean signal that bypasses the optics), `mixing`
     (channels, channels). Count side, what is added to the counts: `response` by feature of the counts, () or
     (N, channels); `shift_px` (N, 2), by how much the image has moved to the right and down.
@@ -78,6 +78,7 @@ class Changes:
     retardance_rad: defaultdict[str, Array] = field(default_factory=_zeros)
     extinction: defaultdict[str, Array] = field(default_factory=_zeros)
     diattenuation: defaultdict[str, Array] = field(default_factory=_zeros)
+    depolarization: defaultdict[str, Array] = field(default_factory=_zeros)
     after: dict[str, Array] = field(default_factory=dict)
     field_retardance_rad: dict[str, Array] = field(default_factory=dict)
     gain: Array = field(init=False)
@@ -95,7 +96,8 @@ class Changes:
 
     def key(self, element: str, azimuth_rad: Array) -> tuple[str, bytes]:
         """What the Mueller matrices of an element depend on, its own values left out."""
-        parts = (azimuth_rad, self.retardance_rad[element], self.extinction[element], self.diattenuation[element])
+        own = (self.retardance_rad, self.extinction, self.diattenuation, self.depolarization)
+        parts = (azimuth_rad, *(change[element] for change in own))
         return element, b"|".join(np.asarray(p, dtype=float).tobytes() for p in parts)
 
     def turn_axis(self, axis: str, error_deg: Array, elements: Mapping[str, float]) -> None:

@@ -23,6 +23,11 @@ from processing.yaml_file import load_yaml
 #: A number, or one number for each wavelength in nm.
 Dispersive = float | dict[float, float]
 
+#: What fitted values belong to: mounts and mechanics, the same in all captures; the detector, the same as long as its
+#: full scale is; optics that follow a smooth curve over the wavelengths; optics with a value at each wavelength that
+#: has nothing to do with the next one; one capture alone.
+Belongs = Literal["mechanics", "detector", "dispersion", "wavelength", "capture"]
+
 
 class WavelengthError(ProcessError):
     """The instrument model has no value for the wavelength asked for."""
@@ -73,15 +78,21 @@ class Polarizer(Element):
 
 
 class Retarder(Element):
-    """Linear retarder with its fast axis at the azimuth; `diattenuation` (T_f - T_s)/(T_f + T_s) is along it."""
+    """Linear retarder with its fast axis at the azimuth; `diattenuation` (T_f - T_s)/(T_f + T_s) is along it.
+
+    `depolarization` is the share of what the retardance acts on that is lost, because light of several retardances is
+    summed: a normal distribution of width s (radians; from the bandwidth, or over the aperture) loses 1 - exp(-s^2/2).
+    """
 
     kind: Literal["retarder"]
     retardance_deg: Dispersive
     diattenuation: Dispersive = 0.0
+    depolarization: Dispersive = 0.0
 
     def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
         retardance = np.deg2rad(_number(self.retardance_deg)) + (changes.retardance_rad[self.name] if changes else 0.0)
-        plain = mueller.retarder(azimuth_rad, retardance)
+        lost = _number(self.depolarization) + (changes.depolarization[self.name] if changes else 0.0)
+        plain = mueller.retarder(azimuth_rad, retardance, lost)
         d = _number(self.diattenuation) + (changes.diattenuation[self.name] if changes else 0.0)
         if np.all(d == 0.0):
             return plain
@@ -171,6 +182,9 @@ class InstrumentModel(_Part):
     `beams` names the channels whose images lie side by side on one detector, in equal parts of its columns.
     `calibrate` names values ("element.field") that are only nominal: `diagnose` fits them to captures of known samples.
     An effect of scope "capture" holds for the captures that it names and for no other.
+    `belongs_to` says of such values, and of kinds of effects, what they belong to where that is not the rule: a
+    spectrograph sees one run of the axes at all wavelengths (`rotation_slip: mechanics`), the axis of an achromatic
+    plate turns with the wavelength (`plate.azimuth_deg: dispersion`).
     `systematic` is what `diagnose` leaves uncertain; `process reduce` carries it into its error bars.
     `free_source`: the source has a level of its own in every state, so only ratios of the channels of one state count
     where the sample is known.
@@ -186,6 +200,7 @@ class InstrumentModel(_Part):
     mosaic: tuple[tuple[str, ...], ...] | None = None
     beams: tuple[str, ...] | None = None
     calibrate: tuple[str, ...] = ()
+    belongs_to: dict[str, Belongs] = {}
     free_source: bool = False
     effects: tuple[AppliedEffect, ...] = ()
     systematic: tuple[SystematicError, ...] = ()

@@ -40,12 +40,14 @@ def rotation(angle: ArrayLike) -> Array:
     return _assemble([[o, z, z, z], [z, c, -s, z], [z, s, c, z], [z, z, z, o]])
 
 
-def retarder(azimuth: ArrayLike, retardance: ArrayLike) -> Array:
-    """Linear retarder with its fast axis at `azimuth` (docs/conventions.md, "Mueller calculus")."""
+def retarder(azimuth: ArrayLike, retardance: ArrayLike, lost: ArrayLike = 0.0) -> Array:
+    """Linear retarder with its fast axis at `azimuth` (docs/conventions.md, "Mueller calculus").
+
+    `lost` : share of what the retardance acts on that is lost to the average over several retardances.
+    """
     t = 2 * np.asarray(azimuth, dtype=float)
-    d = np.asarray(retardance, dtype=float)
-    t, d = np.broadcast_arrays(t, d)
-    c, s, cd, sd = np.cos(t), np.sin(t), np.cos(d), np.sin(d)
+    t, d, kept = np.broadcast_arrays(t, np.asarray(retardance, dtype=float), 1 - np.asarray(lost, dtype=float))
+    c, s, cd, sd = np.cos(t), np.sin(t), kept * np.cos(d), kept * np.sin(d)
     o, z = np.ones_like(c), np.zeros_like(c)
     return _assemble(
         [

@@ -21,8 +21,8 @@ def mueller_slopes(problem: InstrumentProblem, space: Space, values: Array) -> t
     problem, values = problem.near(space, values)
     products, light = np.zeros((space.size, space.size)), 0.0
     for k, moments in enumerate(problem.moments):
-        mine, index = space.acting(k, problem.wavelengths_nm[k])
-        own = values[index]
+        acting = space.acting(k, problem.wavelengths_nm[k])
+        mine, own = acting.space, acting.of(values)
         changes = problem.changes(k, mine, own)
         columns = partial(_all_columns, problem, k)
         w, c = columns(changes), problem.coefficients(k, changes)
@@ -37,7 +37,7 @@ def mueller_slopes(problem: InstrumentProblem, space: Space, values: Array) -> t
             bright = float(m[0] @ m[0])
             slopes -= (slopes[:, 0] @ m[0] / max(bright, 1e-300))[:, None, None] * m
             flat = slopes.reshape(mine.size, -1)
-            products[np.ix_(index, index)] += flat @ flat.T
+            products[np.ix_(acting.index, acting.index)] += acting.spread_products(flat @ flat.T)
             light += bright
     return products, light
 

@@ -143,7 +143,11 @@ class InstrumentProblem:
         if not all(movable(s) for s in shifts):
             return False
         still = [c.undone(undoing(c, bent)) if bent else c for c in self.still]
-        self._others.append(InstrumentProblem(self.models, still, undone, self.folds, shifts))
+        there = InstrumentProblem(self.models, still, undone, self.folds, shifts)
+        if not all(np.all(np.isfinite(m.sigma)) and np.all(m.sigma > 0) for m in there.moments):
+            # So far away that there are no such counts.
+            return False
+        self._others.append(there)
         del self._others[:-MOST_POINTS]
         return True
 
@@ -247,15 +251,15 @@ class InstrumentProblem:
             return other.sums(space, local, derivatives=derivatives)
         out = Sums.empty(self.folds, space.size if derivatives else 0, len(self.captures))
         for k, data in enumerate(self.captures):
-            mine, index = space.acting(k, data.wavelength_nm)
-            own = values[index]
+            acting = space.acting(k, data.wavelength_nm)
+            mine, own = acting.space, acting.of(values)
             part = Sums.empty(self.folds, mine.size if derivatives else 0)
             changes = self.changes(k, mine, own)
             if changes.field_retardance_rad or (derivatives and self._has_field(mine)):
                 self._tile_sums(k, mine, own, changes, part, derivatives)
             else:
                 self._block_sums(k, mine, own, changes, part, derivatives)
-            out.add(k, part, index, float(self.weights[k]))
+            out.add(k, part, acting, float(self.weights[k]))
         return out
 
     def noise_information(self, space: Space, values: Array) -> Array:
@@ -265,12 +269,14 @@ class InstrumentProblem:
             return other.noise_information(space, local)
         out = np.zeros((space.size, space.size))
         for k, moments in enumerate(self.moments):
-            mine, index = space.acting(k, self.wavelengths_nm[k])
-            changes = self.changes(k, mine, values[index])
+            acting = space.acting(k, self.wavelengths_nm[k])
+            mine, own = acting.space, acting.of(values)
+            changes = self.changes(k, mine, own)
             a = self.columns(k, changes)
-            dc = self.slopes_of_counts(k, mine, values[index], self.coefficients(k, changes))
+            dc = self.slopes_of_counts(k, mine, own, self.coefficients(k, changes))
             if np.any(dc[:, -DERIVATIVES:]):
-                out[np.ix_(index, index)] += sum(noise_information(block, a, dc, moments) for block in moments.blocks)
+                told = np.sum([noise_information(block, a, dc, moments) for block in moments.blocks], axis=0)
+                out[np.ix_(acting.index, acting.index)] += acting.spread_products(told)
         return out
 
     def _has_field(self, space: Space) -> bool:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from processing.arrays import Array
+from processing.arrays import Array, BoolArray
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit, minimize
@@ -26,14 +26,19 @@ Values = dict[Candidate, Array]
 def first_values(problem: InstrumentProblem, base: Space, pool: Sequence[Candidate], say: Say) -> Values:
     """Values to begin with, of the nominal values and of what else was found beside them."""
     fit = minimize(problem, base, np.zeros(base.size))
-    if fit.rms < FAR_OFF:
+    several = base.size and len(set(problem.wavelengths_nm)) > 1
+    # Curves over the wavelengths have more valleys than the values at one of them.
+    if fit.rms < (NEAR_ENOUGH if several else FAR_OFF):
         return _by_candidate(base, fit.values)
     say("far off: searching from many starts")
     if not base.size:
         return _far(problem, pool, fit)
-    if len(set(problem.wavelengths_nm)) == 1:
+    if not several:
         return _searched(problem, base, pool, fit)
-    return along_wavelengths(problem, base, say)
+    found = along_wavelengths(problem, base, say)
+    space, values = Space(tuple(found)), np.concatenate([np.zeros(0), *found.values()])
+    other = problem.sums(space, values, derivatives=False)
+    return found if other.excess.sum() < fit.excess else _by_candidate(base, fit.values)
 
 
 def _searched(problem: InstrumentProblem, base: Space, pool: Sequence[Candidate], fit: Fit) -> Values:
@@ -59,17 +64,23 @@ def best_of_starts(problem: InstrumentProblem, space: Space, starts: int, begin:
 
 
 def _best_start(
-    problem: InstrumentProblem, space: Space, values: Array, best: float, starts: int = STARTS, enough: float = 0.0
+    problem: InstrumentProblem,
+    space: Space,
+    values: Array,
+    best: float,
+    starts: int = STARTS,
+    enough: float = 0.0,
+    free: BoolArray | None = None,
 ) -> Array:
     """The best of fits from `values` and from many places about zero, if one leaves less than `best`.
 
-    `enough` : relative rms residual below which no better start is looked for.
+    `enough` : relative rms residual below which no better start is looked for. `free` (K,) : what is fitted.
     """
     random, start = np.random.default_rng(0), values
     for k in range(starts + 1):
         width = _widths(space, NEAR if k % 2 else FAR)
         here = random.uniform(-1, 1, space.size) * width if k else start
-        tried = minimize(problem, space, here, expansions=0)
+        tried = minimize(problem, space, here, expansions=0, free=free)
         if tried.excess < best:
             values, best = tried.values, tried.excess
             if tried.rms < enough:
@@ -79,13 +90,16 @@ def _best_start(
 
 def _widths(space: Space, retardance: float) -> Array:
     def width(candidate: Candidate) -> float:
-        if candidate.kind != "calibrate":
+        if not _anywhere(candidate):
             return 0.0
-        if candidate.place.endswith("azimuth_deg"):
-            return ANY_AZIMUTH
-        return retardance if candidate.place.endswith("_deg") else 0.0
+        return ANY_AZIMUTH if candidate.place.endswith("azimuth_deg") else retardance
 
     return np.concatenate([np.zeros(0), *(np.full(c.size, width(c)) for c in space.candidates)])
+
+
+def _anywhere(candidate: Candidate) -> bool:
+    """A nominal value that may be far off: no window, no diattenuation."""
+    return candidate.kind == "calibrate" and candidate.parameters[0].typical >= NEAR
 
 
 def _far(problem: InstrumentProblem, pool: Sequence[Candidate], fit: Fit) -> Values:
@@ -99,17 +113,18 @@ def _far(problem: InstrumentProblem, pool: Sequence[Candidate], fit: Fit) -> Val
 
 
 def along_wavelengths(problem: InstrumentProblem, base: Space, say: Say) -> Values:
-    """One wavelength from many starts, the others one after the other from their neighbours', then all together."""
+    """One wavelength from many starts, the others one after the other as their neighbours point, then all together."""
     wavelengths = sorted(set(problem.wavelengths_nm))
+    space = Space((*base.candidates, *(c for c in problem.pool() if c.kind == "channel_gain")))
+    each = [_AtOne(problem.at(w), space, w) for w in wavelengths]
     best: Fit | None = None
     for first in (len(wavelengths) // 2, 0, len(wavelengths) - 1):
-        found: Values = {}
-        upwards = range(first, len(wavelengths))
-        for k in (*upwards, *reversed(range(first))):
-            at = wavelengths[k]
-            neighbour = wavelengths[k - 1 if k > first else k + 1] if k != first else None
-            found |= _beside(problem.at(at), base, found, at, neighbour)
-        fit = minimize(problem, base, np.concatenate([found[c] for c in base.candidates]))
+        found: dict[int, Values] = {first: each[first].searched()}
+        for k in range(first + 1, len(wavelengths)):
+            found[k] = each[k].beside(_pointed_to(found, each, k, (k - 1, k - 2)))
+        for k in reversed(range(first)):
+            found[k] = each[k].beside(_pointed_to(found, each, k, (k + 1, k + 2)))
+        fit = minimize(problem, space, _joined(space, [found[k] for k in range(len(wavelengths))]))
         say(f"beginning at {wavelengths[first]:g} nm: {100 * fit.rms:.3g} %")
         if best is None or fit.excess < best.excess:
             best = fit
@@ -117,27 +132,59 @@ def along_wavelengths(problem: InstrumentProblem, base: Space, say: Say) -> Valu
             break
     else:
         say("no mounts fit all wavelengths: were they homed anew in between? Then give each run by itself")
-    return {} if best is None else _by_candidate(base, best.values)
+    return {} if best is None else _by_candidate(space, best.values)
 
 
-def _beside(problem: InstrumentProblem, base: Space, found: Values, at: float, neighbour: float | None) -> Values:
-    """Nominal values at one wavelength; what the wavelengths share is held where it was found."""
-    mine, _ = base.acting(0, at)
-    gains = [c for c in problem.pool() if c.kind == "channel_gain"]
-    space = Space((*mine.candidates, *gains))
-    if neighbour is None:
-        start = minimize(problem, space, np.zeros(space.size))
-        values = start.values
-        if start.rms > FAR_OFF:
-            values = _best_start(problem, space, values, start.excess)
-        return {c: values[p] for c, p in zip(space.candidates, space.slices, strict=True) if c not in gains}
-    before = {(c.place, c.wavelength_nm): v for c, v in found.items()}
-    parts = [before.get((c.place, neighbour), found.get(c, np.zeros(c.size))) for c in space.candidates]
-    free = np.concatenate([np.full(c.size, c not in found) for c in space.candidates])
-    values = minimize(problem, space, np.concatenate(parts), free=free).values
-    return {
-        c: values[p] for c, p in zip(space.candidates, space.slices, strict=True) if c not in gains and c not in found
-    }
+class _AtOne:
+    """Nominal values and gains of the channels at one wavelength, windows and diattenuations left as they are."""
+
+    def __init__(self, problem: InstrumentProblem, space: Space, wavelength_nm: float) -> None:
+        self.problem, self.wavelength_nm = problem, wavelength_nm
+        self.space = space.acting(0, wavelength_nm).space
+
+        large = (_anywhere(c) or c.kind != "calibrate" for c in self.space.candidates for _ in c.parameters)
+        self._large = np.array(list(large))
+
+    def searched(self) -> Values:
+        """From many starts, where it is far off."""
+        fit = minimize(self.problem, self.space, np.zeros(self.space.size), free=self._large)
+        values = fit.values
+        if fit.rms > NEAR_ENOUGH:
+            values = _best_start(self.problem, self.space, values, fit.excess, enough=NEAR_ENOUGH, free=self._large)
+        return _by_candidate(self.space, values)
+
+    def beside(self, start: Mapping[str, Array]) -> Values:
+        """From values of the same places; what the wavelengths share is held."""
+        own = np.array([c.wavelength_nm is not None for c in self.space.candidates for _ in c.parameters])
+        values = np.concatenate([start[c.short] for c in self.space.candidates])
+        fit = minimize(self.problem, self.space, values, free=own & self._large)
+        return _by_candidate(self.space, fit.values)
+
+
+def _pointed_to(
+    found: Mapping[int, Values], each: Sequence[_AtOne], k: int, neighbours: tuple[int, int]
+) -> dict[str, Array]:
+    """Values by place at wavelength k, on the line through two neighbours over the reciprocal of the wavelength."""
+    near = {c.short: v for c, v in found[neighbours[0]].items()}
+    if neighbours[1] not in found:
+        return near
+    far = {c.short: v for c, v in found[neighbours[1]].items()}
+    at, near_at, far_at = (1 / each[i].wavelength_nm for i in (k, *neighbours))
+    share = (at - near_at) / (near_at - far_at)
+    return {place: v + share * (v - far[place]) for place, v in near.items()}
+
+
+def _joined(space: Space, found: Sequence[Values]) -> Array:
+    """Values of the common vector, of those at each wavelength in ascending order."""
+    parts = []
+    for candidate in space.candidates:
+        at = np.stack([v for each in found for c, v in each.items() if c.short == candidate.short])
+        if candidate.curve is not None:
+            parts.append(candidate.curve.through(at))
+        else:
+            own = [v for each in found for c, v in each.items() if c == candidate]
+            parts.append(own[0])
+    return np.concatenate(parts)
 
 
 def _by_candidate(space: Space, values: Array) -> Values:

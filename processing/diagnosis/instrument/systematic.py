@@ -14,7 +14,7 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import TAKES_PART, UNSEEN
 from processing.diagnosis.search.space import Space
-from processing.diagnosis.search.stored import parameters_of, scope_of
+from processing.diagnosis.search.stored import by_wavelength, parameters_of, scope_of
 from processing.instrument.effects.base import FieldEffect, Switch
 from processing.instrument.model import AppliedEffect, EffectParameter, SystematicError
 
@@ -85,15 +85,18 @@ def _takes_part(found: Posterior, k: int) -> bool:
 def _as_effects(space: Space, direction: Array, matters: Array, names: tuple[str, ...]) -> tuple[AppliedEffect, ...]:
     effects = []
     for candidate, part in zip(space.candidates, space.slices, strict=True):
-        if matters[part].any():
+        if not matters[part].any():
+            continue
+        own = direction[part]
+        for one, values, _ in by_wavelength(candidate, own, np.zeros((own.size, own.size))):
             effects.append(
                 AppliedEffect(
-                    kind=candidate.kind,
-                    element=candidate.place or None,
-                    parameters=_without_errors(parameters_of(candidate, direction[part], direction[part])),
-                    captures=names if candidate.capture is None else (names[candidate.capture],),
-                    scope=scope_of(candidate),
-                    wavelength_nm=candidate.wavelength_nm,
+                    kind=one.kind,
+                    element=one.place or None,
+                    parameters=_without_errors(parameters_of(one, values, values)),
+                    captures=names if one.capture is None else (names[one.capture],),
+                    scope=scope_of(one),
+                    wavelength_nm=one.wavelength_nm,
                 )
             )
     return tuple(effects)

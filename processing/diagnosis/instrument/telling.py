@@ -28,7 +28,7 @@ from processing.diagnosis.search.result import (
 from processing.diagnosis.search.rules import DECISIVE, DOUBTED, LIKELY, NOISE_ERROR, SEEN, SURE
 from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
-from processing.diagnosis.search.stored import parameters_of, scope_of
+from processing.diagnosis.search.stored import by_wavelength, parameters_of, scope_of
 from processing.instrument.effects.base import (
     CountsEffect,
     FieldEffect,
@@ -58,11 +58,13 @@ def told_effects(problem: InstrumentProblem, cause: Cause, doubt: str | None) ->
     answer, probability = told_answer(cause, doubt)
     told = []
     # Of one with values of its own in every capture, those captures are told in which it shows.
-    pairs = zip(cause.values, cause.covariance, strict=True)
-    shown = [float(v @ np.linalg.solve(s, v)) / _least_shown(v.size) for v, s in pairs]
-    for candidate, values, covariance, size in zip(
-        cause.candidates, cause.values, cause.covariance, shown, strict=True
-    ):
+    each = [
+        at
+        for found in zip(cause.candidates, cause.values, cause.covariance, strict=True)
+        for at in by_wavelength(*found)
+    ]
+    shown = [float(v @ np.linalg.lstsq(s, v)[0]) / _least_shown(v.size) for _, v, s in each]
+    for (candidate, values, covariance), size in zip(each, shown, strict=True):
         if size < min(1.0, max(shown)):
             continue
         told.append(
@@ -139,23 +141,24 @@ def correction(
 ) -> Correction:
     """What an instrument file would hold: means, with the spread over the sets."""
     part = dict(zip(found.space.candidates, found.space.slices, strict=True))
-    spread = np.sqrt(np.maximum(np.diag(found.covariance), 0.0))
     chance = {found.space.candidates[m]: p for g, p in enumerate(found.samples.probability) for m in found.members[g]}
     effects = []
     for candidate, where in zip(solved.space.candidates, solved.space.slices, strict=True):
         if candidate in solved.base.candidates or not any_cause:
             continue
-        effects.append(
-            AppliedEffect(
-                kind=candidate.kind,
-                element=candidate.place or None,
-                parameters=parameters_of(candidate, solved.fit.values[where], spread[part[candidate]]),
-                probability=float(chance[candidate]),
-                captures=tuple(c.name for k, c in enumerate(problem.captures) if candidate.acts(k, c.wavelength_nm)),
-                scope=scope_of(candidate),
-                wavelength_nm=_wavelength(problem, candidate),
+        covariance = found.covariance[part[candidate], part[candidate]]
+        for one, values, own in by_wavelength(candidate, solved.fit.values[where], covariance):
+            effects.append(
+                AppliedEffect(
+                    kind=one.kind,
+                    element=one.place or None,
+                    parameters=parameters_of(one, values, np.sqrt(np.maximum(np.diag(own), 0.0))),
+                    probability=float(chance[candidate]),
+                    captures=tuple(c.name for k, c in enumerate(problem.captures) if one.acts(k, c.wavelength_nm)),
+                    scope=scope_of(one),
+                    wavelength_nm=_wavelength(problem, one),
+                )
             )
-        )
     error = systematic_error(problem, found)
     together = combinations(found, solved) if any_cause else ()
     return Correction(effects=tuple(effects), systematic=error, combinations=together, checks=guard, refused=refused)
@@ -165,7 +168,8 @@ def _wavelength(problem: InstrumentProblem, candidate: Candidate) -> float | Non
     """Wavelength at which the values hold; None for all of them."""
     several = sorted(set(problem.wavelengths_nm))
     effect = candidate.effect
-    if isinstance(effect, InstrumentEffect) and effect.belongs_to == "mechanics":
+    declared = problem.model.belongs_to.get(candidate.kind)
+    if isinstance(effect, InstrumentEffect) and (declared or effect.belongs_to) == "mechanics":
         return None
     if candidate.capture is not None:
         return problem.wavelengths_nm[candidate.capture]
@@ -178,13 +182,13 @@ def calibrated(problem: InstrumentProblem, found: Posterior, solved: Solution) -
     values: dict[str, dict[float, tuple[float, float]]] = {}
     for candidate, where in zip(solved.base.candidates, solved.base.slices, strict=True):
         element, _, field = candidate.place.rpartition(".")
-        index = part[candidate].start
-        stderr = float(np.sqrt(found.covariance[index, index]))
-        for model, wavelength in zip(problem.models, problem.wavelengths_nm, strict=True):
-            if candidate.wavelength_nm in (None, wavelength):
-                start = float(next(getattr(e, field) for e in model.elements() if e.name == element))
-                value = start + float(solved.fit.values[where.start])
-                values.setdefault(candidate.place, {})[wavelength] = value, stderr
+        covariance = found.covariance[part[candidate], part[candidate]]
+        for one, (fitted,), ((variance,),) in by_wavelength(candidate, solved.fit.values[where], covariance):
+            for model, wavelength in zip(problem.models, problem.wavelengths_nm, strict=True):
+                if one.wavelength_nm in (None, wavelength):
+                    start = float(next(getattr(e, field) for e in model.elements() if e.name == element))
+                    value = start + float(fitted), float(np.sqrt(max(variance, 0.0)))
+                    values.setdefault(candidate.place, {})[wavelength] = value
     unit = {c.place: c.parameters[0].unit for c in solved.base.candidates}
     return {place: _by_wavelength(each, unit[place]) for place, each in values.items()}
 

@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
 
 from processing.arrays import Array
+from processing.diagnosis.search.dispersion import Curve, curve
 from processing.effect import Effect, Parameter
 from processing.errors import ProcessError
 from processing.instrument.applied_effects import instrument_effects
 from processing.instrument.changes import Changes, Conditions
 from processing.instrument.effects.base import FromAState, FromFileOnly, InstrumentEffect
-from processing.instrument.model import InstrumentModel
+from processing.instrument.model import Belongs, InstrumentModel
 
 
 @dataclass(frozen=True)
 class Candidate:
     """One effect at one place; in one capture or at one wavelength, if its values belong to that alone.
 
-    `starts` are values from which a fit starts, besides zero.
+    `starts` are values from which a fit starts, besides zero. With a `curve` the values are a smooth function of the
+    wavelength, and `parameters` its coefficients.
     """
 
     effect: Effect
@@ -30,6 +32,7 @@ class Candidate:
     capture: int | None = None
     starts: tuple[Array, ...] = field(default=(), compare=False)
     wavelength_nm: float | None = None
+    curve: Curve | None = None
 
     def acts(self, capture: int, wavelength_nm: float) -> bool:
         """Whether it acts on a capture, by its number and wavelength."""
@@ -56,6 +59,16 @@ class Candidate:
         where = self.effect.axis(self.place) if isinstance(self.effect, FromAState) else self.place
         return f"{self.kind}:{where}:{self.capture}"
 
+    def at(self, wavelength_nm: float) -> Candidate:
+        """What it is at one wavelength: the same, unless its values are a curve over the wavelengths."""
+        if self.curve is None:
+            return self
+        return replace(self, parameters=self.curve.parameters, wavelength_nm=wavelength_nm, curve=None)
+
+    def matrix(self, wavelength_nm: float) -> Array:
+        """Matrix (own values, size) that makes the values at one wavelength of those that are fitted."""
+        return np.eye(self.size) if self.curve is None else self.curve.at(wavelength_nm)
+
     @property
     def short(self) -> str:
         """kind[element]."""
@@ -70,6 +83,9 @@ class Candidate:
     def apply(self, changes: Changes, model: InstrumentModel, values: Array) -> None:
         """Add the effect of these values to the changes of an instrument, if it is one of an instrument."""
         if isinstance(self.effect, InstrumentEffect):
+            if self.curve is not None:
+                (wavelength,) = model.wavelengths_nm or ()
+                values = self.matrix(wavelength) @ values
             self.effect.apply(changes, model, self.place, values)
 
     @property
@@ -95,11 +111,22 @@ class NominalValue(InstrumentEffect):
         "azimuth_deg": Parameter("azimuth", "degree", -400, 400, 30.0),
         "retardance_deg": Parameter("retardance", "degree", -200, 200, 30.0),
         "extinction": Parameter("extinction", "1", -0.02, 1.0, 0.1),
-        "diattenuation": Parameter("diattenuation", "1", -1.0, 1.0, 0.1),
+        "diattenuation": Parameter("diattenuation", "1", -1.0, 1.0, 0.01),
+        "depolarization": Parameter("depolarization", "1", -0.02, 1.0, 0.01),
+    }
+    #: What has no retardance is a window, and close to that.
+    WINDOW: ClassVar[Parameter] = Parameter("retardance", "degree", -40, 40, 1.0)
+    #: A mount is the same at every wavelength; retardances and diattenuations follow a curve.
+    BELONGS: ClassVar[dict[str, Belongs]] = {
+        "azimuth_deg": "mechanics",
+        "retardance_deg": "dispersion",
+        "diattenuation": "dispersion",
+        "depolarization": "dispersion",
     }
 
     def __init__(self, name: str, model: InstrumentModel) -> None:
         self.kind = "calibrate"
+        self.name = name
         self.element, _, self.field = name.rpartition(".")
         known = {e.name for e in model.elements()}
         if self.element not in known or self.field not in self.FIELDS:
@@ -108,39 +135,29 @@ class NominalValue(InstrumentEffect):
                 f"instrument and a field of {', '.join(self.FIELDS)}"
             )
 
-    @property
-    def shared(self) -> bool:
-        """A mount, the same at every wavelength."""
-        return self.field == "azimuth_deg"
-
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return (f"{self.element}.{self.field}",)
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return (self.FIELDS[self.field],)
+        nominal = next(getattr(e, self.field) for e in model.elements() if e.name == self.element)
+        return (self.WINDOW if self.field == "retardance_deg" and nominal == 0 else self.FIELDS[self.field],)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         value = values[0]
-        if self.field.endswith("_deg"):
-            target = changes.azimuth_rad if self.field == "azimuth_deg" else changes.retardance_rad
-            target[self.element] = target[self.element] + np.deg2rad(value)
-        else:
-            target = changes.extinction if self.field == "extinction" else changes.diattenuation
-            target[self.element] = target[self.element] + value
+        target = getattr(changes, self.field.replace("_deg", "_rad"))
+        target[self.element] = target[self.element] + (np.deg2rad(value) if self.field.endswith("_deg") else value)
 
 
 def nominal_values(
     model: InstrumentModel, conditions: Conditions, wavelengths_nm: Sequence[float]
 ) -> tuple[Candidate, ...]:
     """Candidates for the values that the instrument file calls nominal: azimuths once, all else at every wavelength."""
-    out = []
-    several = sorted(set(wavelengths_nm))
+    out: list[Candidate] = []
     for name in model.calibrate:
         effect = NominalValue(name, model)
-        shared = effect.shared or len(several) == 1
-        for wavelength in (None,) if shared else several:
-            parameters = effect.parameters(model, conditions, name)
-            out.append(Candidate(effect, name, parameters, wavelength_nm=wavelength))
+        belongs = model.belongs_to.get(name, NominalValue.BELONGS.get(effect.field, "wavelength"))
+        parameters = effect.parameters(model, conditions, name)
+        out += _over_wavelengths(Candidate(effect, name, parameters), belongs, wavelengths_nm)
     return tuple(out)
 
 
@@ -153,22 +170,42 @@ def pool(
     indistinguishable effects.
     """
     wavelengths_nm = wavelengths_nm or (0.0,) * len(conditions)
-    found: dict[tuple[str, str, int | None, float | None], Candidate] = {}
+    found: dict[tuple[str, str, int | None], list[Candidate]] = {}
     fitted = set(model.calibrate)
-    several = len(set(wavelengths_nm)) > 1
     one_scale = len({c.full_scale for c in conditions}) == 1
+    _check_declared(model)
     for effect in instrument_effects().values():
         if isinstance(effect, FromFileOnly):
             continue
-        dispersive = several and (
-            effect.belongs_to == "wavelength" or (effect.belongs_to == "detector" and not one_scale)
-        )
-        for k, (condition, wavelength) in enumerate(zip(conditions, wavelengths_nm, strict=True)):
-            number = k if effect.belongs_to == "capture" else None
-            own = wavelength if dispersive else None
+        belongs = model.belongs_to.get(effect.kind, effect.belongs_to)
+        if belongs == "detector" and not one_scale and effect.kind not in model.belongs_to:
+            belongs = "wavelength"
+        for k, condition in enumerate(conditions):
+            number = k if belongs == "capture" else None
             for place in effect.places(model, condition):
-                if fitted.isdisjoint(effect.shifts(model, place)):
+                if (effect.kind, place, number) not in found and fitted.isdisjoint(effect.shifts(model, place)):
                     parameters = effect.parameters(model, condition, place)
-                    candidate = Candidate(effect, place, parameters, number, effect.starts(), own)
-                    found.setdefault((effect.kind, place, number, own), candidate)
-    return tuple(found.values())
+                    candidate = Candidate(effect, place, parameters, number, effect.starts())
+                    found[effect.kind, place, number] = _over_wavelengths(candidate, belongs, wavelengths_nm)
+    return tuple(c for each in found.values() for c in each)
+
+
+def _over_wavelengths(candidate: Candidate, belongs: Belongs, wavelengths_nm: Sequence[float]) -> list[Candidate]:
+    """The candidate as it is in captures at several wavelengths: one for all, a smooth curve, or one at each."""
+    several = sorted(set(wavelengths_nm))
+    if len(several) == 1 or belongs not in ("dispersion", "wavelength"):
+        return [candidate]
+    smooth = curve(several, candidate.parameters) if belongs == "dispersion" else None
+    if smooth is None:
+        return [replace(candidate, wavelength_nm=w) for w in several]
+    return [replace(candidate, parameters=smooth.coefficients, curve=smooth, starts=())]
+
+
+def _check_declared(model: InstrumentModel) -> None:
+    """What `belongs_to` declares has to exist."""
+    unknown = [name for name in model.belongs_to if name not in instrument_effects() and name not in model.calibrate]
+    if unknown:
+        raise ProcessError(
+            f"instrument {model.name!r}: belongs_to: {', '.join(unknown)} is neither a kind of effect nor a value that "
+            "`calibrate` lists"
+        )

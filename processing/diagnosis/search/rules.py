@@ -19,6 +19,11 @@ TAU_WEIGHT = np.array([0.1, 0.2, 0.3, 0.3, 0.1])
 FEW_CAUSES = 0.5
 #: [typical sizes] Standard deviation of a nominal value of the train (30 degrees): the weakest prior that keeps it.
 NOMINAL_TAU = 10.0
+#: [of a factor e in wavelength] Length over which values of optics stay alike from one wavelength to another: an
+#: achromatic plate bends once over an octave, a coating a few times.
+SMOOTH = 0.3
+#: [of the variance of the largest] Principal curves of such values below which nothing is told of them.
+FLAT = 1e-6
 #: [probability] Share of benches on which an effect is there at its typical size, for what the data say nothing of: a
 #: bench that is new has a third of the list.
 UNSEEN = 0.3

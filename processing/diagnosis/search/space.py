@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
@@ -42,17 +43,47 @@ class Sums:
         gradient, stretch = np.zeros((2, f, k))
         return cls(a, b, c, d, gradient, np.zeros((f, k, k)), stretch, np.zeros((captures, 2, f)))
 
-    def add(self, capture: int, part: Sums, index: NDArray[np.int64], weight: float = 1.0) -> None:
-        """Add the sums of one capture, by whose parameters at `index` it is derived; its chi-square counts `weight`."""
+    def add(self, capture: int, part: Sums, acting: Acting, weight: float = 1.0) -> None:
+        """Add the sums of one capture, derived by what is `acting` on it; its chi-square counts `weight`."""
         self.excess += weight * part.excess
         self.freedom += weight * part.freedom
         self.square += part.square
         self.count += part.count
         self.shares[capture] += part.square, part.count
         if part.gradient.shape[1]:
-            self.gradient[:, index] += weight * part.gradient
-            self.stretch[:, index] += weight * part.stretch
-            self.curvature[:, index[:, None], index] += weight * part.curvature
+            index = acting.index
+            self.gradient[:, index] += weight * acting.spread(part.gradient)
+            self.stretch[:, index] += weight * acting.spread(part.stretch)
+            self.curvature[:, index[:, None], index] += weight * acting.spread_products(part.curvature)
+
+
+@dataclass(frozen=True)
+class Acting:
+    """What of a common vector acts on one capture.
+
+    Attributes
+    ----------
+    space : candidates as they are at the capture's wavelength.
+    index : (J,) positions in the common vector.
+    mix : (own values, J), which makes the values of `space` of those; None: they are the same.
+    """
+
+    space: Space
+    index: NDArray[np.int64]
+    mix: Array | None
+
+    def of(self, values: Array) -> Array:
+        """Values of `space`, of the common vector."""
+        mine = values[self.index]
+        return mine if self.mix is None else self.mix @ mine
+
+    def spread(self, slopes: Array) -> Array:
+        """Derivatives (..., J) by the common values, of those (..., own values)."""
+        return slopes if self.mix is None else slopes @ self.mix
+
+    def spread_products(self, products: Array) -> Array:
+        """The same of products (..., own values, own values)."""
+        return products if self.mix is None else np.asarray(self.mix.T @ products @ self.mix)
 
 
 @dataclass
@@ -75,11 +106,15 @@ class Space:
         """(K,) values that are on or off and not fitted."""
         return np.array([isinstance(c.effect, Switch) for c in self.candidates for _ in c.parameters], dtype=bool)
 
-    def acting(self, capture: int, wavelength_nm: float) -> tuple[Space, NDArray[np.int64]]:
+    def acting(self, capture: int, wavelength_nm: float) -> Acting:
         """What acts on a capture, and where its values stand in the common vector."""
         chosen = [k for k, c in enumerate(self.candidates) if c.acts(capture, wavelength_nm)]
         index = [np.zeros(0, dtype=np.int64), *(np.r_[self.slices[k]] for k in chosen)]
-        return Space(tuple(self.candidates[k] for k in chosen)), np.concatenate(index).astype(np.int64)
+        mine = Space(tuple(self.candidates[k].at(wavelength_nm) for k in chosen))
+        mix = None
+        if any(self.candidates[k].curve is not None for k in chosen):
+            mix = block_diag(*(self.candidates[k].matrix(wavelength_nm) for k in chosen))
+        return Acting(mine, np.concatenate(index).astype(np.int64), mix)
 
     def joined(self, name: str) -> Array:
         """A property of all candidates, end to end."""

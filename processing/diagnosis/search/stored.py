@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Literal
 
 from processing.arrays import Array
@@ -26,3 +27,13 @@ def parameters_of(candidate: Candidate, values: Array, stderr: Array) -> dict[st
 def scope_of(candidate: Candidate) -> Literal["instrument", "capture"]:
     """Whether it holds for the instrument or for one capture of it."""
     return "capture" if isinstance(candidate.effect, OfOneCapture) else "instrument"
+
+
+def by_wavelength(candidate: Candidate, values: Array, covariance: Array) -> Iterator[tuple[Candidate, Array, Array]]:
+    """The candidate, its values (n,) and their covariance (n, n); of a curve, each at every one of its wavelengths."""
+    if candidate.curve is None:
+        yield candidate, values, covariance
+        return
+    for wavelength in candidate.curve.wavelengths_nm:
+        mix = candidate.matrix(wavelength)
+        yield candidate.at(wavelength), mix @ values, mix @ covariance @ mix.T

@@ -26,6 +26,8 @@ class RetarderEffect(OpticsEffect):
 class Retardance(RetarderEffect):
     """The retardance differs from the model's."""
 
+    belongs_to = "dispersion"
+
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         return (Parameter("retardance", "degree", -40, 40, 1.0),)
 

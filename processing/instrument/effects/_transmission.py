@@ -12,6 +12,8 @@ from processing.instrument.model import InstrumentModel
 class Transmission(OpticsEffect):
     """Relative change of transmission, once and twice per turn of the element."""
 
+    belongs_to = "dispersion"
+
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         return tuple(Parameter(n, "1", -0.3, 0.3, 0.01) for n in ("cos_1", "sin_1", "cos_2", "sin_2"))
 

@@ -14,15 +14,14 @@ import numpy as np
 from processing.arrays import Array
 from processing.effect import Effect, Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.model import InstrumentModel, Retarder
-
-#: What the values of an effect belong to: mounts and mechanics, the same at every wavelength; the detector, the same as
-#: long as its full scale is; optics, with other values at another wavelength; one capture alone.
-Belongs = Literal["mechanics", "detector", "wavelength", "capture"]
+from processing.instrument.model import Belongs, InstrumentModel, Retarder
 
 
 class InstrumentEffect(Effect, ABC):
-    """One thing that an instrument model can lack."""
+    """One thing that an instrument model can lack.
+
+    `belongs_to` says which captures share its values; an instrument file may declare another (`belongs_to` there).
+    """
 
     belongs_to: ClassVar[Belongs] = "wavelength"
 

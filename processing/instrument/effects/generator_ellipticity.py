@@ -21,6 +21,8 @@ from processing.polarization import mueller
 class GeneratorEllipticity(OpticsEffect):
     """Ellipticity angle in degrees behind the generator's polarizer."""
 
+    belongs_to = "dispersion"
+
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return tuple(e.name for e in model.generator if isinstance(e, Polarizer)) if len(model.generator) > 1 else ()
 

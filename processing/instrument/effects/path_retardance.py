@@ -22,6 +22,8 @@ from processing.polarization import mueller
 class PathRetardance(OpticsEffect):
     """Two components of a linear retardance in degrees: fast axis at 0, and at 45 degrees."""
 
+    belongs_to = "dispersion"
+
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if len(model.generator) > 1 else ()
 

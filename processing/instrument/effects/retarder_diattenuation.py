@@ -18,6 +18,8 @@ from processing.instrument.model import InstrumentModel, Retarder
 class RetarderDiattenuation(OpticsEffect):
     """(T_fast - T_slow) / (T_fast + T_slow) of the retarder."""
 
+    belongs_to = "dispersion"
+
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return tuple(e.name for e in model.elements() if isinstance(e, Retarder))
 

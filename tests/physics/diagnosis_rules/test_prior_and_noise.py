@@ -6,9 +6,10 @@ import numpy as np
 from rule_decisions import QUIET, Patch, bench, decides, made, one
 
 from processing.diagnosis.instrument import systematic, whole_bench
-from processing.diagnosis.search import likely_set, posterior
+from processing.diagnosis.search import dispersion, likely_set, posterior
 from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets, State
 from processing.diagnosis.search.space import Space, Sums
+from processing.effect import Parameter
 
 
 @decides
@@ -34,6 +35,21 @@ def test_nominal_tau(m: Patch) -> bool:
     (group,) = posterior.grouped(Space((candidate,)), [candidate])[1]
     s = Sets(Quadratic(0.0, np.array([-1.0, 0.0]), 0.01 * np.eye(2)), [group, Group(np.array([1]))], QUIET)
     return abs(s.fitted(s.empty()).mean[0] - 50) < 5
+
+
+def principal_curves(last_nm: float) -> np.ndarray:
+    return dispersion.curve(np.geomspace(500.0, last_nm, 8), (Parameter("p", "1", -1.0, 1.0, 1.0),)).basis
+
+
+@decides
+def test_smooth(m: Patch) -> bool:
+    basis = principal_curves(500 * np.exp(0.3))
+    return abs(basis[0] @ basis[-1] - np.exp(-0.5)) < 0.02
+
+
+@decides
+def test_flat(m: Patch) -> bool:
+    return [principal_curves(last).shape[1] for last in (945.0, 960.0)] == [6, 7]
 
 
 @decides
