@@ -52,9 +52,10 @@ class Whitened:
 
     def rest(self, clean: NDArray[np.bool_]) -> Array:
         """Projection (L, L) on what neither the model reaches nor the residual of the `clean` pixels has in common."""
-        r = self.outside @ (self.outside.T @ self.y[:, clean])
-        scale = robust_scale(r)
-        inner = self.outside.T @ np.clip(r, -CUT * scale, CUT * scale)
+        outside = self.outside.astype(np.float32)
+        r = outside @ (outside.T @ (self.y if clean.all() else self.y[:, clean]))
+        scale = robust_scale(r).astype(np.float32)
+        inner = (outside.T @ np.clip(r, -CUT * scale, CUT * scale, out=r)).astype(float)
         value, vector = np.linalg.eigh(inner @ inner.T / inner.shape[1])
         # Largest eigenvalue of noise over the median one (Marchenko and Pastur).
         edge = STRUCTURE * (1 + np.sqrt(len(value) / inner.shape[1])) ** 2

@@ -52,14 +52,14 @@ def outliers_of(data: CaptureData, a: Array) -> Outliers:
     white = Whitened.of(data, a, good)
     if white.outside.shape[1] < FEWEST_DIRECTIONS:
         return found
-    sigma = np.sqrt(np.maximum(white.variance, 0.1))
+    sigma = np.sqrt(np.maximum(white.variance, np.float32(0.1)))
     clean = np.ones(white.y.shape[1], dtype=bool)
     # Twice: what was struck is no structure of the image.
     for _ in range(2):
         rest = white.rest(clean)
         # In standard deviations as the image itself shows them: what is declared of the noise is not asked.
         r = rest.astype(np.float32) @ white.y / sigma
-        t = np.asarray(r / robust_scale(r[:, clean]), dtype=np.float32)
+        t = np.divide(r, robust_scale(r if clean.all() else r[:, clean]).astype(np.float32), out=r)
         struck, noisy = _hits(t, rest)
         clean = (np.max(np.abs(t), axis=0) < HIT) & ~struck.any(axis=0)
         if clean.all() or clean.sum() < FEWEST_PIXELS:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -74,18 +75,15 @@ def image_derivatives(u: NDArray[np.floating]) -> NDArray[np.float32]:
 
 def derivatives_of_part(u: NDArray[np.floating], rows: slice, columns: slice) -> NDArray[np.float32]:
     """The same of a rectangle of the images alone."""
-    from scipy.ndimage import correlate1d
-
     height, width = rows.stop - rows.start, columns.stop - columns.start
     out = np.zeros((DERIVATIVES, u.shape[0], height, width), dtype=np.float32)
     if not derivatives_known(*u.shape[1:]):
         return out
     top, left = max(rows.start - MARGIN, 0), max(columns.start - MARGIN, 0)
-    around = u[:, top : rows.stop + MARGIN, left : columns.stop + MARGIN]
-    across = [correlate1d(around, kernel, axis=2) for kernel in FILTERS]
     here = slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left)
-    for k, (down, right) in enumerate(ORDERS):
-        out[k] = correlate1d(across[right][:, :, here[1]], FILTERS[down], axis=1)[:, here[0]]
+    for n, frame in enumerate(u[:, top : rows.stop + MARGIN, left : columns.stop + MARGIN]):
+        for k, (down, right) in enumerate(ORDERS):
+            out[k, n] = cv2.sepFilter2D(frame, -1, FILTERS[right], FILTERS[down])[here]
     return out
 
 
