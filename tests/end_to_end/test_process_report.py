@@ -2,10 +2,13 @@
 
 import os
 import re
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from playwright.sync_api import Browser, sync_playwright
 
 from processing.commands.application import main
 from processing.instrument.model import InstrumentModel
@@ -13,6 +16,22 @@ from processing.reduction.mueller import reduce_mueller
 from processing.reports.report import collect
 from processing.storage.capture import Capture
 from processing.storage.product import Step
+
+VISIBLE = "n => n.checkVisibility({contentVisibilityAuto: true})"
+
+
+@pytest.fixture
+def browser() -> Iterator[Browser]:
+    """Debian's Chromium, without a window."""
+    program = shutil.which("chromium")
+    if program is None:
+        if os.environ.get("CI"):
+            pytest.fail("CI needs chromium")
+        pytest.skip("no chromium here")
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=program, args=["--no-sandbox", "--disable-dev-shm-usage"])
+        yield opened
+        opened.close()
 
 
 def run(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, str]:
@@ -62,6 +81,27 @@ def test_report_is_self_contained(campaign: Path, capsys: pytest.CaptureFixture[
     assert code == 2
     assert "exists" in err
     assert run(capsys, "report", campaign / "rmsd.csv", "--out", out, "--overwrite")[0] == 0
+
+
+def test_a_report_on_paper_is_whole_and_has_nothing_to_press(campaign: Path, browser: Browser) -> None:
+    out = campaign / "report.html"
+    with pytest.raises(SystemExit):
+        main(["report", str(campaign), "--out", str(out)])
+    # A4 at 96 pixels an inch.
+    page = browser.new_page(viewport={"width": 794, "height": 1123}, color_scheme="dark")
+    page.goto(out.as_uri())
+    folded = page.locator("details > pre").first
+    assert not folded.evaluate(VISIBLE)
+    page.emulate_media(media="print")
+    assert folded.evaluate(VISIBLE)
+    assert page.locator(".simulated").is_visible()
+    assert page.locator("nav, button").evaluate_all("nodes => nodes.every(n => !n.checkVisibility())")
+    assert page.evaluate("document.documentElement.scrollWidth") <= 794
+    # Black on white, also where the screen is dark.
+    body = page.locator("body")
+    assert body.evaluate("n => getComputedStyle(n).backgroundColor") == "rgb(255, 255, 255)"
+    assert body.evaluate("n => getComputedStyle(n).color") == "rgb(0, 0, 0)"
+    assert page.pdf(format="A4").startswith(b"%PDF")
 
 
 def test_files_are_in_the_order_that_they_were_made_in_whatever_their_time_stamps(campaign: Path) -> None:
