@@ -11,11 +11,9 @@ from acquisition.capture.writer import NEW, PARTIAL, mark_not_taken, seal_whole
 from acquisition.commands.doctor import Finding
 from acquisition.errors import AcquisitionError
 from processing.errors import ProcessError
-from processing.reflectance.tables import is_table
-from processing.storage.capture import Capture, CaptureError
+from processing.storage.capture import Capture, CaptureError, made_of_captures
 from processing.storage.h5_door import mark_of
 from processing.storage.packed_capture import pack_capture
-from processing.storage.product import is_product
 from processing.yaml_file import load_yaml
 
 
@@ -34,8 +32,8 @@ def verify(folder: Path) -> Iterator[Finding]:
 
 
 def _is_capture(path: Path) -> bool:
-    """Whether a file is a capture, or named like one and nothing else: products and tables lie beside captures."""
-    return path.name.endswith((".h5", PARTIAL)) and not is_product(path) and not is_table(path)
+    """Whether a file is named like a capture and is nothing else."""
+    return path.name.endswith((".h5", PARTIAL)) and not made_of_captures(path)
 
 
 def _capture(path: Path) -> Finding:

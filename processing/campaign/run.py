@@ -24,8 +24,7 @@ from processing.polarization.image_difference import rmsd
 from processing.reduction.flat import FlatCapture, flat_captures, nearest_flat
 from processing.reduction.mueller import Progress
 from processing.reflectance.tables import ScatteringTable
-from processing.storage.capture import Capture, CaptureError
-from processing.storage.product import is_product
+from processing.storage.capture import Capture, CaptureError, made_of_captures
 from processing.storage.provenance import Step, file_identity
 
 #: The default demosaicing reaches so far across the outline (`processing.reduction.mosaic.methods.REACH`).
@@ -99,7 +98,7 @@ def find_captures(
     """
     found, kinds, left_out = [], {}, []
     for path in sorted(folder.rglob("*.h5")):
-        if (out is not None and path.is_relative_to(out)) or is_product(path):
+        if (out is not None and path.is_relative_to(out)) or made_of_captures(path):
             continue
         try:
             with Capture(path) as capture:

@@ -19,7 +19,7 @@ from processing.storage.capture_door import check_capture
 from processing.storage.capture_schema import SCHEMA_VERSION, CaptureHeader
 from processing.storage.checksums import NONE, row_crc32, state_crc32, summed_values
 from processing.storage.frame_layout import Beams, Cells, FrameLayout
-from processing.storage.h5_door import OpenH5, closed_if_damaged, damage_as, open_h5, text_attribute
+from processing.storage.h5_door import OpenH5, closed_if_damaged, damage_as, mark_of, open_h5, text_attribute
 from processing.storage.segments import Segment, decode_lines, segments_of
 from processing.yaml_file import parse_yaml
 
@@ -289,6 +289,11 @@ class Capture(OpenH5):
 
     def _damage(self) -> AbstractContextManager[None]:
         return damage_as(CaptureError, f"{self.path} is damaged")
+
+
+def made_of_captures(path: Path) -> bool:
+    """Whether a file is what `process` makes of captures, and so lies beside them: a product, or a table."""
+    return any(mark_of(path, mark) is not None for mark in MADE_OF_CAPTURES)
 
 
 def _open(path: Path) -> h5py.File:

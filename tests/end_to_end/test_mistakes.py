@@ -1,8 +1,10 @@
 """Slips of a user: a device that is not plugged in, names and files that are not meant so. One clear message each."""
 
+import h5py
 import pytest
 from ruamel.yaml import YAML
 
+from processing.campaign.run import find_captures
 from processing.commands.application import main as process
 from processing.commands.diagnose import main as diagnose
 
@@ -98,10 +100,15 @@ def test_a_file_that_is_not_meant_is_called_what_it_is(run, acquire, capture, co
         code, err = run(*arguments)
         assert (code, words in err) == (2, True), err
         assert err.count("\n") == 1
-    # Products lie beside captures; none is a damaged capture.
+    # Products and tables lie beside captures; none is a damaged capture.
+    with h5py.File(tmp_path / "table.h5", "w") as h5:
+        h5.attrs["umov_table"] = 1
+    found, _, left_out = find_captures(tmp_path)
+    assert ([path for path, *_ in found], left_out) == ([capture], [])
     for command in ("verify", "repair"):
         code, out, err = acquire(command, tmp_path)
         assert (code, err) == (0, "")
         assert product.name not in out
+        assert "table.h5" not in out
         code, _, err = acquire(command, folder)
         assert (code, "there is no capture in this folder" in err) == (2, True)
