@@ -17,7 +17,7 @@ from viewer.diagnoses import Diagnoses
 from viewer.library import Entry, made_into
 from viewer.pages import file_of, pages_of
 from viewer.planes import Window, sent
-from viewer.starting import instrument_files
+from viewer.starting import geometry_files, instrument_files, material_files
 
 #: Most bars of a histogram.
 BARS = 256
@@ -56,6 +56,8 @@ def capture(request: Request) -> HTMLResponse:
         others=others(entry, entries),
         writing=entry.status == "running",
         instruments=list(instrument_files(library)),
+        materials=list(material_files(library)),
+        geometries=list(geometry_files(library)),
         stories=Diagnoses(library).of_capture(entry.name),
     )
 

@@ -123,12 +123,11 @@ class Library:
         found = [Path(folder) for folder, _, files in self._walk() if IDENTITY in files]
         return sorted(found, key=lambda folder: -_changed_s(folder))
 
-    def yaml_files(self, kind: str) -> list[Path]:
-        """Configuration files that say they are of this kind."""
-        mark = f"kind: {kind}"
+    def yaml_files(self, mark: str) -> list[Path]:
+        """Configuration files that have a line which begins so, as `kind: instrument`."""
         found = []
         for path in self._files(".yaml"):
-            if path.stat().st_size < 1 << 20 and mark in _lines(path):
+            if path.stat().st_size < 1 << 20 and any(f"{line} ".startswith(f"{mark} ") for line in _lines(path)):
                 found.append(path)
         return found
 
@@ -236,8 +235,8 @@ def _is_utf8(name: str) -> bool:
     return True
 
 
-def _lines(path: Path) -> set[str]:
+def _lines(path: Path) -> list[str]:
     try:
-        return {line.strip() for line in path.read_text(encoding="utf-8").splitlines()}
+        return path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError):
-        return set()
+        return []

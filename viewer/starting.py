@@ -14,6 +14,7 @@ from acquisition import CONFIGS, Campaign
 from acquisition.campaign.identity import read_identity
 from acquisition.campaign.log import PLAN
 from processing.errors import ProcessError
+from processing.reflectance.base import kinds
 from processing.storage.capture import Capture
 from viewer.diagnoses import Diagnoses
 from viewer.event_stream import event_stream
@@ -51,7 +52,7 @@ def _campaign(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
 
 def campaign_files(library: Library) -> dict[str, Path]:
     """Campaign files that can be started, by the name that a page shows: those of the folder, and the examples."""
-    own = [path for path in library.yaml_files("campaign") if path.name != PLAN]
+    own = [path for path in library.yaml_files("kind: campaign") if path.name != PLAN]
     return {library.name(path): path for path in own} | {
         f"example: {path.stem}": path for path in sorted((CONFIGS / "campaigns").glob("*.yaml"))
     }
@@ -95,21 +96,48 @@ def _diagnose(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
     return jobs.start(f"diagnose {', '.join(c.name for c in captures)}", command, about, library.root)
 
 
+def _surface(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
+    captures = [library.path(name) for name in asked.get("files", "").split("\n") if name]
+    material = _chosen(material_files(library), asked.get("material", ""), "material")
+    geometry = _chosen(geometry_files(library), asked.get("geometry", ""), "geometry")
+    name, folder = Diagnoses(library).begin(captures, _instrument(library, asked))
+    command = ["diagnose", *map(str, captures), "--instrument", str(folder / "instrument.yaml")]
+    command += ["--reflectance", str(material), "--geometry", str(geometry), "--report", str(folder / "report.html")]
+    about = {"report": name, "file": library.name(captures[0])}
+    return jobs.start(f"diagnose the surface in {', '.join(c.name for c in captures)}", command, about, library.root)
+
+
 def instrument_files(library: Library) -> dict[str, Path]:
     """Instrument files by the name that a page shows: those of the folder, and those that come with the program."""
-    files = {library.name(path): path for path in library.yaml_files("instrument")}
-    return files | {f"example: {path.stem}": path for path in sorted((CONFIGS / "instruments").glob("*.yaml"))}
+    return _with_examples(library, library.yaml_files("kind: instrument"), "instruments")
+
+
+def material_files(library: Library) -> dict[str, Path]:
+    """Material files, as `instrument_files`."""
+    own = [path for kind in kinds() for path in library.yaml_files(f"kind: {kind}")]
+    return _with_examples(library, own, "materials")
+
+
+def geometry_files(library: Library) -> dict[str, Path]:
+    """Geometry files, as `instrument_files`."""
+    return _with_examples(library, library.yaml_files("source_distance_mm:"), "geometries")
+
+
+def _with_examples(library: Library, own: list[Path], folder: str) -> dict[str, Path]:
+    files = {library.name(path): path for path in own}
+    return files | {f"example: {path.stem}": path for path in sorted((CONFIGS / folder).glob("*.yaml"))}
 
 
 def _instrument(library: Library, asked: dict[str, str]) -> Path | None:
     """The instrument file that a page chose; None for the model in the capture. Raises NotHere."""
     name = asked.get("instrument")
-    if not name:
-        return None
-    file = instrument_files(library).get(name)
-    if file is None:
-        raise NotHere(f"{name}: there is no such instrument file")
-    return file
+    return _chosen(instrument_files(library), name, "instrument") if name else None
+
+
+def _chosen(files: dict[str, Path], name: str, what: str) -> Path:
+    if name not in files:
+        raise NotHere(f"{name}: there is no such {what} file")
+    return files[name]
 
 
 KINDS: dict[str, Callable[[Library, Jobs, dict[str, str]], Job]] = {
@@ -118,6 +146,7 @@ KINDS: dict[str, Callable[[Library, Jobs, dict[str, str]], Job]] = {
     "reduce": _reduce,
     "quantities": _quantities,
     "diagnose": _diagnose,
+    "surface": _surface,
 }
 
 
@@ -137,6 +166,8 @@ def told(pages: Pages, jobs: Jobs, found: Job) -> dict[str, Any]:
         links.append(["The campaign", pages.address("campaign", folder=about["campaign"])])
     if "diagnosis" in about and status == "done":
         links.append(["The verdict", pages.address("diagnosis", name=about["diagnosis"])])
+    if "report" in about and status == "done":
+        links.append(["The report", pages.address("diagnosis-report", name=about["report"])])
     if "file" in about:
         entry = library.entry(about["file"])
         if status == "done" and "diagnosis" not in about:

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -19,7 +20,7 @@ from viewer.campaigns import read_campaign, seconds_left
 from viewer.following import seen
 from viewer.jobs import Jobs
 from viewer.lamp import lamp
-from viewer.library import Library
+from viewer.library import Library, NotHere
 from viewer.starting import KINDS
 
 
@@ -212,6 +213,23 @@ class Told:
 
     def start(self, title, command, about, folder):
         return command
+
+
+def test_a_surface_is_diagnosed_with_a_material_and_a_geometry(lab, client, drr_capture, configs):
+    drr_capture("one.h5")
+    (lab / "mine.yaml").write_text((configs / "materials/red_print.yaml").read_text())
+    (lab / "ball.yaml").write_text((configs / "geometries/one_inch_sphere.yaml").read_text())
+    page = client.get("/capture", params={"file": "one.h5"}).text
+    for name in ("mine.yaml", "ball.yaml", "example: red_print", "example: one_inch_sphere"):
+        assert f"<option>{name}</option>" in page
+    asked = {"files": "one.h5", "material": "mine.yaml", "geometry": "example: one_inch_sphere"}
+    command = KINDS["surface"](Library(lab), Told(), asked)
+    given = dict(zip(command[2::2], command[3::2], strict=True))
+    assert given["--reflectance"] == str(lab / "mine.yaml")
+    assert given["--geometry"].endswith("geometries/one_inch_sphere.yaml")
+    assert Path(given["--instrument"]).read_text() == (configs / "instruments/rgb950.yaml").read_text()
+    with pytest.raises(NotHere, match="no such material"):
+        KINDS["surface"](Library(lab), Told(), asked | {"material": "/etc/passwd"})
 
 
 def test_a_product_of_another_instrument_file_is_called_what_it_is(lab, drr_capture):
