@@ -18,6 +18,8 @@ from acquisition.stop_request import StopRequest
 def take_capture(plan: MeasurementPlan, rig: RigConfig, folder: Path | str, home: bool = False) -> Path:
     """Check everything, take the capture, seal it; Ctrl-C ends it after the state that is being taken.
 
+    The guard of `acquire` (docs/acquisition.md) does not stand beside it.
+
     Parameters
     ----------
     folder

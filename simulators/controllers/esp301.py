@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from drivers.axes.esp301 import Config
 from simulators.clock import Clock
 from simulators.serial.emulator import EmulatedAxis, Emulator
+from simulators.serial.line_collector import LineCollector
 from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
 
@@ -67,20 +68,16 @@ class ESP301Emulator(Emulator):
         super().__init__([stage.axis for stage in stages], clock, faults)
         self.stages = list(stages)
         self.errors: deque[tuple[int, int]] = deque(maxlen=10)
-        self._buffer = bytearray()
+        self._lines = LineCollector()
         self._waiting: list[str] = []
         self._wait_for: ESPAxis | None = None
         self._go_on_s = 0.0
 
     def _do_receive(self, data: bytes) -> None:
-        for byte in data:
-            if byte in b"\r\n":
-                line, self._buffer = bytes(self._buffer), bytearray()
-                # Case and blanks mean nothing.
-                text = line.decode("latin-1").replace(" ", "").upper()
-                self._waiting += [part for part in text[:LONGEST_LINE].split(";") if part]
-            elif len(self._buffer) < 256:
-                self._buffer.append(byte)
+        for line in self._lines.lines(data):
+            # Case and blanks mean nothing.
+            text = line.replace(" ", "").upper()
+            self._waiting += [part for part in text[:LONGEST_LINE].split(";") if part]
         self._work()
 
     def _work(self) -> None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from drivers.axes.gcs2 import Config
 from simulators.clock import Clock
 from simulators.serial.emulator import EmulatedAxis, Emulator
+from simulators.serial.line_collector import LineCollector
 from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
 
@@ -63,18 +64,16 @@ class GCS2Emulator(Emulator):
         self.stages = list(stages)
         self.model = "C-884.4DC"
         self.error = 0
-        self._buffer = bytearray()
+        self._lines = LineCollector(b"\n")
 
     def _do_receive(self, data: bytes) -> None:
         for byte in data:
             # Single bytes are heard at once, also in the middle of a line.
             if byte in (MOVING, READY, STOP_ALL):
                 self._single(byte)
-            elif byte == 0x0A:
-                line, self._buffer = bytes(self._buffer), bytearray()
-                self._command(line.decode("latin-1").strip())
-            elif len(self._buffer) < 256:
-                self._buffer.append(byte)
+            else:
+                for line in self._lines.lines(bytes([byte])):
+                    self._command(line.strip())
 
     def _single(self, byte: int) -> None:
         self._apply_faults()

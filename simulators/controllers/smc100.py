@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from drivers.axes.smc100 import Config
 from simulators.clock import Clock
 from simulators.serial.emulator import EmulatedAxis, Emulator
+from simulators.serial.line_collector import LineCollector
 from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
 
@@ -268,18 +269,13 @@ class SMC100Emulator(Emulator):
     ) -> None:
         super().__init__([controller.axis for controller in controllers], clock, faults)
         self.controllers = {controller.address: controller for controller in controllers}
-        self._buffer = bytearray()
+        self._lines = LineCollector()
 
     def _do_receive(self, data: bytes) -> None:
-        for byte in data:
-            if byte in b"\r\n":
-                line, self._buffer = bytes(self._buffer), bytearray()
-                # Blanks mean nothing anywhere in a command.
-                text = line.decode("latin-1").replace(" ", "")
-                if text:
-                    self._command(text)
-            elif len(self._buffer) < 256:
-                self._buffer.append(byte)
+        for line in self._lines.lines(data):
+            # Blanks mean nothing anywhere in a command.
+            if text := line.replace(" ", ""):
+                self._command(text)
 
     def _command(self, text: str) -> None:
         match = _COMMAND.fullmatch(text)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from drivers.axes.zaber import Config
 from simulators.clock import Clock
 from simulators.serial.emulator import EmulatedAxis, Emulator
+from simulators.serial.line_collector import LineCollector
 from simulators.serial.reply_faults import FaultSchedule
 from simulators.serial.serve_options import ServeOptions
 
@@ -235,18 +236,14 @@ class ZaberEmulator(Emulator):
     def __init__(self, devices: Sequence[ZaberDevice], clock: Clock, faults: FaultSchedule | None = None) -> None:
         super().__init__([device.axis for device in devices], clock, faults)
         self.devices = list(devices)
-        self._buffer = bytearray()
+        self._lines = LineCollector()
 
     def _do_receive(self, data: bytes) -> None:
-        for byte in data:
-            if byte in b"\r\n":
-                line, self._buffer = bytes(self._buffer), bytearray()
-                # A new command starts at the slash, whatever was on the line before.
-                start = line.rfind(b"/")
-                if start >= 0:
-                    self._command(line[start:].decode("latin-1"))
-            elif len(self._buffer) < 256:
-                self._buffer.append(byte)
+        for line in self._lines.lines(data):
+            # A new command starts at the slash, whatever was on the line before.
+            start = line.rfind("/")
+            if start >= 0:
+                self._command(line[start:])
 
     def _command(self, text: str) -> None:
         match = _COMMAND.fullmatch(text)

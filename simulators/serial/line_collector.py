@@ -1,0 +1,30 @@
+"""Bytes as they come, in portions of any size, put together to lines of text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+#: Bytes that a controller keeps of a line that does not end.
+MOST = 256
+
+
+class LineCollector:
+    """What an emulator has heard of a line.
+
+    Parameters
+    ----------
+    ends : bytes of which each ends a line.
+    """
+
+    def __init__(self, ends: bytes = b"\r\n") -> None:
+        self._ends = ends
+        self._heard = bytearray()
+
+    def lines(self, data: bytes) -> Iterator[str]:
+        """Lines that end in these bytes, without their ends; empty ones as well."""
+        for byte in data:
+            if byte in self._ends:
+                line, self._heard = bytes(self._heard), bytearray()
+                yield line.decode("latin-1")
+            elif len(self._heard) < MOST:
+                self._heard.append(byte)
