@@ -1,4 +1,4 @@
-"""`acquire verify` and `acquire repair`: what a folder of captures holds, what is damaged and what half done."""
+"""`acquire verify`, `repair` and `compress`: what a folder of captures holds, what is damaged and what half done."""
 
 from __future__ import annotations
 

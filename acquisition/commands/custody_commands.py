@@ -1,4 +1,4 @@
-"""The commands `acquire verify` and `acquire repair`."""
+"""The commands `acquire verify`, `acquire repair` and `acquire compress`."""
 
 from __future__ import annotations
 
