@@ -20,9 +20,9 @@ from pathlib import Path
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
+import cv2
 import numpy as np
 from measuring import Program
-from scipy import ndimage
 
 from processing.computing.threads import thread_count
 from processing.instrument.model import InstrumentModel
@@ -36,7 +36,7 @@ from simulators.blind.undeclared_faults import LISTED
 ROOT = Path(__file__).resolve().parents[1]
 INSTRUMENT = ROOT / "configs/instruments/rgb950.yaml"
 NM, STATES, ELECTRONS, SEED = 662.0, 40, 18_000.0, 1
-ONE = ("psa_retardance",)
+ONE = ("psa_azimuth",)
 EIGHT = (
     *("psg_retardance", "psa_azimuth", "retarder_transmission", "rotation_eccentricity", "source_drift"),
     *("detector_nonlinearity", "image_drift", "beam_wander"),
@@ -83,9 +83,9 @@ def capture(path: Path, case: Case, sample: str) -> None:
     _magnify_shifts(bench)
     angles = state_angles(STATES, mosaic=False, zigzag=False)
     counts = np.empty((STATES, case.rows, case.columns), np.uint16)
-    zoom = case.rows / bench.rows, case.columns / bench.columns
     for k, coarse in enumerate(expose(bench, scenes[sample], angles)):
-        counts[k] = digitize(bench, ndimage.zoom(coarse, zoom)[None], random)[0]
+        light = cv2.resize(coarse, (case.columns, case.rows), interpolation=cv2.INTER_CUBIC)
+        counts[k] = digitize(bench, light[None], random)[0]
     known = Sample(kind="air" if sample == "air" else "unknown")
     write_capture(path, bench, counts, angles, known, INSTRUMENT.read_text(encoding="utf-8"))
 

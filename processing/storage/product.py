@@ -35,6 +35,7 @@ from processing.storage.packed import create_packed, pack, shrinks_to
 from processing.storage.provenance import Step as Step
 from processing.storage.provenance import file_identity as file_identity
 from processing.storage.provenance import jsonable, read_steps, sign, write_steps
+from processing.storage.unpacked import read_rows
 
 PRODUCT_VERSION = 1
 #: Environment variable that switches compression of products off where it is 0.
@@ -292,7 +293,7 @@ class Product(OpenH5):
         """Dataset (leading..., rows, columns)."""
         dataset = self._dataset(name)
         with damage_as(ProductError, f"{self.path} is damaged"):
-            return np.asarray(dataset[..., rows, :])
+            return read_rows(dataset, rows)
 
     def units(self, name: str) -> str:
         """Unit of a dataset."""

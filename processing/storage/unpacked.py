@@ -1,0 +1,87 @@
+"""Rows of datasets, those of `packed` among them: unpacked here, on several threads.
+
+HDF5 unpacks one chunk after the other with zlib. What cannot be unpacked here it is asked to read itself: its errors
+are the only ones.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from itertools import product
+from typing import Any, cast
+
+import h5py
+import numpy as np
+from isal import isal_zlib
+from numpy.typing import NDArray
+
+from processing.computing.threads import thread_count
+
+#: Its stubs say that it were an instance.
+DAMAGED = cast(type[Exception], isal_zlib.IsalError)
+
+
+def read_rows(source: h5py.Dataset, rows: slice, first: tuple[int, ...] = ()) -> NDArray[Any]:
+    """Rows of a dataset (first..., more..., rows, columns), as `source[*first, ..., rows, :]`.
+
+    Raises
+    ------
+    OSError
+        The file is damaged.
+    """
+    start, stop, step = rows.indices(source.shape[-2])
+    if step == 1 and stop > start and is_packed(source):
+        try:
+            return _unpacked(source, start, stop, first)
+        except (OSError, ValueError, RuntimeError, DAMAGED):
+            # A chunk that was never written, is not packed, or is damaged.
+            pass
+    return np.asarray(source[(*first, ..., rows, slice(None))])
+
+
+def is_packed(source: h5py.Dataset) -> bool:
+    """Whether it is one of `packed.create_packed`, in this machine's order of bytes."""
+    chunk = source.chunks
+    if chunk is None or source.compression != "gzip" or not source.shuffle or source.fletcher32:
+        return False
+    native = source.dtype.isnative and sys.byteorder == "little" and source.dtype.kind in "uif"
+    return bool(native and source.scaleoffset is None and set(chunk[:-2]) <= {1} and chunk[-1] == source.shape[-1])
+
+
+def _unpacked(source: h5py.Dataset, start: int, stop: int, first: tuple[int, ...]) -> NDArray[Any]:
+    more, columns, height = source.shape[len(first) : -2], source.shape[-1], source.chunks[-2]
+    out = np.empty((*more, stop - start, columns), dtype=source.dtype)
+
+    def fill(place: tuple[int, ...], top: int) -> None:
+        skipped, raw = source.id.read_direct_chunk((*first, *place, top, 0))
+        if skipped:
+            raise ValueError("a chunk that not every filter was used for")
+        block = _values(isal_zlib.decompress(raw), source.dtype).reshape(height, columns)
+        here = slice(max(start, top), min(stop, top + height))
+        out[place][here.start - start : here.stop - start] = block[here.start - top : here.stop - top]
+
+    chunks = list(_chunks(more, start // height * height, stop, height))
+    threads = min(thread_count(), len(chunks))
+    if threads == 1:
+        for place, top in chunks:
+            fill(place, top)
+        return out
+    with ThreadPoolExecutor(threads) as pool:
+        for done in [pool.submit(fill, *chunk) for chunk in chunks]:
+            done.result()
+    return out
+
+
+def _chunks(more: tuple[int, ...], top: int, stop: int, height: int) -> Iterator[tuple[tuple[int, ...], int]]:
+    return product(product(*map(range, more)), range(top, stop, height))
+
+
+def _values(shuffled: bytes, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Values of which all first bytes, then all second bytes, ... stand together."""
+    by_byte = np.frombuffer(shuffled, np.uint8).reshape(dtype.itemsize, -1)
+    whole = by_byte[0].astype(f"u{dtype.itemsize}")
+    for k, byte in enumerate(by_byte[1:], 1):
+        whole |= np.left_shift(byte, 8 * k, dtype=whole.dtype)
+    return np.asarray(whole.view(dtype))

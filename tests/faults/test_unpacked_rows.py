@@ -1,0 +1,59 @@
+"""Rows of packed datasets, unpacked without HDF5, are what HDF5 reads; damage is an error of the file."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+
+from processing.storage import packed
+from processing.storage.unpacked import is_packed, read_rows
+
+SHAPE = (3, 2, 70, 40)
+
+
+@pytest.fixture
+def write(tmp_path, monkeypatch):
+    """Writes a packed dataset in chunks of 16 rows, the last of each plane not full."""
+    monkeypatch.setattr(packed, "CHUNK_PIXELS", 640)
+
+    def file(values: np.ndarray) -> h5py.File:
+        h5 = h5py.File(tmp_path / "rows.h5", "w")
+        h5["plain"] = values
+        packed.pack(h5["plain"], packed.create_packed(h5, "packed", values.shape, values.dtype))
+        return h5
+
+    return file
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32, np.float32, np.float64])
+@pytest.mark.parametrize("threads", ["1", "2"])
+def test_rows_are_what_hdf5_reads(write, monkeypatch, dtype, threads):
+    monkeypatch.setenv("UMOV_THREADS", threads)
+    values = (1000 * np.random.default_rng(1).normal(size=SHAPE)).astype(np.int64).astype(dtype)
+    with write(values) as h5:
+        assert is_packed(h5["packed"])
+        assert not is_packed(h5["plain"])
+        for name in ("packed", "plain"):
+            np.testing.assert_array_equal(read_rows(h5[name], slice(None)), values)
+            np.testing.assert_array_equal(read_rows(h5[name], slice(15, 66)), values[..., 15:66, :])
+            np.testing.assert_array_equal(read_rows(h5[name], slice(3, 60, 7), (1,)), values[1, ..., 3:60:7, :])
+            np.testing.assert_array_equal(read_rows(h5[name], slice(64, 99), (2, 1)), values[2, 1, 64:, :])
+            assert read_rows(h5[name], slice(5, 5)).shape == (3, 2, 0, 40)
+
+
+def test_a_chunk_that_was_never_written_is_zero(write):
+    with write(np.ones(SHAPE, np.uint16)) as h5:
+        begun = packed.create_packed(h5, "begun", SHAPE, np.uint16)
+        begun[0, 0, :16] = 5
+        np.testing.assert_array_equal(read_rows(begun, slice(None)), begun[...])
+
+
+def test_a_damaged_chunk_is_an_error_of_the_file(write):
+    with write(np.arange(np.prod(SHAPE), dtype=np.uint16).reshape(SHAPE)) as h5:
+        _, raw = h5["packed"].id.read_direct_chunk((1, 0, 16, 0))
+        h5["packed"].id.write_direct_chunk((1, 0, 16, 0), raw[: len(raw) // 2])
+        h5.flush()
+        with pytest.raises(OSError, match="filter"):
+            read_rows(h5["packed"], slice(None))
+        read_rows(h5["packed"], slice(None), (0,))
