@@ -25,6 +25,8 @@ EVERY_S = 0.3
 #: Messages that are kept, and characters of each.
 MESSAGES, LONGEST = 50, 300
 PATTERN = ".run-*.json"
+#: Ending of a version that is being written.
+NEW = ".new"
 
 
 class RunFile(Observer):
@@ -48,9 +50,9 @@ class RunFile(Observer):
         self._writing = threading.Thread(target=self._keep, name="run file", daemon=True)
 
     def __enter__(self) -> Self:
-        for old in self._path.parent.glob(PATTERN):
-            # Left behind by a run that was killed.
-            if _read(old) is None:
+        for old in self._path.parent.glob(".run-*"):
+            # Left behind by a run that was killed, or killed while it wrote.
+            if old.suffix in (".json", NEW) and _read(old.with_suffix(".json")) is None:
                 with contextlib.suppress(OSError):
                     old.unlink()
         self._writing.start()
@@ -98,7 +100,7 @@ class RunFile(Observer):
         self._changed.set()
 
     def _keep(self) -> None:
-        new = self._path.with_suffix(".new")
+        new = self._path.with_suffix(NEW)
         while not self._ended.is_set():
             self._changed.wait()
             self._changed.clear()

@@ -173,6 +173,9 @@ def _look_and_probe(page: Page, address: str, capture: str) -> None:
     expect(page.locator("#pixel")).to_have_text(re.compile(r"column 6\d, row 5\d"))
     keep(page, "capture")
     page.locator("#region").click()
+    expect(page.locator("#region")).to_have_attribute("aria-pressed", "true")
+    box = page.locator("#frame .nsewdrag").first.bounding_box()
+    assert box is not None
     page.mouse.move(box["x"] + box["width"] * 0.5, box["y"] + box["height"] * 0.4)
     page.mouse.down()
     page.mouse.move(box["x"] + box["width"] * 0.6, box["y"] + box["height"] * 0.5, steps=4)

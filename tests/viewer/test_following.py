@@ -61,6 +61,9 @@ def test_a_process_that_has_ended_or_another_with_its_number_runs_nothing(lab):
     for name, facts in (("1", {"pid": ended.pid, "begun_ticks": 5}), ("2", mine), ("3", {"pid": "x"}), ("4", [])):
         (lab / f".run-{name}.json").write_text(json.dumps(facts))
     (lab / ".run-5.json").write_text("{half a")
+    # Killed while it wrote, before its first version and after it.
+    (lab / ".run-6.new").write_text("{half a")
+    (lab / ".run-1.new").write_text("{half a")
     assert running_in(lab) is None
     # The next run takes away what they have left behind.
     with RunFile(lab, simulated=False):

@@ -1,7 +1,7 @@
 // The page of a capture: frames with a slider, histogram, and the intensities of a pixel.
 
 import "./start.js";
-import { ImageView, place, readPlane, saturated } from "./images.js";
+import { drawsRegions, ImageView, place, readPlane, saturated } from "./images.js";
 import { accent, at, bad, byId, draw, embedded, getJson, ink, narrow, newestJson, say } from "./plots.js";
 import { drawCurve, showProbe } from "./probe.js";
 
@@ -100,11 +100,7 @@ slider.value = Math.max(states.role.findIndex(role => role !== "dark"), 0);
 slider.addEventListener("input", show);
 channel.addEventListener("change", show);
 byId("play").addEventListener("click", () => play(timer === null));
-byId("region").addEventListener("click", event => {
-  const on = event.target.getAttribute("aria-pressed") !== "true";
-  event.target.setAttribute("aria-pressed", on);
-  Plotly.relayout(view.node, { dragmode: on ? "select" : "zoom" });
-});
+drawsRegions(byId("region"), view.node);
 document.addEventListener("keydown", event => {
   if (/^(input|select|textarea)$/i.test(event.target.tagName) && event.target.type !== "range") return;
   if (event.key === ",") step(-1);

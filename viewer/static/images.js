@@ -29,6 +29,15 @@ export const place = plane => ({
   x0: plane.x0 + (plane.step - 1) / 2, dx: plane.step, y0: plane.y0 + (plane.step - 1) / 2, dy: plane.step,
 });
 
+/** A button that switches between zooming and drawing a region; it looks pressed once the picture does so. */
+export function drawsRegions(button, node) {
+  button.addEventListener("click", async () => {
+    const on = button.getAttribute("aria-pressed") !== "true";
+    await Plotly.relayout(node, { dragmode: on ? "select" : "zoom" });
+    button.setAttribute("aria-pressed", on);
+  });
+}
+
 /**
  * An image with pan, zoom and a chosen pixel or region; what is zoomed into is read again in full resolution.
  *

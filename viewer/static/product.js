@@ -1,6 +1,7 @@
 // The page of a product: its maps, and what it says of a pixel.
 
 import "./start.js";
+import { drawsRegions } from "./images.js";
 import { mapView, matrixView } from "./maps.js";
 import { byId, embedded, newestJson, say } from "./plots.js";
 import { drawCurve, showProbe } from "./probe.js";
@@ -66,11 +67,7 @@ async function probe(chosen) {
 map.addEventListener("change", () => show(true));
 errors.addEventListener("change", () => show(false));
 normalized.addEventListener("change", () => show(false));
-byId("region").addEventListener("click", event => {
-  const on = event.target.getAttribute("aria-pressed") !== "true";
-  event.target.setAttribute("aria-pressed", on);
-  Plotly.relayout(node, { dragmode: on ? "select" : "zoom" });
-});
+drawsRegions(byId("region"), node);
 node.addEventListener("keydown", event => view.key(event));
 
 addEventListener("load", async () => {
