@@ -62,10 +62,18 @@ const settings = node => ({
 
 const drawn = new Map();
 /** Draw a plot; it is drawn again with the colours of the page when those change. */
-export function draw(node, traces, more) {
+export async function draw(node, traces, more) {
   drawn.set(node, [traces, more]);
-  return Plotly.react(node, traces(), layout(more()), settings(node));
+  while (!node.layout && dragging()) await new Promise(done => setTimeout(done, 50));
+  const [newest, withMore] = drawn.get(node);
+  return Plotly.react(node, newest(), layout(withMore()), settings(node));
 }
+
+// A new plot clears Plotly's timers of all others: a drag in one of them would never end, so it is waited for.
+let released = -Infinity;
+addEventListener("pointerup", () => { released = performance.now(); }, true);
+const dragging = () => document.querySelector(".dragcover") !== null || performance.now() - released < 150;
+
 dark.addEventListener("change", () => drawn.forEach(([traces, more], node) => {
   const kept = ["xaxis", "yaxis"].map(name => node.layout?.[name]?.range);
   const fresh = more();

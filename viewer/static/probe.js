@@ -115,6 +115,14 @@ function showStokes(node, found) {
 
 const chiSquare = fit => `Chi-square of the fit over its degrees of freedom: ${number(fit.chi_square, 2)}${fit.noise_known ? "" : " (noise taken from the residual)"}`;
 
+function simplexPlot() {
+  const plot = document.createElement("div");
+  plot.className = "plot";
+  plot.setAttribute("role", "img");
+  plot.setAttribute("aria-label", "place of the eigenvalues in the simplex");
+  return plot;
+}
+
 /** Mueller matrix with error bars, decomposition, and place in the simplex. */
 export function showProbe(node, found) {
   const matrix = found.matrix, stokes = found.fit?.stokes;
@@ -125,10 +133,7 @@ export function showProbe(node, found) {
   columns.className = "columns";
   left.append(heading("Mueller matrix over m00, with standard errors"), scroll(muellerTable(matrix)));
   const xi = matrix.quantities.coherency_eigenvalues;
-  const plot = document.createElement("div");
-  plot.className = "plot";
-  plot.setAttribute("role", "img");
-  plot.setAttribute("aria-label", "place of the eigenvalues in the simplex");
+  const plot = node.querySelector(".plot") || simplexPlot();
   if (xi && xi.value.every(v => v !== null)) left.append(heading("Where its eigenvalues lie; the thick edge is the triply degenerate model"), plot);
   right.append(heading("Decomposition"), scroll(quantityTable(matrix.quantities)));
   if (found.fit) right.append(cell(chiSquare(found.fit), "p"));
