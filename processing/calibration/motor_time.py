@@ -43,7 +43,7 @@ class Speed:
         return name, cls(speed, acceleration)
 
     def seconds(self, distance_deg: Array) -> Array:
-        """Duration of moves from rest to rest, on a trapezoid of speed."""
+        """Duration of moves (...) in degrees from rest to rest, on a trapezoid of speed."""
         d = np.abs(distance_deg)
         ramp = self.deg_s**2 / self.deg_s2
         return np.where(d < ramp, 2 * np.sqrt(d / self.deg_s2), d / self.deg_s + self.deg_s / self.deg_s2)
@@ -76,7 +76,7 @@ def move_seconds(angles: Array, speeds: Sequence[Speed]) -> float:
 
 
 def ordered(angles: Array, periods: Array, speeds: Sequence[Speed]) -> Array:
-    """The states in an order that takes little time: nearest first, then pieces turned round while that helps."""
+    """(axes, states) in an order that takes little time: nearest first, then pieces turned round while that helps."""
     n = angles.shape[1]
     apart = angles[:, :, None] - angles[:, None, :]
     apart -= periods[:, None, None] * np.round(apart / periods[:, None, None])

@@ -30,12 +30,12 @@ def unit(v: ArrayLike) -> Array:
 
 
 def dot(a: ArrayLike, b: ArrayLike) -> Array:
-    """Scalar products over the last axis."""
+    """Scalar products (...) of vectors (..., 3)."""
     return np.asarray(np.einsum("...i,...i->...", np.asarray(a), np.asarray(b)))
 
 
 def cross(a: ArrayLike, b: ArrayLike) -> Array:
-    """Vector products over the last axis (several times faster than numpy's general one)."""
+    """Vector products (..., 3) over the last axis (several times faster than numpy's general one)."""
     u, v = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
     out = np.empty(u.shape)
     out[..., 0] = u[..., 1] * v[..., 2] - u[..., 2] * v[..., 1]
@@ -61,17 +61,17 @@ class ScatteringGeometry:
 
     @cached_property
     def half(self) -> Array:
-        """h, unit half vector of wi and wo."""
+        """h (..., 3), unit half vector of wi and wo."""
         return unit(self.to_source + self.to_camera)
 
     @cached_property
     def angles(self) -> rusinkiewicz.Angles:
-        """theta_h, theta_d, phi_d in radians."""
+        """theta_h, theta_d, phi_d, each (...), radians."""
         return rusinkiewicz.angles(self.normal, self.to_source, self.to_camera)
 
     @cached_property
     def s_axis(self) -> Array:
-        """s = unit(h cross wi); where source and camera coincide any transverse axis serves, `up` is taken."""
+        """s = unit(h cross wi), (..., 3); where source and camera coincide any transverse axis serves: `up`."""
         s = cross(self.half, self.to_source)
         length = np.sqrt(dot(s, s))
         alike = length < 1e-9
@@ -82,12 +82,12 @@ class ScatteringGeometry:
 
     @property
     def axes_in(self) -> tuple[Array, Array]:
-        """x, y of the generator's beam, ki = -wi."""
+        """x, y of the generator's beam, each (..., 3); ki = -wi."""
         return transverse_axes(-self.to_source, self.up)
 
     @property
     def axes_out(self) -> tuple[Array, Array]:
-        """x, y of the analyzer's beam, ko = wo."""
+        """x, y of the analyzer's beam, each (..., 3); ko = wo."""
         return transverse_axes(self.to_camera, self.up)
 
     def with_up(self, up: ArrayLike) -> ScatteringGeometry:

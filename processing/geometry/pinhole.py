@@ -39,7 +39,7 @@ class PinholeCamera(BaseModel):
 
     @property
     def position_mm(self) -> Array:
-        """Centre of projection in the world, mm."""
+        """(3,), centre of projection in the world, mm."""
         return np.array([0.0, 0.0, self.distance_mm])
 
     def resized(self, rows: int, columns: int) -> PinholeCamera:

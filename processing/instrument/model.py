@@ -342,7 +342,7 @@ def condition_number(w: ArrayLike) -> float:
 
 
 def rank(w: ArrayLike) -> int:
-    """Numerical rank of W, relative tolerance 1e-8."""
+    """Numerical rank of W (any leading shape, 16), relative tolerance 1e-8."""
     return int(np.linalg.matrix_rank(np.asarray(w, dtype=float).reshape(-1, 16), rtol=1e-8))
 
 

@@ -21,7 +21,7 @@ from processing.polarization.quantities import NamedStokes
 
 
 def coherency(m: RealArray) -> dict[str, Derived]:
-    """Coherency eigenvalues, their deviation from the triply degenerate model, entropy.
+    """Coherency eigenvalues, their deviation from the triply degenerate model, entropy, of matrices (..., 4, 4).
 
     d xi_k = v_k^H dH v_k for the eigenvector v_k of H: in Mueller elements (m_k - 4 xi_k e00) / (4 m00).
     """
@@ -44,7 +44,7 @@ def coherency(m: RealArray) -> dict[str, Derived]:
 
 
 def depolarization_index(m: RealArray) -> dict[str, Derived]:
-    """Depolarization index: d DI = (sum of m_ij d m_ij without 00) / (3 m00^2 DI) - DI d m00 / m00."""
+    """Depolarization index of M (..., 4, 4): d DI = (sum of m_ij d m_ij but 00) / (3 m00^2 DI) - DI d m00 / m00."""
     m = np.asarray(m, dtype=float)
     value, m00 = quantities.depolarization_index(m), m[..., 0, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -54,13 +54,13 @@ def depolarization_index(m: RealArray) -> dict[str, Derived]:
 
 
 def diattenuation(m: RealArray) -> dict[str, Derived]:
-    """Diattenuation of M itself: magnitude, linear, circular, orientation."""
+    """Diattenuation of M (..., 4, 4) itself: magnitude, linear, circular, orientation."""
     m = np.asarray(m, dtype=float)
     return _vector("diattenuation", quantities.diattenuation_vector(m), m[..., 0, 0], (1, 2, 3))
 
 
 def polarizance(m: RealArray) -> dict[str, Derived]:
-    """Polarizance of M itself: magnitude, linear, circular, orientation."""
+    """Polarizance of M (..., 4, 4) itself: magnitude, linear, circular, orientation."""
     m = np.asarray(m, dtype=float)
     return _vector("polarizance", quantities.polarizance_vector(m), m[..., 0, 0], (4, 8, 12))
 
@@ -114,7 +114,7 @@ def dominant(m: RealArray) -> dict[str, Derived]:
 
 
 def lu_chipman_quantities(m: RealArray) -> dict[str, Derived]:
-    """Retardance and depolarization power of the Lu-Chipman decomposition; NaN where it is not defined."""
+    """Retardance and depolarization power of M (..., 4, 4) after Lu and Chipman; NaN where it is not defined."""
 
     def values(mueller: RealArray) -> RealArray:
         factors = lu_chipman(mueller)
@@ -158,7 +158,7 @@ def symmetric_quantities(m: RealArray) -> dict[str, Derived]:
 
 
 def differential_quantities(m: RealArray) -> dict[str, Derived]:
-    """Retardance, linear diattenuation and depolarization exponents of the differential decomposition."""
+    """Retardance, linear diattenuation and depolarization exponents of M (..., 4, 4), differential decomposition."""
     found = differential(m)
     slope = differential_slopes(np.asarray(m, dtype=float), found.defined)
     retardance, diattenuation = found.retardance(), found.diattenuation()
@@ -180,7 +180,7 @@ def differential_quantities(m: RealArray) -> dict[str, Derived]:
 
 
 def pairs(m: RealArray, named: Mapping[str, tuple[NamedStokes, NamedStokes]]) -> dict[str, Derived]:
-    """Light between generator and analyzer over m00, for named pairs; linear in M apart from m00."""
+    """Light between generator and analyzer over m00 of M (..., 4, 4), for named pairs; linear in M apart from m00."""
     m = np.asarray(m, dtype=float)
     m00 = m[..., 0, 0]
     found = {}

@@ -107,7 +107,7 @@ def coherency(mueller: ArrayLike) -> ComplexArray:
 
 
 def coherency_to_mueller(h: ArrayLike) -> Array:
-    """Mueller matrix of a coherency matrix; the inverse of `coherency`."""
+    """Mueller matrices (..., 4, 4) of coherency matrices (..., 4, 4); the inverse of `coherency`."""
     h = np.asarray(h, dtype=complex)
     m = h.reshape(*h.shape[:-2], 16) @ _TO_MUELLER.T
     return np.asarray(m.real.reshape(*h.shape[:-2], 4, 4))

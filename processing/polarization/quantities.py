@@ -61,7 +61,7 @@ def deviation_from_td(eigenvalues: RealArray) -> RealArray:
 
 
 def td_missed(eigenvalues: RealArray) -> RealArray:
-    """Fraction of the light that the triply degenerate model puts in the wrong process: sum |deviation| / 2.
+    """Fraction (...) of the light that the triply degenerate model puts in the wrong process: sum |deviation| / 2.
 
     Half, because what one process has too much another has too little. Noise makes it positive even for a matrix
     that is triply degenerate.

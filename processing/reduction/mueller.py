@@ -116,7 +116,7 @@ class Choice:
 
 
 def sample_states(capture: Capture) -> NDArray[np.int64]:
-    """Positions of the states that look at the sample, or at air where a capture has no others."""
+    """Positions (states,) of the states that look at the sample, or at air where a capture has no others."""
     states = capture.states_with("sample")
     if states.size == 0:
         states = capture.states_with("air")
@@ -178,7 +178,7 @@ def field_of(
 
 
 def relative_exposure(capture: Capture, states: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Exposure of each state over the longest one; 1 where the capture does not know exposures."""
+    """Exposure of each state over the longest one, (states,); 1 where the capture does not know exposures."""
     exposure = capture.column("exposure_s")[states].astype(float)
     if not np.any(np.isfinite(exposure)):
         return np.ones(len(states))

@@ -135,7 +135,7 @@ class Capture(OpenH5):
         return self._sums is not None
 
     def column(self, name: str) -> NDArray[Any]:
-        """A column of the state table (exposure_s, host_time_s, ...) for the states done."""
+        """A column of the state table (exposure_s, host_time_s, ...), (states done,)."""
         return self.planned_column(name)[self.done]
 
     @property
@@ -161,7 +161,7 @@ class Capture(OpenH5):
 
     @property
     def sigma(self) -> NDArray[np.float64] | None:
-        """Standard deviation of the noise of one value of each state done, counts; None if none is stated."""
+        """Standard deviation (states done,) of the noise of one value, counts; None if none is stated."""
         return np.asarray(self.column("sigma"), dtype=float) if "sigma" in self._h5["entry/states"] else None
 
     @property
@@ -187,7 +187,7 @@ class Capture(OpenH5):
             return np.asarray(self._h5[f"entry/states/{name}"][...])
 
     def planned_targets_deg(self) -> dict[str, NDArray[np.float64]]:
-        """Target angles of each axis for all planned states, done or not."""
+        """Axis name to target angles (states,) in degrees, for all planned states, done or not."""
         with self._damage():
             return {name: self._h5[f"entry/instrument/{name}/target_value"][...] for name in self.angles_deg}
 
@@ -222,7 +222,7 @@ class Capture(OpenH5):
         return len(self.channel_names)
 
     def states_with(self, role: str) -> NDArray[np.int64]:
-        """Positions, among the states done, of those with the role."""
+        """Positions (n,), among the states done, of those with the role."""
         return np.flatnonzero([r == role for r in self.role])
 
     def frames(self, state: int, rows: slice = slice(None)) -> NDArray[Any]:

@@ -223,7 +223,7 @@ class MuellerImage:
 
 
 def neighbour_correlation(product: Product) -> NDArray[np.float64]:
-    """Correlation of the noise of pixels by distance; 1 at distance 0 alone for a product that holds none."""
+    """Correlation (2 R + 1, 2 R + 1) of the noise of pixels by their distance; [[1]] where a product holds none."""
     if product.has_array("neighbour_correlation"):
         return product.array("neighbour_correlation")
     return np.ones((1, 1))

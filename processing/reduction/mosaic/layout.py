@@ -52,7 +52,7 @@ class MosaicLayout:
         return frame[r::2, c::2]
 
     def sparse(self, frame: Image, channel: int) -> Image:
-        """Frame with one channel's pixels and zero elsewhere."""
+        """Frame (rows, columns) with one channel's pixels and zero elsewhere."""
         out = np.zeros_like(frame)
         r, c = self.offsets[channel]
         out[r::2, c::2] = frame[r::2, c::2]

@@ -30,11 +30,12 @@ GUIDE_CONTRAST = 0.03
 # Reflection about the border pixel keeps the parity of the mosaic.
 _BORDER = cv2.BORDER_REFLECT_101
 
+#: Frame (rows, columns) to an image of each channel, (channels, rows, columns).
 Method = Callable[[Image, MosaicLayout], NDArray[np.float32]]
 
 
 def superpixel(frame: Image, layout: MosaicLayout) -> NDArray[np.float32]:
-    """Each 2 x 2 super-pixel becomes one pixel: half the size, no interpolation."""
+    """Each 2 x 2 super-pixel becomes one pixel: (channels, rows/2, columns/2), no interpolation."""
     return np.stack([layout.samples(frame, k) for k in range(len(layout.channels))]).astype(np.float32)
 
 
