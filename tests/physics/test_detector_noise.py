@@ -55,6 +55,11 @@ def spoiled(name: str, seed: int, **bench) -> Bench:
     return out
 
 
+def dark_margin(state: int, electrons):
+    """The light, with a part of the image beside the object."""
+    return np.where(np.arange(electrons.shape[-1]) < 12, 0.01, 1.0) * electrons
+
+
 @pytest.mark.parametrize("air", [True, False])
 @pytest.mark.parametrize(
     ("name", "bench", "words"),
@@ -65,6 +70,7 @@ def spoiled(name: str, seed: int, **bench) -> Bench:
         ("resampled", {}, "resampled"),
         ("row_noise_10_e", {}, "every row of a frame"),
         ("read_noise_doubled", {"electrons": 400.0}, "as of a read noise of"),
+        ("black_jitter", {"light": [dark_margin]}, "the black level is another one in every frame"),
     ],
 )
 def test_noise_is_told_and_does_not_alarm(taken, configs, name, bench, words, air):
@@ -95,5 +101,6 @@ def test_a_fault_of_the_optics_is_no_noise(taken, configs):
     bench.level.append(lambda k, a: 1 + 0.02 * np.sin(1.7 * k**2))
     bench.shift.append(lambda k, a: (0.4 * np.cos(a["psa"]), 0.4 * np.sin(a["psa"])))
     bench.transfer.append(lambda e: e - 3e-6 * e**2)
+    bench.light.append(dark_margin)
     data, _, _ = read(taken(bench, air=False), configs)
     assert not data.noise_told

@@ -93,6 +93,26 @@ def test_cosmic_rays_and_hot_pixels_are_found_and_left_out(configs, tmp_path):
     assert not found.usable[truth.any(axis=0)][3:].all()
 
 
+def test_cosmic_rays_are_found_where_it_is_dark(configs, tmp_path):
+    """The noise of an intensity is that of its light, not that of what struck it."""
+    bench = Bench(rows=SIDE, columns=SIDE)
+    bench.light.append(lambda k, e: np.where(np.arange(SIDE) < SIDE // 2, 0.004, 1.0) * e)
+    struck = np.argwhere(np.random.default_rng(2).random((STATES, SIDE, SIDE // 2)) < 0.004)
+
+    def strike(electrons, random):
+        electrons = electrons.copy()
+        electrons[tuple(struck.T)] += random.uniform(1e3, 1e4, len(struck))
+        return electrons
+
+    bench.noise.append(strike)
+    found = screened_capture(taken(tmp_path, configs, bench, 5, air=False), configs)
+    hits = {(n, y, x) for n, _, y, x in found.left_out.hits.tolist()}
+    true = set(map(tuple, struck.tolist()))
+    assert len(true - hits) <= 0.02 * len(true)
+    assert not hits - true
+    assert not len(found.left_out.pixels)
+
+
 def mean_error(image: MuellerImage, good: np.ndarray) -> float:
     """Largest error of an element of M/m00 of air, mean over the image."""
     with np.errstate(invalid="ignore"):

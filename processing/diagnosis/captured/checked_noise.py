@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from processing.arrays import Array
+from processing.diagnosis.captured.black_jitter import black_jitter
 from processing.diagnosis.captured.capture_data import CaptureData, SharedNoise
 from processing.diagnosis.captured.detector_noise import DetectorNoise, detector_noise
 
@@ -24,11 +25,19 @@ LEAST_DARK = 0.05
 
 
 def checked_noise(data: CaptureData, a: Array) -> CaptureData:
-    """The capture with the noise that its images show against rows a (L, K) of its model, and what is to be told."""
+    """The capture with the noise that its images show against rows a (L, K) of its model, and what is to be told.
+
+    A black level that jitters is taken off, as far as it shows.
+    """
+    told: list[str] = []
+    offsets = black_jitter(data, a) if data.noise_known else None
+    if offsets is not None:
+        told.append(_in_counts("the black level is another one in every frame", float(np.mean(offsets**2)), data))
+        level = offsets.reshape(*data.signal.shape[:2], 1, 1)
+        data = replace(data, signal=(data.signal - level).astype(np.float32))
     found = detector_noise(data, a) if data.noise_known else None
     if found is None:
-        return data
-    told: list[str] = []
+        return replace(data, noise_told=tuple(told))
     shared = _mixed(found)
     if shared.shown < 1:
         told.append(
@@ -40,14 +49,17 @@ def checked_noise(data: CaptureData, a: Array) -> CaptureData:
     lines = _lines(shared, data)
     for name, part in zip(("row", "column"), lines, strict=True):
         if part > 0:
-            deviation = np.sqrt(part) * data.conditions.full_scale
-            told.append(f"every {name} of a frame has an offset of its own, {deviation:.2g} counts rms")
+            told.append(_in_counts(f"every {name} of a frame has an offset of its own", part, data))
     shot, dark = _factors(found, shared.shown, data.noise_estimated)
     if not data.noise_estimated and (shot, dark) != (1.0, 1.0):
         told.append(_white_in_words(data, found.white / shared.shown, shot, dark))
     # What is common to a line is a part of the variance of its pixels, and more of that of wide patterns.
     slope, floor = data.slope * shot * shared.wide, (data.floor * dark + sum(lines)) * shared.wide
     return replace(data, slope=slope, floor=floor, shared=shared, noise_told=tuple(told))
+
+
+def _in_counts(what: str, variance: float, data: CaptureData) -> str:
+    return f"{what}, {np.sqrt(variance) * data.conditions.full_scale:.2g} counts rms"
 
 
 def _mixed(found: DetectorNoise) -> SharedNoise:

@@ -29,6 +29,9 @@ MOST_HITS = 0.02
 BAD, BAD_DEVIATIONS = 4.0, 10.0
 #: Side of the square of pixels around, and the share of them that may be as bad.
 AROUND, ALSO_BAD = 5, 0.2
+#: Variance of a state over that of the usual one of its pixel, and of a dim pixel over that of all, as far as it is
+#: believed.
+BRIGHTEST, LEAST_VARIANCE = 4.0, 0.1
 #: Below so many pixels, or directions over the states that the model leaves over, nothing can stand out.
 FEWEST_PIXELS, FEWEST_DIRECTIONS = 100, 8
 
@@ -52,15 +55,22 @@ def outliers_of(data: CaptureData, a: Array) -> Outliers:
     white = Whitened.of(data, a, good)
     if white.outside.shape[1] < FEWEST_DIRECTIONS:
         return found
-    sigma = np.sqrt(np.maximum(white.variance, np.float32(0.1)))
+    # What is struck tells a noise of its own: no state is believed to be far brighter than the usual one of its pixel.
+    usual = np.maximum(np.median(white.variance, axis=0), np.float32(LEAST_VARIANCE))
+    share = np.sqrt(np.clip(white.variance / usual, np.float32(LEAST_VARIANCE), np.float32(BRIGHTEST)))
     clean = np.ones(white.y.shape[1], dtype=bool)
     # Twice: what was struck is no structure of the image.
     for _ in range(2):
         rest = white.rest(clean)
         # In standard deviations as the image itself shows them: what is declared of the noise is not asked.
-        r = rest.astype(np.float32) @ white.y / sigma
-        t = np.divide(r, robust_scale(r if clean.all() else r[:, clean]).astype(np.float32), out=r)
-        struck, noisy = _hits(t, rest)
+        r = np.asarray(rest.astype(np.float32) @ white.y / np.sqrt(usual), dtype=np.float32)
+        t = np.asarray(r / share, dtype=np.float32)
+        size = np.sqrt(np.diag(rest))[:, None]
+        scale = (robust_scale(t if clean.all() else t[:, clean]) / size).astype(np.float32)
+        noise = np.asarray(share * scale / np.median(scale), dtype=np.float32)
+        r /= np.median(scale)
+        t /= size.astype(np.float32) * scale
+        struck, noisy = _hits(r, t, noise, rest)
         clean = (np.max(np.abs(t), axis=0) < HIT) & ~struck.any(axis=0)
         if clean.all() or clean.sum() < FEWEST_PIXELS:
             break
@@ -71,27 +81,31 @@ def outliers_of(data: CaptureData, a: Array) -> Outliers:
     return found
 
 
-def _hits(t: NDArray[np.float32], rest: Array) -> tuple[NDArray[np.bool_], Array]:
-    """Hits (L, P) of residuals t (L, P) in standard deviations, and the mean square (P,) of what is left beside them.
+def _hits(
+    r: NDArray[np.float32], t: NDArray[np.float32], noise: NDArray[np.float32], rest: Array
+) -> tuple[NDArray[np.bool_], Array]:
+    """Hits (L, P), and the mean square (P,) of what is left beside them, in standard deviations.
 
     A hit shows in all states through the fit: the strongest is left out of the fit, and the next is looked for.
+    `r` (L, P): residuals as `rest` gives them, over the noise of the usual state of the pixel; `noise` (L, P): that of
+    each state over it; `t` (L, P): residuals in standard deviations.
     """
     hits = np.zeros(t.shape, dtype=bool)
     noisy = np.asarray(np.mean(t**2, axis=0, dtype=float))
-    size = np.sqrt(np.diag(rest))
     for p in np.flatnonzero(np.max(np.abs(t), axis=0) > HIT):
-        r, q = t[:, p] * size, rest.copy()
+        left, q = r[:, p].astype(float), rest.copy()
         struck: list[int] = []
         found: tuple[list[int], float] = ([], float(noisy[p]))
         while len(struck) < MOST_STATES:
-            share = np.maximum(np.diag(q), 1e-6)
-            k = int(np.argmax(np.abs(r) / np.sqrt(share)))
-            far = abs(r[k]) / np.sqrt(share[k])
-            r, q = r - q[:, k] * r[k] / share[k], q - np.outer(q[:, k], q[k]) / share[k]
+            free = np.maximum(np.diag(q), 1e-6)
+            # One hit is strongest where it struck: so it goes with a projection, whatever the noise of each state.
+            k = int(np.argmax(np.abs(left) / np.sqrt(free)))
+            far = abs(left[k]) / np.sqrt(free[k]) / noise[k, p]
+            left, q = left - q[:, k] * left[k] / free[k], q - np.outer(q[:, k], q[k]) / free[k]
             struck.append(k)
-            left = float(np.sum(r**2) / max(np.trace(q), 1.0))
-            if far > HIT * max(np.sqrt(left), 1.0):
-                found = struck.copy(), left
+            square = float(np.sum((left / noise[:, p]) ** 2) / max(np.trace(q), 1.0))
+            if far > HIT * max(np.sqrt(square), 1.0):
+                found = struck.copy(), square
         hits[found[0], p], noisy[p] = True, found[1]
     hits[hits.mean(axis=1) > MOST_HITS] = False
     return hits, noisy

@@ -31,11 +31,21 @@ UNSEEN = 0.3
 # ---- noise ---------------------------------------------------------------------------------------------------------
 #: [standard deviations] Total excess over the noise's own chi-square up to which it is no structure.
 SLACK = 2.0
-#: [of the signal] Least residual that is taken as noise where the noise is not known: no bench repeats better.
+#: [of the signal] Least residual that is taken as noise where the noise is not known, and least change of M/m00 that is
+#: asked for its error: no bench repeats better.
 LEAST_NOISE = 1e-4
 #: [log odds] Of the scatter of the counts against the noise that a correction of them tells, from which on it is
 #: dropped: 1 to 160 000.
 REFUTED = 12.0
+
+# ---- the detector's noise, as its images show it ------------------------------------------------------------------
+#: [standard deviations] From which on a deviation from what is declared of the noise is there.
+NOISE_SURE = 6.0
+#: [of the mean of lit pixels] Brightness below which a pixel is dim: what happens to the light is twenty times weaker
+#: there, an offset is not.
+DIM = 0.05
+#: [pixels] Dim ones that tell the black level of a frame: five times better than one of them.
+FEWEST_DIM = 30
 
 # ---- search --------------------------------------------------------------------------------------------------------
 #: [of the signal] Residual above which nominal values, and what else has far starts, are searched for from many starts.
@@ -69,6 +79,12 @@ TAKES_PART = 0.25
 SHARES = 0.01
 #: [1] Growth of the residual on held-out data that is still put down to chance.
 WORSE = 1.002
+#: [probability] That the error of M grows by a correction, up to which it is written: what is changed has to be 4.65
+#: standard errors of the change, for the error grows where the truth goes less than half as far.
+CHANCE_WORSE = 0.01
+#: [standard deviations] From the mean of the posterior, up to which another correction is as good: one that leaves M as
+#: it is, where the data do not tell how it changes.
+AS_GOOD_AS = 1.0
 #: [1] Growth of the condition number of W that a correction may cause: beyond it the states would be other ones.
 WORSE_CONDITION = 1.5
 #: [of the excess] What a correction without a name (an empirical one) has to take away.

@@ -1,0 +1,49 @@
+"""A black level that is another one in every frame, as the parts of the images show that hardly any light reaches."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from processing.arrays import Array
+from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captured.common_rest import NORMAL_MAD
+from processing.diagnosis.search.rules import DIM, FEWEST_DIM, NOISE_SURE
+
+#: Variance of a median over that of a mean.
+MEDIAN = np.pi / 2
+RANK = 1e-8
+
+
+def black_jitter(data: CaptureData, a: Array) -> Array | None:
+    """Offset (L,) of every row, full scales, beside what the light of a pixel could be; None where none shows.
+
+    An offset changes dim pixels as much as bright ones, what happens to the light changes them by as much less as they
+    are dimmer. `a` (L, K): rows of the model, which both may follow.
+    """
+    rows = data.row_counts
+    y = data.signal.reshape(data.values_per_pixel, *data.usable.shape)[rows]
+    mean = y.mean(axis=0, dtype=np.float64)
+    lit = data.usable & ~data.clipped
+    if not lit.any():
+        return None
+    lit &= mean > np.median(mean[lit]) / 2
+    dim = np.any(y != 0, axis=0) & (mean < DIM * mean[lit].mean())
+    u, size, _ = np.linalg.svd(a[rows], full_matrices=True)
+    outside = u[:, int(np.sum(size > RANK * size[0])) :]
+    free = outside.shape[1]
+    if dim.sum() < FEWEST_DIM or not free:
+        return None
+    # Hits and bad pixels are among them.
+    level = np.median(y[:, dim], axis=1).astype(np.float64)
+    scatter = np.median(np.abs(y[:, dim] - level[:, None]), axis=1) / NORMAL_MAD
+    noise = MEDIAN * float(np.mean(scatter**2)) / int(dim.sum())
+    seen, bright = outside.T @ level, outside.T @ y[:, lit].mean(axis=1, dtype=np.float64)
+    if float(seen @ seen) < noise * (free + NOISE_SURE * np.sqrt(2 * free)):
+        return None
+    follows, light = float(bright @ seen / (seen @ seen)), float(mean[lit].mean() / max(mean[dim].mean(), 1e-300))
+    # Nearer to light than to an offset, which bright pixels follow once.
+    if follows**2 > light:
+        return None
+    offsets = np.zeros(data.values_per_pixel)
+    offsets[rows] = outside @ (seen - bright / light)
+    return offsets
