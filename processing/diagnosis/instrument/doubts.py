@@ -47,6 +47,8 @@ def doubts(
         first = cause.candidates[0]
         if cause not in out and isinstance(first.effect, SourceEffect) and first.capture in patterned:
             out[cause] = "it may be a part of a source that changes as no effect of the list does"
+    # What follows a pattern is no effect of the list: what it took away is left over as well.
+    left += sum(2 * cause.log_odds * found.samples.best.unit for cause, why in out.items() if why == PATTERN)
     for rank, cause in enumerate(causes, 1):
         if problem.noise_known:
             weak = 2 * cause.log_odds * found.samples.best.unit < TIMES * rank**2 * left

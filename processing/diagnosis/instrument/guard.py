@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from processing.arrays import Array
 from processing.diagnosis.instrument.mueller_slopes import mueller_slopes
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.systematic import ELEMENTS
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.result import Check
-from processing.diagnosis.search.rules import WORSE, WORSE_CONDITION
+from processing.diagnosis.search.rules import CHANCE_WORSE, LEAST_NOISE, WORSE, WORSE_CONDITION
 from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
+from processing.diagnosis.search.stored import scope_of
 from processing.instrument.effects.base import FieldEffect, Switch
 
 #: Singular values below this, relative to the largest, are none.
 RANK = 1e-6
 
 
-def checks(problem: InstrumentProblem, found: Posterior, solved: Solution) -> tuple[Check, ...]:
-    """Held-out residual, predicted error of M, rank and condition of W, before and after."""
+def checks(problem: InstrumentProblem, solved: Solution) -> tuple[Check, ...]:
+    """Held-out residual, rank and condition of W, before and after: if one gets worse, it is no explanation."""
     stretch = _stretch(problem, solved)
     before, after = 100 * solved.before.rms, 100 * solved.after.rms / stretch
     out = [
@@ -31,8 +37,6 @@ def checks(problem: InstrumentProblem, found: Posterior, solved: Solution) -> tu
             holds=bool(after <= WORSE * before),
         )
     ]
-    told, off = predicted_error(problem, found, solved)
-    out.append(Check(name="predicted error of M/m00, rms", before=off, after=told, holds=bool(told <= off)))
     for k, data in enumerate(problem.captures):
         (rank, condition), (new_rank, new_condition) = (
             _of_rows(problem, k, space, fit)
@@ -51,19 +55,102 @@ def checks(problem: InstrumentProblem, found: Posterior, solved: Solution) -> tu
     return tuple(out)
 
 
-def predicted_error(problem: InstrumentProblem, found: Posterior, solved: Solution) -> tuple[float, float]:
-    """Rms error of M/m00 of these captures that the posterior expects with the correction, and without it."""
+@dataclass(frozen=True)
+class PredictedChange:
+    """What a correction does to M/m00, as the posterior expects it; all rms over pixels and elements.
+
+    Attributes
+    ----------
+    before, after : error without and with the correction.
+    size, stderr : of the change, and standard error of the true one along it.
+    """
+
+    before: float
+    after: float
+    size: float
+    stderr: float
+
+    @property
+    def chance_worse(self) -> float:
+        """Chance that the error grows: that the true change goes less than half as far along this one."""
+        if self.size <= LEAST_NOISE:
+            return 0.0
+        return float(ndtr(-self.size / (2 * self.stderr))) if self.stderr > 0 else 0.0
+
+
+NOTHING = PredictedChange(0.0, 0.0, 0.0, 0.0)
+
+
+def predicted_changes(
+    problem: InstrumentProblem, found: Posterior, solved: Solution
+) -> tuple[PredictedChange, PredictedChange]:
+    """What a correction does to the captures it was found on, and what its part does that later ones have too."""
+    slopes = slopes_of(problem, found, solved)
+    if slopes is None:
+        return NOTHING, NOTHING
+    mean, covariance = found.values[slopes.index], found.covariance[np.ix_(slopes.index, slopes.index)]
+    later = slopes.lasting
+    both = np.ix_(later, later)
+    return (
+        predicted_change(mean, covariance, slopes.products),
+        predicted_change(mean[later], covariance[both], slopes.products[both]),
+    )
+
+
+@dataclass(frozen=True)
+class Slopes:
+    """How the applied values move M/m00.
+
+    Attributes
+    ----------
+    index : (K,) their places in the posterior; lasting : (K,) those of effects that later captures have too.
+    products : (K, K) of the slopes of M/m00, mean over pixels and elements.
+    """
+
+    index: NDArray[np.int64]
+    lasting: NDArray[np.bool_]
+    products: Array
+
+
+def slopes_of(problem: InstrumentProblem, found: Posterior, solved: Solution) -> Slopes | None:
+    """Slopes of the values of a correction; None where it has none that M follows."""
     part = dict(zip(found.space.candidates, found.space.slices, strict=True))
     space = Space(tuple(c for c in solved.effects if not isinstance(c.effect, FieldEffect | Switch)))
     if not space.size:
-        return 0.0, 0.0
+        return None
     index = np.concatenate([np.r_[part[c]] for c in space.candidates])
-    mean = found.values[index]
-    products, light = mueller_slopes(problem, space, mean)
-    left = float(np.sum(products * found.covariance[np.ix_(index, index)]))
-    removed = float(mean @ products @ mean)
-    scale = max(light, 1e-300) * ELEMENTS
-    return float(np.sqrt(max(left, 0.0) / scale)), float(np.sqrt(max(left + removed, 0.0) / scale))
+    lasting = np.concatenate([np.full(c.size, scope_of(c) == "instrument") for c in space.candidates])
+    products, light = mueller_slopes(problem, space, found.values[index])
+    return Slopes(index, lasting, products / (max(light, 1e-300) * ELEMENTS))
+
+
+def predicted_change(mean: Array, covariance: Array, products: Array) -> PredictedChange:
+    """Of values with a mean (K,) and a covariance (K, K); `products` (K, K) of the slopes of M/m00, averaged."""
+    left = max(float(np.sum(products * covariance)), 0.0)
+    along = products @ mean
+    square = max(float(mean @ along), 0.0)
+    size = float(np.sqrt(square))
+    stderr = float(np.sqrt(max(float(along @ covariance @ along), 0.0))) / max(size, 1e-300)
+    return PredictedChange(float(np.sqrt(left + square)), float(np.sqrt(left)), size, stderr)
+
+
+def chances(here: PredictedChange, later: PredictedChange) -> tuple[Check, ...]:
+    """Error of M as the posterior expects it, and the chance that it grows: an explanation may be too vague to use.
+
+    What is too vague for later captures is written for these alone, where it takes part in more.
+    """
+    grows = "chance that the error of M/m00 grows"
+    alone = "" if lasts(later) else ", so it is written for these captures alone"
+    return (
+        Check(name="predicted error of M/m00, rms", before=here.before, after=here.after, holds=True),
+        Check(name=grows, before=0.0, after=here.chance_worse, holds=here.chance_worse <= CHANCE_WORSE),
+        Check(name=f"{grows} in later captures{alone}", before=0.0, after=later.chance_worse, holds=True),
+    )
+
+
+def lasts(later: PredictedChange) -> bool:
+    """Whether what belongs to the instrument may be used for later captures."""
+    return later.chance_worse <= CHANCE_WORSE
 
 
 def refusal(found: tuple[Check, ...]) -> str | None:

@@ -11,7 +11,8 @@ from processing.arrays import Array
 from processing.diagnosis.instrument.doubts import PATTERN, doubts, testable
 from processing.diagnosis.instrument.empirical import empirical
 from processing.diagnosis.instrument.evidence import wanted_for_evidence, would_be_seen
-from processing.diagnosis.instrument.guard import checks, refusal
+from processing.diagnosis.instrument.guard import chances, checks, lasts, predicted_changes, refusal
+from processing.diagnosis.instrument.least_change import without_change
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.recommend import recommended
 from processing.diagnosis.instrument.structure import Residual, description, residual
@@ -35,7 +36,7 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause, causes
 from processing.diagnosis.search.posterior import Posterior, Say
 from processing.diagnosis.search.result import Diagnosis, Unexplained, Verdict
-from processing.diagnosis.search.rules import GROWTH, LIKELY, LIMIT, WHITE
+from processing.diagnosis.search.rules import CHANCE_WORSE, GROWTH, LIKELY, LIMIT, WHITE
 from processing.diagnosis.search.solution import Solution
 from processing.instrument.effects.base import ValuePerState
 from processing.instrument.model import InstrumentModel
@@ -99,12 +100,18 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
     if unfit:
         solved = solution(bench, found, unfit)
         after = tuple(residual(asked, k, solved.space, solved.fit) for k in captures)
-    guard = checks(asked, found, solved)
-    refused = f"change this first: {wiring.told}" if wiring is not None else refusal(guard)
+    here, later = predicted_changes(asked, found, solved)
+    quiet = None if here.chance_worse <= CHANCE_WORSE else without_change(asked, found, solved)
+    if quiet is not None:
+        found, solved = quiet, solution(bench, quiet, unfit)
+        after = tuple(residual(asked, k, solved.space, solved.fit) for k in captures)
+        here, later = predicted_changes(asked, found, solved)
+    guard, chance = checks(asked, solved), chances(here, later)
+    refused = f"change this first: {wiring.told}" if wiring is not None else refusal((*guard, *chance))
     sure = [c for c in named if c.answer != "unknown" and c not in doubt]
     switched = told_switches(asked, solved)
     verdict = _verdict((*named, *switched), (*sure, *switched), structure or bool(untold))
-    if wiring is not None or (refused is not None and named):
+    if wiring is not None or (refusal(guard) is not None and named):
         verdict = "unexplained"
     if verdict == "consistent" and not would_be_seen(found):
         verdict = "undetermined"
@@ -117,7 +124,9 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
         )
         unexplained = Unexplained(description=lines, tried=tried, empirical=empirical(found, solved))
     unseen = unobservable(bench.whole, found)
-    correction_told = correction(problem, found, solved, bool(named or untold or switched), guard, refused)
+    correction_told = correction(
+        problem, found, solved, bool(named or untold or switched), (*guard, *chance), refused, lasts(later)
+    )
     kept = solved if refused is None else _nothing(solved)
     diagnosis = Diagnosis(
         verdict=verdict,

@@ -36,7 +36,7 @@ def mueller_slopes(problem: InstrumentProblem, space: Space, values: Array) -> t
                 slopes[j] += back @ (np.einsum("fl,flr->lr", dc[j], block.z) * scale)
             bright = float(m[0] @ m[0])
             slopes -= (slopes[:, 0] @ m[0] / max(bright, 1e-300))[:, None, None] * m
-            flat = slopes.reshape(mine.size, -1)
+            flat = slopes.reshape(mine.size, m.size)
             products[np.ix_(acting.index, acting.index)] += acting.spread_products(flat @ flat.T)
             light += bright
     return products, light

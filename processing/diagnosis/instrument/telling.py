@@ -138,8 +138,10 @@ def correction(
     any_cause: bool,
     guard: tuple[Check, ...],
     refused: str | None,
+    lasts: bool,
 ) -> Correction:
-    """What an instrument file would hold: means, with the spread over the sets."""
+    """What an instrument file would hold: means, with the spread over the sets; for these captures alone unless it
+    `lasts`."""
     part = dict(zip(found.space.candidates, found.space.slices, strict=True))
     chance = {found.space.candidates[m]: p for g, p in enumerate(found.samples.probability) for m in found.members[g]}
     effects = []
@@ -155,7 +157,7 @@ def correction(
                     parameters=parameters_of(one, values, np.sqrt(np.maximum(np.diag(own), 0.0))),
                     probability=float(chance[candidate]),
                     captures=tuple(c.name for k, c in enumerate(problem.captures) if one.acts(k, c.wavelength_nm)),
-                    scope=scope_of(one),
+                    scope=scope_of(one) if lasts else "capture",
                     wavelength_nm=_wavelength(problem, one),
                 )
             )

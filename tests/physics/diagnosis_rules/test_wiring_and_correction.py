@@ -5,7 +5,7 @@ from types import SimpleNamespace as Some
 import numpy as np
 from rule_decisions import Patch, cause, decides, made
 
-from processing.diagnosis.instrument import empirical, guard, whole_bench, wiring
+from processing.diagnosis.instrument import empirical, guard, least_change, whole_bench, wiring
 from processing.diagnosis.search import causes
 from processing.diagnosis.search.result import Empirical
 from processing.diagnosis.search.space import Space
@@ -57,15 +57,31 @@ def test_shares(m: Patch) -> bool:
 
 def guarded(m: Patch, rms: float, condition: float) -> bool:
     solved = Some(before=Some(rms=1.0), after=Some(rms=rms), base=None, before_fit=None, space="new", fit=None)
-    m.setattr(guard, "predicted_error", lambda problem, found, solved: (0.0, 0.0))
     m.setattr(guard, "_stretch", lambda problem, solved: 1.0)
     m.setattr(guard, "_of_rows", lambda problem, k, space, fit: (16, condition if space == "new" else 1.0))
-    return all(c.holds for c in guard.checks(Some(captures=[Some(name="a")]), None, solved))
+    return all(c.holds for c in guard.checks(Some(captures=[Some(name="a")]), solved))
 
 
 @decides
 def test_worse(m: Patch) -> bool:
     return guarded(m, 1.0019, 1.0) and not guarded(m, 1.0021, 1.0)
+
+
+def determined(size: float) -> bool:
+    change = guard.PredictedChange(before=0.005, after=0.001, size=size, stderr=0.001)
+    return guard.refusal(guard.chances(change, change)) is None
+
+
+@decides
+def test_chance_worse(m: Patch) -> bool:
+    return determined(0.00472) and not determined(0.00458)
+
+
+@decides
+def test_as_good_as(m: Patch) -> bool:
+    # M follows one value alone, which is so many standard deviations from zero.
+    there = [least_change.least_change(np.array([d]), np.eye(1), np.eye(1)) is not None for d in (0.95, 1.05)]
+    return there == [True, False]
 
 
 @decides

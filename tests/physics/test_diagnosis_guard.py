@@ -1,0 +1,46 @@
+"""The guard of a correction: how likely it is that it makes M worse."""
+
+import numpy as np
+import pytest
+
+from processing.diagnosis.instrument.guard import predicted_change
+from processing.diagnosis.instrument.least_change import least_change
+
+
+def test_chance_that_m_gets_worse_is_that_of_draws_from_the_posterior() -> None:
+    random = np.random.default_rng(0)
+    for size in (0.3, 1.0, 2.0):
+        root, slopes = random.normal(size=(4, 4)), random.normal(size=(60, 4)) / 60
+        mean = size * random.normal(size=4)
+        change = predicted_change(mean, root @ root.T, slopes.T @ slopes)
+        truth = mean + random.normal(size=(40_000, 4)) @ root.T
+        before = np.sum((truth @ slopes.T) ** 2, axis=1)
+        after = np.sum(((truth - mean) @ slopes.T) ** 2, axis=1)
+        assert change.chance_worse == pytest.approx(np.mean(after > before), abs=0.01)
+        assert change.before**2 == pytest.approx(np.mean(before), rel=0.03)
+        assert change.after**2 == pytest.approx(np.mean(after), rel=0.03)
+
+
+def test_of_tied_values_the_sum_that_the_data_tell_counts() -> None:
+    # Two azimuths of which the sum is known to 0.01 and the difference not at all, which M hardly notices.
+    tied = 0.01**2 * np.ones((2, 2)) / 4 + 0.3**2 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    moves_with_the_sum = np.ones((2, 2)) + 1e-6 * np.eye(2)
+    mean = np.array([0.05, 0.05])
+    assert predicted_change(mean, tied, moves_with_the_sum).chance_worse < 1e-6
+    assert predicted_change(mean, tied, np.eye(2)).chance_worse < 1e-6
+    assert predicted_change(mean, tied, np.diag([1.0, 0.0])).chance_worse > 0.4
+
+
+def test_nothing_that_is_changed_makes_nothing_worse() -> None:
+    assert predicted_change(np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))).chance_worse == 0
+    assert predicted_change(np.array([1e-9]), np.eye(1), np.eye(1)).chance_worse == 0
+
+
+def test_what_is_open_is_used_to_leave_m_as_it_is() -> None:
+    # A sum that is known to 0.01; M follows the first value alone.
+    known, open_ = np.ones((2, 2)) / 4, np.array([[1.0, -1.0], [-1.0, 1.0]])
+    mean, products = np.array([0.05, 0.05]), np.diag([1.0, 0.0])
+    moved = least_change(mean, 0.01**2 * known + 0.3**2 * open_, products)
+    assert moved is not None
+    np.testing.assert_allclose(moved, [0.0, 0.1], atol=1e-3)
+    assert least_change(mean, 0.01**2 * (known + open_), products) is None
