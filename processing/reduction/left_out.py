@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from processing.doors import read_json
 from processing.errors import ProcessError
-from processing.storage.capture import Capture
+from processing.storage.capture import Capture, CaptureError
 
 
 class _Entry(BaseModel):
@@ -72,6 +72,23 @@ class LeftOut:
         bad = np.zeros((height, width), dtype=bool)
         bad[pixels[:, 0], pixels[:, 1]] = True
         return cls(entry.states, hits, bad if bad.any() else None)
+
+    def rest_of(self, states: NDArray[np.int64], path: Path) -> NDArray[np.int64]:
+        """Of the numbers (N,) of the states of the sample, those that are not left out.
+
+        Raises
+        ------
+        CaptureError : a state that is left out, or struck, is not among them.
+        """
+        if not set(self.states) | set(self.hits[:, 0].tolist()) <= set(range(len(states))):
+            raise CaptureError(f"{path} has {len(states)} states; some that are to be left out are not among them.")
+        return np.delete(states, self.states)
+
+    def bad_or_struck(self, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
+        """(rows, columns) pixels that are bad, or were struck in some state; None for none."""
+        lost = np.zeros(shape, dtype=bool) if self.bad is None else self.bad.copy()
+        lost[self.hits[:, 2], self.hits[:, 3]] = True
+        return lost if lost.any() else None
 
     @property
     def warnings(self) -> tuple[str, ...]:

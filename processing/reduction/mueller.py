@@ -225,9 +225,7 @@ def reduce_mueller(
     """
     left_out = left_out or LeftOut()
     every = sample_states(capture)
-    if not set(left_out.states) | set(left_out.hits[:, 0].tolist()) <= set(range(len(every))):
-        raise CaptureError(f"{capture.path} has {len(every)} states; some that are to be left out are not among them.")
-    states, cut_off = without_cut_off(capture, np.delete(every, left_out.states))
+    states, cut_off = without_cut_off(capture, left_out.rest_of(every, capture.path))
     cut_off = [*left_out.warnings, *cut_off]
     changes = capture_changes(capture, model, states)
     w = measurement_matrix(capture, model, states, changes)

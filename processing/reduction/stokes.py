@@ -16,6 +16,7 @@ from processing.reduction.counts_to_signal import Correction
 from processing.reduction.cut_off import without_cut_off
 from processing.reduction.effects_of_capture import capture_changes, counts_correction
 from processing.reduction.facts import in_words
+from processing.reduction.left_out import LeftOut
 from processing.reduction.mosaic.layout import MosaicLayout
 from processing.reduction.mosaic.merge import MergedFrame, merge
 from processing.reduction.mosaic.methods import demosaic
@@ -92,13 +93,15 @@ def reduce_stokes(
     correction: Correction | None = None,
     noise: NoiseModel | None = None,
     response: NDArray[np.float32] | None = None,
+    left_out: LeftOut | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Write the Stokes image of a mosaic capture; returns the facts that the product holds.
 
     Several states with the same angles are averaged first. `response` (3, rows, columns) holds the analysis vectors of
-    the raw pixels, where they were calibrated; else the channels' ideal ones.
+    the raw pixels, where they were calibrated; else the channels' ideal ones. Of `left_out` the states count here; its
+    pixels belong into `correction`.
 
     Raises
     ------
@@ -114,7 +117,9 @@ def reduce_stokes(
             "Split it with `process colours`."
         )
     layout = MosaicLayout.of(mosaic, [c.name for c in model.channels])
-    states, cut_off = without_cut_off(capture, sample_states(capture))
+    left_out = left_out or LeftOut()
+    states, cut_off = without_cut_off(capture, left_out.rest_of(sample_states(capture), capture.path))
+    cut_off = [*left_out.warnings, *cut_off]
     changes = capture_changes(capture, model, states)
     model_rows, analyzers = channel_rows(capture, model, states, changes)
     correction = correction or Correction.of(capture)

@@ -75,7 +75,6 @@ class Reduction(FileStep):
             self._refuse(
                 ("weighted", "covariance", "physical"), "a mosaic capture; its product holds the covariance of S always"
             )
-            self._refuse(("leave_out",), "a mosaic capture; bad pixels come from --camera, and states are images each")
             options: dict[str, Any] = {"demosaic": self.demosaic or _default_method()}
         else:
             self._refuse(
@@ -107,8 +106,10 @@ class Reduction(FileStep):
             dark = opened(self.dark) if self.dark else None
             noise, bad = read_camera(self.camera) if self.camera else (None, None)
             left_out = LeftOut.read(self.leave_out, capture) if self.leave_out else LeftOut()
-            if left_out.bad is not None:
-                bad = left_out.bad if bad is None else bad | left_out.bad
+            # Images of a mosaic are averaged before they are solved: what was struck once is bad in the mean.
+            lost = left_out.bad if mueller else left_out.bad_or_struck(capture.frame_shape)
+            if lost is not None:
+                bad = lost if bad is None else bad | lost
             correction = Correction.of(capture, bad, dark, [opened(path) for path in flats])
             model = choose_model(capture, self.instrument)
             if mueller:
@@ -121,7 +122,9 @@ class Reduction(FileStep):
 
             response = read_response(self.analyzers, capture.frame_shape) if self.analyzers else None
             method = record.arguments["demosaic"]
-            reduce_stokes(capture, model, out, (record,), method, correction, noise, response, overwrite, progress)
+            reduce_stokes(
+                capture, model, out, (record,), method, correction, noise, response, left_out, overwrite, progress
+            )
 
 
 def reduced(source: Path, instrument: Path | None = None, progress: Progress | None = None) -> Found:

@@ -17,6 +17,8 @@ from processing.storage.capture import Capture
 from processing.storage.capture_schema import Sample
 from processing.storage.images import MuellerImage
 from processing.storage.pixel_mask import Mask
+from processing.storage.product import Product
+from processing.yaml_file import dump_yaml
 from simulators.blind.detector_cases import DETECTOR
 from simulators.blind.suite import state_angles
 from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
@@ -153,3 +155,27 @@ def test_a_struck_intensity_does_not_count(configs, tmp_path):
     expected = np.linalg.lstsq(w.reshape(STATES, 16)[rest], frames[rest], rcond=None)[0]
     found = MuellerImage.load(tmp_path / "a.h5").values[:, :, 4, 5].reshape(16)
     assert found == pytest.approx(expected, rel=1e-3, abs=1e-3 * expected[0])
+
+
+def test_stokes_of_a_mosaic_leave_out_states_and_struck_pixels(synthetic_capture, configs, tmp_path) -> None:
+    """A frame of other light, a hit and a bad pixel, as `diagnose --json` tells them, do not reach the Stokes image."""
+    model = InstrumentModel.load(configs / "instruments" / "linear_stokes.yaml")
+    frames = np.full((5, 8, 12), 1000, dtype=np.uint16)
+    frames[3] = 3000
+    frames[1, 2:4, 4:6] = 4000
+    frames[:, 6, 9] = 0
+    header = {"instrument_yaml": dump_yaml(model), "mosaic": model.mosaic}
+    path = synthetic_capture(frames[:, None], {"psg": np.zeros(5)}, **header)
+    with Capture(path) as capture:
+        name = f"{capture.header.title} ({capture.path.name})"
+    entry = {"capture": name, "states": [3], "hits": [[1, 0, 2, 4]], "pixels": [[6, 8]], "pitch": 2}
+    result = tmp_path / "result.json"
+    result.write_text(json.dumps({"left_out": [entry]}))
+    made = Reduction(path, demosaic="superpixel", leave_out=result).make(tmp_path / "s.h5")
+    with Product(made) as product:
+        s0, mask = product.get("s0"), product.get("pixel_mask")
+    lost = np.zeros((4, 6), dtype=bool)
+    lost[1, 2] = lost[3, 4] = True
+    np.testing.assert_array_equal(mask == Mask.BAD, lost)
+    np.testing.assert_array_equal(np.isnan(s0), lost)
+    assert np.ptp(s0[~lost]) < 1e-3 * s0[~lost].mean()
