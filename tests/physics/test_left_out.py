@@ -173,7 +173,7 @@ def test_stokes_of_a_mosaic_leave_out_states_and_struck_pixels(synthetic_capture
     result.write_text(json.dumps({"left_out": [entry]}))
     made = Reduction(path, demosaic="superpixel", leave_out=result).make(tmp_path / "s.h5")
     with Product(made) as product:
-        s0, mask = product.get("s0"), product.get("pixel_mask")
+        s0, mask = product.get("s0"), product.get("pixel_flags")
     lost = np.zeros((4, 6), dtype=bool)
     lost[1, 2] = lost[3, 4] = True
     np.testing.assert_array_equal(mask == Mask.BAD, lost)
