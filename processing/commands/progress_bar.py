@@ -19,11 +19,8 @@ def progress_bar(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
 
     def compiling() -> None:
         compile_watch.watchers.clear()
-        console.print(
-            "compiling loops for this machine: once after an installation, up to half a minute",
-            style="dim",
-            soft_wrap=True,
-        )
+        # Within 80 columns, or it would break the bar's line in two.
+        console.print("compiling loops, once after an installation: up to half a minute", style="dim", soft_wrap=True)
 
     compile_watch.watchers.append(compiling)
     try:
