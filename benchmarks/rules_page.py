@@ -18,8 +18,7 @@ HEAD = """# Rules of the diagnosis
 Every constant by which `diagnose` decides, with its unit and its reason. This page is made of
 `processing/diagnosis/search/rules.py` by `python benchmarks/rules_page.py`. A test changes each by a fifth (a whole
 number by one) and holds that a decision is another one then (`tests/physics/diagnosis_rules`). Steps and
-tolerances of the fits stand beside the code that uses them, and what is left out of a capture beside its reading
-(`processing/diagnosis/captured`).
+tolerances of the fits, and sizes below which nothing can be told, stand beside the code that uses them.
 """
 CONSTANT = re.compile(r"((?:^#:[^\n]*\n)+)^([A-Z_]+) = (.+)$", re.MULTILINE)
 SECTION = re.compile(r"^# ---- (.+?) -+$", re.MULTILINE)

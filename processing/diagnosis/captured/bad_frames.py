@@ -10,16 +10,8 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.search.rules import AGAINST_NEXT, LEAST_MISFIT, MOST_BAD_FRAMES, MOSTLY
 
-#: Rms by which a frame has to differ from what all others predict for it, relative to the signal of all: a source or an
-#: axis that is merely unsteady stays below.
-LEAST_MISFIT = 0.015
-#: Times by which its misfit has to be larger, squared, than the next one that is left without it.
-AGAINST_NEXT = 8.0
-#: Share of what is left over that has to go with the frame.
-OF_ALL = 0.5
-#: Share of the states that may be bad.
-MOST = 0.1
 RANK = 1e-8
 
 
@@ -47,12 +39,12 @@ def bad_frames(data: CaptureData, a: Array) -> tuple[BadFrame, ...]:
     left = [k for k in range(states) if data.row_counts[k * channels]]
     found: list[BadFrame] = []
     before = moments.suspect(left)
-    while before is not None and len(found) < MOST * states:
+    while before is not None and len(found) < MOST_BAD_FRAMES * states:
         rest = [k for k in left if k != before.state]
         after = moments.suspect(rest)
         if after is None or before.misfit < LEAST_MISFIT or before.misfit**2 < AGAINST_NEXT * after.misfit**2:
             break
-        if moments.left(rest) > (1 - OF_ALL) * moments.left(left):
+        if moments.left(rest) > (1 - MOSTLY) * moments.left(left):
             break
         found.append(before)
         left, before = rest, after

@@ -10,16 +10,15 @@ from processing.arrays import Array
 from processing.diagnosis.captured.black_jitter import black_jitter
 from processing.diagnosis.captured.capture_data import CaptureData, SharedNoise
 from processing.diagnosis.captured.detector_noise import DetectorNoise, detector_noise
+from processing.diagnosis.search.rules import (
+    AS_GOOD,
+    DARK_NOISE_OFF,
+    NOISE_ALIKE,
+    NOISE_OFF,
+    NOISE_OFF_MIXED,
+    NOISE_SURE,
+)
 
-#: Standard deviations from which on a deviation is there.
-SURE = 6.0
-#: Deviation of the variance of a pixel, of its part without light, and correlation of neighbours, that are told: darks
-#: and photon transfer curves of a lab are as good.
-WHITE, DARK, ALIKE = 0.06, 0.5, 0.05
-#: The first where neighbours share noise: how much a pixel shows of it is not known better.
-WHITE_MIXED = 0.15
-#: Standard deviations up to which another gain alone, or another read noise alone, is as good as both.
-AS_GOOD = 3.0
 #: Least part without light of noise that was estimated.
 LEAST_DARK = 0.05
 
@@ -44,7 +43,7 @@ def checked_noise(data: CaptureData, a: Array) -> CaptureData:
             f"neighbours share noise (correlation {found.right:.2f} across, {found.down:.2f} down): the images were "
             f"resampled or smoothed, and of {1 / shared.shown:.1f} pixels one is independent"
         )
-    if max(found.rows, found.columns) > SURE * found.rows_error:
+    if max(found.rows, found.columns) > NOISE_SURE * found.rows_error:
         shared = _with_lines(shared, found, data)
     lines = _lines(shared, data)
     for name, part in zip(("row", "column"), lines, strict=True):
@@ -63,7 +62,7 @@ def _in_counts(what: str, variance: float, data: CaptureData) -> str:
 
 
 def _mixed(found: DetectorNoise) -> SharedNoise:
-    least = max(ALIKE, SURE * found.alike_error)
+    least = max(NOISE_ALIKE, NOISE_SURE * found.alike_error)
     return SharedNoise(*(_part(alike) if alike > least else 0.0 for alike in (found.right, found.down)))
 
 
@@ -74,7 +73,7 @@ def _part(alike: float) -> float:
 
 
 def _with_lines(shared: SharedNoise, found: DetectorNoise, data: CaptureData) -> SharedNoise:
-    rows, columns = (v if v > SURE * found.rows_error else 0.0 for v in (found.rows, found.columns))
+    rows, columns = (v if v > NOISE_SURE * found.rows_error else 0.0 for v in (found.rows, found.columns))
     height, width = data.usable.shape
     return replace(shared, rows=rows, columns=columns, wide=1 + rows * width + columns * height)
 
@@ -96,9 +95,9 @@ def _factors(found: DetectorNoise, shown: float, estimated: bool) -> tuple[float
         return _balanced(found, white, max(float(both[1]), LEAST_DARK))
     usual = 1.0, 1.0
     bent = found.bent
-    least = WHITE if shown == 1 else WHITE_MIXED
+    least = NOISE_OFF if shown == 1 else NOISE_OFF_MIXED
     far = not min(bent, 1.0) - least < white < max(bent, 1.0) + least
-    if _against(both, usual, inverse) < SURE**2 or not (far or _dark_is_off(found, shown)):
+    if _against(both, usual, inverse) < NOISE_SURE**2 or not (far or _dark_is_off(found, shown)):
         return usual
     # As simple as the images allow: another gain, another read noise, both.
     scales = np.geomspace(0.1, 10, 400)
@@ -116,7 +115,9 @@ def _against(both: Array, told: tuple[float, float], inverse: Array) -> float:
 
 
 def _dark_is_off(found: DetectorNoise, shown: float) -> bool:
-    return abs(found.dark / shown - 1) > max(DARK, SURE * float(np.sqrt(found.covariance[1, 1])) / shown)
+    return abs(found.dark / shown - 1) > max(
+        DARK_NOISE_OFF, NOISE_SURE * float(np.sqrt(found.covariance[1, 1])) / shown
+    )
 
 
 def _balanced(found: DetectorNoise, white: float, dark: float) -> tuple[float, float]:

@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.search.rules import BEYOND_NOISE
 
-#: Eigenvalue of the residual, over the largest that noise alone gives, from which on a direction over the states is
-#: structure.
-STRUCTURE = 1.15
 #: Robust standard deviations at which a residual is cut off before structure is looked for.
 CUT = 4.0
 NORMAL_MAD = 0.6745
@@ -58,7 +56,7 @@ class Whitened:
         inner = (outside.T @ np.clip(r, -CUT * scale, CUT * scale, out=r)).astype(float)
         value, vector = np.linalg.eigh(inner @ inner.T / inner.shape[1])
         # Largest eigenvalue of noise over the median one (Marchenko and Pastur).
-        edge = STRUCTURE * (1 + np.sqrt(len(value) / inner.shape[1])) ** 2
+        edge = BEYOND_NOISE * (1 + np.sqrt(len(value) / inner.shape[1])) ** 2
         # At least half of the directions are left to tell what noise is.
         half = len(value) // 2
         structure = self.outside @ vector[:, half:][:, value[half:] > edge * np.median(value)]

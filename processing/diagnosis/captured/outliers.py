@@ -17,18 +17,10 @@ from scipy import ndimage
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.common_rest import Whitened, robust_scale
+from processing.diagnosis.search.rules import ALSO_BAD, BAD_DEVIATIONS, BAD_PIXEL, HIT, MOST_HITS, MOST_STRUCK
 
-#: Robust standard deviations, of its row and of its pixel, from which on an intensity is a hit: the largest of 10^9
-#: normal ones is 6.1.
-HIT = 8.0
-#: States of one pixel that are hits; with more of them it is a bad pixel.
-MOST_STATES = 4
-#: Share of the pixels of a state beyond which what stands out is no hit: the frame itself moved, or belongs to nothing.
-MOST_HITS = 0.02
-#: Variance of a bad pixel over that of the pixels around; standard deviations of that ratio from one.
-BAD, BAD_DEVIATIONS = 4.0, 10.0
-#: Side of the square of pixels around, and the share of them that may be as bad.
-AROUND, ALSO_BAD = 5, 0.2
+#: Side of the square of pixels around.
+AROUND = 5
 #: Variance of a state over that of the usual one of its pixel, and of a dim pixel over that of all, as far as it is
 #: believed.
 BRIGHTEST, LEAST_VARIANCE = 4.0, 0.1
@@ -96,7 +88,7 @@ def _hits(
         left, q = r[:, p].astype(float), rest.copy()
         struck: list[int] = []
         found: tuple[list[int], float] = ([], float(noisy[p]))
-        while len(struck) < MOST_STATES:
+        while len(struck) < MOST_STRUCK:
             free = np.maximum(np.diag(q), 1e-6)
             # One hit is strongest where it struck: so it goes with a projection, whatever the noise of each state.
             k = int(np.argmax(np.abs(left) / np.sqrt(free)))
@@ -114,7 +106,7 @@ def _hits(
 def _noisier_than_around(noisy: Array, free: int) -> NDArray[np.bool_]:
     """Pixels (rows, columns) with far more noise than those around them, and than the image."""
     around = ndimage.percentile_filter(noisy, 100 * (1 - ALSO_BAD), size=AROUND)
-    least = max(BAD, 1 + BAD_DEVIATIONS * float(np.sqrt(2 / free)))
+    least = max(BAD_PIXEL, 1 + BAD_DEVIATIONS * float(np.sqrt(2 / free)))
     return np.asarray(noisy > least * np.maximum(around, np.median(noisy)))
 
 

@@ -11,6 +11,7 @@ from processing.calibration.train import known_mueller
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.noise_estimate import estimated_noise
 from processing.diagnosis.captured.read_frames import read_frames
+from processing.diagnosis.search.rules import DARK_RIM, FAINTEST
 from processing.instrument.changes import Conditions, elapsed
 from processing.instrument.model import InstrumentModel
 from processing.reduction.counts_to_signal import Correction
@@ -18,12 +19,6 @@ from processing.reduction.mueller import angles_of, relative_exposure, sample_st
 from processing.reduction.noise import NoiseModel
 from processing.storage.capture import Capture, CaptureError
 
-#: Pixels whose mean signal is less than this many standard deviations of one intensity are left out: logarithms and
-#: powers of such counts do not scatter in proportion to the noise, and they say nothing about polarization.
-FAINTEST = 5.0
-#: Pixels around dark ones that are left out too: at an edge, image derivatives (over 7 pixels) do not tell what a shift
-#: of the image does.
-RIM = 4
 #: A state is left out if more than this share of its pixels is cut off.
 MOST_CUT_OFF = 0.01
 #: Below this number of pixels their scatter says nothing about the noise.
@@ -107,6 +102,6 @@ def without_dark_pixels(data: CaptureData) -> CaptureData:
             f"{data.name}: no pixel has a mean signal above {FAINTEST:g} standard deviations of its noise. "
             "Expose longer, or look whether the light was on."
         )
-    wide = ndimage.binary_dilation(dark, structure=np.ones((3, 3), dtype=bool), iterations=RIM)
+    wide = ndimage.binary_dilation(dark, structure=np.ones((3, 3), dtype=bool), iterations=DARK_RIM)
     dark = dark if wide.all() else wide
     return replace(data, usable=data.usable & ~dark, dark_fraction=float(dark.mean()))

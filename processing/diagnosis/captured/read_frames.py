@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.diagnosis.search.rules import CUT_OFF
 from processing.instrument.model import InstrumentModel
 from processing.reduction.counts_to_signal import Correction
 from processing.storage.capture import Capture
@@ -18,8 +19,6 @@ from processing.storage.capture import Capture
 MOST_VALUES = 20_000_000
 #: Values of a pixel beyond which few pixels are kept: the second moments of the states would be larger than the pixels.
 MANY_VALUES, FEW_PIXELS = 160, 64
-#: Counts of zero this many standard deviations of the read-out below black are cut off, not noise.
-CUT_OFF = 6.0
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from processing.diagnosis.captured.capture_data import CaptureData
-
-#: Slope of the image, in standard deviations of an intensity for each pixel of way, from which on there is an edge.
-STEEPEST = 15.0
-#: Pixels around an edge that are left out with it: image derivatives are taken over seven, and one that has the edge
-#: in it is not that of the image beside it.
-AROUND = 3
-#: With more than this share of the pixels near an edge the image is all edges, and they are kept.
-MOST_STEEP = 0.75
+from processing.diagnosis.search.rules import EDGE_RIM, MOST_STEEP, STEEPEST
 
 
 def without_steep_pixels(data: CaptureData) -> CaptureData:
@@ -30,7 +23,7 @@ def without_steep_pixels(data: CaptureData) -> CaptureData:
         down, across = np.gradient(image)
         square += (down**2 + across**2) / (s * np.maximum(image, 0) + f)
     edge = data.usable & (square > STEEPEST**2 * len(frames))
-    steep = data.usable & ndimage.binary_dilation(edge, structure=np.ones((3, 3), dtype=bool), iterations=AROUND)
+    steep = data.usable & ndimage.binary_dilation(edge, structure=np.ones((3, 3), dtype=bool), iterations=EDGE_RIM)
     if steep.sum() > MOST_STEEP * data.usable.sum():
         return data
     return replace(data, usable=data.usable & ~steep, steep=steep)

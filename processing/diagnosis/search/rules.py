@@ -38,9 +38,59 @@ LEAST_NOISE = 1e-4
 #: dropped: 1 to 160 000.
 REFUTED = 12.0
 
+# ---- what is left out of a capture ---------------------------------------------------------------------------------
+#: [standard deviations of one intensity] Mean signal below which a pixel is dark: logarithms and powers of such counts
+#: do not scatter in proportion to the noise, and they say nothing about polarization.
+FAINTEST = 5.0
+#: [pixels] Around dark ones that are left out too: image derivatives over 7 pixels do not tell there what a shift does.
+DARK_RIM = 4
+#: [standard deviations of the read-out] Below black, from which on counts of zero are cut off, not noise.
+CUT_OFF = 6.0
+#: [standard deviations of one intensity a pixel of way] Slope from which on there is an edge: an image that moves by a
+#: part of a pixel changes it by more than can be undone.
+STEEPEST = 15.0
+#: [pixels] Around an edge that are left out with it: image derivatives are taken over seven.
+EDGE_RIM = 3
+#: [of the pixels] Near an edge from which on the image is all edges, and they are kept.
+MOST_STEEP = 0.75
+#: [robust standard deviations] From which on an intensity is a hit: the largest of 10^9 normal ones is 6.1.
+HIT = 8.0
+#: [states] Of one pixel that are hits; with more of them it is a bad pixel.
+MOST_STRUCK = 4
+#: [of the pixels of a state] Beyond which what stands out is no hit: the frame itself moved, or belongs to nothing.
+MOST_HITS = 0.02
+#: [of the variance of the pixels around] From which on a pixel is bad.
+BAD_PIXEL = 4.0
+#: [standard deviations] By which its variance has to stand out as well, where there are few states.
+BAD_DEVIATIONS = 10.0
+#: [of the 25 pixels around] That may be as bad: at an edge that moves more of them are.
+ALSO_BAD = 0.2
+#: [of the signal] Rms by which a bad frame differs from what all others predict: a source or an axis that is merely
+#: unsteady stays below.
+LEAST_MISFIT = 0.015
+#: [1] Times by which its misfit is larger, squared, than the next one that is left without it.
+AGAINST_NEXT = 8.0
+#: [of what is left over] That goes with a bad frame.
+MOSTLY = 0.5
+#: [of the states] That may be bad.
+MOST_BAD_FRAMES = 0.1
+
 # ---- the detector's noise, as its images show it ------------------------------------------------------------------
+#: [of the largest eigenvalue of noise] From which on a direction over the states is structure, which all pixels share.
+BEYOND_NOISE = 1.15
 #: [standard deviations] From which on a deviation from what is declared of the noise is there.
 NOISE_SURE = 6.0
+#: [1] Deviation of the variance of a pixel from what is declared that is told: photon transfer curves of a lab are as
+#: good.
+NOISE_OFF = 0.06
+#: [1] The same where neighbours share noise: how much a pixel shows of it is not known better.
+NOISE_OFF_MIXED = 0.15
+#: [1] The same of the part of the variance without light: darks of a lab are as good.
+DARK_NOISE_OFF = 0.5
+#: [correlation] Of neighbours, from which on they share noise.
+NOISE_ALIKE = 0.05
+#: [standard deviations] Up to which another gain alone, or another read noise alone, is as good as both.
+AS_GOOD = 3.0
 #: [of the mean of lit pixels] Brightness below which a pixel is dim: what happens to the light is twenty times weaker
 #: there, an offset is not.
 DIM = 0.05
