@@ -122,8 +122,8 @@ def _compared(r: Array, light: Array, dark: Array, free: float) -> DetectorNoise
 
 
 def _pairs(x: Array, lag: int, axis: int) -> tuple[Array, Array]:
-    size = x.shape[axis]
-    return np.take(x, range(size - lag), axis), np.take(x, range(lag, size), axis)
+    before = (slice(None),) * axis
+    return x[(*before, slice(-lag))], x[(*before, slice(lag, None))]
 
 
 def _half_square(r: Array, expected: Array, lag: int, axis: int) -> float:
