@@ -1,0 +1,107 @@
+"""Sums over pixels: strips and single precision say what all pixels at once say in double."""
+
+import numpy as np
+import pytest
+
+from processing.diagnosis.captured import read_frames
+from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.instrument import pixel_sums
+from processing.diagnosis.instrument.features import FEATURES, derivatives_of_part, image_derivatives
+from processing.diagnosis.instrument.moments import moments_of
+from processing.diagnosis.instrument.projection import add_block
+from processing.diagnosis.search.space import Sums
+from processing.instrument.changes import Conditions
+from processing.instrument.model import InstrumentModel
+from processing.storage.capture import Capture
+from processing.storage.capture_schema import Sample
+from simulators.blind.suite import state_angles
+from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
+
+STATES, ROWS, COLUMNS, NOISE = 12, 90, 70, 1e-3
+
+
+@pytest.fixture(scope="module")
+def capture():
+    """Three patterns, the brightest a thousand times the noise."""
+    random = np.random.default_rng(6)
+    y, x = np.mgrid[0:ROWS, 0:COLUMNS] / ROWS
+    patterns = np.stack([0.5 + 0.3 * np.sin(3 * x), 0.1 * np.cos(4 * y), 0.05 * x * y])
+    a = np.column_stack([np.ones(STATES), random.normal(size=(STATES, 2))])
+    signal = np.tensordot(a, patterns, 1) + NOISE * random.normal(size=(STATES, ROWS, COLUMNS))
+    data = CaptureData(
+        name="three patterns",
+        signal=signal[:, None].astype(np.float32),
+        conditions=Conditions({}, STATES, ("all",), np.arange(STATES) / STATES, 4095.0),
+        exposure=np.ones(STATES),
+        sample=None,
+        slope=np.zeros(STATES),
+        floor=np.full(STATES, NOISE**2),
+        noise_known=True,
+        noise_source="",
+        clipped=np.zeros((ROWS, COLUMNS), dtype=bool),
+        clipped_states=np.zeros(STATES, dtype=bool),
+        usable=np.ones((ROWS, COLUMNS), dtype=bool),
+        simulated=True,
+        wavelength_nm=662.0,
+    )
+    return a, data
+
+
+def excess(a, data):
+    moments = moments_of(data, 2)
+    c = np.zeros((len(FEATURES), STATES))
+    c[0], c[FEATURES.index("square")], c[FEATURES.index("dx")] = 1.0, 1e-4, 1e-3
+    sums = Sums.empty(2, 0)
+    for block in moments.blocks:
+        add_block(block, a / moments.sigma[:, None], c, np.zeros((0, *a.shape)), None, moments, sums)
+    return moments, sums
+
+
+@pytest.mark.parametrize("threads", ["1", "2"])
+def test_single_precision_in_strips_is_what_double_says(capture, monkeypatch, threads):
+    _, double = excess(*capture)
+    monkeypatch.setenv("UMOV_THREADS", threads)
+    monkeypatch.setattr(pixel_sums, "MANY_PX", 0)
+    monkeypatch.setattr(pixel_sums, "LEAST_NOISE", 0.0)
+    monkeypatch.setattr(pixel_sums, "STRIP_PX", 20 * COLUMNS)
+    _, single = excess(*capture)
+    assert np.all(np.abs(double.excess) < 6 * np.sqrt(2 * double.freedom))
+    assert single.freedom == pytest.approx(double.freedom, rel=1e-6)
+    assert np.all(np.abs(single.excess - double.excess) < 2e-3 * np.sqrt(2 * double.freedom))
+
+
+def test_without_turning_the_rows_single_precision_would_not_do(capture, monkeypatch):
+    _, double = excess(*capture)
+    monkeypatch.setattr(pixel_sums, "MANY_PX", 0)
+    monkeypatch.setattr(pixel_sums.Pixels, "basis", np.eye(STATES))
+    _, single = excess(*capture)
+    assert np.abs(single.excess - double.excess).max() > 2e-3 * np.sqrt(2 * double.freedom).max()
+
+
+def test_derivatives_of_a_part_are_those_of_the_image(capture):
+    images = capture[1].signal[:2, 0]
+    whole = image_derivatives(images)
+    for rows, columns in ((slice(20, 31), slice(40, 52)), (slice(3, 9), slice(3, COLUMNS - 3))):
+        part = derivatives_of_part(images, rows, columns)
+        assert part == pytest.approx(whole[:, :, rows, columns], abs=1e-7)
+
+
+@pytest.mark.parametrize("side", [1, 2, 3])
+def test_squares_are_averaged_while_they_are_read(configs, tmp_path, monkeypatch, side):
+    bench, random = Bench(rows=31, columns=33), np.random.default_rng(2)
+    angles = state_angles(20, False, False)
+    counts = digitize(bench, expose(bench, Scene(random), angles), random)
+    counts[4, 8:9, 11:12] = 2**16 - 1
+    text = (configs / "instruments/rgb950.yaml").read_text()
+    write_capture(tmp_path / "c.h5", bench, counts, angles, Sample(kind="unknown"), text)
+    monkeypatch.setattr(read_frames, "MOST_VALUES", counts.size / (side - 0.5) ** 2)
+    with Capture(tmp_path / "c.h5") as capture:
+        data = read_capture(capture, InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662))
+    assert (data.binned, data.pitch) == (side, side)
+    h, w = 31 // side, 33 // side
+    squares = counts[:, : h * side, : w * side].reshape(20, h, side, w, side).astype(float) - 100
+    assert data.signal[:, 0] * data.conditions.full_scale == pytest.approx(squares.mean(axis=(2, 4)), rel=1e-5)
+    assert np.argwhere(data.clipped).tolist() == [[8 // side, 11 // side]]
+    assert np.flatnonzero(data.clipped_states).tolist() == [4]
+    assert data.floor[0] * data.conditions.full_scale**2 * side**2 == pytest.approx((3.0 / 0.5) ** 2 + 1 / 12, rel=0.02)
