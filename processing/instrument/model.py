@@ -8,20 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from processing.arrays import Array
-from processing.errors import ProcessError
 from processing.instrument.changes import Changes
-from processing.polarization import mueller
+from processing.instrument.elements import AnyElement, Part
+from processing.instrument.elements import Dispersive as Dispersive
+from processing.instrument.elements import Element as Element
+from processing.instrument.elements import Polarizer as Polarizer
+from processing.instrument.elements import Retarder as Retarder
+from processing.instrument.elements import WavelengthError as WavelengthError
 from processing.yaml_file import load_yaml
-
-#: A number, or one number for each wavelength in nm.
-Dispersive = float | dict[float, float]
 
 #: What fitted values belong to: mounts and mechanics, the same in all captures; the detector, the same as long as its
 #: full scale is; optics that follow a smooth curve over the wavelengths; optics with a value at each wavelength that
@@ -29,91 +30,7 @@ Dispersive = float | dict[float, float]
 Belongs = Literal["mechanics", "detector", "dispersion", "wavelength", "capture"]
 
 
-class WavelengthError(ProcessError):
-    """The instrument model has no value for the wavelength asked for."""
-
-
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Element(_Part):
-    """One optical element, fixed or turned: azimuth = azimuth_deg + ratio * angle of `axis`."""
-
-    name: str
-    azimuth_deg: Dispersive = 0.0
-    axis: str | None = None
-    ratio: float = 1.0
-
-    @model_validator(mode="after")
-    def _ratio_needs_axis(self) -> Self:
-        if self.axis is None and self.ratio != 1.0:
-            raise ValueError(f"element {self.name!r} has a ratio but no axis that turns it")
-        return self
-
-    def azimuth_rad(self, angles_deg: Mapping[str, ArrayLike], states: int) -> Array:
-        """Azimuth (states,) in radians; angles_deg holds the angle of each axis for each state."""
-        azimuth = np.full(states, _number(self.azimuth_deg))
-        if self.axis is not None:
-            if self.axis not in angles_deg:
-                known = ", ".join(sorted(angles_deg)) or "none"
-                raise KeyError(f"element {self.name!r} turns with axis {self.axis!r}; the states have: {known}")
-            azimuth = azimuth + self.ratio * np.asarray(angles_deg[self.axis], dtype=float)
-        return np.asarray(np.deg2rad(azimuth))
-
-    def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
-        """Mueller matrices (states, 4, 4) of the element at each azimuth, with what effects change in it."""
-        raise NotImplementedError
-
-
-class Polarizer(Element):
-    """Linear polarizer; `extinction` is the intensity leak T_min/T_max."""
-
-    kind: Literal["polarizer"]
-    extinction: Dispersive = 0.0
-
-    def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
-        extinction = _number(self.extinction) + (changes.extinction[self.name] if changes else 0.0)
-        return mueller.polarizer(azimuth_rad, extinction)
-
-
-class Retarder(Element):
-    """Linear retarder with its fast axis at the azimuth; `diattenuation` (T_f - T_s)/(T_f + T_s) is along it.
-
-    `depolarization` is the share of what the retardance acts on that is lost, because light of several retardances is
-    summed: a normal distribution of width s (radians; from the bandwidth, or over the aperture) loses 1 - exp(-s^2/2).
-    """
-
-    kind: Literal["retarder"]
-    retardance_deg: Dispersive
-    diattenuation: Dispersive = 0.0
-    depolarization: Dispersive = 0.0
-
-    def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
-        retardance = np.deg2rad(_number(self.retardance_deg)) + (changes.retardance_rad[self.name] if changes else 0.0)
-        lost = _number(self.depolarization) + (changes.depolarization[self.name] if changes else 0.0)
-        plain = mueller.retarder(azimuth_rad, retardance, lost)
-        d = _number(self.diattenuation) + (changes.diattenuation[self.name] if changes else 0.0)
-        if np.all(d == 0.0):
-            return plain
-        return mueller.diattenuator(azimuth_rad, 1 + d, 1 - d) @ plain
-
-
-class Diattenuator(Element):
-    """Linear diattenuator with intensity transmissions `t_max` along the azimuth and `t_min` across it."""
-
-    kind: Literal["diattenuator"]
-    t_max: Dispersive = 1.0
-    t_min: Dispersive
-
-    def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
-        return mueller.diattenuator(azimuth_rad, _number(self.t_max), _number(self.t_min))
-
-
-AnyElement = Annotated[Polarizer | Retarder | Diattenuator, Field(discriminator="kind")]
-
-
-class Channel(_Part):
+class Channel(Part):
     """One detector channel: the elements that only its light passes, after the common analyzer train."""
 
     name: str
@@ -121,7 +38,7 @@ class Channel(_Part):
     gain: float = Field(default=1.0, gt=0)
 
 
-class AppliedEffect(_Part):
+class AppliedEffect(Part):
     """One effect that `diagnose` found and added: what, where, how large, on which evidence."""
 
     kind: str
@@ -135,7 +52,7 @@ class AppliedEffect(_Part):
     probability: float | None = None
 
 
-class SystematicError(_Part):
+class SystematicError(Part):
     """What stays uncertain after a correction, as independent directions of one standard deviation each.
 
     Together they are the covariance of all values of the posterior, as far as a Mueller matrix notices it. Each
@@ -154,7 +71,7 @@ class SystematicError(_Part):
     wavelength_nm: float | None = None
 
 
-class EffectParameter(_Part):
+class EffectParameter(Part):
     """A fitted value with its standard error (None: it has none, `note` says why); or one at each wavelength."""
 
     value: float | tuple[float, ...]
@@ -174,7 +91,7 @@ class EffectParameter(_Part):
         return f"{self.value:.{digits}f} ± {self.stderr:.{digits}f}"
 
 
-class InstrumentModel(_Part):
+class InstrumentModel(Part):
     """Generator train, analyzer train and detector channels, in the order in which the light passes them.
 
     `mosaic`, for a division-of-focal-plane sensor, lays out the channel names over the super-pixel, row by
@@ -200,7 +117,7 @@ class InstrumentModel(_Part):
     mosaic: tuple[tuple[str, ...], ...] | None = None
     beams: tuple[str, ...] | None = None
     calibrate: tuple[str, ...] = ()
-    belongs_to: dict[str, Belongs] = {}
+    belongs_to: dict[str, Belongs] = Field(default={})
     free_source: bool = False
     effects: tuple[AppliedEffect, ...] = ()
     systematic: tuple[SystematicError, ...] = ()
@@ -376,12 +293,6 @@ def _state_count(angles_deg: Mapping[str, ArrayLike]) -> int:
     if len(counts) != 1:
         raise ValueError(f"every axis needs one angle a state; got {sorted(counts)}")
     return counts.pop()
-
-
-def _number(value: Dispersive) -> float:
-    if isinstance(value, dict):
-        raise WavelengthError("the instrument model has values for several wavelengths: choose one with .at()")
-    return float(value)
 
 
 def _listed(wavelength_nm: float, known: Sequence[float]) -> bool:

@@ -1,0 +1,110 @@
+"""Optical elements of an instrument: polarizers, retarders, diattenuators, fixed or turned by a named axis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from processing.arrays import Array
+from processing.errors import ProcessError
+from processing.instrument.changes import Changes
+from processing.polarization import mueller
+
+#: A number, or one number for each wavelength in nm.
+Dispersive = float | dict[float, float]
+
+
+class WavelengthError(ProcessError):
+    """The instrument model has no value for the wavelength asked for."""
+
+
+class Part(BaseModel):
+    """A section of an instrument file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Element(Part):
+    """One optical element, fixed or turned: azimuth = azimuth_deg + ratio * angle of `axis`."""
+
+    name: str
+    azimuth_deg: Dispersive = 0.0
+    axis: str | None = None
+    ratio: float = 1.0
+
+    @model_validator(mode="after")
+    def _ratio_needs_axis(self) -> Self:
+        if self.axis is None and self.ratio != 1.0:
+            raise ValueError(f"element {self.name!r} has a ratio but no axis that turns it")
+        return self
+
+    def azimuth_rad(self, angles_deg: Mapping[str, ArrayLike], states: int) -> Array:
+        """Azimuth (states,) in radians; angles_deg holds the angle of each axis for each state."""
+        azimuth = np.full(states, _number(self.azimuth_deg))
+        if self.axis is not None:
+            if self.axis not in angles_deg:
+                known = ", ".join(sorted(angles_deg)) or "none"
+                raise KeyError(f"element {self.name!r} turns with axis {self.axis!r}; the states have: {known}")
+            azimuth = azimuth + self.ratio * np.asarray(angles_deg[self.axis], dtype=float)
+        return np.asarray(np.deg2rad(azimuth))
+
+    def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
+        """Mueller matrices (states, 4, 4) of the element at each azimuth, with what effects change in it."""
+        raise NotImplementedError
+
+
+class Polarizer(Element):
+    """Linear polarizer; `extinction` is the intensity leak T_min/T_max."""
+
+    kind: Literal["polarizer"]
+    extinction: Dispersive = 0.0
+
+    def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
+        extinction = _number(self.extinction) + (changes.extinction[self.name] if changes else 0.0)
+        return mueller.polarizer(azimuth_rad, extinction)
+
+
+class Retarder(Element):
+    """Linear retarder with its fast axis at the azimuth; `diattenuation` (T_f - T_s)/(T_f + T_s) is along it.
+
+    `depolarization` is the share of what the retardance acts on that is lost, because light of several retardances is
+    summed: a normal distribution of width s (radians; from the bandwidth, or over the aperture) loses 1 - exp(-s^2/2).
+    """
+
+    kind: Literal["retarder"]
+    retardance_deg: Dispersive
+    diattenuation: Dispersive = 0.0
+    depolarization: Dispersive = 0.0
+
+    def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
+        retardance = np.deg2rad(_number(self.retardance_deg)) + (changes.retardance_rad[self.name] if changes else 0.0)
+        lost = _number(self.depolarization) + (changes.depolarization[self.name] if changes else 0.0)
+        plain = mueller.retarder(azimuth_rad, retardance, lost)
+        d = _number(self.diattenuation) + (changes.diattenuation[self.name] if changes else 0.0)
+        if np.all(d == 0.0):
+            return plain
+        return mueller.diattenuator(azimuth_rad, 1 + d, 1 - d) @ plain
+
+
+class Diattenuator(Element):
+    """Linear diattenuator with intensity transmissions `t_max` along the azimuth and `t_min` across it."""
+
+    kind: Literal["diattenuator"]
+    t_max: Dispersive = 1.0
+    t_min: Dispersive
+
+    def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
+        return mueller.diattenuator(azimuth_rad, _number(self.t_max), _number(self.t_min))
+
+
+AnyElement = Annotated[Polarizer | Retarder | Diattenuator, Field(discriminator="kind")]
+
+
+def _number(value: Dispersive) -> float:
+    if isinstance(value, dict):
+        raise WavelengthError("the instrument model has values for several wavelengths: choose one with .at()")
+    return float(value)
