@@ -77,6 +77,9 @@ def test_noise_is_told_and_does_not_alarm(taken, configs, name, bench, words, ai
     data, tests, chi2 = read(taken(spoiled(name, 3, **bench), air), configs)
     assert len(data.noise_told) == (words is not None), data.noise_told
     assert words is None or words in data.noise_told[0], data.noise_told
+    if name == "black_jitter":
+        # 3 electrons, of 2 counts each.
+        assert float(data.noise_told[0].split()[-3]) == pytest.approx(6.0, rel=0.25)
     assert data.noise_estimated == (name == "gain_not_stated")
     assert max(tests.values()) < 5, tests
     assert chi2 == pytest.approx(1.0, abs=0.03)

@@ -14,11 +14,11 @@ MEDIAN = np.pi / 2
 RANK = 1e-8
 
 
-def black_jitter(data: CaptureData, a: Array) -> Array | None:
-    """Offset (L,) of every row, full scales, beside what the light of a pixel could be; None where none shows.
+def black_jitter(data: CaptureData, a: Array) -> tuple[Array, float] | None:
+    """Offset (L,) of every row, as far as it is not what the light of a pixel could be, and the variance of the whole.
 
-    An offset changes dim pixels as much as bright ones, what happens to the light changes them by as much less as they
-    are dimmer. `a` (L, K): rows of the model, which both may follow.
+    In full scales; None where none shows. An offset changes dim pixels as much as bright ones, what happens to light
+    changes them by as much less as they are dimmer. `a` (L, K): rows of the model, which both may follow.
     """
     rows = data.row_counts
     y = data.signal.reshape(data.values_per_pixel, *data.usable.shape)[rows]
@@ -46,4 +46,4 @@ def black_jitter(data: CaptureData, a: Array) -> Array | None:
         return None
     offsets = np.zeros(data.values_per_pixel)
     offsets[rows] = outside @ (seen - bright / light)
-    return offsets
+    return offsets, float(np.sum(offsets**2)) / free

@@ -29,9 +29,10 @@ def checked_noise(data: CaptureData, a: Array) -> CaptureData:
     A black level that jitters is taken off, as far as it shows.
     """
     told: list[str] = []
-    offsets = black_jitter(data, a) if data.noise_known else None
-    if offsets is not None:
-        told.append(_in_counts("the black level is another one in every frame", float(np.mean(offsets**2)), data))
+    jitter = black_jitter(data, a) if data.noise_known else None
+    if jitter is not None:
+        offsets, variance = jitter
+        told.append(_in_counts("the black level is another one in every frame", variance, data))
         level = offsets.reshape(*data.signal.shape[:2], 1, 1)
         data = replace(data, signal=(data.signal - level).astype(np.float32))
     found = detector_noise(data, a) if data.noise_known else None
