@@ -38,18 +38,55 @@ def imported(folder: Path, lines: list[str], instrument: Path, wavelength_nm: fl
     return out
 
 
+def wollaston(shared_data: Path, folder: Path, instrument: Path, wavelength_nm: int) -> tuple[Path, np.ndarray]:
+    """Capture of air, and the sum of both channels in the order of its states."""
+    data = json.loads((shared_data / "drr-wollaston-nir/cal_results.json").read_text())
+    theta, left, right = (np.array(data[f"Cal_{k}{wavelength_nm}"]) for k in ("theta", "Il_", "Ir_"))
+    order = np.argsort(theta)
+    lines = ["state,psg_deg,channel_left,channel_right"]
+    lines += [f"{k},{np.rad2deg(theta[n]):.6f},{left[n]},{right[n]}" for k, n in enumerate(order)]
+    return imported(folder, lines, instrument, wavelength_nm, "air"), (left + right)[order]
+
+
+# Goals of the data's owners are 0.27 % at 1200 nm, 0.45 at 1950; the first is not reached.
+@pytest.mark.parametrize(
+    ("wavelength_nm", "least", "most", "sure"),
+    [
+        (1200, 0.2, 0.32, {"channel_gain", "channel_extinction"}),
+        # A value for each intensity would leave 0.001 %, which says nothing.
+        (1300, 0.1, 0.25, {"channel_gain"}),
+        (1950, 0.2, 0.45, {"generator_ellipticity"}),
+    ],
+)
+def test_wollaston_at_other_wavelengths(shared_data, configs, tmp_path, wavelength_nm, least, most, sure):
+    instrument = configs / "instruments/drr_wollaston.yaml"
+    path, _ = wollaston(shared_data, tmp_path, instrument, wavelength_nm)
+    d = diagnose_captures([path], InstrumentModel.load(instrument))[0].diagnosis
+    assert least < d.error_after.rms_percent < most
+    assert sure <= {e.kind for e in d.effects if e.confident}
+
+
+def test_the_telescope_at_one_wavelength(shared_data, configs, tmp_path):
+    instrument = configs / "instruments/dual_beam_charis.yaml"
+    with (shared_data / "dual-beam-charis-nir/fluxes.csv").open() as file:
+        rows = [r for r in csv.DictReader(file) if r["wavelength_nm"].startswith("1685")]
+    lines = ["state,hwp_deg,image_rotator_deg,channel_left,channel_right,sigma"]
+    for k, r in enumerate(rows):
+        noise = float(r["stderr"]) / np.sqrt(2)
+        lines.append(f"{k},{r['hwp_deg']},{r['image_rotator_deg']},{r['left']},{r['right']},{noise}")
+    path = imported(tmp_path, lines, instrument, 1686, "air")
+    d = diagnose_captures([path], InstrumentModel.load(instrument))[0].diagnosis
+    # One angle for each ratio of two channels would leave less than the photon noise of 0.01 %.
+    assert 0.05 < d.error_after.rms_percent < 0.25
+
+
 def test_wollaston_the_source_is_the_cause(shared_data, configs, tmp_path):
     instrument = configs / "instruments/drr_wollaston.yaml"
-    data = json.loads((shared_data / "drr-wollaston-nir/cal_results.json").read_text())
-    theta, left, right = (np.array(data[k]) for k in ("Cal_theta1600", "Cal_Il_1600", "Cal_Ir_1600"))
-    lines = ["state,psg_deg,channel_left,channel_right"]
-    for k, n in enumerate(np.argsort(theta)):
-        lines.append(f"{k},{np.rad2deg(theta[n]):.6f},{left[n]},{right[n]}")
-    path = imported(tmp_path, lines, instrument, 1600, "air")
+    path, total = wollaston(shared_data, tmp_path, instrument, 1600)
     judged, problem = diagnose_captures([path], InstrumentModel.load(instrument))
     d = judged.diagnosis
     assert d.error_before.rms_percent > 2.0
-    assert d.error_after.rms_percent < 0.2
+    assert d.error_after.rms_percent < 0.16
     named = [e for e in d.effects if e.confident]
     assert [e.kind for e in named] == ["source_flicker"]
     assert d.verdict == "explained"
@@ -58,7 +95,6 @@ def test_wollaston_the_source_is_the_cause(shared_data, configs, tmp_path):
     assert np.sqrt(whole.square.sum() / whole.count.sum()) < 0.002
     # Both channels saw it: their sum, which is modulated only as far as they differ, shows the same gains.
     gains = 1 + np.array(named[0].parameters["states"].value)
-    total = (left + right)[np.argsort(theta)]
     assert np.corrcoef(gains, total)[0, 1] > 0.95
 
 

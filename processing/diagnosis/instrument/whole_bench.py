@@ -19,7 +19,14 @@ from processing.diagnosis.search.posterior import Posterior, Say, posterior, qua
 from processing.diagnosis.search.rules import BESIDE_FIELD, DECISIVE, FAR_OFF, LIKELY, REFUTED, SHARES, TAKES_PART
 from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
-from processing.instrument.effects.base import FieldEffect, ImageShift, PointwiseEffect, Switch, ValuePerState
+from processing.instrument.effects.base import (
+    FieldEffect,
+    ImageShift,
+    PointwiseEffect,
+    SourceEffect,
+    Switch,
+    ValuePerState,
+)
 
 
 def predicts(problem: InstrumentProblem) -> InstrumentProblem:
@@ -62,6 +69,9 @@ class WholeBench:
         plain = [c for c in self.pool if self._offered(c)]
         fixed = [*self.base.candidates, *self._clipped()]
         found = self._posterior([*fixed, *plain], fixed)
+        if too_many := self.as_many_as_intensities(found, TAKES_PART):
+            self.say(f"without {', '.join(c.label for c in too_many)}: it would be a value for each intensity")
+            found = self._posterior([*fixed, *(c for c in plain if c not in too_many)], fixed)
         found = self._with_what_scatters_so(found, fixed)
         fields = [c for c in self.pool if isinstance(c.effect, FieldEffect)]
         if fields and not self.whole.holds_out_states:
@@ -120,6 +130,28 @@ class WholeBench:
             # A value for each intensity would be noise by another name.
             return len(self.whole.model.channels) > 1
         return True
+
+    def as_many_as_intensities(self, found: Posterior, least: float) -> set[Candidate]:
+        """Values for each state, of a probability above `least`, that with the others are one for each intensity.
+
+        What is held out says nothing of them. Several channels see the same source: that is the last to be doubted.
+        Many pixels with known noise test them all.
+        """
+        per_state = [
+            found.space.candidates[m]
+            for g, p in enumerate(found.samples.probability)
+            if p > least
+            for m in found.members[g]
+            if isinstance(found.space.candidates[m].effect, ValuePerState)
+        ]
+        doubted = sorted(per_state, key=lambda c: not isinstance(c.effect, SourceEffect))
+        out = set[Candidate]()
+        for k, data in enumerate(self.whole.captures):
+            if self.whole.noise_known and data.usable.sum() > 1:
+                continue
+            room = len(self.whole.model.channels) - 1 - (self.whole.model.free_source and data.sample is not None)
+            out |= set([c for c in doubted if c.acts(k, data.wavelength_nm)][room:])
+        return out
 
     def _posterior(
         self, candidates: Sequence[Candidate], fixed: Sequence[Candidate], old: Posterior | None = None
@@ -187,7 +219,7 @@ def solution(bench: WholeBench, found: Posterior, unfit: Sequence[Candidate] = (
     asked = predicts(bench.problem)
     base_fit = minimize(asked, bench.base, _values_of(bench, bench.base))
     before = held_out(asked, bench.base, base_fit)
-    space, values = applied(found, bench.base, unfit)
+    space, values = applied(found, bench.base, [*unfit, *bench.as_many_as_intensities(found, SHARES)])
     asked.relinearize(space, values)
     sums = asked.sums(space, values)
     fit = Fit(values, sums, float(sums.excess.sum()))
