@@ -77,7 +77,7 @@ class Tiles:
     boxes: tuple[tuple[slice, slice], ...]
     pick: NDArray[np.bool_]
     pixels: Array
-    #: `tile_products` that were asked for before.
+    #: `tile_products` that are kept, by their features.
     products: dict[tuple[int, ...], tuple[Array, Array]] = field(default_factory=dict)
 
 
@@ -156,16 +156,21 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
     )
 
 
-def tile_products(data: CaptureData, tiles: Tiles, used: Sequence[int]) -> tuple[Array, Array]:
-    """Second moments (T, F L, F L) of some features together in every tile, and their noise (T, L, F, F).
+def tile_products(data: CaptureData, tiles: Tiles, used: Sequence[int]) -> tuple[tuple[int, ...], Array, Array]:
+    """Which features, their second moments (T, F L, F L) together in every tile, and their noise (T, L, F, F).
 
-    `used` are numbers of FEATURES in ascending order, of which the counts are the first.
+    `used` are numbers of FEATURES in ascending order, of which the counts are the first; others may stand beside them.
     """
     if tuple(used) == (0,):
-        return tiles.s, tiles.noise[..., None, None]
-    if tuple(used) not in tiles.products:
-        tiles.products[tuple(used)] = _products(data, tiles, list(used))
-    return tiles.products[tuple(used)]
+        return (0,), tiles.s, tiles.noise[..., None, None]
+    for known, (s, noise) in tiles.products.items():
+        if set(used) <= set(known):
+            return known, s, noise
+    # One set of them is kept, with all that was asked for before: they are large.
+    wanted = tuple(sorted(set(used).union(*tiles.products)))
+    tiles.products.clear()
+    tiles.products[wanted] = _products(data, tiles, list(wanted))
+    return wanted, *tiles.products[wanted]
 
 
 def _products(data: CaptureData, tiles: Tiles, used: list[int]) -> tuple[Array, Array]:

@@ -65,7 +65,7 @@ class InstrumentProblem:
         captures: Sequence[CaptureData],
         undone: Mapping[Candidate, Array] | None = None,
         folds: int | None = None,
-        moved_px: Sequence[Array] | None = None,
+        moved_back: bool = False,
     ) -> None:
         self.undone = dict(undone or {})
         self._others: list[InstrumentProblem] = []
@@ -73,13 +73,12 @@ class InstrumentProblem:
         self.models = (models,) * len(captures) if isinstance(models, InstrumentModel) else tuple(models)
         self.model = self.models[0]
         self.wavelengths_nm = tuple(c.wavelength_nm for c in captures)
-        # The captures as taken, by how many of their pixels each frame is moved back, and what of that the model says.
+        # The captures as taken (corrected already if they were moved back), and how far the model says that they moved.
         self.still = tuple(captures)
         pairs = zip(self.models, captures, strict=True)
         own = (changes_of(m, c.conditions, c.name).shift_px / c.pitch for m, c in pairs)
         self.own_px = tuple(s if movable(s) else np.zeros_like(s) for s in own)
-        self.shifts_px = tuple(self.own_px if moved_px is None else moved_px)
-        self.captures = self._moved_back()
+        self.captures = self.still if moved_back else _moved_back(self.still, self.own_px)
         self.folds = folds or (FOLDS_OF_STATES if any(holds_out_states(c) for c in self.captures) else FOLDS_OF_TILES)
         self.moments: tuple[Moments, ...] = tuple(moments_of(c, self.folds) for c in self.captures)
         self._built: list[dict[tuple[str, bytes], Array]] = [{} for _ in self.captures]
@@ -143,17 +142,13 @@ class InstrumentProblem:
         if not all(movable(s) for s in shifts):
             return False
         still = [c.undone(undoing(c, bent)) if bent else c for c in self.still]
-        there = InstrumentProblem(self.models, still, undone, self.folds, shifts)
+        there = InstrumentProblem(self.models, _moved_back(still, shifts), undone, self.folds, moved_back=True)
         if not all(np.all(np.isfinite(m.sigma)) and np.all(m.sigma > 0) for m in there.moments):
             # So far away that there are no such counts.
             return False
         self._others.append(there)
         del self._others[:-MOST_POINTS]
         return True
-
-    def _moved_back(self) -> tuple[CaptureData, ...]:
-        pairs = zip(self.still, self.shifts_px, strict=True)
-        return tuple(c.moved_back(s) if s.any() else c for c, s in pairs)
 
     def _shift_px(self, capture: int, undone: Mapping[Candidate, Array]) -> Array:
         changes = Changes(self.captures[capture].conditions)
@@ -186,7 +181,7 @@ class InstrumentProblem:
         self.still = tuple(
             c.with_noise_of(undoing(c, at)) if at else replace(c, true_variance=None) for c in self.still
         )
-        self.captures = self._moved_back()
+        self.captures = _moved_back(self.still, self.own_px)
         self.moments = tuple(moments_of(c, self.folds) for c in self.captures)
         self.spread = max(m.spread for m in self.moments)
         self._others.clear()
@@ -320,3 +315,8 @@ class InstrumentProblem:
         add_tiles(data, moments, moments.tiles, a, c, da, dc, out)
         if moments.clipped is not None and not changes.drop_clipped:
             add_tiles(data, moments, moments.clipped, a, c, da, dc, out)
+
+
+def _moved_back(captures: Sequence[CaptureData], shifts_px: Sequence[Array]) -> tuple[CaptureData, ...]:
+    """Every frame moved back by so many pixels (N, 2) of its capture."""
+    return tuple(c.moved_back(s) if s.any() else c for c, s in zip(captures, shifts_px, strict=True))

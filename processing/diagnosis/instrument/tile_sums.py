@@ -44,8 +44,9 @@ def add_tiles(
     data: CaptureData, moments: Moments, tiles: Tiles, a: Array, c: Array, da: Array, dc: Array, out: Sums
 ) -> None:
     """Add what tiles say of a (tiles, L, K) and coefficients c (F, L), with their derivatives by each value."""
-    used = np.flatnonzero(np.any(c, axis=1) | np.any(dc, axis=(0, 2)))
-    products = tile_products(data, tiles, used.tolist())
+    asked = np.flatnonzero(np.any(c, axis=1) | np.any(dc, axis=(0, 2)))
+    known, *products = tile_products(data, tiles, asked.tolist())
+    used = np.array(known)
     use = np.flatnonzero(moments.counts)
     of_features = c[used][:, use], dc[:, used][:, :, use]
     for first in range(0, tiles.x.size, TOGETHER):
@@ -57,7 +58,7 @@ def _add_some(
     moments: Moments,
     tiles: Tiles,
     some: slice,
-    products: tuple[Array, Array],
+    products: Sequence[Array],
     used: NDArray[np.int64],
     of_rows: tuple[Array, Array],
     of_features: tuple[Array, Array],
