@@ -5,15 +5,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.special import betaln
 
 from processing.diagnosis.instrument.doubts import ONE_PATTERN, patterned_share
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.likely_set import likely_set
 from processing.diagnosis.search.posterior import descend
-from processing.diagnosis.search.rules import TAU
+from processing.diagnosis.search.rules import FEW_CAUSES, TAU, TAU_WEIGHT
 from processing.diagnosis.search.sampling import sample
 from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets, State
 from processing.diagnosis.search.space import Space
+from processing.diagnosis.search.stays import stay
 from processing.effect import Parameter
 
 #: Nothing but noise, whose unit is one.
@@ -31,7 +33,8 @@ def groups(*sizes):
     return [Group(np.arange(end - size, end)) for size, end in zip(sizes, ends, strict=True)]
 
 
-def test_probabilities_are_those_of_all_sets():
+@pytest.mark.parametrize("average", [sample, stay])
+def test_probabilities_are_those_of_all_sets(average):
     random = np.random.default_rng(3)
     design = random.standard_normal((40, 5)) * np.array([6, 6, 3, 3, 2])
     # Two that are nearly the same, one that is there, one of two values that is weak.
@@ -43,11 +46,56 @@ def test_probabilities_are_those_of_all_sets():
         there.append(np.array(tau) > 0)
     weight = np.exp(np.array(scores) - max(scores))
     exact = weight @ np.array(there) / weight.sum()
-    found = sample(sets, likely_set(sets), 600)
+    found = average(sets, likely_set(sets), 800)
     assert found.probability == pytest.approx(exact, abs=0.08)
     # Which of the two alike is open, that one is there is not.
     assert 0.05 < exact[0] < 0.999
     assert found.any_of([0, 1]) > 0.99
+
+
+def test_what_is_unlikely_one_by_one_is_likely_together():
+    """Thirty weak groups: no set of them is likely, and each keeps its probability and its variance."""
+    size, curvature = 30, 50.0
+    gradient = np.sqrt(curvature) * np.random.default_rng(19).normal(0, 1.5, size)
+    sets = Sets(Quadratic(0.0, gradient, curvature * np.eye(size)), groups(*[1] * size), QUIET)
+    found = stay(sets, sets.empty(), 1000)
+    # Independent data: sums over all sets of one size are elementary symmetric polynomials of the Bayes factors.
+    width = 1 / (curvature + TAU**-2.0)
+    factor = np.sqrt(width) / TAU * np.exp(0.5 * gradient[:, None] ** 2 * width)
+    factor *= TAU_WEIGHT
+    count = np.arange(size + 1)
+    prior = np.exp(betaln(1 + count, size - count + FEW_CAUSES * size))
+    total = prior @ symmetric(factor.sum(axis=1))
+    exact = np.array(
+        [f * (prior[1:] @ symmetric(np.delete(factor.sum(axis=1), k))) for k, f in enumerate(factor.sum(axis=1))]
+    )
+    exact /= total
+    weight = factor / factor.sum(axis=1, keepdims=True)
+    mean = -gradient[:, None] * width
+    square = exact * np.sum(weight * (width + mean**2), axis=1)
+    variance = square - (exact * np.sum(weight * mean, axis=1)) ** 2
+    assert found.probability == pytest.approx(exact, abs=0.05)
+    assert np.diag(found.covariance).sum() == pytest.approx(variance.sum(), rel=0.15)
+
+
+def symmetric(factors):
+    """Sums (N + 1,) over all sets of 0, 1, ... N of the products of their factors (N,)."""
+    out = np.zeros(len(factors) + 1)
+    out[0] = 1.0
+    for f in factors:
+        out[1:] += f * out[:-1]
+    return out
+
+
+def test_two_small_causes_are_found_beside_values_that_imitate_them():
+    """A slip and a ratio of an axis explain together what an error of every state explains, with fewer values."""
+    states = np.arange(40)
+    slip, ratio = (states > 14) * 1.0, states / 39 - 0.5
+    design = 60 * np.column_stack([np.eye(40), slip, ratio])
+    truth = np.concatenate([np.zeros(40), [0.5, -0.6]])
+    both = Sets(form(design, truth, 29), [*groups(40), Group(np.array([40]), 38.0), Group(np.array([41]))], QUIET)
+    assert likely_set(both).tau[1:].all()
+    assert not likely_set(both).tau[0]
 
 
 def test_the_mean_is_nearer_to_the_truth_than_the_data_are():
@@ -91,14 +139,15 @@ def test_structure_that_no_set_explains_widens_the_errors():
     assert not state.tau[1:].any()
 
 
-def test_two_that_say_the_same_share_the_mean():
+@pytest.mark.parametrize("average", [sample, stay])
+def test_two_that_say_the_same_share_the_mean(average):
     random = np.random.default_rng(17)
     design = 100 * random.standard_normal((90, 60))
     design[:, 1] = design[:, 0]
     sets = Sets(form(design, np.eye(60)[0] + np.eye(60)[5] - np.eye(60)[7]), groups(*[1] * 60), QUIET)
-    found = sample(sets, likely_set(sets), 30)
-    assert found.probability[:2] == pytest.approx(0.5, abs=0.1)
-    assert found.mean[:2] == pytest.approx(0.5, abs=0.1)
+    found = average(sets, likely_set(sets), 1500)
+    assert found.probability[:2] == pytest.approx(0.5, abs=0.15)
+    assert found.mean[:2] == pytest.approx(0.5, abs=0.15)
 
 
 def test_values_of_a_jump_beside_a_slope_are_not_random():

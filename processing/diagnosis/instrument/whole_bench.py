@@ -15,6 +15,7 @@ from processing.diagnosis.instrument.undone import exactly_undone
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.fit import Fit, held_out, minimize, prior, score
+from processing.diagnosis.search.likely_set import everything
 from processing.diagnosis.search.posterior import Posterior, Say, posterior, quadratic, resampled
 from processing.diagnosis.search.rules import BESIDE_FIELD, DECISIVE, FAR_OFF, LIKELY, REFUTED, SHARES, TAKES_PART
 from processing.diagnosis.search.solution import Solution
@@ -171,10 +172,16 @@ class WholeBench:
                 return [candidate]
         return []
 
+    def _least_unit(self, found: Posterior) -> float:
+        """Unit of chi-square with every group there: what varies over the image may be what hides the others."""
+        if not self.whole.noise_known:
+            return found.samples.best.unit
+        return min(found.samples.best.unit, found.sets.settled(everything(found.sets)).unit)
+
     def _with_fields(self, found: Posterior, fixed: Sequence[Candidate], fields: Sequence[Candidate]) -> Posterior:
         """The posterior with values that vary over the image, if they promise something beside all others."""
         space, values = applied(found, self.base)
-        unit = found.samples.best.unit
+        unit = self._least_unit(found)
         both = Space((*space.candidates, *fields))
         sums = self.whole.sums(both, np.append(values, np.zeros(both.size - space.size)))
         parts = dict(zip(both.candidates, both.slices, strict=True))

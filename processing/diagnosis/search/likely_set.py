@@ -1,35 +1,45 @@
-"""A likely set of groups to start from: from nothing upwards, and from everything downwards."""
+"""A likely set of groups to start from: from nothing upwards, from everything downwards, and without what can imitate
+many others."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from processing.diagnosis.search.rules import HOPE, NEEDED, PATIENCE, TAU
+from processing.diagnosis.search.rules import HOPE, NEEDED, PATIENCE
 from processing.diagnosis.search.sets import Sets, State
 
 STEPS = 60
 
 
 def likely_set(sets: Sets) -> State:
-    """The more likely of two: several causes together can be plain where each alone is nothing, and the reverse."""
+    """The likeliest of some: several causes together can be plain where each alone is nothing, and the reverse."""
     up = climb(sets, sets.empty())
     down = climb(sets, thinned(sets))
-    return max(up, down, key=lambda s: sets.fitted(s).score)
+    best = max(up, down, key=lambda s: sets.fitted(s).score)
+    large = sets.many & sets.free
+    for k in np.flatnonzero((best.tau > 0) & large):
+        # Many values can do what two or three small causes do, each of which gains nothing beside them.
+        without = sets.without(best, int(k))
+        other = climb(sets, climb(sets, without, never=large & (without.tau == 0)))
+        best = max(best, other, key=lambda s: sets.fitted(s).score)
+    return best
 
 
-def climb(sets: Sets, state: State) -> State:
-    """The change of one group that gains most, as long as one gains; the unit follows."""
+def climb(sets: Sets, state: State, never: NDArray[np.bool_] | None = None) -> State:
+    """The change of one group that gains most, as long as one gains; the unit follows. `never` (G,) are not added."""
     state = sets.settled(state.copy())
     best, barred = sets.fitted(state).score, np.zeros(len(sets.groups), dtype=bool)
+    open_to = sets.free if never is None else sets.free & ~never
     for _ in range(STEPS):
         c = sets.conditional(state)
         there = state.tau > 0
-        gain = np.where(sets.free & ~barred, np.where(there, -c.log_odds, c.log_odds), -np.inf)
+        gain = np.where(open_to & ~barred, np.where(there, -c.log_odds, c.log_odds), -np.inf)
         k = int(np.argmax(gain))
         if gain[k] < HOPE or barred.sum() > PATIENCE:
             break
         tried = state.copy()
-        tried.tau[k] = 0.0 if there[k] else TAU[int(np.argmax(c.tau_weights[k]))]
+        tried.tau[k] = 0.0 if there[k] else sets.taus[int(np.argmax(c.tau_weights[k]))]
         now = sets.fitted(sets.settled(tried)).score
         if now > best:
             state, best = tried, now
@@ -40,13 +50,14 @@ def climb(sets: Sets, state: State) -> State:
     return sets.settled(state)
 
 
-def thinned(sets: Sets) -> State:
-    """From every group at its typical size, the least needed taken away until all are needed; the likeliest of these.
+def everything(sets: Sets) -> State:
+    """Every group at its typical size, but those of which one of many may be there."""
+    return State(np.where(sets.free & (sets.share == 1), 1.0, sets.empty().tau))
 
-    Alternatives of which one may be there are too many to begin with.
-    """
-    base = sets.empty()
-    state = sets.settled(State(np.where(sets.free & (sets.share == 1), 1.0, base.tau)))
+
+def thinned(sets: Sets) -> State:
+    """From everything, the least needed taken away until all are needed; the likeliest of these."""
+    state = sets.settled(everything(sets))
     best, kept = -np.inf, state.copy()
     while True:
         c = sets.conditional(state)
@@ -65,4 +76,4 @@ def retune(sets: Sets, state: State) -> None:
     """Every group at its likeliest variance."""
     c = sets.conditional(state)
     there = (state.tau > 0) & sets.free
-    state.tau[there] = TAU[np.argmax(c.tau_weights[there], axis=1)]
+    state.tau[there] = sets.taus[np.argmax(c.tau_weights[there], axis=1)]

@@ -17,6 +17,7 @@ from processing.diagnosis.search.likely_set import climb, likely_set
 from processing.diagnosis.search.problem import Problem
 from processing.diagnosis.search.rules import (
     BENT,
+    CHANGES,
     LEAST_NOISE,
     NOMINAL_TAU,
     ROUNDS,
@@ -28,8 +29,9 @@ from processing.diagnosis.search.rules import (
     TAU,
 )
 from processing.diagnosis.search.sampling import Samples, sample
-from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets
+from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets, State
 from processing.diagnosis.search.space import Space, Sums
+from processing.diagnosis.search.stays import stay
 
 #: Called with a line that says what is being done.
 Say = Callable[[str], None]
@@ -110,10 +112,15 @@ def posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start:
             x = x if settled else new
         if settled:
             break
-    samples = sample(sets, state, SAMPLES)
+    samples = _averaged(sets, state)
     there = [space.candidates[members[g][0]].label for g in np.flatnonzero((samples.probability > 0.5) & sets.free)]
     say(f"likely: {', '.join(there) or 'nothing'}; unit of chi-square {state.unit:.3g}")
     return _posterior_of(space, members, sets, samples)
+
+
+def _averaged(sets: Sets, state: State) -> Samples:
+    """Average over sets; where what is left is the noise each has a unit of its own, and counts by its evidence."""
+    return stay(sets, state, CHANGES) if sets.noise.known else sample(sets, state, SAMPLES)
 
 
 def _everything(problem: Problem, space: Space, fixed: Sequence[Candidate], x: Array, noise: Noise) -> Array:
@@ -139,7 +146,7 @@ def _everything(problem: Problem, space: Space, fixed: Sequence[Candidate], x: A
 def resampled(found: Posterior, form: Quadratic) -> Posterior:
     """The same with another chi-square, from the likeliest set on."""
     sets = Sets(form, found.sets.groups, found.sets.noise)
-    samples = sample(sets, climb(sets, found.samples.best), SAMPLES)
+    samples = _averaged(sets, climb(sets, found.samples.best))
     return _posterior_of(found.space, found.members, sets, samples)
 
 

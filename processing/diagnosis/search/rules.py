@@ -11,9 +11,14 @@ import numpy as np
 # ---- prior: what is plausible before the data are seen -------------------------------------------------------------
 #: [typical sizes] Standard deviations of the values of a group. Mounts are set to a fraction of a degree far more often
 #: than they are left wrong by three typical sizes.
-TAU = np.array([0.03, 0.1, 0.3, 1.0, 3.0])
-#: [probability] How plausible each of these standard deviations is.
-TAU_WEIGHT = np.array([0.1, 0.2, 0.3, 0.3, 0.1])
+TAU = np.array([0.03, 0.055, 0.1, 0.17, 0.3, 0.55, 1.0, 1.7, 3.0])
+#: [probability] How plausible each of these standard deviations is, for a few values: every second is enough.
+TAU_WEIGHT = np.array([0.1, 0.0, 0.2, 0.0, 0.3, 0.0, 0.3, 0.0, 0.1])
+#: [probability] The same for a value of each state: forty tell theirs so well that with every second two groups of a
+#: third each would do better than the one that is there.
+TAU_WEIGHT_OF_MANY = np.array([0.04, 0.08, 0.1, 0.13, 0.16, 0.16, 0.16, 0.1, 0.07])
+#: [1] Values from which on a group has many: it can do what several others do.
+MANY = 9
 #: [1] Weight of the prior for few causes: with k of n groups there, one more has odds of (1 + k) to ((1 + this) n - k -
 #: 1). A clean bench has few causes, one with six faults may well have a seventh.
 FEW_CAUSES = 0.5
@@ -220,7 +225,9 @@ LEAST_MODULATION = 1.0
 ROUNDS = 7
 #: [standard deviations] A move of the solution below which no new linearization is needed.
 SETTLED = 0.3
-#: [sets] That are visited in the last round.
+#: [changes] Of a chain in the last round.
+CHANGES = 1000
+#: [sets] That are visited in the last round where what is left is the noise.
 SAMPLES = 300
 #: [sets] That are visited in the rounds before.
 SAMPLES_BEFORE = 80

@@ -3,6 +3,7 @@
 Weighted tempered Gibbs sampling (Zanella and Roberts, J. R. Stat. Soc. B 81, 489, 2019): a group whose present state is
 unlikely given the others is the more likely to be asked next, so that of two groups that explain the same now one is
 there and now the other. The chain only finds the sets: what they weigh is known, so each counts once, by its evidence.
+That leaves out the many sets that are unlikely one by one (`stays.py` has them).
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
-from processing.diagnosis.search.rules import ALTERNATIVE, TAU
+from processing.diagnosis.search.rules import ALTERNATIVE
 from processing.diagnosis.search.sets import Conditional, Sets, State
 
 #: Weight of a set below which it changes no mean.
@@ -90,7 +91,7 @@ def sample(sets: Sets, state: State, visits: int, seed: int = 0) -> Samples:
     for _ in range(visits):
         c = sets.conditional(state)
         present = state.tau > 0
-        chance = _chance(sets, c)
+        chance = chance_of(sets, c)
         average.add(c, state, chance)
         now = np.where(present, chance, 1 - chance)
         rate = np.where(sets.free, interest / np.maximum(now, 1e-12), 0.0)
@@ -99,19 +100,20 @@ def sample(sets: Sets, state: State, visits: int, seed: int = 0) -> Samples:
         interest = np.maximum(interest, np.minimum(chance, 0.5) * sets.free)
         k = int(random.choice(rate.size, p=rate / rate.sum()))
         there = random.random() < 0.5
-        state.tau[k] = TAU[int(random.choice(TAU.size, p=c.tau_weights[k]))] if there else 0.0
+        state.tau[k] = sets.taus[int(random.choice(sets.taus.size, p=c.tau_weights[k]))] if there else 0.0
     # Where what is left is the noise, a set that leaves less has a smaller unit, and must be passed to step by step.
-    for other in _swapped(sets, average.best) if sets.noise.known else ():
+    for other in swapped(sets, average.best) if sets.noise.known else ():
         c = sets.conditional(other)
-        average.add(c, other, _chance(sets, c))
+        average.add(c, other, chance_of(sets, c))
     return average.samples()
 
 
-def _chance(sets: Sets, c: Conditional) -> Array:
+def chance_of(sets: Sets, c: Conditional) -> Array:
+    """Probability (G,) of each group given the others."""
     return np.where(sets.free, 1 / (1 + np.exp(-np.clip(c.log_odds, -50, 50))), 1.0)
 
 
-def _swapped(sets: Sets, state: State) -> Iterator[State]:
+def swapped(sets: Sets, state: State) -> Iterator[State]:
     """The set with one of its groups in turn exchanged for one that would do nearly as well in its place.
 
     Of two that say the same the chain may never see the second: it would have to pass a set with both or with none.
@@ -122,5 +124,5 @@ def _swapped(sets: Sets, state: State) -> Iterator[State]:
         rivals = np.flatnonzero(sets.free & (state.tau == 0) & (c.log_odds > c.log_odds[k] - ALTERNATIVE))
         for j in rivals[np.argsort(-c.log_odds[rivals])][:MOST_RIVALS]:
             other = without.copy()
-            other.tau[j] = TAU[int(np.argmax(c.tau_weights[j]))]
+            other.tau[j] = sets.taus[int(np.argmax(c.tau_weights[j]))]
             yield other

@@ -18,7 +18,10 @@ from scipy.linalg import solve_triangular
 from scipy.special import betaln
 
 from processing.arrays import Array
-from processing.diagnosis.search.rules import FEW_CAUSES, TAU, TAU_WEIGHT
+from processing.diagnosis.search.rules import FEW_CAUSES, MANY, TAU, TAU_WEIGHT, TAU_WEIGHT_OF_MANY
+
+#: Probability of what cannot be, for its logarithm.
+LEAST_WEIGHT = 1e-300
 
 
 @dataclass(frozen=True)
@@ -118,16 +121,23 @@ class Conditional(Fitted):
 class Sets:
     """Sets of groups in one quadratic problem.
 
-    `count` is the number of groups that might be there, if these are not all of them.
+    `count` is the number of groups that might be there, if these are not all of them; `beside` is how many are there
+    besides them.
     """
 
-    def __init__(self, form: Quadratic, groups: Sequence[Group], noise: Noise, count: float | None = None) -> None:
-        self.form, self.groups, self.noise = form, tuple(groups), noise
+    def __init__(
+        self, form: Quadratic, groups: Sequence[Group], noise: Noise, count: float | None = None, beside: int = 0
+    ) -> None:
+        self.form, self.groups, self.noise, self.beside = form, tuple(groups), noise, beside
         self.free = np.array([g.fixed_tau is None for g in groups], dtype=bool)
         self.share = np.array([g.share for g in groups])
         self.size = form.gradient.size
         # The alternatives of one group count once.
         self.count = float(np.sum(1 / self.share[self.free])) if count is None else count
+        self.taus = TAU
+        # Where what is left is the noise, what fits better would be taken for a smaller one.
+        self.many = np.array([g.index.size >= MANY and noise.known for g in groups], dtype=bool)
+        self.tau_weight = np.where(self.many[:, None], TAU_WEIGHT_OF_MANY, TAU_WEIGHT)
         sizes = np.array([g.index.size for g in groups])
         self._alike = [np.flatnonzero((sizes == n) & self.free) for n in np.unique(sizes)]
 
@@ -147,13 +157,27 @@ class Sets:
         out.tau[k] = 0.0
         return out
 
+    def among(self, form: Quadratic, kept: NDArray[np.int64], groups: Sequence[Group], beside: int) -> Sets:
+        """The same prior for the groups `kept` alone, with new positions, where `beside` of the others are there."""
+        return Sets(form, groups, self.noise, self.count, self.beside + beside)
+
     def _log_prior(self, tau: Array) -> float:
-        """Log probability of a set: how likely a group is is learnt from how many there are (beta-binomial)."""
+        """Log probability of a set and its variances."""
         there = self.free & (tau > 0)
-        k, n = float(there.sum()), self.count
-        taus = TAU_WEIGHT[np.argmin(np.abs(TAU[:, None] - tau[there]), axis=0)]
+        weight = self.tau_weight[there, np.argmin(np.abs(self.taus[:, None] - tau[there]), axis=0)]
+        return self.log_prior(there) + float(np.log(np.maximum(weight, LEAST_WEIGHT)).sum())
+
+    def log_prior(self, there: NDArray[np.bool_]) -> float:
+        """Log probability of a set: how likely a group is is learnt from how many there are (beta-binomial)."""
+        k, n = float(there.sum()) + self.beside, self.count
         count = betaln(1 + k, max(n - k, 0.0) + FEW_CAUSES * n) - betaln(1, (1 + FEW_CAUSES) * n)
-        return float(count - np.log(self.share[there]).sum() + np.log(taus).sum())
+        return float(count - np.log(self.share[there]).sum())
+
+    def prior_odds(self, there: NDArray[np.bool_]) -> Array:
+        """Log odds (G,) of each group to be there, of the prior, given the others of a set."""
+        others = self.beside + there.sum() - there
+        rest = np.maximum((1 + FEW_CAUSES) * self.count - others - 1, 0.1)
+        return np.asarray(np.log((1 + others) / rest / self.share))
 
     def fitted(self, state: State) -> Fitted:
         """Posterior of the parameters that are there."""
@@ -182,22 +206,21 @@ class Sets:
         """Posterior of the parameters that are there, and odds of every group given the others."""
         fit, inverse, right = self._solved(state)
         log_odds = np.full(len(self.groups), np.inf)
-        weights = np.zeros((len(self.groups), TAU.size))
+        weights = np.zeros((len(self.groups), self.taus.size))
         for members, s, q in self._cavities(state, fit, inverse, right):
             value, vector = np.linalg.eigh((s + s.transpose(0, 2, 1)) / 2)
             value = np.maximum(value, 0.0)[:, None]
             along = (vector.transpose(0, 2, 1) @ q[:, :, None])[:, None, :, 0] ** 2
-            t2 = (TAU**2)[:, None]
-            gain = 0.5 * np.sum(t2 * along / (1 + t2 * value) - np.log1p(t2 * value), axis=2) + np.log(TAU_WEIGHT)
+            t2 = (self.taus**2)[:, None]
+            gain = 0.5 * np.sum(t2 * along / (1 + t2 * value) - np.log1p(t2 * value), axis=2)
+            gain += np.log(np.maximum(self.tau_weight[members], LEAST_WEIGHT))
             top = gain.max(axis=1, keepdims=True)
             weights[members] = np.exp(gain - top)
             total = weights[members].sum(axis=1, keepdims=True)
             weights[members] /= total
             log_odds[members] = (top + np.log(total))[:, 0]
         there = (state.tau > 0) & self.free
-        others = there.sum() - there
-        rest = np.maximum((1 + FEW_CAUSES) * self.count - others - 1, 0.1)
-        log_odds = np.where(self.free, log_odds + np.log((1 + others) / rest / self.share), np.inf)
+        log_odds = np.where(self.free, log_odds + self.prior_odds(there), np.inf)
         return Conditional(fit.active, fit.mean, fit.covariance, fit.left, fit.score, log_odds, weights)
 
     def given_others(self, state: State) -> dict[int, tuple[Array, Array]]:

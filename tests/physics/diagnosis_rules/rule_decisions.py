@@ -74,6 +74,7 @@ class Asked:
     def __init__(self, odds: list[float]) -> None:
         self.odds, self.conditionals, self.fits = np.array(odds), 0, 0
         self.groups, self.free, self.share = [None] * len(odds), np.ones(len(odds), bool), np.ones(len(odds))
+        self.taus, self.many = rules.TAU, np.zeros(len(odds), bool)
 
     def empty(self) -> State:
         return State(np.zeros(self.odds.size))

@@ -25,6 +25,18 @@ def test_tau_weight(m: Patch) -> bool:
 
 
 @decides
+def test_tau_weight_of_many(m: Patch) -> bool:
+    s = Sets(Quadratic(0.0, np.zeros(9), np.zeros((9, 9))), [Group(np.arange(9))], QUIET)
+    return abs(s.conditional(State(np.zeros(1))).log_odds[0] - np.log(1 / 0.5)) < 0.05
+
+
+@decides
+def test_many(m: Patch) -> bool:
+    form = Quadratic(0.0, np.zeros(17), np.zeros((17, 17)))
+    return Sets(form, [Group(np.arange(9)), Group(np.arange(9, 17))], QUIET).many.tolist() == [True, False]
+
+
+@decides
 def test_few_causes(m: Patch) -> bool:
     return abs(one(0.0, 0.0, groups=10).conditional(State(np.zeros(10))).log_odds[0] + np.log(14)) < 0.02
 

@@ -1,5 +1,6 @@
 """Constants of the search, and what it may cost."""
 
+from dataclasses import replace
 from types import SimpleNamespace as Some
 
 import numpy as np
@@ -21,7 +22,7 @@ def test_far_off(m: Patch) -> bool:
     return said == [{}, "far"]
 
 
-def rounds(m: Patch, unit: float = 1.0, moves: float = 9.0) -> tuple[list[int], bool]:
+def rounds(m: Patch, unit: float = 1.0, moves: float = 9.0, known: bool = True) -> tuple[list[int], bool]:
     """Sets visited in each round of `posterior` of a value that moves by so many deviations, and whether all began."""
     visits: list[int] = []
     all_first = False
@@ -36,9 +37,10 @@ def rounds(m: Patch, unit: float = 1.0, moves: float = 9.0) -> tuple[list[int], 
         return x
 
     m.setattr(posterior, "quadratic", lambda *a: Quadratic(0.0, np.zeros(1), np.eye(1)))
-    m.setattr(posterior, "noise_of", lambda *a: QUIET)
+    m.setattr(posterior, "noise_of", lambda *a: replace(QUIET, known=known))
     m.setattr(posterior, "likely_set", lambda s: State(np.zeros(1), unit))
     m.setattr(posterior, "sample", visit)
+    m.setattr(posterior, "stay", visit)
     m.setattr(posterior, "_everything", everything)
     m.setattr(posterior, "_improved", lambda problem, space, groups, samples, x: np.full(1, moves * len(visits)))
     m.setattr(posterior, "_posterior_of", lambda *a: None)
@@ -74,8 +76,13 @@ def test_settled(m: Patch) -> bool:
 
 
 @decides
+def test_changes(m: Patch) -> bool:
+    return rounds(m)[0][-1] == 1000
+
+
+@decides
 def test_samples(m: Patch) -> bool:
-    return rounds(m)[0][-1] == 300
+    return rounds(m, known=False)[0][-1] == 300
 
 
 @decides
@@ -116,7 +123,7 @@ def test_beside_field(m: Patch) -> bool:
     )
     m.setattr(whole_bench, "applied", lambda found, base: (Space(()), np.zeros(0)))
     m.setattr(whole_bench, "score", lambda *a: (1e6, None))
-    asked = bench(whole=Some(sums=lambda *a: None), _posterior=lambda candidates, fixed: candidates)
+    asked = bench(whole=Some(sums=lambda *a: None, noise_known=False), _posterior=lambda candidates, fixed: candidates)
     return len(asked._with_fields(found, [], [made(kind="field")])) == 90 + 1
 
 
