@@ -7,6 +7,7 @@ not applied, and show up here.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.instrument.mueller_slopes import mueller_slopes
@@ -19,7 +20,7 @@ from processing.instrument.effects.base import FieldEffect, Switch
 from processing.instrument.model import AppliedEffect, EffectParameter, SystematicError
 
 #: Share of the squared error of M that the stored directions hold, and how many they are at most.
-SHARE, MOST = 0.995, 16
+SHARE, MOST = 0.995, 20
 #: Part of the largest effect in a direction below which another one in it is left out.
 SMALL = 0.03
 #: Elements of M/m00 that can be wrong.
@@ -35,14 +36,12 @@ def systematic_error(problem: InstrumentProblem, found: Posterior) -> Systematic
     index = np.concatenate([np.r_[found.space.slices[k]] for k in chosen])
     products, light = mueller_slopes(problem, space, found.values[index])
     covariance = (found.covariance + _unseen(found))[np.ix_(index, index)]
-    value, vector = np.linalg.eigh(covariance)
-    root = vector * np.sqrt(np.maximum(value, 0.0))
-    size, turn = np.linalg.eigh(root.T @ products @ root)
-    size, directions = np.maximum(size[::-1], 0.0), (root @ turn)[:, ::-1]
-    total = float(size.sum())
+    total = float(np.sum(covariance * products))
     if total <= 0 or light <= 0:
         return None
-    enough = int(np.searchsorted(np.cumsum(size), SHARE * total)) + 1
+    lasts = np.array([c.capture is None for c in space.candidates for _ in c.parameters])
+    size, directions = _leading(covariance, products, lasts)
+    enough = int(np.searchsorted(np.cumsum(size), SHARE * size.sum())) + 1
     names = tuple(c.name for c in problem.captures)
     told = []
     for direction in directions.T[: min(enough, MOST)]:
@@ -53,6 +52,21 @@ def systematic_error(problem: InstrumentProblem, found: Posterior) -> Systematic
         rms_over_m00=float(np.sqrt(total / light / ELEMENTS)),
         wavelength_nm=problem.wavelengths_nm[0] if len(set(problem.wavelengths_nm)) == 1 else None,
     )
+
+
+def _leading(covariance: Array, products: Array, lasts: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Independent directions (K, K) of one standard deviation, the largest first, and their size (K,).
+
+    What matters is the error of M of these captures and, as much, of any other capture: there only what `lasts` (K,)
+    is wrong still. Forty values of a source in each capture would else leave no room for it.
+    """
+    wanted = np.zeros_like(products)
+    for part in (products, products * np.outer(lasts, lasts)):
+        wanted += part / max(float(np.sum(covariance * part)), 1e-300)
+    value, vector = np.linalg.eigh(covariance)
+    root = vector * np.sqrt(np.maximum(value, 0.0))
+    size, turn = np.linalg.eigh(root.T @ wanted @ root)
+    return np.maximum(size[::-1], 0.0), (root @ turn)[:, ::-1]
 
 
 def _unseen(found: Posterior) -> Array:
