@@ -20,7 +20,7 @@ from processing.storage.product import Product
 from simulators.blind.real_bench import PATCH
 
 #: Standard errors of M / m00 times m00 that come from the instrument, where the product has them.
-SYSTEMATIC = "mueller_systematic_errors"
+SYSTEMATIC = "mueller_systematic"
 #: Pixels darker than this part of the brightest are not looked at, nor so many pixels next to them: what an image that
 #: moves does there is no question of polarization.
 FAINT, RIM = 0.1, 3

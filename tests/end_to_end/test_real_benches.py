@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
-from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
+from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel, SystematicError
 from simulators.blind.bench_judge import WIRING_WORDS, Judgement, names_of, told_of, wiring_of
 from simulators.blind.bench_oracle import known_oracle
 from simulators.blind.bench_run import judge_bench
@@ -46,6 +46,26 @@ def test_bench_has_its_faults_in_every_capture_and_its_truth_apart(bench):
         with h5py.File(path) as h5:
             told = h5["entry"].attrs["header_json"]
         assert not any(f.kind in told for f in truth.faults)
+
+
+def test_intervals_hold_what_the_instrument_file_leaves_uncertain(bench, configs):
+    """Declared values are off by more than noise; with a retardance that may be off by five degrees they are within."""
+    folder, truth = bench
+    away = folder / "truth" / truth.name
+    declared = InstrumentModel.load(configs / "instruments" / truth.instrument)
+    five = {"retardance": EffectParameter(value=5.0, unit="degree")}
+    uncertain = tuple(
+        (AppliedEffect(kind=f"{axis}_retardance", element=f"{axis}_retarder", parameters=five),)
+        for axis in ("psg", "psa")
+    )
+    error = SystematicError(directions=uncertain, rms_over_m00=0.1, wavelength_nm=truth.wavelength_nm)
+    exact = np.load(away / "validation.npy").astype(float)
+    noise, both = (
+        coverage_of(away / "validation_noisy.h5", declared.model_copy(update={"systematic": s}), exact)
+        for s in ((), (error,))
+    )
+    assert both.patches > noise.patches + 0.05
+    assert both.pixels > noise.pixels
 
 
 def test_same_seed_gives_the_same_bench(bench, tmp_path, configs):
