@@ -80,6 +80,25 @@ def test_the_telescope_at_one_wavelength(shared_data, configs, tmp_path):
     assert 0.05 < d.error_after.rms_percent < 0.25
 
 
+def test_ten_wavelengths_share_their_mechanics(shared_data, configs, tmp_path):
+    instrument = configs / "instruments/drr_single_detector.yaml"
+    with (shared_data / "drr-single-detector-vis/air_2021.csv").open() as file:
+        table = np.array([[float(v) for v in row] for row in list(csv.reader(file))[1:]])
+    paths = []
+    for wavelength in range(450, 901, 50):
+        signal = table[np.argmin(np.abs(table[:, 0] - wavelength)), 1:]
+        lines = ["state,psg_deg,psa_deg,channel_camera"]
+        lines += [f"{n},{6 * n},{30 * n},{value}" for n, value in enumerate(signal)]
+        (tmp_path / str(wavelength)).mkdir()
+        paths.append(imported(tmp_path / str(wavelength), lines, instrument, wavelength, "air"))
+    d = diagnose_captures(paths, InstrumentModel.load(instrument))[0].diagnosis
+    assert d.correction.refused is None
+    assert d.error_after.rms_percent < 0.95 * d.error_before.rms_percent
+    assert all(c.rms_after_percent < c.rms_before_percent for c in d.captures)
+    named = [e for e in d.effects if e.confident and e.kind == "retarder_transmission"]
+    assert {e.wavelength_nm for e in named} == set(d.wavelengths_nm)
+
+
 def test_wollaston_the_source_is_the_cause(shared_data, configs, tmp_path):
     instrument = configs / "instruments/drr_wollaston.yaml"
     path, total = wollaston(shared_data, tmp_path, instrument, 1600)
