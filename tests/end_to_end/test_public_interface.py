@@ -91,3 +91,13 @@ def test_the_docstrings_run_as_they_stand(small_rig, tmp_path, monkeypatch, caps
     capsys.readouterr()
     exec(compile(blocks["processing"], "processing", "exec"), {})
     assert "[[" in capsys.readouterr().out
+
+
+def test_a_diagnosis_takes_names_of_files_as_text_and_refuses_none(tmp_path):
+    from processing import InstrumentModel, diagnose_captures
+
+    model = InstrumentModel.load(acquisition.CONFIGS / "instruments" / "rgb950.yaml")
+    with pytest.raises(ProcessError, match="no capture"):
+        diagnose_captures([], model)
+    with pytest.raises(ProcessError, match=re.escape("absent.h5")):
+        diagnose_captures([str(tmp_path / "absent.h5")], model)

@@ -12,11 +12,11 @@ from processing.diagnosis.instrument.judge import Judged, diagnose
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.posterior import Say
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture
+from processing.storage.capture import Capture, CaptureError
 
 
 def diagnose_captures(
-    captures: Sequence[Path], model: InstrumentModel, say: Say = lambda line: None
+    captures: Sequence[Path | str], model: InstrumentModel, say: Say = lambda line: None
 ) -> tuple[Judged, InstrumentProblem]:
     """Diagnose capture files jointly.
 
@@ -27,14 +27,20 @@ def diagnose_captures(
     model
         As loaded from its file.
 
+    Returns
+    -------
+    Verdict, names and correction; and the problem that they are the answer to.
+
     Raises
     ------
     CaptureError
-        A file cannot be used.
+        A file cannot be used, or none is given.
     """
+    if not captures:
+        raise CaptureError("no capture to diagnose: one file or several of one instrument are wanted")
     models: list[InstrumentModel] = []
     data: list[CaptureData] = []
-    for path in captures:
+    for path in map(Path, captures):
         say(f"reading {path.name}")
         with Capture(path) as capture:
             models.append(model.nominal_at(capture.header.wavelength_nm))
