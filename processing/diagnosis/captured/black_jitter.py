@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
@@ -37,6 +38,8 @@ def black_jitter(data: CaptureData, a: Array) -> tuple[Array, float] | None:
     level = np.median(y[:, dim], axis=1).astype(np.float64)
     scatter = np.median(np.abs(y[:, dim] - level[:, None]), axis=1) / NORMAL_MAD
     noise = MEDIAN * float(np.mean(scatter**2)) / int(dim.sum())
+    if not _alike_in_halves(y[:, dim], mean[dim], outside, noise):
+        return None
     seen, bright = outside.T @ level, outside.T @ y[:, lit].mean(axis=1, dtype=np.float64)
     if float(seen @ seen) < noise * (free + NOISE_SURE * np.sqrt(2 * free)):
         return None
@@ -47,3 +50,18 @@ def black_jitter(data: CaptureData, a: Array) -> tuple[Array, float] | None:
     offsets = np.zeros(data.values_per_pixel)
     offsets[rows] = outside @ (seen - bright / light)
     return offsets, float(np.sum(offsets**2)) / free
+
+
+def _alike_in_halves(y: NDArray[np.float32], mean: Array, outside: Array, noise: float) -> bool:
+    """Whether the brighter half of dim pixels (L, P) shows the same as the darker one, as an offset does.
+
+    What happens to light grows with it, and is another thing on another material. `noise` is the variance of a median
+    over all of them.
+    """
+    bright = mean > np.median(mean)
+    if bright.all() or not bright.any():
+        return True
+    one, other = (outside.T @ np.median(y[:, half], axis=1).astype(np.float64) for half in (bright, ~bright))
+    free, apart = outside.shape[1], one - other
+    # Each has twice the variance of the whole, their difference four times.
+    return bool(apart @ apart < 4 * noise * (free + NOISE_SURE * np.sqrt(2 * free)))

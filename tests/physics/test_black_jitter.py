@@ -1,0 +1,42 @@
+"""What light does in dim pixels is no black level that jitters, however it differs from what it does in bright ones."""
+
+import numpy as np
+import pytest
+
+from processing.diagnosis.captured.black_jitter import black_jitter
+from processing.diagnosis.captured.capture_data import CaptureData
+from processing.instrument.changes import Conditions
+
+STATES, SIDE, SIGMA = 20, 60, 1e-4
+
+
+def capture(offset, misfit):
+    """A bright surface under a dim background that grows brighter downwards, each with a misfit of its own."""
+    random = np.random.default_rng(3)
+    bright, dim = np.sqrt(STATES) * np.linalg.qr(random.normal(size=(STATES, 2)))[0].T
+    light = np.full((SIDE, SIDE), 0.5)
+    light[:20] = np.linspace(0.003, 0.009, 20)[:, None]
+    lit = light > 0.1
+    signal = light * (1 + misfit * np.where(lit, bright[:, None, None], dim[:, None, None]))
+    signal = signal + offset * random.normal(size=(STATES, 1, 1)) + SIGMA * random.normal(size=signal.shape)
+    return CaptureData(
+        name="surface",
+        signal=signal[:, None].astype(np.float32),
+        conditions=Conditions({}, STATES, ("all",), np.arange(STATES) / STATES, 4095.0),
+        exposure=np.ones(STATES),
+        sample=None,
+        slope=np.zeros(STATES),
+        floor=np.full(STATES, SIGMA**2),
+        noise_known=True,
+        noise_source="",
+        clipped=np.zeros((SIDE, SIDE), dtype=bool),
+        clipped_states=np.zeros(STATES, dtype=bool),
+        usable=np.ones((SIDE, SIDE), dtype=bool),
+        simulated=True,
+        wavelength_nm=662.0,
+    )
+
+
+@pytest.mark.parametrize(("offset", "misfit", "found"), [(0.0, 0.0, False), (0.0, 0.2, False), (3e-4, 0.0, True)])
+def test_an_offset_is_the_same_in_darker_and_brighter_dim_pixels(offset, misfit, found):
+    assert (black_jitter(capture(offset, misfit), np.ones((STATES, 1))) is not None) == found
