@@ -192,7 +192,8 @@ def _open_port(port: str, baudrate: int, held_by: str | None, xonxoff: bool, rts
             baudrate=baudrate,
             stopbits=serial.STOPBITS_TWO if two_stop_bits else serial.STOPBITS_ONE,
             timeout=READ_SLICE_S,
-            write_timeout=2.0,
+            # Counted by the real clock: a machine that stands still for a moment is no lost port.
+            write_timeout=10.0,
             xonxoff=xonxoff,
             rtscts=rtscts,
             **options,

@@ -31,6 +31,14 @@ def test_of_tied_values_the_sum_that_the_data_tell_counts() -> None:
     assert predicted_change(mean, tied, np.diag([1.0, 0.0])).chance_worse > 0.4
 
 
+def test_an_alternative_stands_in_for_what_is_applied() -> None:
+    # A slip, or in one case of ten another that moves M in the same way: wrong about the name, right about M.
+    mean, both = np.array([0.9, 0.1]), 0.09 * np.array([[1.0, -1.0], [-1.0, 1.0]]) + 1e-4 * np.eye(2)
+    first = np.array([True, False])
+    assert predicted_change(mean, both, np.ones((2, 2)), first).chance_worse < 1e-6
+    assert predicted_change(mean, both, np.eye(2), first).chance_worse > 0.05
+
+
 def test_nothing_that_is_changed_makes_nothing_worse() -> None:
     assert predicted_change(np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))).chance_worse == 0
     assert predicted_change(np.array([1e-9]), np.eye(1), np.eye(1)).chance_worse == 0

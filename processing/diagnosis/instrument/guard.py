@@ -92,45 +92,66 @@ def predicted_changes(
     later = slopes.lasting
     both = np.ix_(later, later)
     return (
-        predicted_change(mean, covariance, slopes.products),
-        predicted_change(mean[later], covariance[both], slopes.products[both]),
+        predicted_change(mean, covariance, slopes.products, slopes.applied),
+        predicted_change(mean[later], covariance[both], slopes.products[both], slopes.applied[later]),
     )
 
 
 @dataclass(frozen=True)
 class Slopes:
-    """How the applied values move M/m00.
+    """How the values that may not be zero move M/m00.
 
     Attributes
     ----------
-    index : (K,) their places in the posterior; lasting : (K,) those of effects that later captures have too.
+    index : (K,) their places in the posterior.
+    applied : (K,) those of the correction; lasting : (K,) those of effects that later captures have too.
     products : (K, K) of the slopes of M/m00, mean over pixels and elements.
     """
 
     index: NDArray[np.int64]
+    applied: NDArray[np.bool_]
     lasting: NDArray[np.bool_]
     products: Array
 
 
 def slopes_of(problem: InstrumentProblem, found: Posterior, solved: Solution) -> Slopes | None:
-    """Slopes of the values of a correction; None where it has none that M follows."""
-    part = dict(zip(found.space.candidates, found.space.slices, strict=True))
-    space = Space(tuple(c for c in solved.effects if not isinstance(c.effect, FieldEffect | Switch)))
-    if not space.size:
+    """Slopes of the values of a correction and of what may be there in their place; None where M follows none."""
+    correction = {c for c in solved.effects if not isinstance(c.effect, FieldEffect | Switch)}
+    if not correction:
         return None
-    index = np.concatenate([np.r_[part[c]] for c in space.candidates])
-    lasting = np.concatenate([np.full(c.size, scope_of(c) == "instrument") for c in space.candidates])
+    spread = np.diag(found.covariance)
+    part = {
+        c: np.r_[p]
+        for c, p in zip(found.space.candidates, found.space.slices, strict=True)
+        if c in correction or (not isinstance(c.effect, FieldEffect | Switch) and spread[p].any())
+    }
+    space, index = Space(tuple(part)), np.concatenate([*part.values()])
     products, light = mueller_slopes(problem, space, found.values[index])
-    return Slopes(index, lasting, products / (max(light, 1e-300) * ELEMENTS))
+    return Slopes(
+        index,
+        np.concatenate([np.full(c.size, c in correction) for c in part]),
+        np.concatenate([np.full(c.size, scope_of(c) == "instrument") for c in part]),
+        products / (max(light, 1e-300) * ELEMENTS),
+    )
 
 
-def predicted_change(mean: Array, covariance: Array, products: Array) -> PredictedChange:
-    """Of values with a mean (K,) and a covariance (K, K); `products` (K, K) of the slopes of M/m00, averaged."""
-    left = max(float(np.sum(products * covariance)), 0.0)
-    along = products @ mean
-    square = max(float(mean @ along), 0.0)
+def predicted_change(
+    mean: Array, covariance: Array, products: Array, applied: NDArray[np.bool_] | None = None
+) -> PredictedChange:
+    """Of values with a mean (K,) and a covariance (K, K), of which those `applied` (K,) are corrected; default all.
+
+    `products` (K, K) of the slopes of M/m00, averaged. Where an applied value is wrong, others are likely to stand in
+    for it, as the covariance tells: an alternative moves M in the same way. What is uncertain whatever is applied does
+    not count.
+    """
+    mine = np.ones(mean.size, dtype=bool) if applied is None else applied
+    change, own = mean[mine], covariance[np.ix_(mine, mine)]
+    with_others = covariance[:, mine] @ np.linalg.pinv(own, hermitian=True)
+    along = with_others.T @ products[:, mine] @ change
+    left = max(float(np.sum((with_others.T @ products @ with_others) * own)), 0.0)
+    square = max(float(change @ products[np.ix_(mine, mine)] @ change), 0.0)
     size = float(np.sqrt(square))
-    stderr = float(np.sqrt(max(float(along @ covariance @ along), 0.0))) / max(size, 1e-300)
+    stderr = float(np.sqrt(max(float(along @ own @ along), 0.0))) / max(size, 1e-300)
     return PredictedChange(float(np.sqrt(left + square)), float(np.sqrt(left)), size, stderr)
 
 

@@ -26,12 +26,12 @@ def without_change(problem: InstrumentProblem, found: Posterior, solved: Solutio
     slopes = slopes_of(problem, found, solved)
     if slopes is None:
         return None
-    covariance = found.covariance[np.ix_(slopes.index, slopes.index)]
-    moved = least_change(found.values[slopes.index], covariance, slopes.products)
+    index, own = slopes.index[slopes.applied], np.ix_(slopes.applied, slopes.applied)
+    moved = least_change(found.values[index], found.covariance[np.ix_(index, index)], slopes.products[own])
     if moved is None:
         return None
     values = found.values.copy()
-    values[slopes.index] = moved
+    values[index] = moved
     return replace(found, values=values)
 
 
