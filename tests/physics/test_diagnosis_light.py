@@ -58,6 +58,12 @@ def test_pixels_at_an_edge_are_left_out_and_those_of_a_slope_are_not(configs, tm
     assert cut.usable[:, :4].all()
     assert cut.usable[:, 12:].all()
     assert cut.steep.mean() == pytest.approx(8 / SIDE)
+    # A small object, all of it near its edge: a quarter is left, where it is flattest.
+    y, x = np.mgrid[:SIDE, :SIDE] - (SIDE - 1) / 2
+    hill = np.broadcast_to(np.exp(-(x**2 + y**2) / (SIDE / 3) ** 2), data.signal.shape).astype(np.float32)
+    left = without_steep_pixels(replace(data, signal=hill)).usable
+    assert left.mean() == pytest.approx(0.25, abs=0.05)
+    assert left[SIDE // 2, SIDE // 2]
     # All edges: there is nothing else to look at.
     stripes = np.broadcast_to(0.2 + 0.4 * (np.arange(SIDE) // 2 % 2), data.signal.shape).astype(np.float32)
     assert without_steep_pixels(replace(data, signal=stripes)).usable.all()

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
+from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.search.rules import EDGE_RIM, MOST_STEEP, STEEPEST
 
@@ -25,5 +27,12 @@ def without_steep_pixels(data: CaptureData) -> CaptureData:
     edge = data.usable & (square > STEEPEST**2 * len(frames))
     steep = data.usable & ndimage.binary_dilation(edge, structure=np.ones((3, 3), dtype=bool), iterations=EDGE_RIM)
     if steep.sum() > MOST_STEEP * data.usable.sum():
-        return data
+        steep = _all_but_the_flattest(square, data.usable)
     return replace(data, usable=data.usable & ~steep, steep=steep)
+
+
+def _all_but_the_flattest(square: Array, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels (H, W) to leave out of an image that is all edge, by the squared slope of their surroundings."""
+    around = ndimage.maximum_filter(square, size=3)
+    # None where all are equally steep: there is nothing else to look at.
+    return usable & (around > np.quantile(around[usable], 1 - MOST_STEEP))

@@ -56,7 +56,7 @@ CUT_OFF = 6.0
 STEEPEST = 15.0
 #: [pixels] Around an edge that are left out with it: image derivatives are taken over seven.
 EDGE_RIM = 3
-#: [of the pixels] Near an edge from which on the image is all edges, and they are kept.
+#: [of the pixels] Near an edge that are left out at most; where the image is all edges the flattest pixels are kept.
 MOST_STEEP = 0.75
 #: [robust standard deviations] From which on an intensity is a hit: the largest of 10^9 normal ones is 6.1.
 HIT = 8.0

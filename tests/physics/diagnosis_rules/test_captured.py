@@ -120,7 +120,7 @@ def test_edge_rim(m: Patch) -> bool:
 
 @decides
 def test_most_steep(m: Patch) -> bool:
-    return steep(20.0, 68) == 67 + 6 and steep(20.0, 72) == 0
+    return steep(20.0, 68) == 67 + 6 and steep(20.0, 72) == 75
 
 
 STATES_OUTSIDE, UNKNOWNS = 40, 16
