@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processing.diagnosis.instrument.guard import predicted_change
+from processing.diagnosis.instrument.guard import predicted_change, predicted_change_of_part
 from processing.diagnosis.instrument.least_change import least_change
 
 
@@ -35,8 +35,14 @@ def test_an_alternative_stands_in_for_what_is_applied() -> None:
     # A slip, or in one case of ten another that moves M in the same way: wrong about the name, right about M.
     mean, both = np.array([0.9, 0.1]), 0.09 * np.array([[1.0, -1.0], [-1.0, 1.0]]) + 1e-4 * np.eye(2)
     first = np.array([True, False])
-    assert predicted_change(mean, both, np.ones((2, 2)), first).chance_worse < 1e-6
-    assert predicted_change(mean, both, np.eye(2), first).chance_worse > 0.05
+    assert predicted_change_of_part(mean, both, np.ones((2, 2)), first).chance_worse < 1e-6
+    assert predicted_change_of_part(mean, both, np.eye(2), first).chance_worse > 0.05
+    # What is open beside it and moves with it makes it no worse.
+    beside = 0.09 * np.ones((2, 2)) + np.diag([0.0, 1.0])
+    alone = predicted_change_of_part(np.array([0.9, 0.0]), beside, np.diag([1.0, 0.0]), first)
+    assert predicted_change_of_part(np.array([0.9, 0.0]), beside, np.ones((2, 2)), first).stderr == pytest.approx(
+        alone.stderr
+    )
 
 
 def test_nothing_that_is_changed_makes_nothing_worse() -> None:

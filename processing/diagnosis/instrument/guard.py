@@ -92,8 +92,8 @@ def predicted_changes(
     later = slopes.lasting
     both = np.ix_(later, later)
     return (
-        predicted_change(mean, covariance, slopes.products, slopes.applied),
-        predicted_change(mean[later], covariance[both], slopes.products[both], slopes.applied[later]),
+        predicted_change_of_part(mean, covariance, slopes.products, slopes.applied),
+        predicted_change_of_part(mean[later], covariance[both], slopes.products[both], slopes.applied[later]),
     )
 
 
@@ -135,23 +135,30 @@ def slopes_of(problem: InstrumentProblem, found: Posterior, solved: Solution) ->
     )
 
 
-def predicted_change(
-    mean: Array, covariance: Array, products: Array, applied: NDArray[np.bool_] | None = None
+def predicted_change_of_part(
+    mean: Array, covariance: Array, products: Array, applied: NDArray[np.bool_]
 ) -> PredictedChange:
-    """Of values with a mean (K,) and a covariance (K, K), of which those `applied` (K,) are corrected; default all.
+    """Where only those `applied` (K,) are corrected, of values with a mean (K,) and a covariance (K, K).
 
-    `products` (K, K) of the slopes of M/m00, averaged. Where an applied value is wrong, others are likely to stand in
-    for it, as the covariance tells: an alternative moves M in the same way. What is uncertain whatever is applied does
-    not count.
+    Where an applied value is wrong, an alternative may stand in for it that moves M in the same way, as the covariance
+    tells; that counts in its favour. What else is uncertain is so whatever is applied.
     """
-    mine = np.ones(mean.size, dtype=bool) if applied is None else applied
-    change, own = mean[mine], covariance[np.ix_(mine, mine)]
-    with_others = covariance[:, mine] @ np.linalg.pinv(own, hermitian=True)
-    along = with_others.T @ products[:, mine] @ change
-    left = max(float(np.sum((with_others.T @ products @ with_others) * own)), 0.0)
-    square = max(float(change @ products[np.ix_(mine, mine)] @ change), 0.0)
+    own = covariance[np.ix_(applied, applied)]
+    with_others = covariance[:, applied] @ np.linalg.pinv(own, hermitian=True)
+    alone = np.where(np.outer(applied, applied), covariance, 0.0)
+    together = with_others @ own @ with_others.T
+    change = np.where(applied, mean, 0.0)
+    told = (predicted_change(change, errors, products) for errors in (alone, together))
+    return min(told, key=lambda one: one.chance_worse)
+
+
+def predicted_change(mean: Array, covariance: Array, products: Array) -> PredictedChange:
+    """Of values with a mean (K,) and a covariance (K, K); `products` (K, K) of the slopes of M/m00, averaged."""
+    left = max(float(np.sum(products * covariance)), 0.0)
+    along = products @ mean
+    square = max(float(mean @ along), 0.0)
     size = float(np.sqrt(square))
-    stderr = float(np.sqrt(max(float(along @ own @ along), 0.0))) / max(size, 1e-300)
+    stderr = float(np.sqrt(max(float(along @ covariance @ along), 0.0))) / max(size, 1e-300)
     return PredictedChange(float(np.sqrt(left + square)), float(np.sqrt(left)), size, stderr)
 
 
