@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
+from steady_capture import steady_capture
 
 from processing.diagnosis.captured.black_jitter import black_jitter
-from processing.diagnosis.captured.capture_data import CaptureData
-from processing.instrument.changes import Conditions
 
 STATES, SIDE, SIGMA = 20, 60, 1e-4
 
@@ -19,22 +18,7 @@ def capture(offset, misfit):
     lit = light > 0.1
     signal = light * (1 + misfit * np.where(lit, bright[:, None, None], dim[:, None, None]))
     signal = signal + offset * random.normal(size=(STATES, 1, 1)) + SIGMA * random.normal(size=signal.shape)
-    return CaptureData(
-        name="surface",
-        signal=signal[:, None].astype(np.float32),
-        conditions=Conditions({}, STATES, ("all",), np.arange(STATES) / STATES, 4095.0),
-        exposure=np.ones(STATES),
-        sample=None,
-        slope=np.zeros(STATES),
-        floor=np.full(STATES, SIGMA**2),
-        noise_known=True,
-        noise_source="",
-        clipped=np.zeros((SIDE, SIDE), dtype=bool),
-        clipped_states=np.zeros(STATES, dtype=bool),
-        usable=np.ones((SIDE, SIDE), dtype=bool),
-        simulated=True,
-        wavelength_nm=662.0,
-    )
+    return steady_capture(signal, SIGMA)
 
 
 @pytest.mark.parametrize(("offset", "misfit", "found"), [(0.0, 0.0, False), (0.0, 0.2, False), (3e-4, 0.0, True)])

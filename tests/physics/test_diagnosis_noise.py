@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
+from steady_capture import steady_capture
 
-from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
 from processing.diagnosis.instrument.moments import moments_of
 from processing.diagnosis.instrument.projection import add_block, noise_information
 from processing.diagnosis.search.space import Sums
-from processing.instrument.changes import Conditions
 
 STATES, SIDE, SIGMA = 8, 240, 0.01
 
@@ -17,23 +16,8 @@ STATES, SIDE, SIGMA = 8, 240, 0.01
 def noisy():
     """A flat scene of which nothing but noise can move."""
     random = np.random.default_rng(4)
-    signal = 0.5 + SIGMA * random.normal(size=(STATES, 1, SIDE, SIDE))
-    return CaptureData(
-        name="noise",
-        signal=signal.astype(np.float32),
-        conditions=Conditions({}, STATES, ("all",), np.arange(STATES) / STATES, 4095.0),
-        exposure=np.ones(STATES),
-        sample=None,
-        slope=np.zeros(STATES),
-        floor=np.full(STATES, SIGMA**2),
-        noise_known=True,
-        noise_source="",
-        clipped=np.zeros((SIDE, SIDE), dtype=bool),
-        clipped_states=np.zeros(STATES, dtype=bool),
-        usable=np.ones((SIDE, SIDE), dtype=bool),
-        simulated=True,
-        wavelength_nm=662.0,
-    )
+    signal = 0.5 + SIGMA * random.normal(size=(STATES, SIDE, SIDE))
+    return steady_capture(signal, SIGMA)
 
 
 @pytest.mark.parametrize("moved", [False, True])

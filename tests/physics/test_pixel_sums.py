@@ -2,16 +2,15 @@
 
 import numpy as np
 import pytest
+from steady_capture import steady_capture
 
 from processing.diagnosis.captured import read_frames
-from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.instrument import pixel_sums
 from processing.diagnosis.instrument.features import FEATURES, derivatives_of_part, image_derivatives
 from processing.diagnosis.instrument.moments import moments_of
 from processing.diagnosis.instrument.projection import add_block
 from processing.diagnosis.search.space import Sums
-from processing.instrument.changes import Conditions
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture import Capture
 from processing.storage.capture_schema import Sample
@@ -29,22 +28,7 @@ def capture():
     patterns = np.stack([0.5 + 0.3 * np.sin(3 * x), 0.1 * np.cos(4 * y), 0.05 * x * y])
     a = np.column_stack([np.ones(STATES), random.normal(size=(STATES, 2))])
     signal = np.tensordot(a, patterns, 1) + NOISE * random.normal(size=(STATES, ROWS, COLUMNS))
-    data = CaptureData(
-        name="three patterns",
-        signal=signal[:, None].astype(np.float32),
-        conditions=Conditions({}, STATES, ("all",), np.arange(STATES) / STATES, 4095.0),
-        exposure=np.ones(STATES),
-        sample=None,
-        slope=np.zeros(STATES),
-        floor=np.full(STATES, NOISE**2),
-        noise_known=True,
-        noise_source="",
-        clipped=np.zeros((ROWS, COLUMNS), dtype=bool),
-        clipped_states=np.zeros(STATES, dtype=bool),
-        usable=np.ones((ROWS, COLUMNS), dtype=bool),
-        simulated=True,
-        wavelength_nm=662.0,
-    )
+    data = steady_capture(signal, NOISE)
     return a, data
 
 

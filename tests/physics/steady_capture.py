@@ -1,0 +1,27 @@
+"""A capture of one channel whose noise is the same everywhere and known."""
+
+import numpy as np
+
+from processing.diagnosis.captured.capture_data import CaptureData
+from processing.instrument.changes import Conditions
+
+
+def steady_capture(signal, sigma):
+    """Data of intensities (N, H, W) with a standard deviation `sigma`, of an unknown sample."""
+    states, *shape = signal.shape
+    return CaptureData(
+        name="steady",
+        signal=signal[:, None].astype(np.float32),
+        conditions=Conditions({}, states, ("all",), np.arange(states) / states, 4095.0),
+        exposure=np.ones(states),
+        sample=None,
+        slope=np.zeros(states),
+        floor=np.full(states, sigma**2),
+        noise_known=True,
+        noise_source="",
+        clipped=np.zeros(shape, dtype=bool),
+        clipped_states=np.zeros(states, dtype=bool),
+        usable=np.ones(shape, dtype=bool),
+        simulated=True,
+        wavelength_nm=662.0,
+    )
