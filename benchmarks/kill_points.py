@@ -12,6 +12,7 @@ run in all but times and segments, and `acquire verify` must find nothing. Exit 
 
 from __future__ import annotations
 
+import hashlib
 import os
 import random
 import shutil
@@ -86,7 +87,7 @@ def run(options: list[str], out: Path, before: Callable[[DiscCalls], None] = lam
 
 
 def content(folder: Path) -> dict[str, bytes]:
-    """Everything in the captures of a campaign but times."""
+    """Digests of everything in the captures of a campaign but times."""
     found: dict[str, bytes] = {}
     for path in sorted((folder / "night").glob("*.h5")):
         with h5py.File(path) as h5:
@@ -94,7 +95,8 @@ def content(folder: Path) -> dict[str, bytes]:
             def visit(name: str, node: h5py.Group | h5py.Dataset, path: Path = path) -> None:
                 if isinstance(node, h5py.Dataset) and not name.endswith(TIMES):
                     value = np.asarray(node[()])
-                    found[f"{path.name}/{name}"] = str(value).encode() if value.dtype == object else value.tobytes()
+                    raw = str(value).encode() if value.dtype == object else value.tobytes()
+                    found[f"{path.name}/{name}"] = hashlib.blake2b(raw).digest()
 
             h5.visititems(visit)
     return found
@@ -140,36 +142,63 @@ def kill(options: list[str], every: int, first: int, sent: signal.Signals | None
 
 
 def night(options: list[str], captures: int, calls: int, seed: int = 1) -> int:
-    """A campaign that is killed at random again and again until it is complete."""
-    out, chance = WORK / "captures" / "night", random.Random(seed)
-    begin_s, kills = time.monotonic(), 0
+    """A campaign that is killed, or has a call fail, at random again and again until it is complete.
+
+    After `LIMIT_S` it is left alone to its end. Then every capture is compared with an undisturbed night's.
+    """
+    status, _ = run(options, WORK / "captures" / "whole", lambda armed: armed.arm(0))
+    assert status == 0, status
+    out, chance, known = WORK / "captures" / "night", random.Random(seed), _Known()
+    begin_s, kills, errors, wrong = time.monotonic(), 0, 0, list[str]()
     while True:
-        number = chance.randint(1, 2 * calls)
-        status, _ = run(options, out, lambda armed, number=number: armed.arm(number))
-        if not os.WIFSIGNALED(status):
+        number, sent = chance.randint(1, 2 * calls), signal.SIGKILL if chance.random() < 0.9 else None
+        if time.monotonic() - begin_s > LIMIT_S:
+            number = 0
+        status, _ = run(options, out, lambda armed, number=number, sent=sent: armed.arm(number, sent))
+        killed = sent is not None and os.WIFSIGNALED(status)
+        wrong += known.lost(out / "night")
+        if not killed and (sent or not number or os.waitstatus_to_exitcode(status) != 1):
             break
-        kills += 1
-        if kills % 50 == 0:
-            print(f"{kills} kills, {time.monotonic() - begin_s:.0f} s", flush=True)
-    wrong = [f"{f.what}: {f.found}" for f in verify(out / "night") if f.well is not True]
+        kills, errors = kills + killed, errors + (not killed)
+        if (kills + errors) % 50 == 0:
+            print(
+                f"{kills} kills, {errors} errors, {known.states()} states, {time.monotonic() - begin_s:.0f} s",
+                flush=True,
+            )
+    wrong += filter(None, [check(out, content(WORK / "captures" / "whole"))])
     complete = len(list((out / "night").glob("*.h5")))
-    states = _states(out / "night")
     print(
-        f"{kills} kills, exit code {os.waitstatus_to_exitcode(status)}, {complete} of {captures} captures complete, "
-        f"{states} states intact, {len(wrong)} findings, {time.monotonic() - begin_s:.0f} s"
+        f"{kills} kills, {errors} calls failed, exit code {os.waitstatus_to_exitcode(status)}, "
+        f"{complete} of {captures} captures complete, {known.states()} states, {len(wrong)} findings, "
+        f"{time.monotonic() - begin_s:.0f} s"
     )
     print("\n".join(wrong[:10]))
     return len(wrong) + (complete != captures)
 
 
-def _states(folder: Path) -> int:
-    states = 0
-    for path in folder.glob("*.h5*"):
-        if path.suffix in (".h5", ".partial"):
+class _Known:
+    """The states of each capture that were there last time, so that none may go again."""
+
+    def __init__(self) -> None:
+        self._captures: dict[str, tuple[int, int]] = {}
+
+    def states(self) -> int:
+        return sum(done for _, done in self._captures.values())
+
+    def lost(self, folder: Path) -> list[str]:
+        """What is wrong with the captures that changed since the last look."""
+        wrong = []
+        for path in sorted(folder.glob("*")):
+            name = path.name.removesuffix(".partial")
+            changed, before = self._captures.get(name, (0, 0))
+            if not name.endswith(".h5") or path.stat().st_mtime_ns == changed:
+                continue
             with Capture(path) as capture:
-                assert not capture.damaged_states()
-                states += len(capture.done)
-    return states
+                done, damaged = len(capture.done), capture.damaged_states()
+            if done < before or damaged:
+                wrong.append(f"{path.name}: {done} states of {before}, {damaged} damaged")
+            self._captures[name] = path.stat().st_mtime_ns, done
+        return wrong
 
 
 class _Reported:

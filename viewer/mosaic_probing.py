@@ -9,15 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.errors import ProcessError
-from processing.reduction.counts_to_signal import BlockReader, Correction
-from processing.reduction.cut_off import without_cut_off
-from processing.reduction.effects_of_capture import capture_changes, counts_correction
 from processing.reduction.mosaic.layout import MosaicLayout
-from processing.reduction.mueller import choose_model, relative_exposure, sample_states
-from processing.reduction.noise import NoiseModel
+from processing.reduction.mueller import relative_exposure
 from processing.reduction.stokes import channel_rows
 from processing.storage.capture import Capture
 from viewer.probing import MOST, Region, finite
+from viewer.sample_states import SampleStates
 
 
 class SuperPixelReducer:
@@ -33,15 +30,12 @@ class SuperPixelReducer:
         with Capture(path) as capture:
             if capture.header.colours is not None:
                 raise ProcessError("each colour of this sensor is a mosaic of its own: split it with `process colours`")
-            self.model = choose_model(capture, instrument)
-            mosaic = capture.header.mosaic or self.model.mosaic or ()
-            self._layout = MosaicLayout.of(mosaic, [channel.name for channel in self.model.channels])
-            self.states, _ = without_cut_off(capture, sample_states(capture))
-            self._changes = capture_changes(capture, self.model, self.states)
-            _, self._analyzers = channel_rows(capture, self.model, self.states, self._changes)
-            self._relative = relative_exposure(capture, self.states)
-            self._correction = Correction.of(capture)
-            self._noise = NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
+            self._sample = SampleStates(capture, instrument)
+            model, states = self._sample.model, self._sample.numbers
+            mosaic = capture.header.mosaic or model.mosaic or ()
+            self._layout = MosaicLayout.of(mosaic, [channel.name for channel in model.channels])
+            _, self._analyzers = channel_rows(capture, model, states, self._sample.changes)
+            self._relative = relative_exposure(capture, states)
 
     def curve(self, region: Region) -> dict[str, Any]:
         """Signal of each analyzer in each state with the fitted one, residuals in units of noise, and Stokes values.
@@ -59,13 +53,13 @@ class SuperPixelReducer:
         s = solve @ signal
         fitted = a @ s
         variance = self._variance(fitted, len(self._layout.channels)) / pixels
-        known = self._noise is not None
+        known = self._sample.noise is not None
         if not known:
             variance = np.full(len(signal), np.sum((signal - fitted) ** 2) / max(len(signal) - len(s), 1))
         residual = (signal - fitted) / np.sqrt(variance)
         covariance = (solve * variance) @ solve.T
         return {
-            "states": np.repeat(self.states, len(self._layout.channels)).tolist(),
+            "states": np.repeat(self._sample.numbers, len(self._layout.channels)).tolist(),
             "series": [f"{name}°" if name.isdecimal() else name for name in self._layout.channels],
             "signal": signal.tolist(),
             "fitted": fitted.tolist(),
@@ -74,7 +68,7 @@ class SuperPixelReducer:
             "chi_square": finite(np.sum(residual**2) / max(len(signal) - len(s), 1)),
             "noise_known": known,
             "stokes": _stokes(s, covariance),
-            "told": f"{self.model.name}; {whole}; black: {self._correction.source}",
+            "told": f"{self._sample.model.name}; {whole}; black: {self._sample.correction.source}",
         }
 
     def _signal(self, region: Region) -> tuple[Region, NDArray[np.float64]]:
@@ -84,24 +78,22 @@ class SuperPixelReducer:
                 for part, size in zip((region.rows, region.columns), capture.frame_shape, strict=True)
             )
             whole = Region(rows, columns)
-            if (rows.stop - rows.start) * capture.frame_shape[1] * len(self.states) > MOST:
+            if (rows.stop - rows.start) * capture.frame_shape[1] * len(self._sample.numbers) > MOST:
                 raise ProcessError(f"{region} is more than is reduced at once; draw a smaller one")
-            reader = BlockReader(capture, self.states, self._correction, counts_correction(self._changes, self.model))
-            frames = reader.read(rows)
-            out = np.empty(frames.shape, np.float32)
-            reader.signal(frames, slice(None), out)
+            _, _, signal = self._sample.read(capture, rows)
             width = capture.frame_shape[1]
-        image = out.reshape(len(self.states), -1, width)[:, :, columns]
+        image = signal.reshape(len(self._sample.numbers), -1, width)[:, :, columns]
         means = [image[:, row::2, column::2].mean(axis=(1, 2), dtype=float) for row, column in self._layout.offsets]
         return whole, np.stack(means, axis=1).ravel()
 
     def _variance(self, signal: NDArray[np.float64], channels: int) -> NDArray[np.float64]:
         """Of one raw pixel (N channels,), counts^2."""
-        if self._noise is None:
+        noise = self._sample.noise
+        if noise is None:
             return np.full(len(signal), np.nan)
         with Capture(self._path) as capture:
-            repeats = np.repeat(np.maximum(capture.column("repeats")[self.states].astype(float), 1), channels)
-        return np.asarray(self._noise.slope * np.maximum(signal, 0) / repeats + self._noise.averaged_floor(repeats))
+            repeats = np.repeat(np.maximum(capture.column("repeats")[self._sample.numbers].astype(float), 1), channels)
+        return np.asarray(noise.slope * np.maximum(signal, 0) / repeats + noise.floor_of_rows(repeats, 0.0, channels))
 
 
 def _stokes(s: NDArray[np.float64], covariance: NDArray[np.float64]) -> dict[str, dict[str, float | None]]:

@@ -12,18 +12,15 @@ from numpy.typing import NDArray
 
 from processing.errors import ProcessError
 from processing.instrument.determined import determined_basis
-from processing.instrument.model import InstrumentModel
 from processing.maps.quantities import quantities_block
-from processing.reduction.counts_to_signal import BlockReader, Correction, saturation
-from processing.reduction.cut_off import without_cut_off
-from processing.reduction.effects_of_capture import capture_changes, counts_correction
-from processing.reduction.mueller import Choice, choose_model, field_of, measurement_matrix, sample_states
-from processing.reduction.noise import NoiseModel
+from processing.reduction.counts_to_signal import saturation
+from processing.reduction.mueller import Choice, field_of, measurement_matrix
 from processing.reduction.solvers.inversion import ELEMENTS, Inversion
 from processing.reduction.solvers.plain import MuellerSolver
 from processing.storage.capture import Capture
 from processing.storage.images import MuellerImage
 from processing.storage.pixel_mask import Mask
+from viewer.sample_states import SampleStates
 
 #: Most intensities that a region may have, states x pixels.
 MOST = 1 << 26
@@ -93,14 +90,11 @@ class PixelReducer:
     def __init__(self, path: Path, instrument: Path | None = None) -> None:
         self._path = path
         with Capture(path) as capture:
-            self.model: InstrumentModel = choose_model(capture, instrument)
-            self.states, _ = without_cut_off(capture, sample_states(capture))
-            self._changes = capture_changes(capture, self.model, self.states)
-            self._w = measurement_matrix(capture, self.model, self.states, self._changes)
-            self._inversion = Inversion.of(self._w.reshape(-1, 16), f"{path}: ", determined_basis(self.model))
-            self._correction = Correction.of(capture)
-            self._noise = NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
-            self._field = field_of(capture, self.model, self.states, self._changes)
+            self.sample = SampleStates(capture, instrument)
+            sample = self.sample
+            self._w = measurement_matrix(capture, sample.model, sample.numbers, sample.changes)
+            self._inversion = Inversion.of(self._w.reshape(-1, 16), f"{path}: ", determined_basis(sample.model))
+            self._field = field_of(capture, sample.model, sample.numbers, sample.changes)
 
     def image(self, region: Region) -> tuple[MuellerImage, NDArray[np.float64]]:
         """The region as an image of one pixel, the mean of those that can be used, and its intensities (N,), counts.
@@ -112,12 +106,10 @@ class PixelReducer:
         if region.pixels * self._w.size // 16 > MOST:
             raise ProcessError(f"{region} is more than is reduced at once; draw a smaller one")
         with Capture(self._path) as capture:
-            reader = BlockReader(capture, self.states, self._correction, counts_correction(self._changes, self.model))
-            solver = Choice(noise=self._noise).solver(MuellerSolver(self._inversion, reader, self._noise), self._field)
-            frames = reader.read(region.rows)
+            reader, frames, signal = self.sample.read(capture, region.rows)
+            noise = self.sample.noise
+            solver = Choice(noise=noise).solver(MuellerSolver(self._inversion, reader, noise), self._field)
             found = solver.solve(frames)
-            signal = np.empty(frames.shape, np.float32)
-            reader.signal(frames, slice(None), signal)
             shape = (region.rows.stop - region.rows.start, capture.frame_shape[1])
             header, simulated, shape_of_image = capture.header, capture.simulated, capture.frame_shape
 
@@ -133,7 +125,7 @@ class PixelReducer:
         intensities = part(signal.reshape(len(self._w.reshape(-1, 16)), -1))[:, good].mean(axis=1, dtype=float)
         m = mueller.reshape(16, -1).mean(axis=1, dtype=float)
         w = self._matrix(region, shape_of_image)
-        nothing, noise = np.full(len(w), np.nan), self._noise
+        nothing = np.full(len(w), np.nan)
         total = np.sqrt(np.square(errors.astype(float)).sum(axis=-1)) / count
         image = MuellerImage(
             values=m.reshape(4, 4, 1, 1).astype(np.float32),
@@ -160,8 +152,9 @@ class PixelReducer:
 
     def told(self) -> str:
         """How it is reduced, in a few words."""
-        effects = f", {len(self.model.effects)} effect(s)" if self.model.effects else ""
-        return f"{self.model.name}{effects}; black: {self._correction.source}"
+        model = self.sample.model
+        effects = f", {len(model.effects)} effect(s)" if model.effects else ""
+        return f"{model.name}{effects}; black: {self.sample.correction.source}"
 
 
 def curve(
@@ -173,7 +166,7 @@ def curve(
     residual = (intensities - fitted) / noise
     free = max(len(fitted) - int(image.facts["rank"]), 1)
     return {
-        "states": np.repeat(reducer.states, channels).tolist(),
+        "states": np.repeat(reducer.sample.numbers, channels).tolist(),
         "signal": intensities.tolist(),
         "fitted": fitted.tolist(),
         "noise": finite(noise),

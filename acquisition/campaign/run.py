@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from acquisition.campaign.identity import require_same_campaign, with_devices
@@ -27,6 +28,7 @@ from acquisition.rig.rig import Rig
 from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
 from drivers.errors import DeviceError
+from processing.instrument.model import InstrumentModel
 from processing.storage.capture import Capture, CaptureError
 
 #: Room for log and index, bytes.
@@ -47,9 +49,10 @@ def prepare(campaign: Campaign, rig: RigConfig) -> list[tuple[CampaignCapture, J
     """Check every capture as far as files tell. Raises PlanRefused with all that is wrong, each once."""
     jobs = []
     failures: dict[str, str] = {}
+    read = cache(InstrumentModel.load)
     for capture in captures(campaign):
         try:
-            jobs.append((capture, prepare_job(capture.plan, rig)))
+            jobs.append((capture, prepare_job(capture.plan, rig, read)))
         except PlanRefused as refused:
             for failure in refused.failures:
                 failures.setdefault(failure, capture.name)

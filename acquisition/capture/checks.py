@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
@@ -17,6 +19,9 @@ from processing.instrument.applied_effects import changes_at
 from processing.instrument.determined import determined_basis
 from processing.instrument.model import InstrumentModel, WavelengthError, rank
 from processing.instrument.states import StateTable
+
+#: Reads an instrument file.
+ReadInstrument: TypeAlias = Callable[[Path], InstrumentModel]
 
 
 @dataclass(frozen=True)
@@ -127,10 +132,10 @@ def _free_ways(rig: RigConfig, poses: Sequence[Mapping[str, float]]) -> list[Che
     return checks
 
 
-def load_instrument(plan: MeasurementPlan, rig: RigConfig) -> InstrumentModel:
+def load_instrument(plan: MeasurementPlan, rig: RigConfig, read: ReadInstrument) -> InstrumentModel:
     """The declared instrument of the plan's mode at its wavelength. Raises ConfigError, PlanRefused."""
     try:
-        return InstrumentModel.load(rig.modes[plan.mode].instrument).at(plan.wavelength_nm)
+        return read(rig.modes[plan.mode].instrument).at(plan.wavelength_nm)
     except WavelengthError as error:
         raise PlanRefused([str(error)]) from error
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from acquisition.capture.checks import (
     Check,
+    ReadInstrument,
     check_devices,
     check_plan,
     check_table,
@@ -59,10 +60,11 @@ class Result:
     worst_angle_deg: float = 0.0
 
 
-def prepare(plan: MeasurementPlan, rig: RigConfig) -> Job:
+def prepare(plan: MeasurementPlan, rig: RigConfig, read: ReadInstrument = InstrumentModel.load) -> Job:
     """Check a plan against a rig file; touches no device.
 
-    Where the plan leaves the exposure to be found, the table holds the one that the search starts with.
+    Where the plan leaves the exposure to be found, the table holds the one that the search starts with. `read` reads
+    the instrument's file; whoever prepares many plans reads it once.
 
     Raises
     ------
@@ -71,7 +73,7 @@ def prepare(plan: MeasurementPlan, rig: RigConfig) -> Job:
     """
     checks = check_plan(plan, rig)
     refuse_failed(checks)
-    instrument = load_instrument(plan, rig)
+    instrument = load_instrument(plan, rig, read)
     chosen = plan.exposure_s if isinstance(plan.exposure_s, float) else plan.exposure_s.start_s
     table = plan.state_table(standing_pose_deg(plan, rig), chosen)
     checks += check_table(table, rig, instrument)

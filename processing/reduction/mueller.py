@@ -30,7 +30,7 @@ from processing.reduction.effects_of_capture import (
 )
 from processing.reduction.facts import mueller_facts
 from processing.reduction.left_out import LeftOut
-from processing.reduction.noise import NoiseModel
+from processing.reduction.noise import NoiseModel, noise_of
 from processing.reduction.sent_light import PLANES as SENT_PLANES
 from processing.reduction.sent_light import SentLight
 from processing.reduction.solvers.field import Field, FieldSolver
@@ -234,7 +234,7 @@ def reduce_mueller(
     struck = _among(left_out.hits, every, states)
     reader = BlockReader(capture, states, correction, counts_correction(changes, model), struck)
     choice = choice or Choice()
-    noise = choice.noise or _noise_of(capture, states)
+    noise = choice.noise or noise_of(capture, states)
     if inversion.rank < ELEMENTS and (choice.physical or (changes is not None and changes.field_retardance_rad)):
         raise ProcessError(
             f"{capture.path}: instrument {model.name!r} determines {inversion.rank} of 16 numbers; --physical and "
@@ -278,13 +278,6 @@ def _among(hits: NDArray[np.int64], every: NDArray[np.int64], states: NDArray[np
     out = hits[np.isin(every[hits[:, 0]], states)]
     out[:, 0] = np.searchsorted(states, every[out[:, 0]])
     return out
-
-
-def _noise_of(capture: Capture, states: NDArray[np.int64]) -> NoiseModel | None:
-    """As the states file states it for each state, else from the detector's constants; None without either."""
-    if capture.sigma is not None:
-        return NoiseModel.of_sigma(capture.sigma[states])
-    return NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
 
 
 def _further_facts(choice: Choice, sent: SentLight | None) -> dict[str, Any]:

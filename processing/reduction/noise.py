@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from processing.storage.capture import Capture
 from processing.storage.capture_schema import Detector
 
 #: Variance of rounding to whole counts, counts^2.
@@ -71,3 +72,10 @@ class NoiseModel:
     def variance(self, signal: ArrayLike) -> NDArray[np.float64]:
         """Variance, counts^2, at a signal in counts above black; a negative signal has the floor's."""
         return np.asarray(self.slope * np.maximum(signal, 0.0) + self.floor)
+
+
+def noise_of(capture: Capture, states: NDArray[np.int64]) -> NoiseModel | None:
+    """As the states file states it for each state, else from the detector's constants; None without either."""
+    if capture.sigma is not None:
+        return NoiseModel.of_sigma(capture.sigma[states])
+    return NoiseModel.of(capture.header.detector, integer=capture.integer_counts)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from processing.steps.reduction import Reduction
+from processing.storage.importing import ImportRequest, import_capture
 from processing.storage.product import Product
 
 
@@ -113,6 +114,17 @@ def test_a_pixel_is_reduced_as_its_product_is(lab, client, drr_capture):
     assert found["fit"]["states"] == list(range(4, 44))
     assert np.sqrt(np.mean(residual**2)) < 1.5
     assert np.ptp(found["fit"]["signal"]) > 200
+
+
+def test_the_noise_that_a_states_file_states_is_that_of_the_curve(lab, client, configs):
+    lines = ["state,psg_deg,channel_left,channel_right,sigma"]
+    lines += [f"{k},{4 * k},{1000 + k},{500 + 3 * k},{2 + k}" for k in range(46)]
+    states, instrument = lab / "states.csv", configs / "instruments" / "drr_wollaston.yaml"
+    states.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    import_capture(ImportRequest(states, lab / "one.h5", 1200, instrument=instrument))
+    fit = client.get("/curve", params={"file": "one.h5", "x0": 0, "y0": 0}).json()["fit"]
+    assert fit["noise_known"]
+    assert fit["noise"] == pytest.approx(np.repeat(2.0 + np.arange(46), 2))
 
 
 def test_a_region_is_the_mean_of_its_pixels_with_a_smaller_error(client, drr_capture):
