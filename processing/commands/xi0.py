@@ -23,10 +23,10 @@ def register(app: typer.Typer) -> None:
 def xi0_command(
     source: Annotated[Path, typer.Argument(help="Capture, or a product of `process reduce`.")],
     geometry: Annotated[
-        Path | None, typer.Option(help="Geometry file: camera, source, shape (needed for a Stokes capture).")
+        Path | None, typer.Option(help="Geometry file: camera, source, shape (for less than whole matrices).")
     ] = None,
     material: Annotated[
-        Path | None, typer.Option(help="Material file: the dominant process (needed for a Stokes capture).")
+        Path | None, typer.Option(help="Material file: the dominant process (for less than whole matrices).")
     ] = None,
     instrument: Annotated[Path | None, typer.Option(help="Instrument file, where the capture is reduced here.")] = None,
     out: ProductFile = None,
@@ -34,15 +34,17 @@ def xi0_command(
     no_figure: NoFigure = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """xi0 from a Mueller capture (coherency eigenvalues) or a linear Stokes capture (two coefficients)."""
+    """xi0 from a Mueller capture (coherency eigenvalues), or from less with a model (two coefficients)."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from processing.steps.maps import Xi0
+    from processing.storage.images import seen_elements
     from processing.storage.product import Product
 
     image = reduced_source(source, instrument)
     with Product(image) as product:
-        if product.kind != "stokes" and (geometry or material):
-            typer.echo(f"warning: {image} is no Stokes image: --geometry and --material are not looked at", err=True)
+        if product.kind == "mueller" and seen_elements(product.facts).all() and (geometry or material):
+            told = "holds whole Mueller matrices: --geometry and --material are not looked at"
+            typer.echo(f"warning: {image} {told}", err=True)
     step = Xi0(image, geometry, material)
     with progress_bar("xi0", "rows") as tick:
         made = step.make(out, overwrite, tick)

@@ -12,6 +12,7 @@ from scipy.ndimage import binary_erosion
 from processing.errors import ProcessError
 from processing.geometry.frames import ScatteringGeometry
 from processing.geometry.viewing import ViewingGeometry
+from processing.reduction.sent_light import sent_rows
 from processing.reflectance.material_fit import MaterialFit, fit_values
 from processing.storage.images import SMALLEST, MuellerImage, StokesImage
 from processing.storage.product import Product
@@ -21,7 +22,9 @@ PIXELS = 3000
 #: Pixels nearer than this to the outline are left out: the default demosaicing reaches across it.
 BORDER_PX = 4
 #: Two coefficients of each pixel are fitted with the constants: as many elements leave nothing over.
-LEAST_ELEMENTS = 3
+LEAST_VALUES = 3
+#: Difference of rows that is rounding of what the axes read.
+ALIKE = 1e-4
 
 
 def fit_products(sources: Sequence[Path], geometry_file: Path) -> tuple[MaterialFit, float, bool]:
@@ -51,34 +54,53 @@ def fit_products(sources: Sequence[Path], geometry_file: Path) -> tuple[Material
 
 
 def _fit_mueller(sources: Sequence[Path], view: ViewingGeometry) -> MaterialFit:
-    parts, matrices, covariances = [], [], []
-    seen = None
+    parts, data, covariances = [], [], []
+    rows: NDArray[np.float64] | None = None
     for source in sources:
         with Product(source) as product:
             points, index = _sample(view, product)
             image = MuellerImage.of(product).at(index)
-        if seen is not None and np.any(seen != image.seen):
-            raise ProcessError(f"{source} determines other elements of M than the first product.")
-        seen = image.seen
+        values, seen = determined_values(image)
+        if rows is not None and (rows.shape != seen.shape or not np.allclose(rows, seen, atol=ALIKE)):
+            raise ProcessError(f"{source} determines something else of M than the first product.")
+        rows = seen
         parts.append(points)
-        matrices.append(image.values.reshape(16, -1)[seen].astype(float))
-        covariances.append(covariance_by_light(image)[:, seen][:, :, seen])
-    if seen is None or seen.sum() < LEAST_ELEMENTS:
-        raise ProcessError(f"a fit needs {LEAST_ELEMENTS} elements of M or more; see what `process reduce` determined.")
-    return _fit(parts, matrices, np.eye(16)[seen], covariances)
+        data.append(values)
+        covariances.append(covariance_by_light(image, seen))
+    if rows is None or len(rows) < LEAST_VALUES:
+        raise ProcessError(f"a fit needs {LEAST_VALUES} elements of M or more; see what `process reduce` determined.")
+    return _fit(parts, data, rows, covariances)
 
 
-def covariance_by_light(image: MuellerImage) -> NDArray[np.float64]:
-    """Covariance (pixels, 16, 16) as if the sample did not polarize: so that it follows no element's noise."""
-    light = np.maximum(image.values[0, 0].reshape(-1).astype(float), 0.0)
+def determined_values(image: MuellerImage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What a product determines, (K, pixels), and the rows (K, 16) that lead to it from M.
+
+    Elements of M, or the Stokes vector that is sent back where no element is determined alone.
+    """
+    if image.sent is None:
+        return image.values.reshape(16, -1)[image.seen].astype(float), np.eye(16)[image.seen]
+    seen = np.isfinite(image.sent).any(axis=(1, 2))
+    return image.sent.reshape(4, -1)[seen].astype(float), sent_rows(image.w)[seen]
+
+
+def covariance_by_light(image: MuellerImage, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Covariance (pixels, K, K) of rows (K, 16) . vec(M), as if the sample did not polarize.
+
+    So that it follows no element's noise.
+    """
+    level = image.values[0, 0] if image.sent is None else image.sent[0]
+    light = np.maximum(level.reshape(-1).astype(float), 0.0)
     if np.isnan(image.noise_slope).any():
         variance = np.ones((len(image.w), light.size))
     else:
         # A floor of nothing, in the dark, would be an infinite weight.
         floor = np.maximum(image.noise_floor, 1e-3 * image.noise_slope**2)
         variance = np.outer(image.noise_slope * image.w[:, 0], light) + floor[:, None]
-    inverse = np.linalg.pinv(image.w, rcond=SMALLEST)
-    return np.asarray(np.einsum("np,in,jn->pij", variance, inverse, inverse, optimize=True))
+    if image.facts["weighted"]:
+        information = np.einsum("np,ni,nj->pij", 1 / variance, image.w, image.w, optimize=True)
+        return np.asarray(rows @ np.linalg.pinv(information, rcond=SMALLEST**2, hermitian=True) @ rows.T)
+    solve = rows @ np.linalg.pinv(image.w, rcond=SMALLEST)
+    return np.asarray(np.einsum("np,in,jn->pij", variance, solve, solve, optimize=True))
 
 
 def _fit_stokes(sources: Sequence[Path], view: ViewingGeometry) -> MaterialFit:

@@ -26,6 +26,12 @@ PLANES = {
 ALIKE = 1e-6
 
 
+def sent_rows(w: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rows (4, 16) that lead from M to the Stokes vector sent back, for a light of intensity 1, of W (N, 16)."""
+    light = np.linalg.svd(w.reshape(-1, 4), full_matrices=False)[2][0]
+    return np.kron(np.eye(4), light / light[0])
+
+
 @dataclass(frozen=True)
 class SentLight:
     """Stokes vector of the light that the sample sends back.
@@ -44,10 +50,10 @@ class SentLight:
         """None where the generator turns, or where elements of M are determined by themselves."""
         if determined_elements(inversion.basis).any():
             return None
-        _, size, vt = np.linalg.svd(inversion.w.reshape(-1, 4), full_matrices=False)
+        size = np.linalg.svd(inversion.w.reshape(-1, 4), compute_uv=False)
         if size[1] > ALIKE * size[0]:
             return None
-        rows = np.kron(np.eye(4), vt[0] / vt[0, 0])
+        rows = sent_rows(inversion.w)
         inside = np.sum((rows @ inversion.basis) ** 2, axis=1) > (1 - 1e-9) * np.sum(rows**2, axis=1)
         return cls(rows, inside)
 

@@ -169,20 +169,26 @@ def _search(residual: Callable[[Array], Array]) -> tuple[Array, Array]:
     return np.asarray(best.x), np.asarray(best.jac)
 
 
+def _scaled(jacobian: Array) -> Array:
+    return np.asarray(jacobian / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300))
+
+
 def _result(found: Array, jacobian: Array, left: Array, residual: float, correlation: float) -> MaterialFit:
     width = UPPER - LOWER
     free = (found > LOWER + 1e-4 * width) & (found < UPPER - 1e-4 * width)
-    per_pixel = jacobian.reshape(*left.shape, 4)[..., free]
-    scaled = jacobian[:, free]
-    singular = np.linalg.svd(scaled / np.maximum(np.linalg.norm(scaled, axis=0), 1e-300), compute_uv=False)
+    singular = np.linalg.svd(_scaled(jacobian[:, free]), compute_uv=False)
     condition = float(singular[0] / max(singular[-1], 1e-300)) if free.any() else np.inf
     covariance = np.full((4, 4), np.nan)
     if free.any() and condition < 1e7:
-        bread = np.linalg.inv(scaled.T @ scaled)
-        score = np.einsum("nkp,nk->np", per_pixel, left)
-        covariance[np.ix_(free, free)] = bread @ (score.T @ score) @ bread
+        # A constant at its bound is not known there: without its share the others would look sure.
+        prior = np.diag(np.where(free, 0.0, 1 / width**2))
+        bread = np.linalg.inv(jacobian.T @ jacobian + prior)
+        score = np.einsum("nkp,nk->np", jacobian.reshape(*left.shape, 4), left)
+        whole = bread @ (score.T @ score + prior) @ bread
+        covariance[np.ix_(free, free)] = whole[np.ix_(free, free)]
     stderr = np.sqrt(np.diag(covariance))
     limit = RELATIVE_LIMIT * np.abs(found)
     limit[1] = max(limit[1], K_LIMIT)
-    identified = {name: bool(s <= m) for name, s, m in zip(NAMES, stderr, limit, strict=True)}
+    # k and a may well be 0; an n at the end of its range is no surface, and what was fitted beside it means nothing.
+    identified = {name: bool(s <= m and free[0]) for name, s, m in zip(NAMES, stderr, limit, strict=True)}
     return MaterialFit(found, covariance, identified, condition, residual, correlation, len(left))

@@ -64,7 +64,7 @@ def test_options_that_do_not_fit_are_told_before_the_work_and_not_passed_over(ru
     assert not list(capture.parent.glob("*.mueller.h5"))
     code, err = run("xi0", capture, "--geometry", "no_such_file.yaml", "--no-figure")
     assert code == 0
-    assert "is no Stokes image: --geometry and --material are not looked at" in err
+    assert "holds whole Mueller matrices: --geometry and --material are not looked at" in err
 
 
 def test_a_place_for_no_file_is_refused_before_the_work(acquire, small_rig, capture, configs, capfd):

@@ -1,5 +1,7 @@
 """Material constants from Mueller images and from light behind polarizers: recovery, error bars, identifiability."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from noisy_images import noisy_image
@@ -8,8 +10,9 @@ from processing.errors import NotDetermined
 from processing.geometry.frames import ScatteringGeometry
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
-from processing.maps.material_fit import covariance_by_light
+from processing.maps.material_fit import covariance_by_light, determined_values
 from processing.polarization.cloude import xi0_and_dominant
+from processing.reduction.sent_light import sent_rows
 from processing.reflectance.material_fit import NAMES, MaterialFit, fit_values
 from simulators.bench.scene import Scene
 
@@ -77,12 +80,66 @@ def test_a_mueller_image_gives_constants_without_noise_bias(sphere, angles, elec
     pulls = []
     for seed in range(5):
         image = noisy_image(m, electrons, seed)
-        values, covariance = image.values.reshape(16, -1), covariance_by_light(image)
-        fit = fit_values(geometry, values, np.eye(16), covariance)
+        values, rows = determined_values(image)
+        fit = fit_values(geometry, values, rows, covariance_by_light(image, rows))
         pulls.append((fit.constants - TRUE) / fit.stderr)
     # Of 5 draws of 4 correlated values.
     assert np.abs(np.nanmean(pulls, axis=0)).max() < 1.5
     assert 0.5 < np.sqrt(np.nanmean(np.square(pulls))) < 1.6
+
+
+#: Sides of partial polarimeters: what the generator sends and what the analyzer looks for.
+LINEAR = np.array([[1, np.cos(x), np.sin(x), 0] for x in np.deg2rad([0.0, 90, 180, 270])]) / 2
+SPHERE = np.array([[1, *v] for v in np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)]) / 2
+PARTIAL = {
+    "3 x 3": (LINEAR, LINEAR),
+    "3 x 4": (SPHERE, LINEAR),
+    "4 x 3": (LINEAR, SPHERE),
+    "Stokes under light at 45 degrees": (np.array([[1.0, 0, 1, 0]]) / 2, SPHERE),
+}
+
+
+def partial_image(m, electrons, seed, generator, analyzer):
+    """Image of a partial polarimeter, as `process reduce` leaves it."""
+    w = (np.tile(analyzer, (2, 1))[:, None, :, None] * generator[:, None, :]).reshape(-1, 16)
+    image = noisy_image(m, electrons, seed, w)
+    spans = [np.abs(side).max(axis=0) > 0 for side in (analyzer, generator)]
+    facts = {"weighted": False, "rank": np.linalg.matrix_rank(w)}
+    if len(generator) == 1:
+        sent = sent_rows(w) @ image.values.reshape(16, -1)
+        sent[~spans[0]] = np.nan
+        unknown = np.full_like(image.values, np.nan)
+        facts["determined"] = "S0, S1, S2"
+        return replace(image, values=unknown, errors=unknown, sent=sent[:, None].astype(np.float32), facts=facts)
+    seen = np.outer(*spans).reshape(16)
+    facts["determined"] = ", ".join(f"m{k // 4}{k % 4}" for k in np.flatnonzero(seen))
+    return replace(image, facts=facts)
+
+
+def partial_fit(sphere, sides, electrons, seed):
+    geometry, m = sphere
+    image = partial_image(m[::4] / m[::4, 0, 0].mean(), electrons, seed, *sides)
+    values, rows = determined_values(image)
+    return fit_values(geometry[::4], values, rows, covariance_by_light(image, rows))
+
+
+@pytest.mark.parametrize("name", PARTIAL)
+def test_partial_polarimeters_give_constants_without_noise_bias(sphere, name):
+    fits = [partial_fit(sphere, PARTIAL[name], 8000, seed) for seed in range(5)]
+    pulls = [(fit.constants - TRUE) / fit.stderr for fit in fits]
+    assert np.abs(np.nanmean(pulls, axis=0)).max() < 1.5
+    assert 0.5 < np.sqrt(np.nanmean(np.square(pulls))) < 1.6
+    assert all(fit.identified["n"] and fit.identified["a"] and fit.identified["b"] for fit in fits)
+
+
+def test_unpolarized_light_does_not_pretend_to_tell_what_it_cannot(sphere):
+    # Here n and k run into their bounds, and what is fitted beside them is far from the truth.
+    fits = [partial_fit(sphere, (np.array([[0.5, 0, 0, 0]]), SPHERE), 500, seed) for seed in range(3)]
+    known = [
+        [(fit.constants[k] - TRUE[k]) / fit.stderr[k] for k in range(4) if fit.identified[NAMES[k]]] for fit in fits
+    ]
+    assert np.abs(np.concatenate(known)).max(initial=0) < 4
+    assert not any(fit.identified["k"] or fit.identified["a"] for fit in fits)
 
 
 def test_standard_errors_of_a_stokes_fit_cover_the_truth(sphere):
