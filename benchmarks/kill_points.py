@@ -112,7 +112,7 @@ def check(out: Path, whole: dict[str, bytes]) -> str:
     return "; ".join(wrong)
 
 
-def kill(options: list[str], every: int, first: int, sent: signal.Signals | None) -> int:
+def kill(options: list[str], every: int, first: int, fails: bool) -> int:
     """Kill before every n-th call, or have it fail, go on, compare."""
     captures = WORK / "captures"
     status, total = run(options, captures / "whole", lambda calls: calls.arm(0))
@@ -125,10 +125,11 @@ def kill(options: list[str], every: int, first: int, sent: signal.Signals | None
             print(f"stopped before call {number}: no time left")
             break
         out = captures / f"run{number}"
-        status, _ = run(options, out, lambda calls, number=number: calls.arm(number, sent))
+        at = {"number": 0, "failing": number} if fails else {"number": number}
+        status, _ = run(options, out, lambda calls, at=at: calls.arm(**at))
         # An error is told with exit code 1, but where it concerns nothing that matters, as the figure of a capture.
         killed = status != 0
-        crashed = "" if sent or not os.WIFSIGNALED(status) else f"crashed with signal {os.WTERMSIG(status)}"
+        crashed = "" if not fails or not os.WIFSIGNALED(status) else f"crashed with signal {os.WTERMSIG(status)}"
         status, _ = run(options, out)
         wrong = crashed or (check(out, whole) if status == 0 else f"going on ended with {status}")
         points += killed
@@ -136,13 +137,13 @@ def kill(options: list[str], every: int, first: int, sent: signal.Signals | None
             lost += 1
             print(f"call {number}: {wrong}", flush=True)
         shutil.rmtree(out)
-    what = "kill points" if sent else "errors told"
+    what = "errors told" if fails else "kill points"
     print(f"{points} {what} of {total} calls, {lost} with something lost, {time.monotonic() - begin_s:.0f} s")
     return lost
 
 
 def night(options: list[str], captures: int, calls: int, seed: int = 1) -> int:
-    """A campaign that is killed, or has a call fail, at random again and again until it is complete.
+    """A campaign that is killed at random again and again until it is complete; in every tenth run a call fails first.
 
     After `LIMIT_S` it is left alone to its end. Then every capture is compared with an undisturbed night's.
     """
@@ -151,24 +152,24 @@ def night(options: list[str], captures: int, calls: int, seed: int = 1) -> int:
     out, chance, known = WORK / "captures" / "night", random.Random(seed), _Known()
     begin_s, kills, errors, wrong = time.monotonic(), 0, 0, list[str]()
     while True:
-        number, sent = chance.randint(1, 2 * calls), signal.SIGKILL if chance.random() < 0.9 else None
+        number, failing = chance.randint(1, 2 * calls), 0
+        if chance.random() < 0.1:
+            failing = chance.randint(1, number)
         if time.monotonic() - begin_s > LIMIT_S:
-            number = 0
-        status, _ = run(options, out, lambda armed, number=number, sent=sent: armed.arm(number, sent))
-        killed = sent is not None and os.WIFSIGNALED(status)
+            number = failing = 0
+        status, _ = run(options, out, lambda armed, at=(number, failing): armed.arm(at[0], failing=at[1]))
         wrong += known.lost(out / "night")
-        if not killed and (sent or not number or os.waitstatus_to_exitcode(status) != 1):
+        killed = os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
+        if not killed and not (failing and os.waitstatus_to_exitcode(status) == 1):
             break
-        kills, errors = kills + killed, errors + (not killed)
-        if (kills + errors) % 50 == 0:
-            print(
-                f"{kills} kills, {errors} errors, {known.states()} states, {time.monotonic() - begin_s:.0f} s",
-                flush=True,
-            )
+        kills, errors = kills + killed, errors + (failing > 0)
+        if kills % 50 == 0:
+            passed_s = time.monotonic() - begin_s
+            print(f"{kills} kills, {errors} failing calls, {known.states()} states, {passed_s:.0f} s", flush=True)
     wrong += filter(None, [check(out, content(WORK / "captures" / "whole"))])
     complete = len(list((out / "night").glob("*.h5")))
     print(
-        f"{kills} kills, {errors} calls failed, exit code {os.waitstatus_to_exitcode(status)}, "
+        f"{kills} kills, {errors} failing calls, exit code {os.waitstatus_to_exitcode(status)}, "
         f"{complete} of {captures} captures complete, {known.states()} states, {len(wrong)} findings, "
         f"{time.monotonic() - begin_s:.0f} s"
     )
@@ -336,8 +337,8 @@ def main() -> None:
     options = write_files(WORK, captures)
     every, first = [*numbers, *(1, 1)[len(numbers) :]][:2] if which in ("kill", "error") else (1, 1)
     work: dict[str, Callable[[], int]] = {
-        "kill": lambda: kill(options, every, first, signal.SIGKILL),
-        "error": lambda: kill(options, every, first, None),
+        "kill": lambda: kill(options, every, first, fails=False),
+        "error": lambda: kill(options, every, first, fails=True),
         "power": lambda: power(options, (numbers or [0])[0]),
         "image": lambda: image(options, (numbers or [200])[0]),
         "night": lambda: night(options, captures, numbers[1] if len(numbers) > 1 else 45),

@@ -2,9 +2,9 @@
  * writes down what each of them does, so that any state of the disc can be made again.
  *
  * Loaded with LD_PRELOAD. Environment: UMOV_DISC_FOLDER, and UMOV_DISC_LOG for the record. Functions for the program
- * itself: disc_calls_arm(n, signal) sends the signal before the n-th call from now on, or with signal 0 lets it fail
- * if it is a write, a sync or the like; disc_calls_made() counts;
- * disc_calls_note(text) adds a remark to the record.
+ * itself: disc_calls_arm(n, signal, m) sends the signal before the n-th call from now on, and lets the m-th fail if it
+ * is a write, a sync or the like (0 for never); disc_calls_made() counts; disc_calls_note(text) adds a remark to the
+ * record.
  *
  * A record is a line "call number path offset length", and after it the bytes of a write.
  */
@@ -24,9 +24,9 @@
 #include <unistd.h>
 
 static pthread_mutex_t lock = PTHREAD_RECURSIVE_MUTEX_INITIALIZER_NP;
-static long made, armed;
+static long made, armed, to_fail;
 static int armed_signal = SIGKILL;
-/* Set when the call that was armed is to fail with an input/output error instead. */
+/* Set when the call that is being made is to fail with an input/output error. */
 static __thread int failing;
 static int record = -2;
 
@@ -78,8 +78,8 @@ static void put(const char *call, const char *path, long offset, const void *dat
 /* Before a call that changes the disc. */
 static void before(const char *call, const char *path, long offset, const void *data, size_t size) {
     made++;
+    if (to_fail && made == to_fail) { failing = 1; return; }
     if (armed && made == armed) {
-        if (armed_signal == 0) { failing = 1; return; }
         kill(getpid(), armed_signal);
         /* A signal to the process may take a moment to arrive at this thread. */
         while (armed_signal == SIGKILL) pause();
@@ -94,7 +94,7 @@ static int failed(void) {
     return 1;
 }
 
-void disc_calls_arm(long n, int number) { made = 0; armed = n; armed_signal = number; }
+void disc_calls_arm(long n, int number, long fails) { made = 0; armed = n; armed_signal = number; to_fail = fails; }
 long disc_calls_made(void) { return made; }
 void disc_calls_note(const char *text) { pthread_mutex_lock(&lock); put("note", text, 0, NULL, 0); pthread_mutex_unlock(&lock); }
 

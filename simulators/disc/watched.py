@@ -48,12 +48,12 @@ class DiscCalls:
         self._library = ctypes.CDLL(None)
         self._library.disc_calls_made.restype = ctypes.c_long
 
-    def arm(self, number: int, sent: signal.Signals | None = signal.SIGKILL) -> None:
+    def arm(self, number: int, sent: signal.Signals = signal.SIGKILL, failing: int = 0) -> None:
         """Count from zero, and send this process a signal before the call of that number; 0 for never.
 
-        Without a signal that call fails with an input/output error, if it is one of a file that is open.
+        The call of number `failing` fails with an input/output error, if it is one of a file that is open.
         """
-        self._library.disc_calls_arm(ctypes.c_long(number), ctypes.c_int(sent or 0))
+        self._library.disc_calls_arm(ctypes.c_long(number), ctypes.c_int(sent), ctypes.c_long(failing))
 
     def made(self) -> int:
         """Calls since `arm`."""
