@@ -118,7 +118,9 @@ def _axis(axis: MotionAxis) -> str:
     warnings = "".join(f", warning: {text}" for text in axis.warnings())
     stop = "" if axis.can_stop_a_move else ", cannot be stopped once it moves"
     name = f"{who.kind} {who.model}, serial {who.serial_number}, firmware {who.firmware}"
-    return f"{name}, {who.port}: {homed}{moving}, {position}{ends}{stop}{warnings}"
+    # As `process design --speed` wants it.
+    speed = f"{axis.speed_deg_s:.4g}:{axis.acceleration_deg_s2:.4g} deg/s:deg/s2"
+    return f"{name}, {who.port}: {homed}{moving}, {position}{ends}, speed {speed}{stop}{warnings}"
 
 
 def _source(rig: Rig) -> str:

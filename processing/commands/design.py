@@ -24,7 +24,10 @@ def design_command(
     wavelength: Annotated[float | None, typer.Option(help="Wavelength in nm.")] = None,
     states: Annotated[str, typer.Option(help="Number of states; several for --optimize: 24,30,40.")] = "40",
     ratio: Annotated[float, typer.Option(help="Analyzer retarder angle over generator retarder angle.")] = 4.91,
-    step: Annotated[float | None, typer.Option(help="Generator step in degrees; default: one turn.")] = None,
+    step: Annotated[
+        float | None,
+        typer.Option(help="Step in degrees; default: one turn, or half of one if its states repeat."),
+    ] = None,
     table: Annotated[
         Path | None, typer.Option(help="CSV of your own states: a column of degrees for each axis.")
     ] = None,
@@ -90,8 +93,12 @@ def design_command(
         w = model.rows(chosen.angles_deg, changes_at(model, chosen.angles_deg))
         intensities = len(chosen) * len(model.channels)
         found = score(w, noise, determined_basis(model), bound_of(model, intensities))
-        _show(f"{model.name}, {nm:g} nm, {len(chosen)} states", found, noise)
-        _tell_robustness(model, chosen)
+        at = f", {nm:g} nm" if nm else ""
+        _show(f"{model.name}{at}, {len(chosen)} states", found, noise)
+        if found.rank == found.wanted:
+            from processing.commands.loaded_late.design_angles import tell_robustness
+
+            tell_robustness(model, chosen.angles_deg)
     if out is not None:
         _write(chosen, out, nm)
         typer.echo(str(out))
@@ -121,7 +128,10 @@ def _given(
     if table is not None:
         return read_table(table, model.axes)
     if len(model.axes) == 1:
-        turn = step if step is not None else 360 / counts[0]
+        from processing.calibration.motor_time import periods_deg
+
+        # Where rows repeat after half a turn, equal steps over a whole one would take every state twice.
+        turn = step if step is not None else periods_deg(model)[model.axes[0]] / counts[0]
         return StateTable.of_angles({model.axes[0]: turn * np.arange(counts[0], dtype=float)})
     turning = [next((e.axis for e in train if e.axis), "") for train in (model.generator, model.analyzer)]
     if sorted(turning) != list(model.axes):
@@ -173,18 +183,11 @@ def _show(title: str, found: Score, noise: Noise) -> None:
         typer.echo("    " + "  ".join(f"{value:.5f}" if value == value else "   -   " for value in row))
 
 
-def _tell_robustness(model: InstrumentModel, table: StateTable) -> None:
-    from processing.calibration.robustness import ERRORS, errors_of_table
-
-    typer.echo("  rms error of m_ij / m00 that an undeclared error of the bench makes (a sample with rms m_ij of 0.3):")
-    for name, value in errors_of_table(model, table.angles_deg).items():
-        typer.echo(f"    {ERRORS[name]}: {value:.5f}")
-
-
 def _write(table: StateTable, path: Path, wavelength_nm: float) -> None:
     names = list(table.angles_deg)
     if path.suffix in (".yaml", ".yml"):
-        lines = ["kind: plan", f"wavelength_nm: {wavelength_nm:g}", "states:", "  kind: table", "  angles:"]
+        light = [f"wavelength_nm: {wavelength_nm:g}"] if wavelength_nm else []
+        lines = ["kind: plan", *light, "states:", "  kind: table", "  angles:"]
         for name in names:
             lines.append(f"    {name}: [{', '.join(f'{angle:.4f}' for angle in table.angles_deg[name])}]")
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")

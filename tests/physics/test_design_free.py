@@ -134,3 +134,29 @@ def test_command_writes_a_plan_that_acquire_takes(configs, tmp_path):
     assert set(states.angles_deg()) == {"psg", "psa"}
     wrong = CliRunner().invoke(app, [*options, "--optimize", "angles", "--speed", "arm=3"])
     assert "the instrument turns" in str(wrong.exception)
+
+
+def test_robustness_is_told_of_what_was_optimized(configs):
+    instrument = str(configs / "instruments/rotating_retarder_stokes.yaml")
+    done = CliRunner().invoke(app, ["design", instrument, "--states", "6", "--optimize", "angles"])
+    assert done.exit_code == 0, done.output
+    assert "every turning retarder off by 1 degree" in done.output
+
+
+def test_partial_instruments_need_no_table_or_wavelength(configs, tmp_path):
+    instrument = str(configs / "instruments/rotating_retarder_stokes.yaml")
+    # Of eight equal steps over a whole turn four would be the others again, and leave rank 3.
+    done = CliRunner().invoke(app, ["design", instrument, "--states", "8"])
+    assert "rotating-retarder Stokes polarimeter, 8 states\n  rank 4 of 4" in done.output
+    plan = tmp_path / "plan.yaml"
+    CliRunner().invoke(app, ["design", instrument, "--states", "8", "--out", str(plan)])
+    assert "wavelength_nm" not in plan.read_text()
+
+
+def test_states_that_cannot_determine_all_are_no_design(configs):
+    # Two beams of one axis: 16 intensities of 8 states, of which no 8 states give rank 16.
+    options = ["design", str(configs / "instruments/drr_wollaston.yaml"), "--states", "8"]
+    refused = CliRunner().invoke(app, [*options, "--optimize", "angles"])
+    assert "no 8 states" in str(refused.exception)
+    # What errors of the bench would do to a matrix that is not determined means nothing.
+    assert "off its zero" not in CliRunner().invoke(app, options).output

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import typer
 
-from processing.calibration.free_angles import FreeDesign, Goal, free_design
+from processing.arrays import Array
+from processing.calibration.free_angles import FreeDesign, Goal, free_design, with_retardances
 from processing.calibration.motor_time import Point, Speed, front, move_seconds
+from processing.calibration.robustness import ERRORS, errors_of_table
 from processing.calibration.state_design import Noise
 from processing.commands.progress_bar import progress_bar
 from processing.errors import ProcessError
@@ -15,6 +17,8 @@ from processing.instrument.model import InstrumentModel
 from processing.instrument.states import StateTable, rotating_retarders
 
 MAY_CHANGE = {"angles", "retardances"}
+#: Of a table without rank: `Cost.value` says 1e12.
+SINGULAR = 1e9
 
 
 def optimize_angles(
@@ -43,15 +47,26 @@ def optimize_angles(
             else:
                 points = [Point(free_design(model, n, goal, "retardances" in names, progress=tick), float("nan"))]
         best = points[0].design
+        if best.variance >= SINGULAR:
+            raise ProcessError(f"no {n} states of {model.name!r} were found that determine all that it can; take more")
         _show(model, n, best)
         if given:
             _show_front(model, n, points, given)
+        tell_robustness(with_retardances(model, best.retardances_deg), best.angles_deg)
     return StateTable.of_angles(best.angles_deg)
+
+
+def tell_robustness(model: InstrumentModel, angles_deg: Mapping[str, Array]) -> None:
+    """Print what errors of the bench would do to a matrix that a table gives."""
+    typer.echo("  rms error of m_ij / m00 that an undeclared error of the bench makes (a sample with rms m_ij of 0.3):")
+    for name, value in errors_of_table(model, angles_deg).items():
+        typer.echo(f"    {ERRORS[name]}: {value:.5f}")
 
 
 def _show(model: InstrumentModel, states: int, best: FreeDesign) -> None:
     plates = ", ".join(f"{name} {value:.1f}" for name, value in best.retardances_deg.items())
-    typer.echo(f"{states} states, free angles, rank {best.rank}, retardances {plates} degrees")
+    told = f", retardances {plates} degrees" if plates else ""
+    typer.echo(f"{states} states, free angles, rank {best.rank}{told}")
     typer.echo(
         f"  equally weighted variance {best.variance:.4f}; the bound for {states * len(model.channels)} intensities "
         f"is {best.bound:.4f} ({best.variance / best.bound - 1:+.2%})"
