@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import plotly
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import Request
@@ -19,8 +18,8 @@ from viewer.library import Library, NotHere
 from viewer.pages import Pages, pages_of, whole_style
 
 STATIC = Path(__file__).parent / "static"
-#: The plotting library as its Python package carries it.
-PLOTLY = Path(plotly.__file__).parent / "package_data" / "plotly.min.js"
+#: The plotting library; its address has its version, so that a browser may keep it.
+PLOTLY = STATIC / "plotly" / "plotly-cartesian-4.1.1.min.js"
 
 
 def application(folder: Path, token: str) -> Starlette:
@@ -56,7 +55,7 @@ def application(folder: Path, token: str) -> Starlette:
         Route("/curve", probes.curve_of),
         Route("/matrix", probes.matrix_of),
         Route("/style.css", _style),
-        Route(f"/plotly-{plotly.__version__}.js", _plotly),
+        Route(f"/{PLOTLY.name}", _plotly),
         Mount("/static", StaticFiles(directory=STATIC)),
     ]
     app = Starlette(
@@ -64,7 +63,7 @@ def application(folder: Path, token: str) -> Starlette:
         middleware=[Middleware(Guard, token=token)],
         exception_handlers={ProcessError: _refused},
     )
-    app.state.pages = Pages(Library(folder), f"/{token}", f"/{token}/plotly-{plotly.__version__}.js")
+    app.state.pages = Pages(Library(folder), f"/{token}", f"/{token}/{PLOTLY.name}")
     return app
 
 
@@ -73,7 +72,6 @@ async def _style(request: Request) -> Response:
 
 
 async def _plotly(request: Request) -> Response:
-    # Its address changes with its version.
     return FileResponse(PLOTLY, headers={"Cache-Control": "private, max-age=31536000, immutable"})
 
 

@@ -145,6 +145,7 @@ class XPSConversation(Emulator):
             "GroupInitialize": self._initialize,
             "GroupHomeSearch": self._home,
             "GroupMoveAbsolute": self._move,
+            "GroupMoveRelative": lambda group, words: self._move(group, words, group.axis.position_deg()),
             "GroupMoveAbort": self._abort,
             "GroupKill": self._kill,
             "GroupMotionEnable": lambda group, _: self._enable(group, True),
@@ -173,11 +174,11 @@ class XPSConversation(Emulator):
         group.axis.home()
         group.came_by, group.aborted, self._waits_for = 11, False, group
 
-    def _move(self, group: Group, words: list[str]) -> None:
+    def _move(self, group: Group, words: list[str], from_deg: float = 0.0) -> None:
         if not 10 <= group.status() <= 18:
             raise Failed(NOT_ALLOWED)
         try:
-            target_deg = float(words[0])
+            target_deg = from_deg + float(words[0])
         except (ValueError, IndexError):
             raise Failed(WRONG_FORMAT) from None
         if not group.axis.within(target_deg):

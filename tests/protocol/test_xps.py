@@ -25,6 +25,9 @@ def test_xps_bytes() -> None:
         (talk, b"GroupStatusGet(Group1,int *)", b"0,11,EndOfAPI"),
         (motion, b"GroupMoveAbsolute(Group1.Pos,-12.500000)", b"0,,EndOfAPI"),
         (talk, b"GroupPositionCurrentGet(Group1.Pos,double *)", b"0,-12.5,EndOfAPI"),
+        (motion, b"GroupMoveRelative(Group1.Pos,2.5)", b"0,,EndOfAPI"),
+        (talk, b"GroupPositionCurrentGet(Group1,double *)", b"0,-10,EndOfAPI"),
+        (motion, b"GroupMoveRelative(Group1,-170)", b"-17,GroupMoveRelative(Group1,-170),EndOfAPI"),
         (motion, b"GroupMoveAbsolute(Group1.Pos,999)", b"-17,GroupMoveAbsolute(Group1.Pos,999),EndOfAPI"),
         (talk, b"GroupStatusGet(Group7,int *)", b"-19,GroupStatusGet(Group7,int *),EndOfAPI"),
     ):

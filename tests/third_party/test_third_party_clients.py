@@ -2,36 +2,14 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from types import ModuleType
 from unittest.mock import MagicMock
 
 import pytest
-
-from simulators.clock import Clock
-from simulators.rig.controller_kinds import served_kinds
-from simulators.serial.emulator import Emulator
-from simulators.serial.pty_port import PtyPort
-from simulators.serial.serve_options import ServeOptions
+from served_emulator import served, wait_until
 
 # The warnings that these packages cause are theirs, not ours.
 pytestmark = [pytest.mark.third_party, pytest.mark.filterwarnings("ignore")]
-
-
-@contextmanager
-def served(kind: str, speed: float = 20.0) -> Iterator[tuple[Emulator, str]]:
-    emulator = served_kinds()[kind](ServeOptions(clock=Clock(speed)))
-    with PtyPort(emulator) as port:
-        yield emulator, port.path
-
-
-def wait_until(what: str, condition: Callable[[], bool], allowed_s: float = 8.0) -> None:
-    give_up_s = time.monotonic() + allowed_s
-    while not condition():
-        if time.monotonic() > give_up_s:
-            pytest.fail(f"not within {allowed_s} s: {what}")
-        time.sleep(0.01)
 
 
 def test_zaber_motion() -> None:

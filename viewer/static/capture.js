@@ -127,11 +127,13 @@ async function follow() {
   if (now.status === "running") setTimeout(follow, 1000);
 }
 
-addEventListener("load", async () => {
+async function begin() {
   await show();
   const wanted = new URLSearchParams(location.hash.slice(1));
   const x = Number(wanted.get("x")), y = Number(wanted.get("y"));
   if (wanted.has("x")) view.choose({ x0: x, y0: y });
   if (byId("look").dataset.writing) run(follow);
   document.body.dataset.ready = "yes";
-});
+}
+
+begin();

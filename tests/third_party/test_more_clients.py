@@ -1,0 +1,193 @@
+"""Clients that CI does not install; each runs where `more_clients.txt` beside this file was installed as well."""
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from served_emulator import served, wait_until
+
+pytestmark = [pytest.mark.third_party, pytest.mark.filterwarnings("ignore")]
+
+
+@pytest.mark.parametrize("kind", ["zaber", "zaber-no-checksums"])
+def test_zaber_serial(kind: str) -> None:
+    zaber = pytest.importorskip("zaber.serial")
+    with served(kind) as (emulator, path):
+        line = zaber.AsciiSerial(path, 115200)
+        try:
+            stage = zaber.AsciiDevice(line, 1)
+            stage.home()
+            stage.move_abs(10_000)
+            stage.move_rel(-500)
+            assert stage.get_position() == 9500
+            assert emulator.true_deg(0) == pytest.approx(9500 / 768_000 * 360)
+            stage.move_vel(1000)
+            stage.stop()
+            assert stage.get_status() == "IDLE"
+        finally:
+            line.close()
+
+
+def test_microscope_zaber() -> None:
+    zaber = pytest.importorskip("microscope.controllers.zaber")
+    with served("zaber") as (emulator, path):
+        chain = zaber.ZaberDaisyChain(path, {1: zaber.ZaberDeviceType.STAGE})
+        (stage,) = chain.devices.values()
+        # It homes the axis and does not wait for it.
+        stage.enable()
+        wait_until("homed", lambda: emulator.axes[0].homed and not emulator.axes[0].is_moving())
+        axis = stage.axes["1"]
+        axis.move_to(5000)
+        wait_until("target", lambda: axis.position == 5000)
+        axis.move_by(-1500)
+        wait_until("target", lambda: axis.position == 3500)
+        assert emulator.true_deg(0) == pytest.approx(3500 / 768_000 * 360)
+        assert axis.limits.lower < 0 < axis.limits.upper
+        chain.shutdown()
+
+
+def test_microscope_filter_wheel() -> None:
+    thorlabs = pytest.importorskip("microscope.filterwheels.thorlabs")
+    with served("fw102c") as (_, path):
+        wheel = thorlabs.ThorlabsFilterWheel(com=path, timeout=5.0)
+        assert wheel.n_positions == 6
+        for position in (2, 5, 0):
+            wheel.position = position
+            assert wheel.position == position
+
+
+def test_elliptec() -> None:
+    elliptec = pytest.importorskip("elliptec")
+    with served("elliptec") as (emulator, path), elliptec.Controller(path) as controller:
+        rotator = elliptec.Rotator(controller)
+        rotator.home()
+        for angle_deg in (45.0, -30.0):
+            rotator.set_angle(angle_deg)
+            assert rotator.get_angle() == pytest.approx(angle_deg, abs=0.01)
+            assert emulator.true_deg(0) == pytest.approx(angle_deg, abs=0.01)
+
+
+def test_thorlabs_elliptec() -> None:
+    package = pytest.importorskip("thorlabs_elliptec")
+    with served("elliptec") as (emulator, path):
+        mount = package.ELLx(path)
+        try:
+            mount.home(blocking=True)
+            for angle_deg in (30.0, -20.0):
+                mount.move_absolute(angle_deg, blocking=True)
+                assert mount.get_position() == pytest.approx(angle_deg, abs=0.01)
+                assert emulator.true_deg(0) == pytest.approx(angle_deg, abs=0.01)
+        finally:
+            mount.close()
+
+
+def test_tl_elliptec() -> None:
+    package = pytest.importorskip("tl_elliptec")
+    with served("elliptec") as (emulator, path), package.ElliptecBus(path) as bus:
+        mounts = package.discover_devices(bus, addresses="012")
+        assert {address: type(mount).__name__ for address, mount in mounts.items()}.items() >= {("0", "ELL14")}
+        mount = mounts["0"]
+        mount.home()
+        assert mount.move_absolute(60.0) == pytest.approx(60.0, abs=0.01)
+        assert emulator.true_deg(0) == pytest.approx(60.0, abs=0.01)
+
+
+@contextmanager
+def daemon(command: str, folder: Path, path: str, **more: object) -> Iterator[Any]:
+    """A daemon of the yaq family as it stands, and its client."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    entries = {"port": port, "serial_port": path, **more}
+    lines = [f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value}" for key, value in entries.items()]
+    config = folder / "config.toml"
+    config.write_text("[axis]\n" + "\n".join(lines) + "\n")
+    # It keeps its state where XDG says.
+    environment = os.environ | {"XDG_DATA_HOME": str(folder)}
+    running = subprocess.Popen([Path(sys.executable).parent / command, "--config", config], env=environment)
+    try:
+        client = None
+        give_up_s = time.monotonic() + 20
+        while client is None:
+            try:
+                client = pytest.importorskip("yaqc").Client(port)
+            except OSError:
+                assert time.monotonic() < give_up_s
+                time.sleep(0.1)
+        yield client
+    finally:
+        running.terminate()
+        running.wait()
+
+
+@pytest.mark.parametrize(
+    ("package", "command", "kind", "more"),
+    [
+        ("yaqd_thorlabs", "yaqd-thorlabs-ell18", "elliptec", {"scalar": 143360 / 360}),
+        ("yaqd_newport", "yaqd-newport-smc100", "smc100", {"units": "deg"}),
+    ],
+)
+def test_yaq_daemons(package: str, command: str, kind: str, more: dict[str, object], tmp_path: Path) -> None:
+    pytest.importorskip(package)
+    with served(kind) as (emulator, path), daemon(command, tmp_path, path, **more) as axis:
+        # It homes the axis when it starts, after a reset of five seconds.
+        wait_until("homed", lambda: emulator.axes[0].homed and not axis.busy(), 30)
+        for target in (75.0, 30.0):
+            axis.set_position(target)
+            wait_until("target", lambda target=target: abs(axis.get_position() - target) < 0.02, 30)
+            assert emulator.true_deg(0) == pytest.approx(target, abs=0.02)
+
+
+def test_newport_library_of_the_xps() -> None:
+    package = pytest.importorskip("newportxps.XPS_C8_drivers")
+    with served("xps") as (emulator, path):
+        host, port = path.removeprefix("socket://").split(":")
+        xps = package.XPS()
+        line = xps.TCP_ConnectToServer(host, int(port), 20)
+        assert line >= 0
+        assert xps.GroupHomeSearch(line, "Group1")[0] == -22
+        assert xps.GroupInitialize(line, "Group1")[0] == 0
+        assert xps.GroupHomeSearch(line, "Group1")[0] == 0
+        assert xps.GroupStatusGet(line, "Group1") == [0, 11]
+        assert xps.GroupMoveAbsolute(line, "Group1", [33.25])[0] == 0
+        assert xps.GroupMoveRelative(line, "Group1", [-40.0])[0] == 0
+        assert xps.GroupPositionCurrentGet(line, "Group1", 1) == [0, pytest.approx(-6.75)]
+        assert emulator.true_deg(0) == pytest.approx(-6.75)
+        error, low, high = xps.PositionerUserTravelLimitsGet(line, "Group1.Pos")
+        assert (error, low < 0 < high) == (0, True)
+        assert xps.PositionerPositionCompareSet(line, "Group1.Pos", 0, 10, 0.5)[0] == 0
+        assert xps.PositionerPositionCompareGet(line, "Group1.Pos")[:4] == [0, 0.0, 10.0, 0.5]
+        xps.TCP_CloseSocket(line)
+
+
+def test_pipython() -> None:
+    package = pytest.importorskip("pipython")
+    with served("gcs2") as (emulator, path):
+        # Through a port of Python's, in place of PI's library in C.
+        serial = pytest.importorskip("pipython.pidevice.interfaces.piserial")
+        gateway = serial.PISerial(path, 115200)
+        controller = package.GCSDevice(gateway=gateway)
+        try:
+            assert "0115012345" in controller.qIDN()
+            axis = controller.axes[0]
+            controller.SVO(axis, True)
+            with pytest.raises(package.GCSError):
+                controller.MOV(axis, 10.0)
+            controller.FRF(axis)
+            wait_until("referenced", lambda: controller.qFRF(axis)[axis] and not controller.IsMoving(axis)[axis])
+            controller.MOV(axis, 10.0)
+            wait_until("target", lambda: controller.qONT(axis)[axis])
+            controller.MVR(axis, -25.0)
+            wait_until("target", lambda: controller.qONT(axis)[axis])
+            assert controller.qPOS(axis)[axis] == pytest.approx(-15.0, abs=1e-3)
+            assert emulator.true_deg(0) == pytest.approx(-15.0, abs=1e-3)
+            controller.StopAll(noraise=True)
+        finally:
+            gateway.close()
