@@ -19,17 +19,23 @@ from pydantic import ValidationError
 from processing.diagnosis.instrument.residual_file import StoredResidual, read_residuals
 from processing.diagnosis.instrument_file import write_instrument
 from processing.diagnosis.search.result import Diagnosis
+from processing.diagnosis.surface.judge import SurfaceDiagnosis
+from processing.diagnosis.surface.write import write_surface
 from processing.doors import read_json, read_text
 from processing.errors import ProcessError
+from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
+from processing.reflectance.base import load_reflectance
 from processing.storage.capture import Capture
+from processing.yaml_file import dump_yaml
 from viewer.library import OWN, Library, NotHere
 
+#: What is said of a verdict; `{model}` is what the captures were compared with.
 VERDICTS = {
-    "consistent": "The captures agree with the instrument model: what is left over is noise.",
-    "explained": "The captures disagree with the instrument model, and what was found explains all of it.",
+    "consistent": "The captures agree with {model}: what is left over is noise.",
+    "explained": "The captures disagree with {model}, and what was found explains all of it.",
     "partly_explained": "Something was found, but more is left over than noise.",
-    "unexplained": "The captures disagree with the instrument model, and nothing that is known explains it.",
+    "unexplained": "The captures disagree with {model}, and nothing that is known explains it.",
     "undetermined": "Nothing can be said: a fault of typical size would not have been seen in these captures.",
 }
 
@@ -44,6 +50,23 @@ class Story:
     decision: dict[str, Any] | None
     begun: str
 
+    @property
+    def of_surface(self) -> bool:
+        """Whether a material was asked, not the instrument alone."""
+        return isinstance(self.diagnosis, SurfaceDiagnosis)
+
+    @property
+    def verdict(self) -> str:
+        """The verdict as a sentence."""
+        model = "the material on its geometry" if self.of_surface else "the instrument model"
+        return VERDICTS[self.diagnosis.verdict].format(model=model)
+
+    @property
+    def writes(self) -> bool:
+        """Whether a file could hold something of what was found."""
+        found = self.diagnosis
+        return bool(found.effects if self.of_surface else found.applied() or found.calibrated)
+
 
 class Diagnoses:
     """The diagnoses of a folder."""
@@ -52,12 +75,19 @@ class Diagnoses:
         self._library = library
         self._folder = library.root / OWN / "diagnoses"
 
-    def begin(self, captures: Sequence[Path], instrument: Path | None) -> tuple[str, Path]:
-        """A new folder with the instrument file to compare with: a copy, or the model stored in the first capture.
+    def begin(
+        self, captures: Sequence[Path], instrument: Path | None, surface: tuple[Path, Path] | None = None
+    ) -> tuple[str, Path]:
+        """A new folder with what to compare with, as it is now.
+
+        Parameters
+        ----------
+        instrument : its file; without one the model stored in the first capture is taken.
+        surface : files of the material and the geometry, where a surface is asked.
 
         Raises
         ------
-        ProcessError : there is no capture, or no model in it.
+        ProcessError : there is no capture, or no model in it; a file that cannot be read.
         """
         if not captures:
             raise ProcessError("a diagnosis needs a capture")
@@ -68,10 +98,17 @@ class Diagnoses:
                 text = capture.header.instrument_yaml
             if not text:
                 raise ProcessError(f"{captures[0].name} holds no instrument model; choose a file")
+        texts = {"instrument.yaml": text}
+        if surface is not None:
+            material, geometry = surface
+            texts["material.yaml"] = read_text(material)
+            # A mesh is named from where the geometry's own file lies.
+            texts["geometry.yaml"] = dump_yaml(ViewingGeometry.load(geometry))
         name = f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
         folder = self._folder / name
         folder.mkdir(parents=True)
-        (folder / "instrument.yaml").write_text(text, encoding="utf-8")
+        for file, content in texts.items():
+            (folder / file).write_text(content, encoding="utf-8")
         about = {
             "captures": [self._library.name(path) for path in captures],
             "instrument": "the model in the capture" if instrument is None else str(instrument),
@@ -91,8 +128,9 @@ class Diagnoses:
         folder = self.folder(name)
         about = read_json(folder / "about.json")
         decided = folder / "decision.json"
+        kind = SurfaceDiagnosis if (folder / "material.yaml").exists() else Diagnosis
         try:
-            diagnosis = Diagnosis.model_validate_json(read_text(folder / "diagnosis.json"))
+            diagnosis = kind.model_validate_json(read_text(folder / "diagnosis.json"))
         except ValidationError as error:
             raise ProcessError(f"diagnosis {name}: this version cannot read it; diagnose anew") from error
         return Story(
@@ -116,8 +154,12 @@ class Diagnoses:
         path = self.folder(name) / "residuals.npz"
         return _read(path, path.stat().st_mtime_ns) if path.exists() else []
 
-    def accept(self, name: str, file: str, note: str) -> Path:
-        """Write the corrected instrument model into the folder under a new name; nothing is ever replaced.
+    def accept(self, name: str, file: str, note: str) -> list[Path]:
+        """Write the corrected model into the folder under a new name; nothing is ever replaced.
+
+        Returns
+        -------
+        The files written: the instrument; of a surface, material, geometry and instrument as far as they changed.
 
         Raises
         ------
@@ -125,12 +167,18 @@ class Diagnoses:
         """
         if not re.fullmatch(r"[\w. -]+\.yaml", file) or file.startswith("."):
             raise ProcessError(f"{file!r}: give a plain file name that ends in .yaml")
-        story = self._undecided(name)
-        model = InstrumentModel.load(self.folder(name) / "instrument.yaml")
-        path = self._library.root / file
-        write_instrument(path, model, story.diagnosis, note)
-        self._decide(name, {"accepted": True, "file": file, "note": note})
-        return path
+        story, folder = self._undecided(name), self.folder(name)
+        model, path = InstrumentModel.load(folder / "instrument.yaml"), self._library.root / file
+        if isinstance(story.diagnosis, SurfaceDiagnosis):
+            material = load_reflectance(folder / "material.yaml")
+            view = ViewingGeometry.load(folder / "geometry.yaml")
+            written = write_surface(path, story.diagnosis, material, view, model, note)
+        else:
+            write_instrument(path, model, story.diagnosis, note)
+            written = [path]
+        first, *others = (path.name for path in written)
+        self._decide(name, {"accepted": True, "file": first, "beside": others, "note": note})
+        return written
 
     def reject(self, name: str, note: str) -> None:
         """Note that the model is not believed, and why. Raises ProcessError where it is decided already."""

@@ -89,22 +89,24 @@ def _quantities(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
 def _diagnose(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
     captures = [library.path(name) for name in asked.get("files", "").split("\n") if name]
     name, folder = Diagnoses(library).begin(captures, _instrument(library, asked))
-    command = ["diagnose", *map(str, captures), "--instrument", str(folder / "instrument.yaml")]
-    for option, file in (("--json", "diagnosis.json"), ("--report", "report.html"), ("--residuals", "residuals.npz")):
-        command += [option, str(folder / file)]
-    about = {"diagnosis": name, "file": library.name(captures[0])}
-    return jobs.start(f"diagnose {', '.join(c.name for c in captures)}", command, about, library.root)
+    more = ["--residuals", str(folder / "residuals.npz")]
+    return _diagnosis(library, jobs, captures, name, folder, more)
 
 
 def _surface(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
     captures = [library.path(name) for name in asked.get("files", "").split("\n") if name]
     material = _chosen(material_files(library), asked.get("material", ""), "material")
     geometry = _chosen(geometry_files(library), asked.get("geometry", ""), "geometry")
-    name, folder = Diagnoses(library).begin(captures, _instrument(library, asked))
+    name, folder = Diagnoses(library).begin(captures, _instrument(library, asked), (material, geometry))
+    more = ["--reflectance", str(folder / "material.yaml"), "--geometry", str(folder / "geometry.yaml")]
+    return _diagnosis(library, jobs, captures, name, folder, more)
+
+
+def _diagnosis(library: Library, jobs: Jobs, captures: list[Path], name: str, folder: Path, more: list[str]) -> Job:
     command = ["diagnose", *map(str, captures), "--instrument", str(folder / "instrument.yaml")]
-    command += ["--reflectance", str(material), "--geometry", str(geometry), "--report", str(folder / "report.html")]
-    about = {"report": name, "file": library.name(captures[0])}
-    return jobs.start(f"diagnose the surface in {', '.join(c.name for c in captures)}", command, about, library.root)
+    command += ["--json", str(folder / "diagnosis.json"), "--report", str(folder / "report.html"), *more]
+    about = {"diagnosis": name, "file": library.name(captures[0])}
+    return jobs.start(f"diagnose {', '.join(c.name for c in captures)}", command, about, library.root)
 
 
 def instrument_files(library: Library) -> dict[str, Path]:
@@ -166,8 +168,6 @@ def told(pages: Pages, jobs: Jobs, found: Job) -> dict[str, Any]:
         links.append(["The campaign", pages.address("campaign", folder=about["campaign"])])
     if "diagnosis" in about and status == "done":
         links.append(["The verdict", pages.address("diagnosis", name=about["diagnosis"])])
-    if "report" in about and status == "done":
-        links.append(["The report", pages.address("diagnosis-report", name=about["report"])])
     if "file" in about:
         entry = library.entry(about["file"])
         if status == "done" and "diagnosis" not in about:

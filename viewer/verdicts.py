@@ -14,7 +14,7 @@ from processing.diagnosis.instrument.residual_file import MOMENTS, StoredResidua
 from processing.doors import require_file
 from processing.errors import ProcessError
 from processing.reports.colours import ALL, PLAIN, SIGNED, steps
-from viewer.diagnoses import VERDICTS, Diagnoses
+from viewer.diagnoses import Diagnoses
 from viewer.library import NotHere
 from viewer.pages import fields_of, pages_of
 from viewer.planes import Window, sent
@@ -33,23 +33,20 @@ def diagnosis(request: Request) -> HTMLResponse:
     story = diagnoses.story(name)
     residuals = diagnoses.residuals(name)
     found = story.diagnosis
-    writes = bool(found.applied() or found.calibrated)
     return pages.draw(
         "diagnosis.html",
         simulated=found.simulated,
         story=story,
         found=found,
-        verdict=VERDICTS[found.verdict],
-        writes=writes,
-        proposed=_free_name(pages.library.root, found.instrument),
+        proposed=_free_name(pages.library.root, found.material if story.of_surface else found.instrument),
         captures=[(capture, pages.address("capture", file=capture)) for capture in story.captures],
         look={"captures": [_told(residual) for residual in residuals]},
         colours={name: steps(name) for name in ALL},
     )
 
 
-def _free_name(folder: Path, instrument: str) -> str:
-    stem = "".join(c if c.isalnum() else "_" for c in instrument).strip("_") or "instrument"
+def _free_name(folder: Path, model: str) -> str:
+    stem = "".join(c if c.isalnum() else "_" for c in model).strip("_") or "model"
     number = 2
     while (folder / f"{stem}_{number}.yaml").exists():
         number += 1
@@ -113,14 +110,14 @@ def _chosen(request: Request) -> StoredResidual:
 
 
 async def decide(request: Request) -> JSONResponse:
-    """Accept the corrected model, which writes a new instrument file, or reject it; both with a note."""
+    """Accept the corrected model, which writes new files, or reject it; both with a note."""
     asked, diagnoses = await fields_of(request), diagnoses_of(request)
     name, note = asked.get("name", ""), asked.get("note", "")
     if asked.get("accept"):
-        path = await run_in_threadpool(diagnoses.accept, name, asked.get("file", ""), note)
-        return JSONResponse({"file": path.name})
+        written = await run_in_threadpool(diagnoses.accept, name, asked.get("file", ""), note)
+        return JSONResponse({"files": [path.name for path in written]})
     diagnoses.reject(name, note)
-    return JSONResponse({"file": None})
+    return JSONResponse({"files": []})
 
 
 def report(request: Request) -> Response:

@@ -21,7 +21,7 @@ from processing.storage.checksums import NONE, row_crc32, state_crc32, summed_va
 from processing.storage.frame_layout import Beams, Cells, FrameLayout
 from processing.storage.h5_door import OpenH5, closed_if_damaged, damage_as, mark_of, open_h5, text_attribute
 from processing.storage.segments import Segment, decode_lines, segments_of
-from processing.storage.unpacked import is_packed, read_rows
+from processing.storage.unpacked import KeptChunks, is_packed, read_rows
 from processing.yaml_file import parse_yaml
 
 #: What else a file can be, by its mark.
@@ -89,6 +89,7 @@ class Capture(OpenH5):
             if group.attrs.get("NX_class") == "NXpositioner"
         }
         self._frames: h5py.Dataset = entry["instrument/detector/data"]
+        self._kept = KeptChunks()
         self.layout = self._layout()
         self._contradictory: list[int] = []
         self._sums = self._verified_sums(entry) if version > 1 else None
@@ -230,7 +231,7 @@ class Capture(OpenH5):
         number = int(self.done[state])
         stored = rows if self.layout is None or rows == slice(None) else self.layout.stored_rows(rows)
         with self._damage():
-            counts = read_rows(self._frames, stored, (number,))
+            counts = read_rows(self._frames, stored, (number,), self._kept)
         self._verify(state, stored, counts)
         return counts if self.layout is None else self.layout.split(counts[0])
 
@@ -255,7 +256,7 @@ class Capture(OpenH5):
             for k, state in enumerate(states):
                 number = int(self.done[state])
                 if is_packed(self._frames):
-                    out[k] = read_rows(self._frames, rows, (number,))
+                    out[k] = read_rows(self._frames, rows, (number,), self._kept)
                 else:
                     self._frames.read_direct(out, np.s_[number, :, rows, :], np.s_[k])
                 self._verify(int(state), rows, out[k])

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,7 +36,7 @@ from processing.storage.packed import create_packed, pack, shrinks_to
 from processing.storage.provenance import Step as Step
 from processing.storage.provenance import file_identity as file_identity
 from processing.storage.provenance import jsonable, read_steps, sign, write_steps
-from processing.storage.unpacked import read_rows
+from processing.storage.unpacked import KeptChunks, read_rows
 
 PRODUCT_VERSION = 1
 #: Environment variable that switches compression of products off where it is 0.
@@ -273,6 +274,7 @@ class Product(OpenH5):
         stored = [name for name in data if not _is_beside(name, data[name])]
         self._stored = {FORMER_NAMES.get(name, name): name for name in stored}
         self.names: tuple[str, ...] = tuple(self._stored)
+        self._kept: defaultdict[str, KeptChunks] = defaultdict(KeptChunks)
         rows, columns = data[text_attribute(data, "signal")].shape[-2:]
         self.shape: tuple[int, int] = (int(rows), int(columns))
         for name in stored:
@@ -293,7 +295,7 @@ class Product(OpenH5):
         """Dataset (leading..., rows, columns)."""
         dataset = self._dataset(name)
         with damage_as(ProductError, f"{self.path} is damaged"):
-            return read_rows(dataset, rows)
+            return read_rows(dataset, rows, kept=self._kept[name])
 
     def units(self, name: str) -> str:
         """Unit of a dataset."""

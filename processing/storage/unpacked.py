@@ -7,9 +7,11 @@ are the only ones.
 from __future__ import annotations
 
 import sys
+from collections import OrderedDict
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import product
+from threading import Lock
 from typing import Any, cast
 
 import h5py
@@ -23,8 +25,42 @@ from processing.computing.threads import thread_count
 DAMAGED = cast(type[Exception], isal_zlib.IsalError)
 
 
-def read_rows(source: h5py.Dataset, rows: slice, first: tuple[int, ...] = ()) -> NDArray[Any]:
+class KeptChunks:
+    """The unpacked chunks of one dataset that were used in part: who reads it row by row wants the next row soon."""
+
+    #: A band of rows of some fifty states.
+    MOST_BYTES = 1 << 25
+
+    def __init__(self) -> None:
+        self._chunks: OrderedDict[tuple[int, ...], NDArray[Any]] = OrderedDict()
+        self._bytes = 0
+        self._lock = Lock()
+
+    def get(self, start: tuple[int, ...]) -> NDArray[Any] | None:
+        """The chunk that begins at this index; None where it is not kept."""
+        with self._lock:
+            if start in self._chunks:
+                self._chunks.move_to_end(start)
+            return self._chunks.get(start)
+
+    def keep(self, start: tuple[int, ...], chunk: NDArray[Any]) -> None:
+        """Keep a chunk, in place of those that were not asked for the longest."""
+        with self._lock:
+            if start not in self._chunks:
+                self._bytes += chunk.nbytes
+            self._chunks[start] = chunk
+            while self._bytes > self.MOST_BYTES:
+                self._bytes -= self._chunks.popitem(last=False)[1].nbytes
+
+
+def read_rows(
+    source: h5py.Dataset, rows: slice, first: tuple[int, ...] = (), kept: KeptChunks | None = None
+) -> NDArray[Any]:
     """Rows of a dataset (first..., more..., rows, columns), as `source[*first, ..., rows, :]`.
+
+    Parameters
+    ----------
+    kept : chunks of this dataset that earlier calls have unpacked; this one adds its own.
 
     Raises
     ------
@@ -34,7 +70,7 @@ def read_rows(source: h5py.Dataset, rows: slice, first: tuple[int, ...] = ()) ->
     start, stop, step = rows.indices(source.shape[-2])
     if step == 1 and stop > start and is_packed(source):
         try:
-            return _unpacked(source, start, stop, first)
+            return _unpacked(source, start, stop, first, kept)
         except (OSError, ValueError, RuntimeError, DAMAGED):
             # A chunk that was never written, is not packed, or is damaged.
             pass
@@ -50,16 +86,23 @@ def is_packed(source: h5py.Dataset) -> bool:
     return bool(native and source.scaleoffset is None and set(chunk[:-2]) <= {1} and chunk[-1] == source.shape[-1])
 
 
-def _unpacked(source: h5py.Dataset, start: int, stop: int, first: tuple[int, ...]) -> NDArray[Any]:
+def _unpacked(
+    source: h5py.Dataset, start: int, stop: int, first: tuple[int, ...], kept: KeptChunks | None
+) -> NDArray[Any]:
     more, columns, height = source.shape[len(first) : -2], source.shape[-1], source.chunks[-2]
     out = np.empty((*more, stop - start, columns), dtype=source.dtype)
 
     def fill(place: tuple[int, ...], top: int) -> None:
-        skipped, raw = source.id.read_direct_chunk((*first, *place, top, 0))
-        if skipped:
-            raise ValueError("a chunk that not every filter was used for")
-        block = _values(isal_zlib.decompress(raw), source.dtype).reshape(height, columns)
         here = slice(max(start, top), min(stop, top + height))
+        index = (*first, *place, top, 0)
+        block = None if kept is None else kept.get(index)
+        if block is None:
+            skipped, raw = source.id.read_direct_chunk(index)
+            if skipped:
+                raise ValueError("a chunk that not every filter was used for")
+            block = _values(isal_zlib.decompress(raw), source.dtype).reshape(height, columns)
+            if kept is not None and here.stop - here.start < height:
+                kept.keep(index, block)
         out[place][here.start - start : here.stop - start] = block[here.start - top : here.stop - top]
 
     chunks = list(_chunks(more, start // height * height, stop, height))

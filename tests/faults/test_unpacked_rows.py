@@ -5,9 +5,10 @@ from __future__ import annotations
 import h5py
 import numpy as np
 import pytest
+from isal import isal_zlib
 
 from processing.storage import packed
-from processing.storage.unpacked import is_packed, read_rows
+from processing.storage.unpacked import KeptChunks, is_packed, read_rows
 
 SHAPE = (3, 2, 70, 40)
 
@@ -40,6 +41,23 @@ def test_rows_are_what_hdf5_reads(write, monkeypatch, dtype, threads):
             np.testing.assert_array_equal(read_rows(h5[name], slice(3, 60, 7), (1,)), values[1, ..., 3:60:7, :])
             np.testing.assert_array_equal(read_rows(h5[name], slice(64, 99), (2, 1)), values[2, 1, 64:, :])
             assert read_rows(h5[name], slice(5, 5)).shape == (3, 2, 0, 40)
+
+
+@pytest.mark.parametrize("most_bytes", [1 << 25, 3000])
+def test_who_reads_row_by_row_has_each_chunk_unpacked_once(write, monkeypatch, most_bytes):
+    monkeypatch.setattr(KeptChunks, "MOST_BYTES", most_bytes)
+    unpacked = []
+    decompress = isal_zlib.decompress
+    monkeypatch.setattr(isal_zlib, "decompress", lambda raw: unpacked.append(raw) or decompress(raw))
+    values = np.arange(np.prod(SHAPE), dtype=np.uint16).reshape(SHAPE)
+    kept = KeptChunks()
+    with write(values) as h5:
+        for state in range(3):
+            for row in range(70):
+                rows = read_rows(h5["packed"], slice(row, row + 1), (state,), kept)
+                np.testing.assert_array_equal(rows, values[state, :, row : row + 1])
+    # Three states of two channels of five chunks; where two fit, those of the two channels take turns.
+    assert len(unpacked) == 3 * 2 * 5
 
 
 def test_a_chunk_that_was_never_written_is_zero(write):

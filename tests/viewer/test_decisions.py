@@ -4,8 +4,11 @@ import json
 
 import pytest
 
-from processing.diagnosis.search.result import Correction, Diagnosis, Error
+from processing.diagnosis.search.result import Correction, Diagnosis, Error, FoundEffect
+from processing.diagnosis.surface.judge import SurfaceDiagnosis
+from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import AppliedEffect, InstrumentModel
+from processing.reflectance.base import load_reflectance
 from viewer.diagnoses import Diagnoses
 from viewer.library import Library, NotHere
 
@@ -59,7 +62,7 @@ def test_an_accepted_model_is_a_new_file_with_its_note(lab, client, diagnosed):
     assert (taken.status_code, "never replaces a file" in taken.text) == (422, True)
     assert (lab / "taken.yaml").read_text() == "mine"
     asked["file"] = "new.yaml"
-    assert client.post("/decide", json=asked, headers=ORIGIN).json() == {"file": "new.yaml"}
+    assert client.post("/decide", json=asked, headers=ORIGIN).json() == {"files": ["new.yaml"]}
     text = (lab / "new.yaml").read_text()
     assert "# seen\n# at the bench\n" in text
     assert [effect.kind for effect in InstrumentModel.load(lab / "new.yaml").effects] == ["psa_azimuth"]
@@ -78,7 +81,7 @@ def test_what_one_tab_has_decided_no_other_changes(lab, client, diagnosed, later
 def test_a_rejected_model_leaves_its_note_and_no_file(lab, client, diagnosed):
     before = set(lab.iterdir())
     answer = client.post("/decide", json={"name": diagnosed, "note": "the lamp was cold"}, headers=ORIGIN)
-    assert answer.json() == {"file": None}
+    assert answer.json() == {"files": []}
     page = client.get("/diagnosis", params={"name": diagnosed}).text
     assert "Not accepted" in page
     assert "the lamp was cold" in page
@@ -110,3 +113,69 @@ def test_a_diagnosis_that_cannot_be_read_takes_no_other_page_away(lab, client, d
 
 def test_a_report_that_is_not_there_is_said_to_be_missing(client, diagnosed):
     assert client.get("/diagnosis-report", params={"name": diagnosed}).status_code == 404
+
+
+@pytest.fixture
+def surface_diagnosed(lab, drr_capture, configs):
+    """A diagnosis that has found other constants of the material and a zero of the arm; returns its name."""
+    diagnoses = Diagnoses(Library(lab))
+    surface = (configs / "materials/red_print.yaml", configs / "geometries/one_inch_sphere.yaml")
+    name, folder = diagnoses.begin([drr_capture("one.h5")], None, surface)
+    error = Error(rms_percent=2.0, chi2_reduced=1.5, held_out="every other tile")
+    found = {"evidence": 900.0, "indistinguishable_from": (), "scope": "instrument", "removal_chance": 0.0}
+    arm = {"arm": {"value": 0.7, "unit": "degree"}}
+    effects = (
+        FoundEffect(kind="arm_zero", element=None, parameters=arm, confident=True, **found),
+        FoundEffect(kind="refractive_index", element=None, parameters={}, confident=True, **found),
+    )
+    diagnosis = SurfaceDiagnosis(
+        verdict="explained",
+        error_before=error,
+        error_after=error,
+        noise_floor_percent=None,
+        effects=effects,
+        unobservable=(),
+        recommendation="",
+        unexplained=None,
+        calibrated={},
+        ranking=(),
+        captures=(),
+        instrument="RGB950",
+        wavelengths_nm=(662.0,),
+        simulated=True,
+        material="red 3D print",
+        constants={"n": 1.4, "k": 0.1, "a": 0.2, "b": 2.0},
+        quantities_before=(),
+        quantities_after=(),
+        xi0_change=(),
+    )
+    (folder / "diagnosis.json").write_text(diagnosis.model_dump_json())
+    return name
+
+
+def test_an_accepted_surface_is_a_new_material_and_a_new_geometry(lab, client, surface_diagnosed, configs):
+    page = client.get("/diagnosis", params={"name": surface_diagnosed}).text
+    assert "red 3D print: explained" in page
+    assert "disagree with the material on its geometry" in page
+    assert 'value="red_3D_print_2.yaml"' in page
+    asked = {"name": surface_diagnosed, "accept": "yes", "file": "print.yaml", "note": "looked at twice"}
+    assert client.post("/decide", json=asked, headers=ORIGIN).json() == {"files": ["print.yaml", "print.geometry.yaml"]}
+    for file in ("print.yaml", "print.geometry.yaml"):
+        assert "# looked at twice\n" in (lab / file).read_text()
+        assert f"<code>{file}</code>" in client.get("/diagnosis", params={"name": surface_diagnosed}).text
+    constants = load_reflectance(lab / "print.yaml").constants
+    assert (constants[662].n, constants[451].n) == (1.4, 1.2)
+    assert ViewingGeometry.load(lab / "print.geometry.yaml").arm_zero_deg == 0.7
+    page = client.get("/capture", params={"file": "one.h5"}).text
+    assert "<option>print.yaml</option>" in page
+    assert "<option>print.geometry.yaml</option>" in page
+
+
+def test_nothing_of_an_accepted_surface_replaces_a_file(lab, client, surface_diagnosed):
+    (lab / "print.geometry.yaml").write_text("mine")
+    asked = {"name": surface_diagnosed, "accept": "yes", "file": "print.yaml", "note": ""}
+    answer = client.post("/decide", json=asked, headers=ORIGIN)
+    assert (answer.status_code, "never replaces a file" in answer.text) == (422, True)
+    assert (lab / "print.geometry.yaml").read_text() == "mine"
+    assert not (lab / "print.yaml").exists()
+    assert "Believe it?" in client.get("/diagnosis", params={"name": surface_diagnosed}).text

@@ -14,6 +14,7 @@ import pytest
 from acquisition.screen.observer import StateReport
 from acquisition.screen.run_file import RunFile, begun_ticks, running_in
 from drivers.motion import Position
+from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture import Capture
 from viewer.campaigns import read_campaign, seconds_left
@@ -228,9 +229,16 @@ def test_a_surface_is_diagnosed_with_a_material_and_a_geometry(lab, client, drr_
     asked = {"files": "one.h5", "material": "mine.yaml", "geometry": "example: one_inch_sphere"}
     command = KINDS["surface"](Library(lab), Told(), asked)
     given = dict(zip(command[2::2], command[3::2], strict=True))
-    assert given["--reflectance"] == str(lab / "mine.yaml")
-    assert given["--geometry"].endswith("geometries/one_inch_sphere.yaml")
+    assert Path(given["--reflectance"]).read_text() == (lab / "mine.yaml").read_text()
+    assert ViewingGeometry.load(given["--geometry"]) == ViewingGeometry.load(lab / "ball.yaml")
     assert Path(given["--instrument"]).read_text() == (configs / "instruments/rgb950.yaml").read_text()
+    # A mesh is found from the copy as well.
+    text = (lab / "ball.yaml").read_text().replace("{kind: sphere, radius_mm: 12.7}", "{kind: mesh, file: vase.stl}")
+    (lab / "vase.yaml").write_text(text)
+    command = KINDS["surface"](Library(lab), Told(), asked | {"geometry": "vase.yaml"})
+    copied = ViewingGeometry.load(command[command.index("--geometry") + 1])
+    assert copied == ViewingGeometry.load(lab / "vase.yaml")
+    assert copied.shape.file == str(lab / "vase.stl")
     with pytest.raises(NotHere, match="no such material"):
         KINDS["surface"](Library(lab), Told(), asked | {"material": "/etc/passwd"})
 

@@ -63,9 +63,19 @@ def _applied(effect: FoundEffect, diagnosis: SurfaceDiagnosis) -> AppliedEffect:
 
 
 def write_surface(
-    path: Path, diagnosis: SurfaceDiagnosis, material: Any, view: ViewingGeometry, instrument: InstrumentModel
+    path: Path,
+    diagnosis: SurfaceDiagnosis,
+    material: Any,
+    view: ViewingGeometry,
+    instrument: InstrumentModel,
+    note: str = "",
 ) -> list[Path]:
     """Write the files that the effects found change; returns them.
+
+    Parameters
+    ----------
+    path : of the material; the others are named after it (`targets`).
+    note : why it is believed, for the head of each file.
 
     Raises
     ------
@@ -91,5 +101,7 @@ def write_surface(
             raise WriteError(f"{target} exists; diagnose never replaces a file. Give another --write.")
     for target, model in models:
         with target.open("x", encoding="utf-8") as file:
-            file.write(f"# Written by `diagnose --reflectance`: {diagnosis.verdict}.\n{dump_yaml(model)}")
+            file.write(f"# Written by `diagnose --reflectance`: {diagnosis.verdict}.\n")
+            file.writelines(f"# {line}\n" for line in note.splitlines())
+            file.write(dump_yaml(model))
     return [target for target, _ in models]
