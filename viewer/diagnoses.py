@@ -56,6 +56,12 @@ class Story:
         return isinstance(self.diagnosis, SurfaceDiagnosis)
 
     @property
+    def model(self) -> str:
+        """Name of the material, or of the instrument."""
+        found = self.diagnosis
+        return found.material if isinstance(found, SurfaceDiagnosis) else found.instrument
+
+    @property
     def verdict(self) -> str:
         """The verdict as a sentence."""
         model = "the material on its geometry" if self.of_surface else "the instrument model"

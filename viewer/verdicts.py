@@ -38,7 +38,7 @@ def diagnosis(request: Request) -> HTMLResponse:
         simulated=found.simulated,
         story=story,
         found=found,
-        proposed=_free_name(pages.library.root, found.material if story.of_surface else found.instrument),
+        proposed=_free_name(pages.library.root, story.model),
         captures=[(capture, pages.address("capture", file=capture)) for capture in story.captures],
         look={"captures": [_told(residual) for residual in residuals]},
         colours={name: steps(name) for name in ALL},
