@@ -12,7 +12,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from drivers.pixel_formats import PIXEL_FORMATS, pixel_format
-from processing.yaml_file import load_yaml
+from processing.yaml_file import ConfigError, load_yaml
 
 FOLDER = Path(__file__).parent / "node_maps"
 
@@ -60,7 +60,11 @@ class NodeMap(BaseModel):
 
 
 def node_map(name: str) -> NodeMap:
-    """Read a table by the name of its file. Raises ConfigError if there is none or it is wrong."""
+    """Read a table: one of `node_maps`, or a file by its path. Raises ConfigError if there is none or it is wrong."""
+    if name.endswith(".yaml"):
+        return load_yaml(name, NodeMap)
+    if name not in node_maps():
+        raise ConfigError(f"there is no feature table {name!r}; give a file (.yaml) or one of {', '.join(node_maps())}")
     return load_yaml(FOLDER / f"{name}.yaml", NodeMap)
 
 

@@ -57,7 +57,8 @@ class SimulatorConfig(_Part):
     dark_current_e_per_s: float = Field(default=DARK_CURRENT_E_PER_S, ge=0)
     effects: tuple[AnyBenchEffect, ...] = ()
     camera: str = Field(
-        default="loopback", description="feature table of a maker's camera, simulators/camera/node_maps"
+        default="loopback",
+        description="feature table of a maker's camera: a name in simulators/camera/node_maps, or a file (.yaml)",
     )
     camera_address: str = Field(
         default="127.0.0.1",
@@ -69,8 +70,10 @@ class SimulatorConfig(_Part):
 
     def below(self, folder: Path) -> SimulatorConfig:
         """The same with its relative paths made absolute, from `folder`."""
+        own_table = self.camera.endswith(".yaml")
         return self.model_copy(
             update={
+                "camera": str(folder / self.camera) if own_table else self.camera,
                 "samples": {name: folder / path for name, path in self.samples.items()},
                 "truth": {name: folder / path for name, path in self.truth.items()},
             }

@@ -200,6 +200,47 @@ def test_a_maker_s_polarization_camera_takes_a_capture_with_its_node_map(
     assert_horizontal(path)
 
 
+OWN_TABLE = """\
+vendor: Somebody
+model: Own-5MP-P
+sources: [the test]
+sensor: [2448, 2048]
+step: {Width: 16, Height: 2}
+exposure: ExposureTimeAbs
+exposure_us: [20, 1.0e+6]
+gain: GainRaw
+gain_range: [0, 400]
+black_level: BlackLevelRaw
+black_level_range: [0, 255]
+temperature: TemperatureAbs
+status: [FrameTriggerWait, ExposureActive]
+pixel_formats: [PolarizedMono8, PolarizedMono12p]
+"""
+
+
+def test_a_feature_table_of_one_s_own_is_a_camera(
+    acquire: Acquire, small_rig: Rig, short_plan: Callable[[str], Path], tmp_path: Path
+) -> None:
+    settings = {"pixel_format": "PolarizedMono12p", "width": 48, "height": 32, "offset_x": 3, "offset_y": 5}
+    rig = small_rig(top={"camera": CAMERA | {"settings": settings}}, camera="own.yaml")
+    (rig.parent / "own.yaml").write_text(OWN_TABLE)
+    out = tmp_path / "captures"
+    code, _, err = acquire("--rig", rig, "--plan", short_plan("stokes"), *THROUGH, "--out", out)
+    assert code == 0, err
+    (path,) = out.glob("*.h5")
+    with Capture(path) as capture:
+        assert capture.camera_nodes["DeviceModelName"] == "Own-5MP-P"
+        assert capture.frame_shape == (32, 48)
+    assert_horizontal(path)
+
+
+def test_a_feature_table_that_is_not_there_is_named_with_those_that_are(acquire: Acquire, small_rig: Rig) -> None:
+    code, out, _ = acquire("doctor", "--rig", small_rig(camera="lucid"))
+    assert code != 0
+    assert "no feature table 'lucid'" in out
+    assert "lucid_tri050s_p" in out
+
+
 def test_all_states_at_omega_35_on_the_node_map_of_the_paper_s_camera(
     acquire: Acquire, small_rig: Rig, tmp_path: Path
 ) -> None:

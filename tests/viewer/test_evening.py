@@ -141,6 +141,8 @@ def _start_watch_stop_resume(page: Page, other: Page, lab: Path, address: str) -
     page.get_by_role("button", name="Stop").click()
     expect(page.locator("#run")).to_be_hidden()
     _ended(lab)
+    # The page loads anew when the run has ended, and would take the next one away.
+    expect(page.locator("#resume")).to_be_visible()
     statuses = [entry["status"] for entry in json.loads((lab / "evening" / "index.json").read_text()).values()]
     assert statuses[0] == "complete"
     assert "failed" not in statuses

@@ -61,13 +61,13 @@ const settings = node => ({
 });
 
 // The plotting library is the last script of a page: what a plot shows is read while the browser compiles it.
-const library = document.readyState === "complete" ? Promise.resolve() : new Promise(done => addEventListener("load", done));
+const library = new Promise(done => addEventListener("load", done));
 
 const drawn = new Map();
 /** Draw a plot; it is drawn again with the colours of the page when those change. */
 export async function draw(node, traces, more) {
   drawn.set(node, [traces, more]);
-  await library;
+  if (!globalThis.Plotly) await library;
   while (!node.layout && dragging()) await new Promise(done => setTimeout(done, 50));
   const [newest, withMore] = drawn.get(node);
   return Plotly.react(node, newest(), layout(withMore()), settings(node));
