@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from processing.diagnosis.captured import averaged
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.captured.screening import screened
@@ -93,6 +94,24 @@ def test_cosmic_rays_and_hot_pixels_are_found_and_left_out(configs, tmp_path):
     assert len([t for t in true if t not in hits and t[1:] not in bad]) <= 0.03 * len(true)
     assert len(hits - true) <= 0.01 * len(true)
     assert not found.usable[truth.any(axis=0)][3:].all()
+
+
+def test_hits_are_found_pixel_by_pixel_where_means_are_fitted(configs, tmp_path, monkeypatch):
+    monkeypatch.setattr(averaged, "MOST_FITTED", STATES * SIDE**2 // 4)
+    bench = Bench(rows=SIDE, columns=SIDE)
+
+    def strike(electrons, random):
+        electrons = electrons.copy()
+        electrons[7, 21, 10] += 2000
+        return electrons
+
+    bench.noise.append(strike)
+    found = screened_capture(taken(tmp_path, configs, bench, 5, air=False), configs)
+    assert found.binned == 2
+    assert found.signal.shape == (STATES, 1, SIDE // 2, SIDE // 2)
+    assert found.left_out.hits.tolist() == [[7, 0, 21, 10]]
+    assert found.left_out.pitch == 1
+    assert not found.usable[10, 5]
 
 
 def test_cosmic_rays_are_found_where_it_is_dark(configs, tmp_path):

@@ -62,6 +62,8 @@ def _show_capture(c: CaptureReport, several: bool) -> None:
     if c.cut_off:
         states = f"state{'s' if len(c.cut_off) > 1 else ''} {', '.join(str(k) for k in c.cut_off)}"
         typer.echo(f"  left out: {states} of {c.name}, cut off at zero counts; raise the black level")
+    if c.binned > 1:
+        typer.echo(f"  fitted: means over squares of {c.binned} x {c.binned} pixels of {c.name}")
     if c.dark_fraction > 0:
         typer.echo(f"  left out as too dark, with their rim: {c.dark_fraction:.1%} of the pixels of {c.name}")
     if c.steep_fraction > 0:

@@ -10,12 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.diagnosis.captured.squares import means, side_for, squares
 from processing.diagnosis.search.rules import CUT_OFF
 from processing.instrument.model import InstrumentModel
 from processing.reduction.counts_to_signal import Correction
 from processing.storage.capture import Capture
 
-#: Values of a capture that are kept; a larger one is averaged over squares of pixels, and takes no longer.
+#: Values of a capture that are read; a larger one is averaged over squares of pixels.
 MOST_VALUES = 20_000_000
 #: Values of a pixel beyond which few pixels are kept: the second moments of the states would be larger than the pixels.
 MANY_VALUES, FEW_PIXELS = 160, 64
@@ -61,9 +62,9 @@ def read_frames(capture: Capture, model: InstrumentModel, states: NDArray[np.int
         side = _side(len(states) * len(planes), *planes.shape[1:])
         tops.append(float(planes.max(initial=-np.inf, where=np.isfinite(planes))))
         share[n] = under.mean()
-        counts.append(_means(planes, side))
-        clipped.append(np.asarray(_squares(over, side).any(axis=(-3, -1))))
-        zero.append(np.asarray(_squares(under, side).any(axis=(-3, -1))))
+        counts.append(means(planes, side))
+        clipped.append(np.asarray(squares(over, side).any(axis=(-3, -1))))
+        zero.append(np.asarray(squares(under, side).any(axis=(-3, -1))))
     over_states = np.stack(clipped)
     return Frames(
         counts=np.stack(counts),
@@ -104,22 +105,10 @@ class _Split:
 
 def _side(values: int, height: int, width: int) -> int:
     """Side of the squares of pixels that are averaged, of images with so many values in each pixel."""
-    side = int(np.ceil(np.sqrt(values * height * width / MOST_VALUES)))
+    side = side_for(values * height * width, MOST_VALUES)
     if values > MANY_VALUES:
         side = max(side, int(np.ceil(np.sqrt(height * width / FEW_PIXELS))))
-    return max(side, 1)
-
-
-def _squares(image: NDArray[np.generic], side: int) -> NDArray[np.generic]:
-    height, width = image.shape[-2] // side, image.shape[-1] // side
-    whole = image[..., : height * side, : width * side]
-    return whole.reshape(*image.shape[:-2], height, side, width, side)
-
-
-def _means(planes: NDArray[np.float32], side: int) -> NDArray[np.float32]:
-    if side == 1:
-        return planes
-    return np.asarray(_squares(planes, side).mean(axis=(-3, -1), dtype=np.float64), dtype=np.float32)
+    return side
 
 
 def _cuts_off(capture: Capture) -> bool:

@@ -1,4 +1,7 @@
-"""Before anything is fitted: what of a capture is no measurement is found, left out, and kept to be told."""
+"""Before anything is fitted: what of a capture is no measurement is found, left out, and kept to be told.
+
+Pixel by pixel; what is fitted of a large capture are means over squares of pixels.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,13 @@ from dataclasses import replace
 import numpy as np
 
 from processing.arrays import Array
+from processing.diagnosis.captured.averaged import averaged_for_fits
 from processing.diagnosis.captured.bad_frames import bad_frames
 from processing.diagnosis.captured.capture_data import CaptureData, LeftOut
 from processing.diagnosis.captured.checked_noise import checked_noise
 from processing.diagnosis.captured.noise_estimate import estimated_noise
 from processing.diagnosis.captured.outliers import outliers_of, without
+from processing.diagnosis.captured.read_capture import without_dark_pixels
 from processing.diagnosis.captured.steep_pixels import without_steep_pixels
 from processing.instrument.applied_effects import changes_of
 from processing.instrument.model import InstrumentModel
@@ -30,7 +35,7 @@ def screened(data: CaptureData, model: InstrumentModel, say: Callable[[str], Non
         data = without(data, found)
         # What was struck is no noise either.
         data = estimated_noise(data) if data.noise_estimated else data
-        data = replace(data, left_out=LeftOut(hits=hits, pixels=bad))
+        data = replace(data, left_out=LeftOut(hits=hits, pixels=bad, pitch=data.pitch))
         say(f"left out of {data.name}: {len(hits)} hits, {len(bad)} bad pixels")
     frames = bad_frames(data, a)
     if frames:
@@ -41,7 +46,21 @@ def screened(data: CaptureData, model: InstrumentModel, say: Callable[[str], Non
     data = checked_noise(without_steep_pixels(data) if data.noise_known else data, a)
     for line in data.noise_told:
         say(f"the noise of {data.name} is not what is declared: {line}")
-    return data
+    return _as_fitted(data, say)
+
+
+def _as_fitted(data: CaptureData, say: Callable[[str], None]) -> CaptureData:
+    """The capture, or means over squares of its pixels, without those that are dark or at sharp edges."""
+    with_edges = data if data.steep is None else replace(data, usable=data.usable | data.steep, steep=None)
+    fitted = averaged_for_fits(with_edges)
+    if fitted is with_edges:
+        return data
+    say(f"{data.name} is fitted by means over squares of {fitted.binned} x {fitted.binned} pixels")
+    if not data.noise_known:
+        return fitted
+    # Again: a rim, and the slope of an edge, are counted in what a derivative of the image is taken of.
+    dark = without_dark_pixels(fitted)
+    return without_steep_pixels(replace(dark, dark_fraction=max(dark.dark_fraction, data.dark_fraction)))
 
 
 def rows_of(data: CaptureData, model: InstrumentModel) -> Array:

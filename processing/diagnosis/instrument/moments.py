@@ -77,8 +77,8 @@ class Tiles:
     boxes: tuple[tuple[slice, slice], ...]
     pick: NDArray[np.bool_]
     pixels: Array
-    #: `tile_products` that are kept, by their features.
-    products: dict[tuple[int, ...], tuple[Array, Array]] = field(default_factory=dict)
+    #: `features_of_tiles` that are kept, by their numbers.
+    features: dict[tuple[int, ...], tuple[Array, Array]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -156,33 +156,38 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
     )
 
 
-def tile_products(data: CaptureData, tiles: Tiles, used: Sequence[int]) -> tuple[tuple[int, ...], Array, Array]:
-    """Which features, their second moments (T, F L, F L) together in every tile, and their noise (T, L, F, F).
+def features_of_tiles(data: CaptureData, tiles: Tiles, used: Sequence[int]) -> tuple[tuple[int, ...], Array, Array]:
+    """Which features, pseudo-pixels (T, F, L, R) of them in every tile, and their noise (T, L, F, F).
 
     `used` are numbers of FEATURES in ascending order, of which the counts are the first; others may stand beside them.
     """
     if tuple(used) == (0,):
-        return (0,), tiles.s, tiles.noise[..., None, None]
-    for known, (s, noise) in tiles.products.items():
+        value, vector = np.linalg.eigh(tiles.s)
+        root = vector * np.sqrt(np.maximum(value, 0.0))[:, None]
+        return (0,), root[:, None], tiles.noise[..., None, None]
+    for known, (z, noise) in tiles.features.items():
         if set(used) <= set(known):
-            return known, s, noise
+            return known, z, noise
     # One set of them is kept, with all that was asked for before: they are large.
-    wanted = tuple(sorted(set(used).union(*tiles.products)))
-    tiles.products.clear()
-    tiles.products[wanted] = _products(data, tiles, list(wanted))
-    return wanted, *tiles.products[wanted]
+    wanted = tuple(sorted(set(used).union(*tiles.features)))
+    tiles.features.clear()
+    tiles.features[wanted] = _features_of_tiles(data, tiles, list(wanted))
+    return wanted, *tiles.features[wanted]
 
 
-def _products(data: CaptureData, tiles: Tiles, used: list[int]) -> tuple[Array, Array]:
+def _features_of_tiles(data: CaptureData, tiles: Tiles, used: list[int]) -> tuple[Array, Array]:
+    """The pixels of every tile, or as many pseudo-pixels as there are products to tell where they are fewer."""
     pixels, count = Pixels(data), tiles.x.size
     size = len(used) * len(pixels.u)
-    s, noise = np.zeros((count, size, size)), np.zeros((count, len(pixels.u), len(used), len(used)))
+    z = np.zeros((count, size, min(int(tiles.pixels.max()), size)))
+    noise = np.zeros((count, len(pixels.u), len(used), len(used)))
     for t, (rows, columns) in enumerate(tiles.boxes):
         part = pixels.part(rows, columns, np.float64)
-        z, of_pixels = part.weighted(np.flatnonzero(tiles.pick[rows, columns]))
-        flat = z[used].reshape(size, -1)
-        s[t], noise[t] = flat @ flat.T, of_pixels[:, used][:, :, used]
-    return s, noise
+        of_part, of_pixels = part.weighted(np.flatnonzero(tiles.pick[rows, columns]))
+        flat = of_part[used].reshape(size, -1)
+        few = np.linalg.qr(flat.T, mode="r").T if flat.shape[1] > size else flat
+        z[t, :, : few.shape[1]], noise[t] = few, of_pixels[:, used][:, :, used]
+    return z.reshape(count, len(used), len(pixels.u), -1), noise
 
 
 @dataclass(frozen=True)

@@ -273,16 +273,16 @@ def not_measured(problem: InstrumentProblem) -> tuple[NotMeasured, ...]:
     """Frames, hits and pixels that were left out, as the frames are stored."""
     told = []
     for data in problem.captures:
-        out, pitch = data.left_out, data.pitch
+        out = data.left_out
         if out:
             told.append(
                 NotMeasured(
                     capture=data.name,
                     states=tuple(out.frames),
                     misfits_percent=tuple(100 * m for m in out.frames.values()),
-                    hits=tuple((n, c, y * pitch, x * pitch) for n, c, y, x in out.hits.tolist()),
-                    pixels=tuple((y * pitch, x * pitch) for y, x in out.pixels.tolist()),
-                    pitch=pitch,
+                    hits=tuple((n, c, y * out.pitch, x * out.pitch) for n, c, y, x in out.hits.tolist()),
+                    pixels=tuple((y * out.pitch, x * out.pitch) for y, x in out.pixels.tolist()),
+                    pitch=out.pitch,
                 )
             )
     return tuple(told)

@@ -1,0 +1,64 @@
+"""Means over squares of pixels, for fits to a capture with far more pixels than they need.
+
+Pixels next to each other say the same of an instrument: a mean over them keeps what they know, error bars included, and
+takes a fraction of the time. What needs pixels one by one (hits, bad pixels, the noise of the detector) comes before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.diagnosis.captured.capture_data import CaptureData, SharedNoise
+from processing.diagnosis.captured.squares import means, side_for, squares
+
+#: Values of a capture that are fitted; more are averaged over squares of pixels.
+MOST_FITTED = 5_000_000
+
+
+def averaged_for_fits(data: CaptureData) -> CaptureData:
+    """The capture as it is fitted: itself, or means over as small squares of pixels as leave few enough values."""
+    side = side_for(data.signal.size, MOST_FITTED)
+    return averaged(data, side) if side > 1 else data
+
+
+def averaged(data: CaptureData, side: int) -> CaptureData:
+    """Means over squares of so many pixels a side, of a capture of which nothing was undone or moved back yet.
+
+    A square counts if all of its pixels do, and is clipped if one of them is.
+    """
+    return replace(
+        data,
+        signal=means(data.signal, side),
+        slope=data.slope / side**2,
+        floor=data.floor / side**2,
+        shared=_shared(data.shared, side),
+        clipped=_any(data.clipped, side),
+        usable=~_any(~data.usable, side),
+        steep=None if data.steep is None else _any(data.steep, side),
+        binned=data.binned * side,
+        pitch=data.pitch * side,
+    )
+
+
+def _any(mask: NDArray[np.bool_], side: int) -> NDArray[np.bool_]:
+    return np.asarray(squares(mask, side).any(axis=(-3, -1)))
+
+
+def _shared(shared: SharedNoise, side: int) -> SharedNoise:
+    """What squares have of their noise in common: neighbours less than pixels, lines more."""
+    return replace(
+        shared,
+        right=_mixed(shared.right, side),
+        down=_mixed(shared.down, side),
+        rows=shared.rows * side,
+        columns=shared.columns * side,
+    )
+
+
+def _mixed(part: float, side: int) -> float:
+    """Part m of the next square that is mixed into each: the covariance m (1 - m) of neighbours goes with 1 / side."""
+    product = part * (1 - part) / side
+    return float((1 - np.sqrt(1 - 4 * product)) / 2)

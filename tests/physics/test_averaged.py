@@ -1,0 +1,90 @@
+"""Means over squares of pixels say of an instrument what the pixels say, with the same errors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from steady_capture import steady_capture
+
+from processing.diagnosis.captured.averaged import averaged
+from processing.diagnosis.captured.capture_data import SharedNoise
+from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.search.fit import minimize
+from processing.diagnosis.search.space import Space
+from processing.instrument.model import InstrumentModel
+from processing.storage.capture import Capture
+from processing.storage.capture_schema import Sample
+from simulators.blind.suite import state_angles
+from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
+
+SIGMA, SIDE = 2e-3, 3
+
+
+def test_noise_of_means_is_as_told():
+    random = np.random.default_rng(5)
+    white = random.normal(0, SIGMA, (4, 301, 300))
+    mixed = 0.7 * white[:, :, :-1] + 0.3 * white[:, :, 1:]
+    mixed = 0.9 * mixed[:, :-1] + 0.1 * mixed[:, 1:]
+    data = replace(steady_capture(0.5 + mixed, SIGMA), shared=SharedNoise(right=0.3, down=0.1))
+    found = averaged(data, SIDE)
+    left = found.signal[:, 0] - 0.5
+    across, down = found.shared.right * (1 - found.shared.right), found.shared.down * (1 - found.shared.down)
+    assert np.var(left) == pytest.approx(found.floor[0] * found.shared.shown, rel=0.02)
+    right = np.mean(left[:, :, :-1] * left[:, :, 1:])
+    assert right == pytest.approx(found.floor[0] * across * (1 - 2 * down), rel=0.1)
+    below = np.mean(left[:, :-1] * left[:, 1:])
+    assert below == pytest.approx(found.floor[0] * down * (1 - 2 * across), rel=0.2)
+
+
+def test_offsets_of_lines_weigh_more_beside_means():
+    random = np.random.default_rng(6)
+    noise = random.normal(0, SIGMA, (6, 240, 240)) + random.normal(0, 0.3 * SIGMA, (6, 240, 1))
+    wide = 1 + 0.09 * 240
+    told = SharedNoise(rows=0.09, wide=wide)
+    found = averaged(replace(steady_capture(noise, SIGMA * np.sqrt(wide)), shared=told), SIDE)
+    pixel = found.floor[0] / found.shared.wide
+    rows = found.signal[:, 0].mean(axis=2)
+    assert np.var(rows) - pixel / 80 == pytest.approx(found.shared.rows * pixel, rel=0.15)
+    assert found.shared.wide == wide
+
+
+def test_a_square_counts_if_all_its_pixels_do():
+    data = steady_capture(np.ones((2, 7, 6)), SIGMA)
+    data.usable[3, 1], data.clipped[0, 5] = False, True
+    found = averaged(data, SIDE)
+    assert found.signal.shape == (2, 1, 2, 2)
+    assert found.usable.tolist() == [[True, True], [False, True]]
+    assert found.clipped.tolist() == [[False, True], [False, False]]
+    assert (found.binned, found.pitch) == (SIDE, SIDE)
+
+
+@pytest.fixture(scope="module")
+def fitted(configs, tmp_path_factory):
+    """Azimuth and image drift with their errors: of the pixels, and of means over them."""
+    path = tmp_path_factory.mktemp("averaged") / "capture.h5"
+    bench, random = Bench(rows=96, columns=96), np.random.default_rng(7)
+    bench.oa += np.deg2rad(0.3)
+    bench.shift.append(lambda k, a: (0.02 * k, -0.01 * k))
+    angles = state_angles(24, False, False)
+    counts = digitize(bench, expose(bench, Scene(random), angles), random)
+    text = (configs / "instruments/rgb950.yaml").read_text()
+    write_capture(path, bench, counts, angles, Sample(kind="unknown"), text)
+    model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
+    with Capture(path) as capture:
+        data = read_capture(capture, model)
+    found = []
+    for each in (data, averaged(data, 2)):
+        problem = InstrumentProblem(model, [each])
+        space = Space(tuple(c for c in problem.pool() if c.kind in ("psa_azimuth", "image_drift")))
+        fit = minimize(problem, space, np.zeros(space.size))
+        found.append((fit.values, np.sqrt(np.diag(np.linalg.inv(fit.sums.curvature.sum(axis=0))))))
+    return found
+
+
+def test_means_say_what_the_pixels_say(fitted):
+    (values, errors), (of_means, their_errors) = fitted
+    # Of a small image three rows of squares at each edge, in place of three of pixels, are some of the information.
+    assert np.all((errors <= their_errors) & (their_errors < 1.2 * errors))
+    assert np.all(np.abs(of_means - values) < 3 * np.sqrt(their_errors**2 - errors**2))
+    assert np.all(np.abs(of_means) > 10 * their_errors)
