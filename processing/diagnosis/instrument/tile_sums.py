@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
@@ -48,26 +47,26 @@ def add_tiles(
     used, use = np.array(known), np.flatnonzero(moments.counts)
     sigma, around = moments.sigma[use], used >= len(FEATURES) - DERIVATIVES
     c, dc = c[used][:, use], dc[:, used][:, :, use]
-    for first in range(0, tiles.x.size, TOGETHER):
-        some = slice(first, first + TOGETHER)
-        of_noise = noise[some][:, use] / (sigma**2)[:, None, None]
-        part = _Tiled(z[some][:, :, use] / sigma[:, None], of_noise, a[some][:, use], c, around)
-        fold, squares = tiles.fold[some], np.sum(part.residual**2, axis=2)
-        free = np.diagonal(part.outside, axis1=1, axis2=2)
-        np.add.at(out.excess, fold, squares.sum(axis=1) - part.expected)
-        np.add.at(out.freedom, fold, part.expected)
-        np.add.at(out.square, fold, squares @ sigma**2 * moments.relative)
-        np.add.at(out.count, fold, free @ moments.left[use] * tiles.pixels[some])
-        if len(da):
-            folds = [fold == f for f in range(len(out.excess))]
-            gradient, stretch, curvature = part.slopes(da[:, some][:, :, use], dc, folds)
-            out.gradient += gradient
-            out.stretch += stretch
-            out.curvature += curvature
+    for fold in range(len(out.excess)):
+        mine = np.flatnonzero(tiles.fold == fold)
+        for some in np.split(mine, range(TOGETHER, mine.size, TOGETHER)):
+            of_noise = noise[some][:, use] / (sigma**2)[:, None, None]
+            part = _Tiled(z[some][:, :, use] / sigma[:, None], of_noise, a[some][:, use], c, around)
+            squares, left = np.sum(part.residual**2, axis=(0, 2)), float(part.expected.sum())
+            out.excess[fold] += squares.sum() - left
+            out.freedom[fold] += left
+            out.square[fold] += squares @ sigma**2 * moments.relative
+            free = np.diagonal(part.outside, axis1=1, axis2=2)
+            out.count[fold] += tiles.pixels[some] @ free @ moments.left[use]
+            if len(da):
+                gradient, stretch, curvature = part.slopes(da.take(some, axis=1).take(use, axis=2), dc)
+                out.gradient[fold] += gradient
+                out.stretch[fold] += stretch
+                out.curvature[fold] += curvature
 
 
 class _Tiled:
-    """As `add_block` with all tiles at once, each against a matrix of its own.
+    """As `add_block` with several tiles at once, each against a matrix of its own.
 
     Attributes
     ----------
@@ -98,32 +97,29 @@ class _Tiled:
         self._carried = mean.reshape(*hat.shape[:2], -1) @ onto.reshape(*hat.shape[:2], -1).transpose(0, 2, 1)
         self._of_features = np.sum(takes * mean, axis=3)
 
-    def slopes(self, da: Array, dc: Array, folds: Sequence[NDArray[np.bool_]]) -> tuple[Array, Array, Array]:
-        """Half gradient (folds, K) of the excess and of its noise, and curvature (folds, K, K) of the excess.
+    def slopes(self, da: Array, dc: Array) -> tuple[Array, Array, Array]:
+        """Half gradient (K,) of the excess and of its noise, and curvature (K, K) of the excess, summed over the tiles.
 
         From dr = -P dA A+ y + P dB z.
         """
         da = self.outside @ da
         yy = self._y @ self._y.transpose(0, 2, 1)
-        pull = _flat(dc) @ _flat(self._of_features.transpose(0, 2, 1)).T
-        pull -= np.einsum("ktli,tli->kt", da, self._carried @ self._back)
-        slope = -pull - np.einsum("ktli,tli->kt", da, self.outside @ yy @ self._back)
+        pull = _flat(dc) @ self._of_features.sum(axis=0).T.reshape(-1)
+        pull -= _flat(da) @ (self._carried @ self._back).reshape(-1)
+        gradient = -pull - _flat(da) @ (self.outside @ yy @ self._back).reshape(-1)
+        # A+ y as few pseudo-pixels.
+        value, vector = np.linalg.eigh(self._back.transpose(0, 2, 1) @ yy @ self._back)
+        along = _flat(da @ (vector * np.sqrt(np.maximum(value, 0.0))[:, None]))
+        curvature = along @ along.T
         counted = np.flatnonzero(np.any(dc, axis=(1, 2)))
-        of_counts = np.stack([self.outside @ self._weighted(dc[j]) for j in counted]) if counted.size else None
-        ds = da @ (self._back.transpose(0, 2, 1) @ yy @ self._back)
-        curvature = np.stack([_flat(ds[:, mine]) @ _flat(da[:, mine]).T for mine in folds])
-        if of_counts is not None:
-            slope[counted] += np.einsum("jtlr,tlr->jt", of_counts, self.residual)
-            onto_unknowns = of_counts @ (self._y.transpose(0, 2, 1) @ self._back)
-            for f, mine in enumerate(folds):
-                across = _flat(onto_unknowns[:, mine]) @ _flat(da[:, mine]).T
-                curvature[f, counted] -= across
-                curvature[f, :, counted] -= across
-                among = _flat(of_counts[:, mine])
-                curvature[f, counted[:, None], counted] += among @ among.T
-        gradient = np.stack([slope[:, mine].sum(axis=1) for mine in folds])
-        stretch = np.stack([pull[:, mine].sum(axis=1) for mine in folds])
-        return gradient, stretch, curvature
+        if counted.size:
+            of_counts = np.stack([self.outside @ self._weighted(dc[j]) for j in counted])
+            gradient[counted] += _flat(of_counts) @ self.residual.reshape(-1)
+            across = _flat(of_counts @ (self._y.transpose(0, 2, 1) @ self._back)) @ _flat(da).T
+            curvature[counted] -= across
+            curvature[:, counted] -= across.T
+            curvature[np.ix_(counted, counted)] += _flat(of_counts) @ _flat(of_counts).T
+        return gradient, pull, curvature
 
     def _weighted(self, c: Array) -> Array:
         """Sum (T, L, R) of the features, each times its coefficient (F, L)."""

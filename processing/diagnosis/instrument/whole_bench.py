@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from processing.arrays import Array
+from processing.diagnosis.instrument.beside_fields import likeliest_that_fit
 from processing.diagnosis.instrument.features import MARGIN
 from processing.diagnosis.instrument.noise_of_light import scatter_prefers
 from processing.diagnosis.instrument.problem import EXACT, InstrumentProblem
@@ -17,7 +18,7 @@ from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.fit import Fit, held_out, minimize, prior, score
 from processing.diagnosis.search.likely_set import everything
 from processing.diagnosis.search.posterior import Posterior, Say, posterior, quadratic, resampled
-from processing.diagnosis.search.rules import BESIDE_FIELD, DECISIVE, FAR_OFF, LIKELY, REFUTED, SHARES, TAKES_PART
+from processing.diagnosis.search.rules import DECISIVE, FAR_OFF, LIKELY, REFUTED, SHARES, TAKES_PART
 from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import (
@@ -189,17 +190,9 @@ class WholeBench:
         best = max(gains, key=lambda c: gains[c])
         if gains[best] < DECISIVE:
             return found
-        odds = found.sets.conditional(found.samples.best).log_odds
-        kept: list[Candidate] = [*fixed]
-        size = 0
-        for k in np.argsort(-odds):
-            mine = [found.space.candidates[m] for m in found.members[k]]
-            if mine[0] in fixed or size + sum(c.size for c in mine) > BESIDE_FIELD:
-                continue
-            kept += mine
-            size += sum(c.size for c in mine)
         self.say(f"with {', '.join(c.label for c in fields)}")
-        return self._posterior([*kept, *fields], fixed)
+        beside = likeliest_that_fit(self.whole, found, [*fixed, *fields])
+        return self._posterior([*fixed, *beside, *fields], fixed)
 
 
 def applied(found: Posterior, base: Space, unfit: Sequence[Candidate] = ()) -> tuple[Space, Array]:

@@ -4,9 +4,9 @@ from dataclasses import replace
 from types import SimpleNamespace as Some
 
 import numpy as np
-from rule_decisions import QUIET, Asked, Patch, bench, decides, made
+from rule_decisions import QUIET, Asked, Patch, decides, made
 
-from processing.diagnosis.instrument import judge, starts, whole_bench
+from processing.diagnosis.instrument import beside_fields, judge, starts
 from processing.diagnosis.search import likely_set, posterior
 from processing.diagnosis.search.sets import Quadratic, Sets, State
 from processing.diagnosis.search.space import Space, Sums
@@ -114,17 +114,19 @@ def test_needed(m: Patch) -> bool:
 
 @decides
 def test_beside_field(m: Patch) -> bool:
-    space = Space(tuple(made(place=str(k)) for k in range(200)))
+    space = Space(tuple(made(place=str(k)) for k in range(500)))
+    odds = np.random.default_rng(0).permutation(500)
     found = Some(
         space=space,
-        members=[(k,) for k in range(200)],
-        samples=Some(best=Some(unit=1.0)),
-        sets=Some(conditional=lambda best: Some(log_odds=np.zeros(200))),
+        members=[(k,) for k in range(500)],
+        samples=Some(best=None),
+        sets=Some(conditional=lambda best: Some(log_odds=odds)),
     )
-    m.setattr(whole_bench, "applied", lambda found, base: (Space(()), np.zeros(0)))
-    m.setattr(whole_bench, "score", lambda *a: (1e6, None))
-    asked = bench(whole=Some(sums=lambda *a: None, noise_known=False), _posterior=lambda candidates, fixed: candidates)
-    return len(asked._with_fields(found, [], [made(kind="field")])) == 90 + 1
+    # In 256 tiles of 40 states of an unknown sample a value has 163 840 slopes, and one takes part already.
+    tiles, seen = Some(tiles=Some(x=np.zeros(256))), Some(values_per_pixel=40, sample=None)
+    problem = Some(captures=[seen], moments=[tiles], wavelengths_nm=(662.0,))
+    kept = beside_fields.likeliest_that_fit(problem, found, [made(kind="field")])
+    return {int(c.place) for c in kept} == set(np.argsort(-odds)[:304].tolist())
 
 
 @decides
