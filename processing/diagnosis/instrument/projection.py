@@ -1,4 +1,4 @@
-"""One block of pixels against a matrix: residual, excess over the noise, and their derivatives."""
+"""Parts of an image against a matrix: residual, excess over the noise, and their derivatives."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import for_strips
-from processing.diagnosis.instrument.features import DERIVATIVES, derivatives_of_part, features
+from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES, derivatives_of_part, features
 from processing.diagnosis.instrument.moments import Block, Moments
 from processing.diagnosis.search.space import Sums
 
@@ -44,83 +44,93 @@ def add_response(counts: NDArray[Any], coefficients: Array, a: Array) -> NDArray
 
 def add_block(block: Block, a: Array, c: Array, da: Array, dc: Array | None, moments: Moments, out: Sums) -> None:
     """Add what a block says of rows a (L, K) and coefficients c (F, L), with their derivatives by each value."""
-    rows = block.rows
-    scale = 1 / moments.sigma[rows]
-    c, da = c[:, rows], da[:, rows]
-    dc = None if dc is None or not np.any(dc) else dc[:, :, rows]
+    rows, fold = block.rows, block.fold
+    dc = np.zeros((len(da), *c.shape)) if dc is None else dc
+    used = np.flatnonzero(np.any(c, axis=1) | np.any(dc, axis=(0, 2)))
     # Without corrections of the counts, as few pseudo-pixels as there are rows say the same.
-    plain = dc is None and not np.any(c[1:])
-    z = block.counts[None, rows] if plain else block.z[:, rows]
-    u, size, vt = np.linalg.svd(a[rows], full_matrices=False)
-    keep = size > RANK * size[0]
-    q = u[:, keep]
-    around = bool(np.any(c[-DERIVATIVES:])) or (dc is not None and bool(np.any(dc[:, -DERIVATIVES:])))
-    if around:
-        # Derivatives of the fitted image in place of those of the noisy frames.
-        z = np.concatenate([z[:-DERIVATIVES], q @ (q.T @ (z[-DERIVATIVES:] * scale[:, None])) / scale[:, None]])
-    noise = _Noise(block.noise[rows] * scale[:, None, None] ** 2, c, q, around)
-    y = _weighted_sum(c, z) * scale[:, None]
-    pinv = (vt[keep].T / size[keep]) @ q.T
-    r = y - q @ (q.T @ y)
-    f = block.fold
-    out.freedom[f] += noise.left
-    out.excess[f] += float(np.sum(r * r)) - noise.left
-    out.square[f] += float(np.sum((r / scale[:, None]) ** 2)) * moments.relative
-    out.count[f] += (1 - np.sum(q * q, axis=1)) @ moments.left[rows] * block.pixels
-    if da.shape[0] == 0:
-        return
-    k = da.shape[0]
-    d = -(da.reshape(-1, a.shape[1]) @ (pinv @ y)).reshape(k, rows.size, -1)
-    pull = -np.einsum("kli,il->k", da, pinv @ noise.carried)
-    if dc is not None:
-        for j in np.flatnonzero(np.any(dc, axis=(1, 2))):
-            d[j] += _weighted_sum(dc[j], z) * scale[:, None]
-            pull[j] += noise.along(dc[j])
-    d -= q @ (q.T @ d)
-    flat = d.reshape(k, -1)
-    out.gradient[f] += flat @ r.reshape(-1) - pull
-    out.stretch[f] += pull
-    out.curvature[f] += flat @ flat.T
+    z = block.counts[None, rows] if used.tolist() == [0] else block.z[used][:, rows]
+    sigma, noise = moments.sigma[rows], block.noise[rows][:, used][:, :, used]
+    part = Projected(
+        (z / sigma[:, None])[None],
+        (noise / (sigma**2)[:, None, None])[None],
+        a[None, rows],
+        c[used][:, rows],
+        used >= len(FEATURES) - DERIVATIVES,
+    )
+    squares, left = np.sum(part.residual**2, axis=(0, 2)), float(part.expected.sum())
+    out.freedom[fold] += left
+    out.excess[fold] += squares.sum() - left
+    out.square[fold] += squares @ sigma**2 * moments.relative
+    out.count[fold] += np.diag(part.outside[0]) @ moments.left[rows] * block.pixels
+    if len(da):
+        gradient, stretch, curvature = part.slopes(da[:, None, rows], dc[:, used][:, :, rows])
+        out.gradient[fold] += gradient
+        out.stretch[fold] += stretch
+        out.curvature[fold] += curvature
 
 
-class _Noise:
-    """What the noise of the pixels is expected to give in the products of a block.
+class Projected:
+    """Parts of an image, tiles or a whole block, each against a matrix of its own.
 
-    The corrected counts y have the noise sum over e of A_e n_e: n_0 is that of all features that need no neighbours,
-    as the coefficients join them, with A_0 the identity; n_1 to n_5 that of the derivatives, of which the fitted image
-    has the part A_e = diag(c_e) Q Q^T. The noises of one row go together, those of two rows do not.
+    The corrected counts y = c z are joined of features z, of which derivatives are those of the fitted image: the noise
+    of one row goes together in all of them, that of two rows does not.
 
     Attributes
     ----------
-    left : sum of squares of the residual; carried : (L, L) mean of y times residual.
+    outside : (T, L, L) projection P; residual : (T, L, R) P y; expected : (T,) squares of noise alone.
     """
 
-    def __init__(self, noise: Array, c: Array, q: Array, around: bool) -> None:
-        """`noise` (L, F, F) of products of features, in weighted units; c (F, L); q (L, rank)."""
-        rows = len(noise)
-        self._hat = q @ q.T
-        outside = np.eye(rows) - self._hat
-        joined = np.zeros((1 + DERIVATIVES * around, *c.shape))
-        joined[0, :-DERIVATIVES] = c[:-DERIVATIVES]
-        for e in range(1, len(joined)):
-            joined[e, e - 1 - DERIVATIVES] = 1.0
-        with_features = np.einsum("efl,lfg->elg", joined, noise)
-        among = np.einsum("elg,hgl->leh", with_features, joined)
-        into = np.stack([np.eye(rows), *(c[e - 1 - DERIVATIVES, :, None] * self._hat for e in range(1, len(joined)))])
-        residual = outside @ into
-        # Mean of residual (L, .) times n_e of a row (., L).
-        mean = np.einsum("elk,keh->hlk", residual, among)
-        self.left = float(np.sum(mean * residual))
-        self.carried = np.einsum("elk,emk->lm", into, mean)
-        self._of_features = np.einsum("ell,elg->lg", residual, with_features)
-        self._of_derivatives = mean[1:]
+    def __init__(self, z: Array, noise: Array, a: Array, c: Array, around: NDArray[np.bool_]) -> None:
+        """z (T, F, L, R), noise (T, L, F, F), a (T, L, K), c (F, L); `around` (F,) features that are derivatives."""
+        rows = a.shape[1]
+        u, size, vt = np.linalg.svd(a, full_matrices=False)
+        keep = size > RANK * size[:, :1]
+        q = u * keep[:, None, :]
+        # A+, turned over.
+        self._back = q * np.where(keep, 1 / np.maximum(size, 1e-300), 0.0)[:, None, :] @ vt
+        hat = q @ q.transpose(0, 2, 1)
+        self.outside = np.eye(rows) - hat
+        self._z = z
+        if around.any():
+            self._z = z.copy()
+            self._z[:, around] = hat[:, None] @ z[:, around]
+        self._y = np.einsum("fl,tflr->tlr", c, self._z)
+        self.residual = self.outside @ self._y
+        # What takes the noise of each feature to the rows, and the mean product of the residual's noise with it.
+        takes = np.where(around[:, None], hat[:, :, None], np.eye(rows)[:, None])
+        onto = c.T[:, :, None] * takes
+        left = (self.outside @ onto.reshape(*hat.shape[:2], -1)).reshape(onto.shape)
+        mean = (left.transpose(0, 3, 1, 2) @ noise).transpose(0, 2, 3, 1)
+        self.expected = np.sum(mean * left, axis=(1, 2, 3))
+        self._carried = mean.reshape(*hat.shape[:2], -1) @ onto.reshape(*hat.shape[:2], -1).transpose(0, 2, 1)
+        self._of_features = np.sum(takes * mean, axis=3)
 
-    def along(self, dc: Array) -> float:
-        """Sum of residual times a change of the corrected counts by coefficients dc (F, L)."""
-        out = np.sum(dc[:-DERIVATIVES] * self._of_features.T[:-DERIVATIVES])
-        for e, mean in enumerate(self._of_derivatives):
-            out += np.sum(dc[e - DERIVATIVES, :, None] * self._hat * mean)
-        return float(out)
+    def slopes(self, da: Array, dc: Array) -> tuple[Array, Array, Array]:
+        """Half gradient (K,) of the excess and of its noise, and curvature (K, K) of the excess, summed over the parts.
+
+        From dr = -P dA A+ y + P dB z.
+        """
+        da = self.outside @ da
+        y = self._y.transpose(0, 2, 1)
+        pull = _flat(dc) @ self._of_features.sum(axis=0).T.reshape(-1)
+        pull -= _flat(da) @ (self._carried @ self._back).reshape(-1)
+        gradient = -pull - _flat(da) @ (self.residual @ y @ self._back).reshape(-1)
+        unknowns = y @ self._back
+        curvature = _flat(da @ (unknowns.transpose(0, 2, 1) @ unknowns)) @ _flat(da).T
+        counted = np.flatnonzero(np.any(dc, axis=(1, 2)))
+        if counted.size:
+            of_counts = np.stack([self.outside @ self._weighted(dc[j]) for j in counted])
+            gradient[counted] += _flat(of_counts) @ self.residual.reshape(-1)
+            across = _flat(of_counts @ unknowns) @ _flat(da).T
+            curvature[counted] -= across
+            curvature[:, counted] -= across.T
+            curvature[np.ix_(counted, counted)] += _flat(of_counts) @ _flat(of_counts).T
+        return gradient, pull, curvature
+
+    def _weighted(self, c: Array) -> Array:
+        """Sum (T, L, R) of the features, each times its coefficient (F, L)."""
+        used = np.flatnonzero(np.any(c, axis=1))
+        return np.asarray(np.einsum("fl,tflr->tlr", c[used], self._z[:, used]))
 
 
 def noise_information(block: Block, a: Array, dc: Array, moments: Moments) -> Array:
@@ -128,17 +138,20 @@ def noise_information(block: Block, a: Array, dc: Array, moments: Moments) -> Ar
 
     Of rows a (L, K) in units of their noise and derivatives dc (K, F, L) of the coefficients by the values.
     """
-    rows = block.rows
+    rows, out = block.rows, np.zeros((len(dc), len(dc)))
+    moving = np.flatnonzero(np.any(dc[:, -DERIVATIVES:, rows], axis=(1, 2)))
+    if not moving.size:
+        return out
     u, size, _ = np.linalg.svd(a[rows], full_matrices=False)
     q = u[:, size > RANK * size[0]]
     hat = q @ q.T
     noise = block.noise[rows, -DERIVATIVES:, -DERIVATIVES:] / moments.sigma[rows, None, None] ** 2
     # P diag(dc) Q Q^T for each value and derivative.
-    into = dc[:, -DERIVATIVES:, rows, None] * hat
+    into = dc[moving, -DERIVATIVES:][:, :, rows, None] * hat
     into -= hat @ into
-    return np.asarray(np.einsum("ielk,keh,jhlk->ij", into, noise, into, optimize=True))
+    out[np.ix_(moving, moving)] = np.einsum("ielk,keh,jhlk->ij", into, noise, into, optimize=True)
+    return out
 
 
-def _weighted_sum(c: Array, z: Array) -> Array:
-    used = np.flatnonzero(np.any(c != 0, axis=1))
-    return np.asarray(sum(c[f][:, None] * z[f] for f in used))
+def _flat(x: Array) -> Array:
+    return x.reshape(len(x), -1)

@@ -5,13 +5,12 @@ from __future__ import annotations
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
 from processing.diagnosis.instrument.moments import Moments, Tiles, features_of_tiles
-from processing.diagnosis.instrument.projection import RANK
+from processing.diagnosis.instrument.projection import Projected
 from processing.diagnosis.search.space import Sums
 from processing.instrument.changes import Changes
 from processing.instrument.model import InstrumentModel
@@ -51,7 +50,7 @@ def add_tiles(
         mine = np.flatnonzero(tiles.fold == fold)
         for some in np.split(mine, range(TOGETHER, mine.size, TOGETHER)):
             of_noise = noise[some][:, use] / (sigma**2)[:, None, None]
-            part = _Tiled(z[some][:, :, use] / sigma[:, None], of_noise, a[some][:, use], c, around)
+            part = Projected(z[some][:, :, use] / sigma[:, None], of_noise, a[some][:, use], c, around)
             squares, left = np.sum(part.residual**2, axis=(0, 2)), float(part.expected.sum())
             out.excess[fold] += squares.sum() - left
             out.freedom[fold] += left
@@ -63,69 +62,3 @@ def add_tiles(
                 out.gradient[fold] += gradient
                 out.stretch[fold] += stretch
                 out.curvature[fold] += curvature
-
-
-class _Tiled:
-    """As `add_block` with several tiles at once, each against a matrix of its own.
-
-    Attributes
-    ----------
-    outside : (T, L, L) projection P; residual : (T, L, R) P y; expected : (T,) squares of noise alone.
-    """
-
-    def __init__(self, z: Array, noise: Array, a: Array, c: Array, around: NDArray[np.bool_]) -> None:
-        """z (T, F, L, R), noise (T, L, F, F), a (T, L, K), c (F, L); `around` (F,) features that are derivatives."""
-        rows = a.shape[1]
-        u, size, vt = np.linalg.svd(a, full_matrices=False)
-        keep = size > RANK * size[:, :1]
-        q = u * keep[:, None, :]
-        # A+, turned over.
-        self._back = q * np.where(keep, 1 / np.maximum(size, 1e-300), 0.0)[:, None, :] @ vt
-        hat = q @ q.transpose(0, 2, 1)
-        self.outside = np.eye(rows) - hat
-        # Derivatives are those of the fitted image.
-        self._z = z
-        self._z[:, around] = hat[:, None] @ z[:, around]
-        self._y = np.einsum("fl,tflr->tlr", c, self._z)
-        self.residual = self.outside @ self._y
-        # What takes the noise of each feature to the rows, and the mean product of the residual's noise with it.
-        takes = np.where(around[:, None], hat[:, :, None], np.eye(rows)[:, None])
-        onto = c.T[:, :, None] * takes
-        left = (self.outside @ onto.reshape(*hat.shape[:2], -1)).reshape(onto.shape)
-        mean = (left.transpose(0, 3, 1, 2) @ noise).transpose(0, 2, 3, 1)
-        self.expected = np.sum(mean * left, axis=(1, 2, 3))
-        self._carried = mean.reshape(*hat.shape[:2], -1) @ onto.reshape(*hat.shape[:2], -1).transpose(0, 2, 1)
-        self._of_features = np.sum(takes * mean, axis=3)
-
-    def slopes(self, da: Array, dc: Array) -> tuple[Array, Array, Array]:
-        """Half gradient (K,) of the excess and of its noise, and curvature (K, K) of the excess, summed over the tiles.
-
-        From dr = -P dA A+ y + P dB z.
-        """
-        da = self.outside @ da
-        yy = self._y @ self._y.transpose(0, 2, 1)
-        pull = _flat(dc) @ self._of_features.sum(axis=0).T.reshape(-1)
-        pull -= _flat(da) @ (self._carried @ self._back).reshape(-1)
-        gradient = -pull - _flat(da) @ (self.outside @ yy @ self._back).reshape(-1)
-        # A+ y as few pseudo-pixels.
-        value, vector = np.linalg.eigh(self._back.transpose(0, 2, 1) @ yy @ self._back)
-        along = _flat(da @ (vector * np.sqrt(np.maximum(value, 0.0))[:, None]))
-        curvature = along @ along.T
-        counted = np.flatnonzero(np.any(dc, axis=(1, 2)))
-        if counted.size:
-            of_counts = np.stack([self.outside @ self._weighted(dc[j]) for j in counted])
-            gradient[counted] += _flat(of_counts) @ self.residual.reshape(-1)
-            across = _flat(of_counts @ (self._y.transpose(0, 2, 1) @ self._back)) @ _flat(da).T
-            curvature[counted] -= across
-            curvature[:, counted] -= across.T
-            curvature[np.ix_(counted, counted)] += _flat(of_counts) @ _flat(of_counts).T
-        return gradient, pull, curvature
-
-    def _weighted(self, c: Array) -> Array:
-        """Sum (T, L, R) of the features, each times its coefficient (F, L)."""
-        used = np.flatnonzero(np.any(c, axis=1))
-        return np.asarray(np.einsum("fl,tflr->tlr", c[used], self._z[:, used]))
-
-
-def _flat(x: Array) -> Array:
-    return x.reshape(len(x), -1)
