@@ -4,10 +4,11 @@ from collections import defaultdict
 
 import numpy as np
 import pytest
+from steady_capture import steady_capture
 
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.instrument.features import FEATURES
-from processing.diagnosis.instrument.moments import FOLDS_OF_TILES, moments_of
+from processing.diagnosis.instrument.moments import FOLDS_OF_TILES, features_of_tiles, moments_of
 from processing.diagnosis.instrument.projection import add_block
 from processing.diagnosis.instrument.tile_sums import add_tiles, tile_columns
 from processing.diagnosis.search.space import Sums
@@ -52,6 +53,20 @@ def test_columns_of_every_tile_are_those_of_its_own_retardance(seen, elements):
             here.retardance_rad[element] = here.retardance_rad[element] + extra
         rows = model.rows(data.conditions.angles_deg, here).reshape(-1, 16)
         assert found[tile] == pytest.approx(rows / moments.sigma[:, None], abs=1e-12 / moments.sigma.min())
+
+
+def test_many_pixels_of_a_tile_are_as_few_as_their_products_need():
+    random = np.random.default_rng(4)
+    data = steady_capture(random.uniform(0.2, 0.8, (2, 72, 72)), 1e-3)
+    tiles = moments_of(data, FOLDS_OF_TILES).tiles
+    _, z, _ = features_of_tiles(data, tiles, [0, FEATURES.index("square")])
+    assert z.shape == (256, 2, 2, 4)
+    assert z[:, 0] @ z[:, 0].transpose(0, 2, 1) == pytest.approx(tiles.s, rel=1e-6)
+    u = data.signal[:, 0, :5, :5].reshape(2, -1)[:, tiles.pick[:5, :5].reshape(-1)].astype(float)
+    assert np.sum(z[0, 1, 1] * z[0, 0, 0]) == pytest.approx(1e6 * np.sum(u[1] ** 2 * u[0]), rel=1e-6)
+    again = features_of_tiles(data, tiles, [0])
+    assert again[0] == (0,)
+    assert again[1] @ again[1].transpose(0, 1, 3, 2) == pytest.approx(tiles.s[:, None], rel=1e-6)
 
 
 @pytest.mark.parametrize("shifted", [False, True])

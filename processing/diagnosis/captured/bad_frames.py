@@ -29,11 +29,11 @@ def bad_frames(data: CaptureData, a: Array) -> tuple[BadFrame, ...]:
     Faults of the model make many states misfit, none by itself.
     """
     states, channels = data.signal.shape[:2]
-    good = (data.usable & ~data.clipped).reshape(-1)
+    good = data.usable & ~data.clipped
     if not good.any():
         return ()
-    y = data.signal.reshape(data.values_per_pixel, -1)[:, good].astype(np.float64)
-    noise = data.variance().reshape(data.values_per_pixel, -1)[:, good].mean(axis=1)
+    y = data.signal[:, :, good].reshape(data.values_per_pixel, -1).astype(np.float64)
+    noise = data.variance_of(good).mean(axis=2).reshape(-1)
     bright = float(np.mean(y**2))
     moments = _Moments(y @ y.T / y.shape[1] / bright, noise * data.noise_known / bright, a, channels)
     left = [k for k in range(states) if data.row_counts[k * channels]]

@@ -152,6 +152,12 @@ class CaptureData:
         shape = (-1, 1, 1, 1)
         return np.asarray(self.slope.reshape(shape) * self.signal[:, :, rows] + self.floor.reshape(shape))
 
+    def variance_of(self, pixels: NDArray[np.bool_]) -> Array:
+        """The same (N, channels, P) of the pixels (rows, columns) that are true."""
+        if self.true_variance is not None:
+            return np.asarray(self.true_variance[:, :, pixels], dtype=float)
+        return np.asarray(self.slope[:, None, None] * self.signal[:, :, pixels] + self.floor[:, None, None])
+
     def undone(self, correct: Correct) -> CaptureData:
         """The capture with corrected counts, and noise that is stretched with them."""
         signal, variance = np.empty((2, *self.signal.shape), dtype=np.float32)

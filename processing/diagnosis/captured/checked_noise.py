@@ -81,8 +81,10 @@ def _with_lines(shared: SharedNoise, found: DetectorNoise, data: CaptureData) ->
 
 def _lines(shared: SharedNoise, data: CaptureData) -> tuple[float, float]:
     """Variance of the offsets of rows and of columns, full scales squared."""
+    if not (shared.rows or shared.columns):
+        return 0.0, 0.0
     # They are told relative to the noise of each state, of which the dark ones show most.
-    variance = data.variance()[:, :, data.usable].mean(axis=2)
+    variance = data.variance_of(data.usable).mean(axis=2)
     usual = 1 / float(np.mean(1 / np.maximum(variance, 1e-300)))
     return shared.rows * usual, shared.columns * usual
 

@@ -39,9 +39,8 @@ class Whitened:
     def of(cls, data: CaptureData, a: Array, good: NDArray[np.bool_]) -> Whitened:
         """Pixels `good` (rows, columns) against rows a (L, K) of the model."""
         rows, keep = data.values_per_pixel, data.row_counts
-        part = np.ix_(keep, good.reshape(-1))
-        y = data.signal.reshape(rows, -1)[part]
-        variance = data.variance().reshape(rows, -1)[part].astype(np.float32)
+        y = data.signal.reshape(rows, -1)[np.ix_(keep, good.reshape(-1))]
+        variance = data.variance_of(good).reshape(rows, -1)[keep].astype(np.float32)
         mean = np.mean(variance, axis=1, dtype=float)
         level = np.sqrt(np.maximum(mean, 1e-3 * mean.max()))
         u, power, _ = np.linalg.svd(a[keep] / level[:, None], full_matrices=True)

@@ -106,6 +106,11 @@ class Moments:
     noise_floor: float
     held_out: str
 
+    def forget_features(self) -> None:
+        """Drop the features of the tiles, which are made again where they are asked for."""
+        for tiles in filter(None, (self.tiles, self.clipped)):
+            tiles.features.clear()
+
 
 def holds_out_states(data: CaptureData) -> bool:
     """Whether states are held out (few pixels, or many states) instead of tiles of the image."""
@@ -185,7 +190,7 @@ def _features_of_tiles(data: CaptureData, tiles: Tiles, used: list[int]) -> tupl
         part = pixels.part(rows, columns, np.float64)
         of_part, of_pixels = part.weighted(np.flatnonzero(tiles.pick[rows, columns]))
         flat = of_part[used].reshape(size, -1)
-        few = np.linalg.qr(flat.T, mode="r").T if flat.shape[1] > size else flat
+        few = np.asarray(np.linalg.qr(flat.T, mode="r")).T if flat.shape[1] > size else flat
         z[t, :, : few.shape[1]], noise[t] = few, of_pixels[:, used][:, :, used]
     return z.reshape(count, len(used), len(pixels.u), -1), noise
 

@@ -146,6 +146,10 @@ class InstrumentProblem:
         if not all(np.all(np.isfinite(m.sigma)) and np.all(m.sigma > 0) for m in there.moments):
             # So far away that there are no such counts.
             return False
+        # What is kept of the tiles is large: that of one point at a time.
+        for point in (self, *self._others):
+            for moments in point.moments:
+                moments.forget_features()
         self._others.append(there)
         del self._others[:-MOST_POINTS]
         return True
