@@ -7,6 +7,7 @@ from steady_capture import steady_capture
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
 from processing.diagnosis.instrument.moments import moments_of
 from processing.diagnosis.instrument.projection import add_block, noise_information
+from processing.diagnosis.instrument.structure import Images, _tests
 from processing.diagnosis.search.space import Sums
 
 STATES, SIDE, SIGMA = 8, 240, 0.01
@@ -42,3 +43,18 @@ def test_a_shift_of_noise_promises_nothing(noisy, moved):
     # All of the curvature is noise.
     part = noise_information(block, a, dc, moments)
     assert part == pytest.approx(sums.curvature[0], rel=0.03, abs=0.03 * np.max(part))
+
+
+def test_neighbours_of_pure_noise_scatter_by_one_standard_deviation():
+    random = np.random.default_rng(6)
+    rows, side = 24, 24
+    q = np.linalg.qr(random.normal(size=(rows, 16)))[0]
+    outside = np.eye(rows) - q @ q.T
+    expected = np.broadcast_to(np.diag(outside)[:, None, None], (rows, side, side)).astype(np.float32)
+    found = []
+    for _ in range(100):
+        left = np.tensordot(outside, random.normal(size=(rows, side, side)), 1).astype(np.float32)
+        images = Images(left, np.ones_like(left), expected, np.ones((side, side), dtype=bool))
+        tests, _ = _tests(images, np.ones(rows), np.zeros((rows, 2)), 16, 1.0, noise_known=True)
+        found += [tests["neighbours, rows"], tests["neighbours, columns"]]
+    assert np.std(found) == pytest.approx(1, abs=0.15)

@@ -230,7 +230,9 @@ def _tests(
             product[:, ~both] = 0.0
             if both.sum() * len(r) > 100:
                 null = alike[:, k] @ np.sum(expected[first], axis=(1, 2), where=both, dtype=float)
-                found[name] = (np.sum(product, dtype=float) - null, np.sqrt(_square(product)))
+                # The residuals of the rows of one pixel go together: a pair of pixels counts as one.
+                pairs = product.sum(axis=0, dtype=float)
+                found[name] = (pairs.sum() - null, np.sqrt(_square(pairs)))
     # Tiles: mean residual of every row over patches of the image.
     found["patches"] = _patches(r, expected, spread)
     return _in_deviations(found)
