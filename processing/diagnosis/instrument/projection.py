@@ -44,7 +44,7 @@ def add_response(counts: NDArray[Any], coefficients: Array, a: Array) -> NDArray
 
 def add_block(block: Block, a: Array, c: Array, da: Array, dc: Array | None, moments: Moments, out: Sums) -> None:
     """Add what a block says of rows a (L, K) and coefficients c (F, L), with their derivatives by each value."""
-    rows, fold = block.rows, block.fold
+    rows = block.rows
     dc = np.zeros((len(da), *c.shape)) if dc is None else dc
     used = np.flatnonzero(np.any(c, axis=1) | np.any(dc, axis=(0, 2)))
     # Without corrections of the counts, as few pseudo-pixels as there are rows say the same.
@@ -57,16 +57,8 @@ def add_block(block: Block, a: Array, c: Array, da: Array, dc: Array | None, mom
         c[used][:, rows],
         used >= len(FEATURES) - DERIVATIVES,
     )
-    squares, left = np.sum(part.residual**2, axis=(0, 2)), float(part.expected.sum())
-    out.freedom[fold] += left
-    out.excess[fold] += squares.sum() - left
-    out.square[fold] += squares @ sigma**2 * moments.relative
-    out.count[fold] += np.diag(part.outside[0]) @ moments.left[rows] * block.pixels
-    if len(da):
-        gradient, stretch, curvature = part.slopes(da[:, None, rows], dc[:, used][:, :, rows])
-        out.gradient[fold] += gradient
-        out.stretch[fold] += stretch
-        out.curvature[fold] += curvature
+    slopes = da[:, None, rows], dc[:, used][:, :, rows]
+    add_parts(part, *slopes, moments, rows, np.array([float(block.pixels)]), block.fold, out)
 
 
 class Projected:
@@ -131,6 +123,32 @@ class Projected:
         """Sum (T, L, R) of the features, each times its coefficient (F, L)."""
         used = np.flatnonzero(np.any(c, axis=1))
         return np.asarray(np.einsum("fl,tflr->tlr", c[used], self._z[:, used]))
+
+
+def add_parts(
+    parts: Projected,
+    da: Array,
+    dc: Array,
+    moments: Moments,
+    rows: NDArray[np.int64],
+    pixels: NDArray[np.floating],
+    fold: int,
+    out: Sums,
+) -> None:
+    """Add what parts of one fold say, with derivatives of their `rows`: da (K, T, L, K'), dc (K, F, L).
+
+    `pixels` (T,) : how many stand behind each.
+    """
+    squares, left = np.sum(parts.residual**2, axis=(0, 2)), float(parts.expected.sum())
+    out.excess[fold] += squares.sum() - left
+    out.freedom[fold] += left
+    out.square[fold] += squares @ moments.sigma[rows] ** 2 * moments.relative
+    out.count[fold] += pixels @ np.diagonal(parts.outside, axis1=1, axis2=2) @ moments.left[rows]
+    if len(da):
+        gradient, stretch, curvature = parts.slopes(da, dc)
+        out.gradient[fold] += gradient
+        out.stretch[fold] += stretch
+        out.curvature[fold] += curvature
 
 
 def noise_information(block: Block, a: Array, dc: Array, moments: Moments) -> Array:

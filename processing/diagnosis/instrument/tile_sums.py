@@ -10,7 +10,7 @@ from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
 from processing.diagnosis.instrument.moments import Moments, Tiles, features_of_tiles
-from processing.diagnosis.instrument.projection import Projected
+from processing.diagnosis.instrument.projection import Projected, add_parts
 from processing.diagnosis.search.space import Sums
 from processing.instrument.changes import Changes
 from processing.instrument.model import InstrumentModel
@@ -51,14 +51,5 @@ def add_tiles(
         for some in np.split(mine, range(TOGETHER, mine.size, TOGETHER)):
             of_noise = noise[some][:, use] / (sigma**2)[:, None, None]
             part = Projected(z[some][:, :, use] / sigma[:, None], of_noise, a[some][:, use], c, around)
-            squares, left = np.sum(part.residual**2, axis=(0, 2)), float(part.expected.sum())
-            out.excess[fold] += squares.sum() - left
-            out.freedom[fold] += left
-            out.square[fold] += squares @ sigma**2 * moments.relative
-            free = np.diagonal(part.outside, axis1=1, axis2=2)
-            out.count[fold] += tiles.pixels[some] @ free @ moments.left[use]
-            if len(da):
-                gradient, stretch, curvature = part.slopes(da.take(some, axis=1).take(use, axis=2), dc)
-                out.gradient[fold] += gradient
-                out.stretch[fold] += stretch
-                out.curvature[fold] += curvature
+            slopes = da.take(some, axis=1).take(use, axis=2)
+            add_parts(part, slopes, dc, moments, use, tiles.pixels[some], fold, out)
