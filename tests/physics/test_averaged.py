@@ -9,6 +9,7 @@ from steady_capture import steady_capture
 from processing.diagnosis.captured.averaged import averaged
 from processing.diagnosis.captured.capture_data import SharedNoise
 from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.captured.steep_pixels import without_steep_pixels, without_steep_squares
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.space import Space
@@ -88,3 +89,15 @@ def test_means_say_what_the_pixels_say(fitted):
     assert np.all((errors <= their_errors) & (their_errors < 1.2 * errors))
     assert np.all(np.abs(of_means - values) < 3 * np.sqrt(their_errors**2 - errors**2))
     assert np.all(np.abs(of_means) > 10 * their_errors)
+
+
+def test_what_is_an_edge_is_judged_by_the_pixels():
+    """A slope of 10 standard deviations a pixel is none, though it is 40 from one square to the next."""
+    x = np.arange(120)
+    gentle, sharp = 0.3 + 10 * SIGMA * np.abs(x % 40 - 20), 0.3 + 60 * SIGMA * (x > 30)
+    for image, found in ((gentle, 0.0), (sharp, 9 / 60)):
+        signal = np.broadcast_to(image, (4, 120, 120)).copy()
+        data = without_steep_pixels(steady_capture(signal, SIGMA))
+        means = without_steep_squares(averaged(replace(data, usable=np.ones((120, 120), dtype=bool)), 2))
+        assert means.steep.mean() == pytest.approx(found)
+        assert not (means.usable & means.steep).any()

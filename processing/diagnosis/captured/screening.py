@@ -18,7 +18,7 @@ from processing.diagnosis.captured.checked_noise import checked_noise
 from processing.diagnosis.captured.noise_estimate import estimated_noise
 from processing.diagnosis.captured.outliers import outliers_of, without
 from processing.diagnosis.captured.read_capture import without_dark_pixels
-from processing.diagnosis.captured.steep_pixels import without_steep_pixels
+from processing.diagnosis.captured.steep_pixels import without_steep_pixels, without_steep_squares
 from processing.instrument.applied_effects import changes_of
 from processing.instrument.model import InstrumentModel
 
@@ -51,16 +51,17 @@ def screened(data: CaptureData, model: InstrumentModel, say: Callable[[str], Non
 
 def _as_fitted(data: CaptureData, say: Callable[[str], None]) -> CaptureData:
     """The capture, or means over squares of its pixels, without those that are dark or at sharp edges."""
-    with_edges = data if data.steep is None else replace(data, usable=data.usable | data.steep, steep=None)
+    # Edges are left out of the fits, not of the means.
+    with_edges = data if data.steep is None else replace(data, usable=data.usable | data.steep)
     fitted = averaged_for_fits(with_edges)
     if fitted is with_edges:
         return data
     say(f"{data.name} is fitted by means over squares of {fitted.binned} x {fitted.binned} pixels")
     if not data.noise_known:
         return fitted
-    # Again: a rim, and the slope of an edge, are counted in what a derivative of the image is taken of.
+    # Again: rims are as wide as the derivatives of the image reach.
     dark = without_dark_pixels(fitted)
-    return without_steep_pixels(replace(dark, dark_fraction=max(dark.dark_fraction, data.dark_fraction)))
+    return without_steep_squares(replace(dark, dark_fraction=max(dark.dark_fraction, data.dark_fraction)))
 
 
 def rows_of(data: CaptureData, model: InstrumentModel) -> Array:
