@@ -101,3 +101,5 @@ def test_what_is_an_edge_is_judged_by_the_pixels():
         means = without_steep_squares(averaged(replace(data, usable=np.ones((120, 120), dtype=bool)), 2))
         assert means.steep.mean() == pytest.approx(found)
         assert not (means.usable & means.steep).any()
+        # As where so large an image is averaged while it is read.
+        assert without_steep_pixels(averaged(steady_capture(signal, SIGMA), 2)).steep.any() == bool(found)

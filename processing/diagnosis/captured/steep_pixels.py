@@ -33,7 +33,7 @@ def without_steep_squares(data: CaptureData) -> CaptureData:
 
 
 def _squared_slopes(data: CaptureData) -> Array:
-    """Squared slope (rows, columns) of a pixel of way over the noise, mean over the frames."""
+    """Squared slope (rows, columns) over a pixel of the sensor in standard deviations of one, mean over the frames."""
     square = np.zeros(data.signal.shape[2:])
     frames = data.signal.reshape(-1, *data.signal.shape[2:])
     floor = np.repeat(data.floor, data.signal.shape[1])
@@ -41,7 +41,7 @@ def _squared_slopes(data: CaptureData) -> Array:
     for image, s, f in zip(frames, slope, floor, strict=True):
         down, across = np.gradient(image)
         square += (down**2 + across**2) / (s * np.maximum(image, 0) + f)
-    return square / len(frames)
+    return square / len(frames) / data.binned**4
 
 
 def _without(data: CaptureData, edge: NDArray[np.bool_], square: Array, rim: int) -> CaptureData:
