@@ -94,7 +94,7 @@ def test_means_say_what_the_pixels_say(fitted):
 def test_what_is_an_edge_is_judged_by_the_pixels():
     """A slope of 10 standard deviations a pixel is none, though it is 40 from one square to the next."""
     x = np.arange(120)
-    gentle, sharp = 0.3 + 10 * SIGMA * np.abs(x % 40 - 20), 0.3 + 60 * SIGMA * (x > 30)
+    gentle, sharp = 0.3 + 10 * SIGMA * np.abs(x % 40 - 20), 0.3 + 100 * SIGMA * (x > 30)
     for image, found in ((gentle, 0.0), (sharp, 9 / 60)):
         signal = np.broadcast_to(image, (4, 120, 120)).copy()
         data = without_steep_pixels(steady_capture(signal, SIGMA))

@@ -198,7 +198,7 @@ def bad_states(m: Patch, misfit: float, following: float, left: float = 0.1, sta
         signal=np.ones((states, 1, 1, 1)),
         usable=np.ones((1, 1), dtype=bool),
         clipped=np.zeros((1, 1), dtype=bool),
-        variance=lambda: np.ones((states, 1, 1, 1)),
+        variance_of=lambda good: np.ones((states, 1, 1)),
         values_per_pixel=states,
         noise_known=True,
         row_counts=np.ones(states, dtype=bool),
