@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML
@@ -19,6 +19,8 @@ from processing.errors import ProcessError
 from processing.yaml_words import names_in, words_of
 
 Model = TypeVar("Model", bound=BaseModel)
+#: Keys that lead to a value or to a key, and it.
+_Scalar: TypeAlias = tuple[tuple[Any, ...], Any]
 
 #: Most bytes and most values of a file, aliases counted as often as they are used. The parser takes up to 0.2 ms a
 #: value, so that this is about two seconds; a table of 5000 states of two axes fits.
@@ -88,21 +90,35 @@ def parse_yaml(text: str, model: type[Model], source: str = "text") -> Model:
     except ValidationError as error:
         lines = _described(source, tree, model, error.errors())
         told = {line.split(" ", 1)[0] for line in lines}
-        more = [line for line in _not_finite(source, tree, tree) if line.split(" ", 1)[0] not in told]
+        more = [line for line in _not_finite(source, tree, _scalars(tree)) if line.split(" ", 1)[0] not in told]
         raise _refusal(source, lines + more) from error
-    # As the model understood them: the text "nan" becomes a number where one is asked for.
-    lines = _not_finite(source, tree, value.model_dump(exclude_unset=True))
+    # As the model understood them: the text "nan" and the word true become numbers where one is asked for.
+    understood = list(_scalars(value.model_dump(exclude_unset=True)))
+    lines = _not_finite(source, tree, understood) + _truths_as_numbers(source, tree, understood)
     if lines:
         raise _refusal(source, lines)
     return value
 
 
-def _not_finite(source: str, tree: CommentedMap, values: Any) -> list[str]:
+def _not_finite(source: str, tree: CommentedMap, values: Iterable[_Scalar]) -> list[str]:
     return [
-        f"{source}:{_line(tree, where)}: {'.'.join(map(str, where))}: must be a finite number"
-        for where, value in _scalars(values)
+        f"{_place(source, tree, where)}: must be a finite number"
+        for where, value in values
         if isinstance(value, float) and not math.isfinite(value)
     ]
+
+
+def _truths_as_numbers(source: str, tree: CommentedMap, understood: Iterable[_Scalar]) -> list[str]:
+    became = dict(understood)
+    return [
+        f"{_place(source, tree, where)}: must be a number, not {str(value).lower()}"
+        for where, value in _scalars(tree)
+        if isinstance(value, bool) and type(became.get(where)) in (int, float)
+    ]
+
+
+def _place(source: str, tree: CommentedMap, where: tuple[Any, ...]) -> str:
+    return f"{source}:{_line(tree, where)}: {'.'.join(map(str, where))}"
 
 
 def _refusal(source: str, lines: list[str]) -> ConfigError:

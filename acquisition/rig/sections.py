@@ -38,13 +38,13 @@ class RigSections(Part):
     """A rig. Relative paths are relative to the rig file."""
 
     kind: Literal["rig"] = "rig"
-    name: str
+    name: str = Field(min_length=1)
     axes: dict[str, AxisEntry]
     camera: CameraEntry
     source: SourceEntry | None = None
     detector: Detector
-    modes: dict[str, ModeConfig]
-    wavelengths_nm: tuple[Annotated[float, Field(gt=0)], ...]
+    modes: dict[str, ModeConfig] = Field(min_length=1)
+    wavelengths_nm: tuple[Annotated[float, Field(gt=0)], ...] = Field(min_length=1)
     home_at_start: bool = Field(default=False, description="home axes without a reference before the first move")
     home_order: tuple[str, ...] = ()
     homing: dict[str, HomingPath] = Field(default={}, description="what an axis may pass while it homes; default all")

@@ -6,16 +6,24 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
+import shutil
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from acquisition.rig.way import find_homing_obstacle, find_obstacle
 from drivers.motion import AxisConfig
+from processing.storage.capture_schema import NOT_AXES
+from processing.storage.state_csv import NAME
 from simulators.rig.model import SCHEME
 
 if TYPE_CHECKING:
     from acquisition.rig.sections import RigSections
 
+#: What the name of a port on the network begins with.
+SOCKET = "socket://"
+#: An interlock on a higher temperature of a camera could not be meant.
+HOTTEST_C = 150.0
 #: Keys that lead to the place in the file, and what is wrong there.
 Mistake = tuple[tuple[int | str, ...], str]
 
@@ -29,12 +37,16 @@ def find_mistakes(rig: RigSections) -> list[Mistake]:
     """
     looks: tuple[Callable[[RigSections], Iterator[Mistake]], ...] = (
         _axis_names,
+        _names_in_captures,
         _axes_given_twice,
+        _ports,
         _shared_places,
         _emulated_ports,
         _angles_outside_limits,
         _wavelengths,
+        _detector,
         _interlocks,
+        _alert,
         _solids,
         _ways,
     )
@@ -43,7 +55,7 @@ def find_mistakes(rig: RigSections) -> list[Mistake]:
 
 def _named_axes(rig: RigSections) -> Iterator[tuple[tuple[int | str, ...], str]]:
     """Every place in the file that names an axis, with the name."""
-    for section in ("park_deg", "backlash_deg", "homing"):
+    for section in ("park_deg", "backlash_deg", "homing", "fold_deg"):
         for name in getattr(rig, section):
             yield (section, name), name
     for section in ("home_order", "endless"):
@@ -70,12 +82,30 @@ def _axis_names(rig: RigSections) -> Iterator[Mistake]:
             yield where, f"there is no axis {name!r}, only {', '.join(rig.axes)}{hint}"
 
 
+def _names_in_captures(rig: RigSections) -> Iterator[Mistake]:
+    """An axis is a group of its own in a capture file."""
+    for name in rig.axes:
+        if not NAME.fullmatch(name):
+            yield ("axes", name), f"{name!r} is no name for an axis: letters, digits and _, and begin with a letter"
+        elif name in NOT_AXES:
+            yield ("axes", name), f"no axis can be called {name!r}; give it another name"
+
+
 def _axes_given_twice(rig: RigSections) -> Iterator[Mistake]:
     for section in ("home_order", "endless"):
         names = getattr(rig, section)
         for k, name in enumerate(names):
             if name in names[:k]:
                 yield (section, k), f"axis {name!r} is there twice"
+
+
+def _ports(rig: RigSections) -> Iterator[Mistake]:
+    for where, _, entry in _devices_with_port(rig):
+        port = entry.port
+        if not port.strip():
+            yield (*where, "port"), "names no port"
+        elif port.startswith(SOCKET) and not re.fullmatch(r"[^:/]+:\d{1,5}", port.removeprefix(SOCKET)):
+            yield (*where, "port"), f"{port!r}: a network port is {SOCKET}ADDRESS:NUMBER"
 
 
 def _shared_places(rig: RigSections) -> Iterator[Mistake]:
@@ -138,8 +168,28 @@ def _wavelengths(rig: RigSections) -> Iterator[Mistake]:
     for k, wavelength in enumerate(given):
         if wavelength in given[:k]:
             yield ("wavelengths_nm", k), f"{wavelength:g} nm is there twice"
+    for mode, config in rig.modes.items():
+        for axis, angles in config.pose_deg.items():
+            for wavelength in angles if isinstance(angles, dict) else ():
+                if wavelength not in given:
+                    where = ("modes", mode, "pose_deg", axis)
+                    yield where, f"{wavelength:g} nm is none of `wavelengths_nm`"
     if rig.exposure_s[0] <= 0:
         yield ("exposure_s",), f"the shortest exposure must be positive, not {rig.exposure_s[0]:g} s"
+
+
+def _detector(rig: RigSections) -> Iterator[Mistake]:
+    detector = getattr(rig, "detector", None)
+    if detector is None:
+        return
+    black, top = detector.black_level_counts, 2 ** (detector.bits or 32) - 1
+    if not 0 <= black < top:
+        yield ("detector", "black_level_counts"), f"{black:g} lies outside the counts, 0 to {top}"
+
+
+def _alert(rig: RigSections) -> Iterator[Mistake]:
+    if rig.alert and shutil.which(rig.alert[0]) is None:
+        yield ("alert",), f"there is no program {rig.alert[0]!r} here: nobody would be called"
 
 
 def _interlocks(rig: RigSections) -> Iterator[Mistake]:
@@ -149,10 +199,15 @@ def _interlocks(rig: RigSections) -> Iterator[Mistake]:
             yield ("interlocks", k), f"{entry.kind} is there twice; one would be forgotten"
         if entry.kind == "door" and getattr(rig, "source", None) is None:
             yield ("interlocks", k), "door: the rig has no source whose interlock circuit could tell"
-        if entry.kind in ("temperature", "drift") and entry.limit == 0:
-            yield ("interlocks", k), f"{entry.kind}: limit 0 is never kept; give a limit"
-        if entry.kind in ("lamp", "saturation") and entry.limit >= 1:
+        if entry.kind == "door" and entry.limit:
+            yield ("interlocks", k), "door: it is open or closed and has no limit"
+        if entry.kind in ("temperature", "drift", "lamp") and entry.limit == 0:
+            kept = "always" if entry.kind == "lamp" else "never"
+            yield ("interlocks", k), f"{entry.kind}: limit 0 is {kept} kept; give a limit"
+        if entry.kind in ("lamp", "saturation", "drift") and entry.limit >= 1:
             yield ("interlocks", k), f"{entry.kind}: limit {entry.limit:g} is a fraction, less than 1"
+        if entry.kind == "temperature" and entry.limit > HOTTEST_C:
+            yield ("interlocks", k), f"temperature: no camera reaches {entry.limit:g} degrees Celsius"
 
 
 def _solids(rig: RigSections) -> Iterator[Mistake]:

@@ -22,7 +22,7 @@ class SimulatedPort(_Part):
     """An emulated controller behind a pseudo-terminal; `faults` as in `simulate serve`, e.g. "garbled@12x1"."""
 
     kind: str
-    axes: int | None = None
+    axes: int | None = Field(default=None, ge=1, le=99)
     speed_deg_s: float = Field(default=300.0, gt=0)
     acceleration_deg_s2: float = Field(default=1500.0, gt=0)
     limits_deg: tuple[float | None, float | None] | None = None
@@ -44,7 +44,7 @@ class SimulatorConfig(_Part):
     `detector` the same for the detector. `stamp` writes the true axis angles into the first pixels of each frame.
     """
 
-    seed: int = 1
+    seed: int = Field(default=1, ge=0)
     clock_speed: float = Field(default=10.0, gt=0, description="simulated seconds for a real second")
     rows: int = Field(default=600, gt=0)
     columns: int = Field(default=600, gt=0)

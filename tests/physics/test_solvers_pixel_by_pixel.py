@@ -26,7 +26,7 @@ DARKS = 6
 BLACK, TOP = 64.0, 4095.0
 GAIN, READ = 2.0, 12.0
 #: Where what happens: all other pixels are sound.
-NO_LIGHT, SATURATED, STRUCK, LOST, BAD = (2, 14), (20, 41, 74), (20, 55), 33, 60
+NO_LIGHT, SATURATED, STRUCK, LOST, BAD = (2, 14), (20, 41, 74), (2, 20, 55), 33, 60
 NOISE = NoiseModel(1 / GAIN, (READ / GAIN) ** 2, 1 / 12, "test")
 
 
@@ -179,6 +179,7 @@ def test_plain_least_squares(bench, known):
 
 
 FLAGS = {
+    2: Mask.STRUCK,
     20: Mask.SATURATED | Mask.STRUCK,
     41: Mask.SATURATED,
     74: Mask.SATURATED,
@@ -190,6 +191,22 @@ FLAGS = {
 
 def flags(found):
     return {int(pixel): Mask(int(found["pixel_flags"][pixel])) for pixel in np.flatnonzero(found["pixel_flags"])}
+
+
+@pytest.mark.parametrize(("share", "determined"), [(1 / 900, True), (1 / 1100, False)])
+def test_what_is_left_determines_a_pixel_or_does_not(share, determined, synthetic_capture):
+    """One state for each element, of which one sees next to nothing, and a last one that is saturated."""
+    w = np.vstack([np.eye(16), np.eye(16)[-1]])
+    w[15] *= share
+    counts = np.full((17, 1, 1, 1), 1000.0)
+    counts[15], counts[16] = 1000 * share, TOP
+    with Capture(synthetic_capture(counts.astype(np.uint16), {}, detector={"bits": 12})) as capture:
+        reader = BlockReader(capture, np.arange(17), Correction(Black.level(0.0), "test", saturation=TOP))
+        found = MuellerSolver(Inversion.of(w), reader, NOISE).solve(reader.read(slice(0, 1)))
+    assert (flags(found)[0] == Mask.SATURATED) == determined
+    # As many states as unknowns: nothing is left over.
+    assert np.isnan(found["reduced_chi_square"][0])
+    np.testing.assert_allclose(found["mueller"][:15, 0], 1000.0, rtol=1e-5)
 
 
 def test_noise_weighted_least_squares(bench):
