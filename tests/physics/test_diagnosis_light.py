@@ -47,6 +47,16 @@ def test_light_that_leaks_scatters_and_an_offset_does_not(configs, tmp_path, lea
     assert gain < -REFUTED if leaks else gain > REFUTED
 
 
+def test_what_a_fit_leaves_of_the_optics_is_no_noise(configs, tmp_path):
+    bench = Bench(rows=SIDE, columns=SIDE, electrons=6000.0)
+    bench.dg += np.deg2rad(15)
+    model, data = captured(tmp_path, configs, bench)
+    problem = InstrumentProblem(model, [data], folds=1)
+    offset = next(c for c in problem.pool() if c.kind == "detector_offset")
+    # The plate is not in the fit, so much is left over. More light below black would scatter more, but nothing does.
+    assert scatter_prefers(problem, Space(()), np.zeros(0), {offset: np.array([-400.0])}, {}) < -REFUTED
+
+
 def test_pixels_at_an_edge_are_left_out_and_those_of_a_slope_are_not(configs, tmp_path):
     _, data = captured(tmp_path, configs, Bench(rows=SIDE, columns=SIDE))
     across = np.broadcast_to(np.linspace(0.3, 0.6, SIDE), (SIDE, SIDE))

@@ -44,7 +44,7 @@ def scatter_prefers(problem: InstrumentProblem, space: Space, values: Array, new
 def _log_scatter(
     still: CaptureData, rest: NDArray[np.float32], share: Array, use: BoolArray, good: BoolArray, correct: Correct
 ) -> float:
-    """Minus twice the log likelihood of a residual (L, rows, columns) with the noise of corrected counts.
+    """Minus twice the log likelihood of the scatter of a residual (L, rows, columns), with noise of corrected counts.
 
     Of the rows to `use` (L,), of which `share` (L,) of the noise is in the residual, and of `good` pixels.
     """
@@ -53,9 +53,13 @@ def _log_scatter(
     def strip(rows: slice) -> None:
         left = rest[:, rows].astype(float)
         light = still.signal[:, :, rows] - left.reshape(still.signal[:, :, rows].shape)
-        variance = still.noise_of(*correct(light)).reshape(left.shape)[use]
-        scatter = np.sum(left[use] ** 2 / variance, axis=0) + np.tensordot(share[use], np.log(variance), 1)
-        found[rows.start] = scatter[good[rows]].sum()
+        variance = still.noise_of(*correct(light)).reshape(left.shape)
+        # Of neighbours: what both have in common is no noise, but what the fit does not explain.
+        first, second = (slice(k, left.shape[2] // 2 * 2, 2) for k in (0, 1))
+        apart = (left[:, :, first] - left[:, :, second])[use]
+        both = (variance[:, :, first] + variance[:, :, second])[use]
+        scatter = np.sum(apart**2 / both, axis=0) + np.tensordot(share[use], np.log(both), 1)
+        found[rows.start] = scatter[good[rows, first] & good[rows, second]].sum()
 
     for_strips(len(good), strip)
     return float(found.sum())

@@ -91,20 +91,26 @@ class WholeBench:
 
         Unless nothing else explains the counts: then it is the noise that is not what is declared.
         """
-        space, values = applied(found, self.base)
         # Noise that was taken from the counts has what an offset lacks or adds in it already.
         if not self.whole.noise_known or any(c.noise_estimated or c.noise_told for c in self.whole.captures):
             return found
+        # Where one is gone another may stand in for it; each round has fewer of them.
+        while against := self._refuted_by_scatter(found):
+            self.say(f"the noise speaks against {', '.join(c.label for c in against)}")
+            rest = [c for c in found.space.candidates if c not in against]
+            other = self._posterior(rest, fixed, found)
+            if not other.score > found.score + sum(against.values()):
+                break
+            found = other
+        return found
+
+    def _refuted_by_scatter(self, found: Posterior) -> dict[Candidate, float]:
+        """Corrections of the counts that the noise speaks against, with the log likelihood that they lose."""
+        space, values = applied(found, self.base)
         undone = exactly_undone(space, values, pointwise=True)
         far = {c: v for c, v in undone.items() if np.any(np.abs(v) > EXACT * c.typical)}
         gains = {c: scatter_prefers(self.whole, space, values, {c: v}, {}) for c, v in far.items()}
-        against = {c: gain for c, gain in gains.items() if gain < -REFUTED}
-        if not against:
-            return found
-        self.say(f"the noise speaks against {', '.join(c.label for c in against)}")
-        rest = [c for c in found.space.candidates if c not in against]
-        other = self._posterior(rest, fixed, found)
-        return other if other.score > found.score + sum(against.values()) else found
+        return {c: gain for c, gain in gains.items() if gain < -REFUTED}
 
     def _unknowns(self, k: int) -> int:
         return int(np.linalg.matrix_rank(self.whole.columns(k, self.whole.changes(k, Space(()), np.zeros(0)))))

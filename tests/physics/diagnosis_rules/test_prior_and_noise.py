@@ -91,10 +91,10 @@ def test_least_noise(m: Patch) -> bool:
 def test_refuted(m: Patch) -> bool:
     candidates = [made(place="a"), made(place="b")]
     odds = {candidates[0]: -11.0, candidates[1]: -13.0}
-    m.setattr(whole_bench, "applied", lambda found, base: (Space(()), np.zeros(0)))
-    m.setattr(whole_bench, "exactly_undone", lambda *a, **k: {c: np.ones(1) for c in candidates})
+    m.setattr(whole_bench, "applied", lambda found, base: (found.space, np.zeros(0)))
+    m.setattr(whole_bench, "exactly_undone", lambda space, *a, **k: {c: np.ones(1) for c in space.candidates})
     m.setattr(whole_bench, "scatter_prefers", lambda problem, space, values, new, old: odds[next(iter(new))])
     asked = bench(whole=Some(noise_known=True, captures=[]))
-    m.setattr(asked, "_posterior", lambda rest, fixed, found: Some(score=0.0, rest=rest))
-    found = Some(score=0.0, space=Some(candidates=candidates), rest=candidates)
-    return asked._with_what_scatters_so(found, []).rest == candidates[:1]
+    m.setattr(asked, "_posterior", lambda rest, fixed, found: Some(score=0.0, space=Some(candidates=rest)))
+    found = Some(score=0.0, space=Some(candidates=candidates))
+    return asked._with_what_scatters_so(found, []).space.candidates == candidates[:1]
