@@ -179,14 +179,27 @@ def _named_files(path: Path, before: tuple[Any, ...], seen: set[Path]) -> Iterat
 
 
 def dump_yaml(value: BaseModel) -> str:
-    """YAML text of a model; `parse_yaml` of it gives an equal model."""
+    """YAML text of a model; `parse_yaml` of it gives an equal model. Lists of numbers are written in a row."""
     from io import StringIO
 
     yaml = YAML()
     yaml.indent(mapping=2, sequence=4, offset=2)
+    yaml.width = 120
     out = StringIO()
-    yaml.dump(value.model_dump(mode="json", exclude_none=True), out)
+    yaml.dump(_numbers_in_rows(value.model_dump(mode="json", exclude_none=True)), out)
     return out.getvalue()
+
+
+def _numbers_in_rows(node: Any) -> Any:
+    if isinstance(node, dict):
+        return {key: _numbers_in_rows(part) for key, part in node.items()}
+    if not isinstance(node, list):
+        return node
+    if all(isinstance(part, int | float) for part in node):
+        row = CommentedSeq(node)
+        row.fa.set_flow_style()
+        return row
+    return [_numbers_in_rows(part) for part in node]
 
 
 def _plain(node: Any) -> Any:

@@ -7,7 +7,7 @@ from pathlib import Path
 from processing.diagnosis.search.result import Diagnosis
 from processing.errors import ProcessError
 from processing.instrument.model import Dispersive, EffectParameter, InstrumentModel
-from processing.yaml_file import dump_yaml
+from processing.yaml_file import ConfigError, dump_yaml, parse_yaml
 
 
 class WriteError(ProcessError):
@@ -55,13 +55,19 @@ def write_instrument(path: Path, model: InstrumentModel, diagnosis: Diagnosis, n
     Raises
     ------
     WriteError
-        The file exists, or there is nothing to write.
+        The file exists, there is nothing to write, or more than an instrument file may hold.
     """
     if diagnosis.correction is not None and diagnosis.correction.refused is not None:
         raise WriteError(f"{path} was not written: {diagnosis.correction.refused}.")
     if not diagnosis.applied() and not diagnosis.calibrated:
         raise WriteError(f"nothing was found that could go into {path}; it was not written.")
     text = dump_yaml(extended(model, diagnosis))
+    try:
+        parse_yaml(text, InstrumentModel, source=str(path))
+    except ConfigError as error:
+        raise WriteError(
+            f"{error}: what was found is too much for one file. Diagnose fewer captures at once."
+        ) from error
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(f"# Written by `diagnose`: {diagnosis.verdict}, see `effects`.\n")

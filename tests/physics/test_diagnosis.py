@@ -274,6 +274,19 @@ def test_reduce_with_the_written_model_is_closer_to_the_truth(configs, tmp_path)
         errors.append(np.abs(mean - np.eye(4)).max())
     assert errors[0] > 0.02
     assert errors[1] < 0.004
+    assert_no_file_that_cannot_be_read(tmp_path / "large.yaml", model, judged.diagnosis)
+
+
+def assert_no_file_that_cannot_be_read(path, model, diagnosis):
+    """An instrument file that is larger than what is read is refused, and not written."""
+    from processing import yaml_file
+    from processing.diagnosis.instrument_file import WriteError, write_instrument
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(yaml_file, "MOST_BYTES", 1000)
+        with pytest.raises(WriteError, match="Diagnose fewer captures"):
+            write_instrument(path, model, diagnosis)
+    assert not path.exists()
 
 
 @pytest.mark.parametrize(
