@@ -8,10 +8,15 @@ import numpy as np
 import pytest
 
 from processing.commands import diagnose as cli
+from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.residual_file import read_residuals
 from processing.diagnosis.instrument.run import diagnose_captures
+from processing.diagnosis.instrument.unevenness import unevenness
 from processing.diagnosis.search.result import Diagnosis
+from processing.diagnosis.search.space import Space
 from processing.instrument.model import EffectParameter, InstrumentModel
+from processing.storage.capture import Capture
 from processing.storage.capture_schema import Sample
 from simulators.blind.suite import declared_bench, state_angles
 from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
@@ -211,6 +216,19 @@ def test_what_changes_in_a_part_of_the_image_is_no_source(configs, tmp_path):
     found = diagnosed(capture(tmp_path, configs, bench, air=True), configs)
     assert not [e for e in found.effects if e.confident]
     assert found.verdict == "unexplained"
+
+
+def test_a_source_whose_size_is_told_too_small_is_as_even_as_one_that_is_told_right(configs, tmp_path):
+    """Values that shrink to their prior leave a part of themselves in the whole image; that is no variation over it."""
+    bench = Bench(rows=40, columns=40)
+    bench.level.append(lambda k, a: 1 + 0.05 * k / (STATES - 1))
+    model = InstrumentModel.load(configs / "instruments/rgb950.yaml").nominal_at(662)
+    with Capture(capture(tmp_path, configs, bench, air=True)) as taken:
+        problem = InstrumentProblem(model, [read_capture(taken, model)])
+    drift = next(c for c in problem.pool() if c.kind == "source_drift")
+    for size in (0.05, 0.02):
+        excess, terms = unevenness(problem, drift, Space((drift,)), np.array([size, 0.0]))
+        assert excess < 4 * np.sqrt(2 * terms)
 
 
 def test_what_is_written_is_used_and_nothing_is_overwritten(configs, tmp_path, capsys):

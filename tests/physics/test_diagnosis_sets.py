@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.special import betaln
 
-from processing.diagnosis.instrument.doubts import ONE_PATTERN, patterned_share
+from processing.diagnosis.instrument.doubts import ONE_PATTERN, patterned
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.likely_set import likely_set
 from processing.diagnosis.search.posterior import descend
@@ -150,12 +150,32 @@ def test_two_that_say_the_same_share_the_mean(average):
     assert found.mean[:2] == pytest.approx(0.5, abs=0.15)
 
 
-def test_values_of_a_jump_beside_a_slope_are_not_random():
+def share(values, information):
+    """Of what values explain beyond noise, as the data alone have them, the part that one pattern has."""
+    seen = patterned(values, information, np.linalg.pinv(information, rtol=1e-9, hermitian=True))
+    return seen.held / seen.beyond_noise
+
+
+def test_values_of_a_jump_beside_a_drift_are_not_random():
     k = np.arange(40)
     information = np.eye(40) * 1e4
-    assert patterned_share(np.where(k > 15, 0.5, -0.3) - 0.02 * k, information) > ONE_PATTERN
-    assert patterned_share(np.cos(0.7 * k), information) > ONE_PATTERN
-    assert patterned_share(np.random.default_rng(2).standard_normal(40), information) < ONE_PATTERN
+    assert share(np.where(k > 15, 0.5, -0.3) - 0.08 * k + 0.002 * k**2, information) > ONE_PATTERN
+    assert share(np.where(k > 15, 0.5, -0.3) - 0.02 * k, information) > ONE_PATTERN
+    assert share(np.cos(0.7 * k), information) > ONE_PATTERN
+    assert share(np.random.default_rng(2).standard_normal(40), information) < ONE_PATTERN
+
+
+def test_random_gains_that_are_known_up_to_a_common_factor_are_random():
+    """A factor that all gains share is taken up by the throughput: a constant is seen as the gains themselves."""
+    gains = 0.003 * np.random.default_rng(4).standard_normal(40)
+    factor = (1 + gains) / np.linalg.norm(1 + gains)
+    assert share(gains, 1e8 * (np.eye(40) - np.outer(factor, factor))) < ONE_PATTERN
+
+
+def test_noise_of_values_that_shrink_to_their_prior_shrinks_with_them():
+    values, information = np.zeros(40), np.diag(np.repeat([1.0, 0.0], 20))
+    assert patterned(values, information, 0.5 * np.eye(40)).noise == pytest.approx(20 * 0.5**2)
+    assert patterned(values, information, 1e6 * np.eye(40)).noise == pytest.approx(20)
 
 
 def test_a_descent_stays_where_the_model_has_numbers():

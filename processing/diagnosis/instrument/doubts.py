@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from processing.arrays import Array
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.unevenness import unevenness
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.causes import Cause
+from processing.diagnosis.search.causes import Cause, shown
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import BOUND, ONE_PATTERN, TESTABLE, TIMES, UNEVEN, UNEVEN_SHARE, UNKNOWN_NOISE
 from processing.diagnosis.search.solution import Solution
@@ -65,14 +66,28 @@ def doubts(
 
 
 def testable(problem: InstrumentProblem, solved: Solution, cause: Cause, causes: Sequence[Cause]) -> bool:
-    """Values for each state are fewer than the directions in which the data could show something else."""
-    values = sum(c.size for other in causes for c in other.candidates if isinstance(c.effect, ValuePerState))
-    values += sum(1 for other in causes if other is not cause)
-    directions = 0.0
-    for free, power in problem.powers():
-        seen = max(solved.before.excess, 0.0) * power / power.sum()
-        directions += free * max(1.0, float(np.sum(seen / (1 + seen)))) if problem.noise_known else free
-    return bool(values < TESTABLE * directions)
+    """Values for each state are fewer than the directions in which the data could show something else.
+
+    In all captures together, where something else would show in others, or in one by itself in which they show; with
+    those of other causes that are more certain: what hardly takes part does not make them as many as the data.
+    """
+    before = [c for other in causes if other is cause or other.log_odds > cause.log_odds for c in other.candidates]
+    sizes = [shown(*found) for found in zip(cause.values, cause.covariance, strict=True)]
+    least = min(1.0, max(sizes))
+    excess = max(solved.before.excess, 0.0)
+    values, directions, shows = [], [], []
+    for k, ((free, power), nm) in enumerate(zip(problem.powers(), problem.wavelengths_nm, strict=True)):
+        seen = excess * power / power.sum()
+        directions.append(free * max(1.0, float(np.sum(seen / (1 + seen)))) if problem.noise_known else free)
+        values.append(sum(c.size for c in before if isinstance(c.effect, ValuePerState) and c.acts(k, nm)))
+        shows.append(
+            any(size >= least and c.acts(k, nm) for size, c in zip(sizes, cause.candidates, strict=True)),
+        )
+    others = len(causes) - 1
+    return bool(
+        sum(values) + others < TESTABLE * sum(directions)
+        or np.any((np.array(values) + others < TESTABLE * np.array(directions)) & shows)
+    )
 
 
 def _at_bound(cause: Cause) -> bool:
@@ -86,37 +101,50 @@ def _at_bound(cause: Cause) -> bool:
 def _one_pattern(found: Posterior, cause: Cause) -> bool:
     typical = found.space.joined("typical")
     part = dict(zip(found.space.candidates, found.space.slices, strict=True))
-    shares = []
-    for candidate, values in zip(cause.candidates, cause.values, strict=True):
+    held, beyond, noise = 0.0, 0.0, 0.0
+    for candidate, values, covariance in zip(cause.candidates, cause.values, cause.covariance, strict=True):
         p = part[candidate]
         curvature = found.sets.form.curvature[p, p] / np.outer(typical[p], typical[p]) / found.samples.best.unit
-        shares.append(patterned_share(values, curvature))
-    return max(shares) > ONE_PATTERN
+        seen = patterned(values, curvature, covariance)
+        held, beyond, noise = held + seen.held, beyond + seen.beyond_noise, noise + seen.noise
+    return beyond > noise and held > ONE_PATTERN * beyond
 
 
-def patterned_share(values: Array, information: Array) -> float:
-    """Largest share of what values (N,) explain that one sine over the states explains too, or a jump beside a slope.
+@dataclass(frozen=True)
+class Patterned:
+    """Chi-square that values explain, as far as one pattern holds it, beyond noise, and what noise alone explains."""
+
+    held: float
+    beyond_noise: float
+    noise: float
+
+
+def patterned(values: Array, information: Array, covariance: Array) -> Patterned:
+    """What of values (N,) one sine over the states explains too, or a jump beside a drift.
 
     `information` (N, N) is the curvature of the chi-square: patterns that the unknown sample takes up do not count.
+    `covariance` (N, N) is that of the values, which shrink to their prior, and their noise with them.
     """
     n = values.size
     k = np.arange(n)
     power, vector = np.linalg.eigh(information)
     root = (vector * np.sqrt(np.maximum(power, 0.0))).T
-    seen = root @ values
-    total = float(seen @ seen)
-    # N values fitted to noise alone explain N.
-    if total <= 2 * n:
-        return 0.0
+    # All about their means: gains that all grow by one factor are taken up by the throughput, so that one constant for
+    # all is seen as these values themselves, with the other sign, and would be a pattern of any values.
+    seen = root @ (values - values.mean())
+    kept = np.clip(np.linalg.eigvalsh(root @ covariance @ root.T), 0.0, 1.0)
+    noise = float(kept @ kept)
     turns = 2 * np.pi * np.outer(np.linspace(0.5 / n, 0.5, 8 * n), k)
     waves = np.stack([np.cos(turns), np.sin(turns)], axis=2)
-    jumps = [np.stack([k >= first, np.ones(n), k / n], axis=1) for first in range(2, n - 1)]
-    best = 0.0
+    drift = np.stack([k / n, (k / n) ** 2], axis=1)
+    drift -= drift.mean(axis=0)
+    jumps = [np.column_stack([(k >= first) - 1 + first / n, drift]) for first in range(2, n - 1)]
+    held = 0.0
     for pattern in (*waves, *jumps):
         u, size, _ = np.linalg.svd(root @ pattern, full_matrices=False)
         along = u[:, size > 1e-6 * size[0]].T @ seen
-        best = max(best, float(along @ along))
-    return best / (total - n)
+        held = max(held, float(along @ along))
+    return Patterned(held, float(seen @ seen) - noise, noise)
 
 
 def _uneven(problem: InstrumentProblem, solved: Solution, candidate: Candidate, cause: Cause) -> bool:

@@ -76,7 +76,7 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
     captures = range(len(problem.captures))
     before = tuple(residual(asked, k, solved.base, solved.before_fit) for k in captures)
     after = tuple(residual(asked, k, solved.space, solved.fit) for k in captures)
-    units = np.array([1 + r.left / directions(asked, k) for k, r in enumerate(after)])
+    units = np.array([1 + _left(problem, r) / directions(asked, k) for k, r in enumerate(after)])
     if problem.noise_known and _grown(units, found.samples.best.unit):
         # Single tests see structure that the sum of squares does not.
         found = bench.weighed(found, units)
@@ -85,7 +85,7 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
     else:
         units = np.ones(len(after))
     structure = _structure(problem, after)
-    left = float(sum(r.left / u for r, u in zip(after, units, strict=True))) if structure else 0.0
+    left = float(sum(_left(problem, r) / u for r, u in zip(after, units, strict=True)))
     named = _told(found, left)
     untold = [
         c for c in named if isinstance(c.candidates[0].effect, ValuePerState) and not testable(asked, solved, c, named)
@@ -183,6 +183,11 @@ def _structure(problem: InstrumentProblem, after: Sequence[Residual]) -> bool:
     if problem.noise_known:
         return any(value > LIMIT for r in after for value in r.tests.values())
     return any(not _white(r) for r in after)
+
+
+def _left(problem: InstrumentProblem, r: Residual) -> float:
+    """Chi-square of the structure of one capture; none where no test sees any: of many some err by two deviations."""
+    return r.left if _structure(problem, [r]) else 0.0
 
 
 def _verdict(named: Sequence[object], sure: Sequence[object], structure: bool) -> Verdict:

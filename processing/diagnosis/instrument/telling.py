@@ -12,7 +12,7 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.structure import Residual
 from processing.diagnosis.instrument.systematic import systematic_error
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.causes import Answer, Cause
+from processing.diagnosis.search.causes import Answer, Cause, shown
 from processing.diagnosis.search.fit import HeldOut
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.result import (
@@ -63,9 +63,9 @@ def told_effects(problem: InstrumentProblem, cause: Cause, doubt: str | None) ->
         for found in zip(cause.candidates, cause.values, cause.covariance, strict=True)
         for at in by_wavelength(*found)
     ]
-    shown = [float(v @ np.linalg.lstsq(s, v)[0]) / _least_shown(v.size) for _, v, s in each]
-    for (candidate, values, covariance), size in zip(each, shown, strict=True):
-        if size < min(1.0, max(shown)):
+    sizes = [shown(values, covariance) for _, values, covariance in each]
+    for (candidate, values, covariance), size in zip(each, sizes, strict=True):
+        if size < min(1.0, max(sizes)):
             continue
         told.append(
             FoundEffect(
@@ -84,11 +84,6 @@ def told_effects(problem: InstrumentProblem, cause: Cause, doubt: str | None) ->
             )
         )
     return told
-
-
-def _least_shown(values: int) -> float:
-    """Chi-square from which on so many values are not zero: three standard deviations."""
-    return max(9.0, values + 3 * float(np.sqrt(2 * values)))
 
 
 def told_answer(cause: Cause, doubt: str | None) -> tuple[Answer, float]:

@@ -16,8 +16,9 @@ from processing.instrument.changes import field_terms
 def unevenness(problem: InstrumentProblem, candidate: Candidate, space: Space, values: Array) -> tuple[float, int]:
     """Chi-square by which the size of an effect varies smoothly over the image, beyond noise, and its terms.
 
-    In each tile the effect is scaled, all else held; then second-order surfaces are laid through the tiles. Both
-    zero where the image has no tiles.
+    In each tile the effect is scaled, all else held; then second-order surfaces are laid through the tiles. What one
+    size for all tiles explains is no variation: values that shrink to their prior leave that over. Both zero where the
+    image has no tiles.
     """
     problem, local = problem.near(space, values)
     part = space.slices[space.candidates.index(candidate)]
@@ -44,5 +45,6 @@ def unevenness(problem: InstrumentProblem, candidate: Candidate, space: Space, v
         smooth = np.vstack([np.ones(tiles.x.size), field_terms(tiles.x, tiles.y)])
         pull = smooth @ slope
         out += float(pull @ np.linalg.pinv((smooth * power) @ smooth.T, hermitian=True) @ pull)
-        count += len(smooth)
+        out -= float(pull[0] ** 2 / max(power.sum(), 1e-300))
+        count += len(smooth) - 1
     return out - count, count

@@ -82,6 +82,12 @@ def causes(found: Posterior, left: float) -> tuple[Cause, ...]:
     return tuple(sorted(out, key=lambda c: -c.log_odds))
 
 
+def shown(values: Array, covariance: Array) -> float:
+    """Chi-square of values (N,) over that from which on so many are not zero: three standard deviations."""
+    n = values.size
+    return float(values @ np.linalg.lstsq(covariance, values)[0]) / max(9.0, n + 3 * float(np.sqrt(2 * n)))
+
+
 def least_odds(odds: float, left: float) -> float:
     """Log odds from which on another group in a cause's place is named with it.
 

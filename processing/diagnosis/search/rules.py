@@ -169,7 +169,7 @@ ALIKE = 1e-3
 # ---- why a name is doubted -----------------------------------------------------------------------------------------
 #: [of the range] How close to the end of a parameter's range a value stands at its bound.
 BOUND = 1e-3
-#: [of their scatter] What a single wave, or a jump beside a slope, may hold of values that belong to one state each, if
+#: [of their scatter] What a single wave, or a jump beside a drift, may hold of values that belong to one state each, if
 #: they are to be random.
 ONE_PATTERN = 0.85
 #: [standard deviations] By which the size of an effect of the source may differ over the image.

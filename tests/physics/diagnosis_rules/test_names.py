@@ -1,5 +1,6 @@
 """Constants by which structure is seen, causes are named, and names are doubted."""
 
+from dataclasses import replace
 from types import SimpleNamespace as Some
 
 import numpy as np
@@ -7,6 +8,7 @@ from rule_decisions import Patch, cause, decides, made, one
 
 from processing.diagnosis.instrument import combinations, doubts, judge, telling
 from processing.diagnosis.search import causes
+from processing.diagnosis.search.causes import Cause
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import ValuePerState
 
@@ -15,6 +17,12 @@ from processing.instrument.effects.base import ValuePerState
 def test_limit(m: Patch) -> bool:
     seen = [judge._structure(Some(noise_known=True), [Some(tests={"a": t})]) for t in (4.8, 5.2)]
     return seen == [False, True]
+
+
+def test_what_no_test_takes_for_structure_is_not_left():
+    known, found = Some(noise_known=True), Some(tests={"a": 3.0, "b": -1.0}, left=50.0)
+    assert judge._left(known, found) == 0.0
+    assert judge._left(known, Some(tests={"a": 3.0, "b": 7.0}, left=50.0)) == 50.0
 
 
 @decides
@@ -74,15 +82,29 @@ def test_bound(m: Patch) -> bool:
     return [doubts._at_bound(cause(values=[v])) for v in (0.0009, 0.0011)] == [True, False]
 
 
+def follows(m: Patch, *seen: tuple[float, float]) -> bool:
+    """Whether values follow a pattern that has, in each capture, so much of so much."""
+    told = replace(
+        cause(), candidates=tuple(made() for _ in seen), values=(0,) * len(seen), covariance=(0,) * len(seen)
+    )
+    found = Some(space=Space(told.candidates), sets=one(1.0, 0.0, len(seen)), samples=Some(best=Some(unit=1.0)))
+    each = iter(seen)
+    m.setattr(doubts, "patterned", lambda *a: doubts.Patterned(*next(each), 10.0))
+    return doubts._one_pattern(found, told)
+
+
 @decides
 def test_one_pattern(m: Patch) -> bool:
-    told = cause()
-    found = Some(space=Space(told.candidates), sets=one(1.0, 0.0), samples=Some(best=Some(unit=1.0)))
-    said = []
-    for share in (0.83, 0.87):
-        m.setattr(doubts, "patterned_share", lambda values, information, s=share: s)
-        said.append(doubts._one_pattern(found, told))
-    return said == [False, True]
+    return [follows(m, (held, 100.0)) for held in (83.0, 87.0)] == [False, True]
+
+
+def test_a_capture_that_tells_little_does_not_make_all_others_follow_a_pattern(monkeypatch):
+    assert not follows(monkeypatch, (900.0, 3000.0), (95.0, 100.0))
+    assert follows(monkeypatch, (2900.0, 3000.0), (30.0, 100.0))
+
+
+def test_of_what_is_hardly_beyond_noise_no_pattern_is_told(monkeypatch):
+    assert not follows(monkeypatch, (9.0, 9.5))
 
 
 def uneven(m: Patch, excess: float, odds: float) -> bool:
@@ -104,10 +126,42 @@ def test_uneven_share(m: Patch) -> bool:
 
 @decides
 def test_testable(m: Patch) -> bool:
-    problem = Some(powers=lambda: [(100, np.ones(1))], noise_known=False)
+    problem = Some(powers=lambda: [(100, np.ones(1))], noise_known=False, wavelengths_nm=(662.0,))
     solved = Some(before=Some(excess=0.0))
     told = [cause(candidate=made(ValuePerState, size)) for size in (73, 77)]
     return [doubts.testable(problem, solved, c, [c]) for c in told] == [True, False]
+
+
+def per_state(odds: float, *sizes: float) -> Cause:
+    """A value of each of 40 states, in captures one after the other, of such sizes in units of their errors."""
+    told = cause(odds, candidate=made(ValuePerState, 40))
+    return replace(
+        told,
+        candidates=tuple(replace(told.candidates[0], capture=k) for k in range(len(sizes))),
+        values=tuple(np.full(40, size) for size in sizes),
+        covariance=told.covariance * len(sizes),
+    )
+
+
+def test_values_for_each_state_beside_others_that_hardly_take_part_are_testable():
+    problem = Some(powers=lambda: [(100, np.ones(1))], noise_known=False, wavelengths_nm=(662.0,))
+    solved = Some(before=Some(excess=0.0))
+    strong, weak = (per_state(odds, 9.0) for odds in (2000.0, 2.0))
+    assert doubts.testable(problem, solved, strong, [strong, weak])
+    assert not doubts.testable(problem, solved, weak, [strong, weak])
+
+
+def test_one_capture_that_tells_more_than_a_value_for_each_state_tests_them():
+    problem = Some(powers=lambda: [(30, np.ones(1)), (60, np.ones(1))], noise_known=False, wavelengths_nm=(662.0,) * 2)
+    solved = Some(before=Some(excess=0.0))
+    found = [per_state(2000.0, *sizes) for sizes in ((9.0, 9.0), (9.0, 0.1))]
+    assert [doubts.testable(problem, solved, c, [c]) for c in found] == [True, False]
+
+
+def test_captures_that_tell_more_together_test_values_for_each_state():
+    problem = Some(powers=lambda: [(39, np.ones(1)), (72, np.ones(1))], noise_known=False, wavelengths_nm=(662.0,) * 2)
+    found = per_state(2000.0, 9.0, 0.1)
+    assert doubts.testable(problem, Some(before=Some(excess=0.0)), found, [found])
 
 
 def doubted(odds: float, known: bool, left: float) -> bool:
