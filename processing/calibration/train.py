@@ -1,12 +1,13 @@
 """Fit parameters of an instrument's trains to a capture of a known sample.
 
 The sample is known up to one throughput for each pixel, so the throughput is eliminated: for every trial of the
-parameters it has its least-squares value (variable projection), and only the train's parameters are searched.
+parameters it has its least-squares value (variable projection), and only the train's parameters are searched. Captures
+at several wavelengths are fitted at once: what a mount does is the same in all of them, what a plate does is not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import StringIO
 from itertools import product
@@ -38,6 +39,8 @@ FITTABLE = {
     "t_min": (0.01, 0.0, np.inf),
     "ratio": (0.001, -np.inf, np.inf),
 }
+#: Fields that belong to a mount: by how much they differ from the file is the same at every wavelength.
+MECHANICAL = ("azimuth_deg", "ratio")
 #: A residual above this part of the mean signal is no fit.
 POOR_FIT = 0.05
 #: Other starts turn at most this many azimuths by 45 degrees.
@@ -109,6 +112,41 @@ def region_means(capture: Capture, rows: slice, columns: slice) -> tuple[NDArray
     return np.asarray(means) - np.asarray(share @ means_of_dark.mean(axis=(2, 3))), np.array(used)
 
 
+@dataclass(frozen=True)
+class Part:
+    """One capture of a joint fit.
+
+    Attributes
+    ----------
+    model : resolved at the wavelength of the capture.
+    angles_deg : axis name to (N,), as read back.
+    signal : (N, channels) counts above black, or (N, channels, pixels): one throughput for each pixel.
+    sample : (4, 4) up to a factor.
+    exposure : (N,) relative, default 1.
+    wavelength_nm : parts of one wavelength share all parameters.
+    """
+
+    model: InstrumentModel
+    angles_deg: dict[str, NDArray[np.float64]]
+    signal: NDArray[np.float64]
+    sample: NDArray[np.float64]
+    exposure: NDArray[np.float64] | None = None
+    wavelength_nm: float = 0.0
+
+    @property
+    def data(self) -> NDArray[np.float64]:
+        """(N * channels, pixels)."""
+        return self.signal.reshape(self.signal.shape[0] * self.signal.shape[1], -1)
+
+    def residual(self, model: InstrumentModel) -> NDArray[np.float64]:
+        """(N * channels * pixels,), over the mean signal, with the best throughput of each pixel."""
+        weight = np.ones(self.signal.shape[0]) if self.exposure is None else self.exposure
+        w = model.rows(self.angles_deg, changes_at(model, self.angles_deg)) * weight[:, None, None]
+        shape = w.reshape(-1, 16) @ self.sample.reshape(16)
+        throughput = shape @ self.data / (shape @ shape)
+        return np.asarray((self.data - shape[:, None] * throughput).reshape(-1) / np.mean(self.data))
+
+
 def fit_train(
     model: InstrumentModel,
     angles_deg: dict[str, NDArray[np.float64]],
@@ -117,38 +155,52 @@ def fit_train(
     free: Sequence[str],
     exposure: NDArray[np.float64] | None = None,
 ) -> Calibration:
-    """Fit the free parameters to signals of a known sample.
+    """`fit_trains` of a single capture; for the parameters see `Part`."""
+    return fit_trains([Part(model, angles_deg, signal, sample, exposure)], free)[0]
+
+
+def fit_trains(parts: Sequence[Part], free: Sequence[str]) -> list[Calibration]:
+    """Fit the free parameters to signals of known samples; the search starts from the values of the models.
 
     Parameters
     ----------
-    model : resolved at the wavelength; its values are where the search starts.
-    angles_deg : axis name to (N,), as read back.
-    signal : (N, channels) counts above black, or (N, channels, pixels): one throughput for each pixel.
-    sample : (4, 4) up to a factor.
-    free : "element.field", fields as in FITTABLE.
-    exposure : (N,) relative, default 1.
+    free : "element.field", fields as in FITTABLE. Those in MECHANICAL change by the same amount in all parts, the
+        others take a value of their own at each wavelength.
+
+    Returns
+    -------
+    One for each part, in their order.
 
     Raises
     ------
     CalibrationError : an unknown parameter, or fewer data than parameters.
     NotDetermined : the data leave a combination of parameters open; the message names them.
     """
-    names = _checked(model, free)
-    data = signal.reshape(signal.shape[0] * signal.shape[1], -1)
-    if data.size <= len(names) + data.shape[1]:
-        raise CalibrationError(f"{data.size} intensities cannot fix {len(names)} parameters and the throughput")
-    start = np.array([_value(model, name) for name in names])
-    step = np.array([FITTABLE[name.rpartition(".")[2]][0] for name in names])
-    lower, upper = np.array([FITTABLE[name.rpartition(".")[2]][1:] for name in names]).T
-    weight = np.ones(signal.shape[0]) if exposure is None else exposure
-    scale = float(np.mean(data))
+    names = _checked(parts[0].model, free)
+    mounted = np.array([name.rpartition(".")[2] in MECHANICAL for name in names])
+    # What is searched: a name with its wavelength, or for all of them.
+    wanted = [
+        [(name, None if shared else part.wavelength_nm) for name, shared in zip(names, mounted, strict=True)]
+        for part in parts
+    ]
+    unknown = list(dict.fromkeys(key for keys in wanted for key in keys))
+    where = [np.array([unknown.index(key) for key in keys]) for keys in wanted]
+    throughputs = sum(part.data.shape[1] for part in parts)
+    size = sum(part.data.size for part in parts)
+    if size <= len(unknown) + throughputs:
+        raise CalibrationError(f"{size} intensities cannot fix {len(unknown)} parameters and the throughput")
+    nominal = [np.array([_value(part.model, name) for name in names]) for part in parts]
+    # Of a mount the change is searched, from 0; of a plate the value.
+    base = [np.where(mounted, values, 0.0) for values in nominal]
+    start = np.zeros(len(unknown))
+    for index, values, own in zip(where, nominal, base, strict=True):
+        start[index] = values - own
+    step = np.array([FITTABLE[name.rpartition(".")[2]][0] for name, _ in unknown])
+    lower, upper = np.array([FITTABLE[name.rpartition(".")[2]][1:] for name, _ in unknown]).T
 
     def residual(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        tried = _with_values(model, names, x)
-        w = tried.rows(angles_deg, changes_at(tried, angles_deg)) * weight[:, None, None]
-        shape = w.reshape(-1, 16) @ sample.reshape(16)
-        throughput = shape @ data / (shape @ shape)
-        return np.asarray((data - shape[:, None] * throughput).reshape(-1) / scale)
+        tried = (_with_values(p.model, names, b + x[i]) for p, b, i in zip(parts, base, where, strict=True))
+        return np.concatenate([part.residual(model) for part, model in zip(parts, tried, strict=True)])
 
     def search(x0: NDArray[np.float64]) -> Any:
         inside = np.clip(x0, lower + 1e-9 * step, upper - 1e-9 * step)
@@ -157,7 +209,8 @@ def fit_train(
     found = search(start)
     if np.sqrt(np.mean(found.fun**2)) > POOR_FIT:
         # Azimuths have several valleys; a residual like this is the bottom of a wrong one.
-        found = min([found, *(search(x0) for x0 in _other_starts(names, start))], key=lambda f: float(f.cost))
+        others = _other_starts([name for name, _ in unknown], start)
+        found = min([found, *(search(x0) for x0 in others)], key=lambda f: float(f.cost))
     if not found.success:
         raise NotDetermined(
             f"the fit did not converge ({found.message}); start from an instrument file closer to the truth"
@@ -165,34 +218,43 @@ def fit_train(
     jacobian = found.jac * step
     _, singular, vt = np.linalg.svd(jacobian, full_matrices=False)
     if singular[-1] < UNSEEN * singular[0]:
-        parts = [names[k] for k in np.flatnonzero(np.abs(vt[-1]) > 0.1)]
-        raise NotDetermined(f"the data do not tell apart: {', '.join(parts)}. Hold one of them fixed.")
-    freedom = data.size - data.shape[1] - len(names)
+        open_ones = dict.fromkeys(unknown[k][0] for k in np.flatnonzero(np.abs(vt[-1]) > 0.1))
+        raise NotDetermined(f"the data do not tell apart: {', '.join(open_ones)}. Hold one of them fixed.")
+    freedom = size - throughputs - len(unknown)
     variance = float(np.sum(found.fun**2)) / max(freedom, 1)
     covariance = np.linalg.inv(jacobian.T @ jacobian) * variance * np.outer(step, step)
-    return Calibration(
-        names=names,
-        values=np.asarray(found.x),
-        stderr=np.sqrt(np.diag(covariance)),
-        covariance=covariance,
-        residual_over_mean=float(np.sqrt(np.mean(found.fun**2))),
-        residual=found.fun.reshape(*signal.shape[:2], -1).mean(axis=2),
-        model=_with_values(model, names, found.x),
-    )
+    left = np.split(found.fun, np.cumsum([part.data.size for part in parts])[:-1])
+    return [
+        Calibration(
+            names=names,
+            values=own + found.x[index],
+            stderr=np.sqrt(np.diag(covariance))[index],
+            covariance=covariance[np.ix_(index, index)],
+            residual_over_mean=float(np.sqrt(np.mean(rest**2))),
+            residual=rest.reshape(*part.signal.shape[:2], -1).mean(axis=2),
+            model=_with_values(part.model, names, own + found.x[index]),
+        )
+        for part, own, index, rest in zip(parts, base, where, left, strict=True)
+    ]
 
 
 def calibrate(
     capture: Capture, model: InstrumentModel, free: Sequence[str], rows: slice, columns: slice
 ) -> Calibration:
     """Fit to the region means of a capture of a known sample; see `fit_train`."""
+    return fit_trains([part_of(capture, model, rows, columns)], free)[0]
+
+
+def part_of(capture: Capture, model: InstrumentModel, rows: slice, columns: slice) -> Part:
+    """The region means of a capture of a known sample, for `fit_trains`; `model` is at its wavelength."""
     sample = known_mueller(capture.header.sample)
     signal, states = region_means(capture, rows, columns)
     angles = {name: values[states] for name, values in capture.angles_deg.items()}
-    return fit_train(model, angles, signal, sample, free, relative_exposure(capture, states))
+    return Part(model, angles, signal, sample, relative_exposure(capture, states), capture.header.wavelength_nm)
 
 
-def write_fitted(source: Path, target: Path, calibration: Calibration, wavelength_nm: float, note: str) -> None:
-    """Copy an instrument file with the fitted values put in; comments stay. Never overwrites.
+def write_fitted(source: Path, target: Path, fitted: Mapping[float, Calibration], note: str) -> None:
+    """Copy an instrument file with the values fitted at some wavelengths put in; comments stay. Never overwrites.
 
     Raises
     ------
@@ -204,16 +266,19 @@ def write_fitted(source: Path, target: Path, calibration: Calibration, wavelengt
     yaml.indent(mapping=2, sequence=4, offset=2)
     yaml.width = 120
     tree = yaml.load(source.read_text(encoding="utf-8"))
-    for name, value, stderr in zip(calibration.names, calibration.values, calibration.stderr, strict=True):
-        element, _, field = name.rpartition(".")
-        node = _node(tree, element)
-        digits = 1 - int(np.floor(np.log10(stderr))) if stderr > 0 else 6
-        number = round(float(value), max(digits, 0))
-        if isinstance(node.get(field), dict):
-            key = next((k for k in node[field] if abs(float(k) - wavelength_nm) < 0.5), wavelength_nm)
-            node[field][key] = number
-        else:
-            node[field] = number
+    for wavelength_nm, calibration in fitted.items():
+        for name, value, stderr in zip(calibration.names, calibration.values, calibration.stderr, strict=True):
+            element, _, field = name.rpartition(".")
+            node = _node(tree, element)
+            digits = 1 - int(np.floor(np.log10(stderr))) if stderr > 0 else 6
+            number = round(float(value), max(digits, 0))
+            if len(fitted) > 1 and field not in MECHANICAL and not isinstance(node.get(field), dict):
+                node[field] = {}
+            if isinstance(node.get(field), dict):
+                key = next((k for k in node[field] if abs(float(k) - wavelength_nm) < 0.5), wavelength_nm)
+                node[field][key] = number
+            else:
+                node[field] = number
     tree["source"] = note
     text = StringIO()
     yaml.dump(tree, text)

@@ -17,7 +17,9 @@ def register(app: typer.Typer) -> None:
 
 
 def calibrate_command(
-    capture: Annotated[Path, typer.Argument(help="Capture of air, a mirror or another known sample.")],
+    captures: Annotated[
+        list[Path], typer.Argument(help="Captures of air, a mirror or another known sample, at any wavelengths.")
+    ],
     instrument: Annotated[Path, typer.Option(help="Instrument file that the fit starts from.")],
     free: Annotated[str, typer.Option(help="Parameters to fit: element.field,element.field,...")],
     region: Annotated[
@@ -25,29 +27,39 @@ def calibrate_command(
     ] = None,
     write: Annotated[Path | None, typer.Option(help="New instrument file with the fitted values.")] = None,
 ) -> None:
-    """Fit element parameters (azimuth_deg, retardance_deg, ...) to region means; the throughput is eliminated."""
-    from processing.calibration.train import POOR_FIT, calibrate, write_fitted
+    """Fit element parameters (azimuth_deg, retardance_deg, ...) to region means; the throughput is eliminated.
+
+    Captures at several wavelengths are fitted at once: azimuths and ratios change by the same amount in all of them.
+    """
+    from processing.calibration.train import POOR_FIT, fit_trains, part_of, write_fitted
     from processing.instrument.model import InstrumentModel
     from processing.storage.capture import Capture
 
-    with Capture(capture, by_super_pixel=True) as source:
-        wavelength = source.header.wavelength_nm
-        rows, columns = _region(region, source.frame_shape)
-        model = InstrumentModel.load(instrument).at(wavelength)
-        result = calibrate(source, model, free.split(","), rows, columns)
-        if source.simulated:
-            typer.echo("SIMULATED data")
-    typer.echo(
-        f"{capture.name}: rows {rows.start}:{rows.stop}, columns {columns.start}:{columns.stop}, {wavelength:g} nm"
-    )
-    for name, value, stderr in zip(result.names, result.values, result.stderr, strict=True):
-        typer.echo(f"  {name:32s} {value:12.5f} +- {stderr:.5f}")
-    typer.echo(f"  residual {100 * result.residual_over_mean:.3f} % of the mean signal (rms)")
-    if result.residual_over_mean > POOR_FIT:
+    model = InstrumentModel.load(instrument)
+    parts, titles, simulated = [], [], False
+    for capture in captures:
+        with Capture(capture, by_super_pixel=True) as source:
+            nm = source.header.wavelength_nm
+            rows, columns = _region(region, source.frame_shape)
+            parts.append(part_of(source, model.at(nm), rows, columns))
+            simulated |= source.simulated
+        where = f"rows {rows.start}:{rows.stop}, columns {columns.start}:{columns.stop}"
+        titles.append(f"{capture.name}: {where}, {nm:g} nm")
+    found = fit_trains(parts, free.split(","))
+    if simulated:
+        typer.echo("SIMULATED data")
+    for title, result in zip(titles, found, strict=True):
+        typer.echo(title)
+        for name, value, stderr in zip(result.names, result.values, result.stderr, strict=True):
+            typer.echo(f"  {name:32s} {value:12.5f} +- {stderr:.5f}")
+        typer.echo(f"  residual {100 * result.residual_over_mean:.3f} % of the mean signal (rms)")
+    worst = max(result.residual_over_mean for result in found)
+    if worst > POOR_FIT:
         typer.echo("warning: a poor fit; start from values closer to the truth, or free more parameters", err=True)
     if write is not None:
-        note = f"process calibrate of {capture.name}, residual {100 * result.residual_over_mean:.2f} % of the mean"
-        write_fitted(instrument, write, result, wavelength, note)
+        names = ", ".join(capture.name for capture in captures)
+        note = f"process calibrate of {names}, residual {100 * worst:.2f} % of the mean"
+        write_fitted(instrument, write, {p.wavelength_nm: r for p, r in zip(parts, found, strict=True)}, note)
         typer.echo(str(write))
 
 
