@@ -74,7 +74,7 @@ class Entry:
 
 @dataclass
 class Library:
-    """A folder; every file is opened once and again when it has changed."""
+    """A folder; every file is opened once and again when it has changed, or while it is written."""
 
     root: Path
     _known: dict[Path, tuple[tuple[int, int], Entry]] = field(default_factory=dict)
@@ -157,7 +157,12 @@ class Library:
             entry = _read(path, common)
         except ProcessError as error:
             entry = Entry(**common, kind="unreadable", status="failed", flags=(str(error),))
-        self._known[path] = (seen, entry)
+        # HDF5 answers for a file that another page has open with what it was then; its end changes neither size nor,
+        # within one tick of the clock, the time.
+        if entry.status == "running":
+            self._known.pop(path, None)
+        else:
+            self._known[path] = (seen, entry)
         return entry
 
 

@@ -11,8 +11,11 @@ import pytest
 
 from acquisition.capture.layout import put_layout
 from acquisition.capture.state_file import StateFile
+from acquisition.capture.writer import finish
 from acquisition.errors import AcquisitionError
+from processing.storage.capture import Capture
 from processing.storage.capture_schema import CaptureHeader, create_layout
+from viewer.library import Library
 
 
 def asked(address, what):
@@ -46,6 +49,28 @@ def test_states_appear_as_they_are_written(lab, address):
         assert "the fit comes when it is complete" in curve["told"]
     # The run may take its file again although the page has just looked.
     StateFile(partial).close()
+
+
+def test_a_capture_that_is_sealed_while_somebody_reads_it_is_complete_afterwards(lab):
+    partial = lab / "now.h5.partial"
+    header = CaptureHeader(title="now", simulated=True, mode="drr", wavelength_nm=662)
+    angles = {"psg": np.arange(1.0)}
+    put_layout(
+        partial,
+        1 << 20,
+        lambda h5: create_layout(h5, header, angles, ("sample",), (6, 8), np.uint16, "2026-01-01T00:00:00"),
+    )
+    library = Library(lab)
+    # HDF5 takes what it has of a file that is open already, whatever its name: a picture that is being read, say.
+    with Capture(partial):
+        # As a run does it, who has the file locked.
+        raw = partial.read_bytes()
+        with partial.open("r+b") as file:
+            file.seek(raw.index(b"running\0"))
+            file.write(b"complete")
+        finish(partial)
+        assert [entry.name for entry in library.entries()] == ["now.h5"]
+    assert library.entry("now.h5").status == "complete"
 
 
 def test_a_capture_without_a_state_says_so(lab, address, drr_capture):
