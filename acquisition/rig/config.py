@@ -11,7 +11,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from acquisition.rig.sections import AxisEntry, RigSections
 from acquisition.rig.soundness import Mistake, find_mistakes
-from processing.yaml_file import load_yaml
+from processing.yaml_file import ConfigError, load_yaml
 from processing.yaml_words import names_in, words_of
 
 
@@ -74,4 +74,6 @@ def load_rig(path: Path | str) -> RigConfig:
     modes = {name: mode.model_copy(update={"instrument": folder / mode.instrument}) for name, mode in rig.modes.items()}
     simulator = rig.simulator.below(folder) if rig.simulator else None
     wire_log = folder / rig.wire_log if rig.wire_log else None
+    if wire_log is not None and wire_log.exists() and not wire_log.is_dir():
+        raise ConfigError(f"{path}: wire_log: {wire_log} is a file, and a folder is asked for")
     return rig.model_copy(update={"modes": modes, "simulator": simulator, "wire_log": wire_log})

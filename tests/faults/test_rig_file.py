@@ -113,6 +113,12 @@ def test_what_cannot_be_meant_is_refused(changed, name):
     assert all(re.match(r".*rig\.yaml:\d+: ", line) for line in str(refused.value).splitlines())
 
 
+def test_a_transcript_needs_a_folder(changed, tmp_path):
+    (tmp_path / "wires").write_text("mine")
+    with pytest.raises(ConfigError, match=r"rig\.yaml: wire_log: .*wires is a file"):
+        load_rig(changed({"wire_log": "wires"}))
+
+
 def test_all_mistakes_come_at_once(changed):
     """Mistakes of a value and mistakes between sections do not hide each other."""
     changes = {
