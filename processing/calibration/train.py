@@ -217,7 +217,7 @@ def fit_trains(parts: Sequence[Part], free: Sequence[str]) -> list[Calibration]:
         )
     jacobian = found.jac * step
     _, singular, vt = np.linalg.svd(jacobian, full_matrices=False)
-    if singular[-1] < UNSEEN * singular[0]:
+    if singular[-1] <= UNSEEN * singular[0]:
         open_ones = dict.fromkeys(unknown[k][0] for k in np.flatnonzero(np.abs(vt[-1]) > 0.1))
         raise NotDetermined(f"the data do not tell apart: {', '.join(open_ones)}. Hold one of them fixed.")
     freedom = size - throughputs - len(unknown)

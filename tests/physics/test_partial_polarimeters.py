@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from processing.calibration.train import calibrate
+from processing.diagnosis.instrument.run import diagnose_captures
 from processing.errors import NotDetermined, ProcessError
 from processing.instrument.determined import determined_basis, determined_elements
 from processing.instrument.model import InstrumentModel, Polarizer
@@ -18,7 +19,7 @@ from processing.reflectance.base import normalized_mueller
 from processing.reports.figures import product_figure
 from processing.steps.maps import Xi0
 from processing.storage.axostep_product import axostep_of_product
-from processing.storage.capture import Capture
+from processing.storage.capture import Capture, CaptureError
 from processing.storage.images import MuellerImage
 from processing.storage.pixel_mask import Mask
 from processing.storage.product import Product, ProductError, Step
@@ -228,3 +229,18 @@ def test_a_known_sample_calibrates_the_train(name, synthetic_capture, configs):
         found = calibrate(capture, nominal, [f"{element}.azimuth_deg"], slice(None), slice(None))
     assert found.values[0] == pytest.approx(1.5, abs=5 * found.stderr[0])
     assert found.stderr[0] < 0.1
+
+
+def test_a_sample_that_does_not_see_the_train_does_not_calibrate_it(synthetic_capture, configs):
+    # Unpolarized light through air is the same for every angle of the plate.
+    nominal = InstrumentModel.load(configs / "instruments/rotating_retarder_stokes.yaml")
+    frames = np.full((8, 1, 8, 8), 5000, dtype=np.uint16)
+    path = synthetic_capture(frames, {"psa": 22.5 * np.arange(8)}, sample={"kind": "air"})
+    with Capture(path) as capture, pytest.raises(NotDetermined, match="do not tell apart"):
+        calibrate(capture, nominal, ["psa_retarder.azimuth_deg"], slice(None), slice(None))
+
+
+def test_as_many_states_as_unknowns_leave_nothing_to_diagnose(noisy):
+    path, model, _ = noisy("rotating_retarder_stokes", {"psa": np.array([-51.7, -15.1, 15.1, 51.7])})
+    with pytest.raises(CaptureError, match="Take more states"):
+        diagnose_captures([path], model)

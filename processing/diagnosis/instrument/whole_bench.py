@@ -29,6 +29,7 @@ from processing.instrument.effects.base import (
     Switch,
     ValuePerState,
 )
+from processing.storage.capture import CaptureError
 
 
 def predicts(problem: InstrumentProblem) -> InstrumentProblem:
@@ -51,6 +52,12 @@ class WholeBench:
         self.base = Space(problem.nominal())
         self.pool = problem.pool()
         self._free = [c.values_per_pixel - self._unknowns(k) for k, c in enumerate(self.whole.captures)]
+        if max(self._free) <= 0:
+            most = max(c.values_per_pixel for c in self.whole.captures)
+            raise CaptureError(
+                f"{most} intensities of a pixel are no more than what is unknown of it: nothing is left over that "
+                "could speak against the model. Take more states than the sample has unknowns, or a known sample."
+            )
         self._start = first_values(self.whole, self.base, self.pool, say)
 
     @property
