@@ -23,9 +23,14 @@ def require_all_elements(product: Product) -> None:
     """Raise ProductError for the image of a partial polarimeter, which has no whole Mueller matrices."""
     product.require("mueller")
     if int(product.facts.get("rank", 16)) < 16:
+        rest = (
+            "With a model of the surface, `process xi0` and `process fit-material` take it."
+            if "stokes" in product.names
+            else "`process quantities` gives what follows from those that it has."
+        )
         raise ProductError(
             f"{product.path} is of a partial polarimeter: it determines {product.facts.get('determined', 'less')}, and "
-            "this needs all 16 elements. `process quantities` gives what follows from those that it has."
+            f"this needs all 16 elements. {rest}"
         )
 
 

@@ -157,6 +157,8 @@ def test_polarized_light_gives_the_stokes_vector_that_is_sent_back_and_xi0(name,
         facts = reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
     count = facts["rank"]
     assert facts["determined"].startswith(", ".join(f"S{k}" for k in range(count)) + " of the light")
+    with pytest.raises(ProductError, match=r"needs all 16 elements\. With a model"):
+        quantities_of_mueller(tmp_path / "m.h5", tmp_path / "q.h5", Step("quantities", {}))
     light = np.array([0.5, 0.5 * np.cos(np.deg2rad(40)), 0.5 * np.sin(np.deg2rad(40)), 0])
     with Product(tmp_path / "m.h5") as product:
         stokes, errors = (product.get(plane).reshape(4, -1) for plane in ("stokes", "stokes_errors"))
