@@ -15,6 +15,7 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.captured.screening import screened
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import PRIOR_WIDTH, minimize
@@ -35,7 +36,8 @@ def fit_of_the_truth(
     data = []
     for path in captures:
         with Capture(path) as capture:
-            data.append(read_capture(capture, model.at(capture.header.wavelength_nm)))
+            there = model.at(capture.header.wavelength_nm)
+            data.append(screened(read_capture(capture, there), there, lambda line: None))
     problem = InstrumentProblem(model.at(data[0].wavelength_nm), data)
     numbers = {path.stem: k for k, path in enumerate(captures)}
     wanted = {(f.kind, f.place, numbers.get(f.capture) if f.capture else None) for f in faults}

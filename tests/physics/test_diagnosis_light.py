@@ -59,21 +59,22 @@ def test_what_a_fit_leaves_of_the_optics_is_no_noise(configs, tmp_path):
 
 def test_pixels_at_an_edge_are_left_out_and_those_of_a_slope_are_not(configs, tmp_path):
     _, data = captured(tmp_path, configs, Bench(rows=SIDE, columns=SIDE))
+
+    def left(image):
+        return without_steep_pixels(replace(data, signal=np.broadcast_to(image, data.signal.shape).astype(np.float32)))
+
     across = np.broadcast_to(np.linspace(0.3, 0.6, SIDE), (SIDE, SIDE))
-    sloping = replace(data, signal=np.broadcast_to(across, data.signal.shape).astype(np.float32))
-    assert without_steep_pixels(sloping).usable.sum() == sloping.usable.sum()
-    edge = np.where(np.arange(SIDE) < 8, 0.1, across)
-    cut = without_steep_pixels(replace(data, signal=np.broadcast_to(edge, data.signal.shape).astype(np.float32)))
+    assert left(across).usable.sum() == data.usable.sum()
+    cut = left(np.where(np.arange(SIDE) < 8, 0.1, across))
     assert not cut.usable[:, 4:12].any()
-    assert cut.usable[:, :4].all()
-    assert cut.usable[:, 12:].all()
-    assert cut.steep.mean() == pytest.approx(8 / SIDE)
-    # A small object, all of it near its edge: a quarter is left, where it is flattest.
+    assert cut.usable[:, 14:].all()
+    assert np.array_equal(cut.steep, ~cut.usable)
+    # A small object before a dark wall: its inside, steep as it is, moves as it should.
     y, x = np.mgrid[:SIDE, :SIDE] - (SIDE - 1) / 2
-    hill = np.broadcast_to(np.exp(-(x**2 + y**2) / (SIDE / 3) ** 2), data.signal.shape).astype(np.float32)
-    left = without_steep_pixels(replace(data, signal=hill)).usable
-    assert left.mean() == pytest.approx(0.25, abs=0.05)
-    assert left[SIDE // 2, SIDE // 2]
-    # All edges: there is nothing else to look at.
-    stripes = np.broadcast_to(0.2 + 0.4 * (np.arange(SIDE) // 2 % 2), data.signal.shape).astype(np.float32)
-    assert without_steep_pixels(replace(data, signal=stripes)).usable.all()
+    hill = 0.01 + np.exp(-(x**2 + y**2) / (SIDE / 3) ** 2)
+    ball = left(np.where(np.hypot(x, y) < SIDE / 3, hill, 0.01)).usable
+    assert ball[np.hypot(x, y) < 2].all()
+    assert not ball[np.abs(np.hypot(x, y) - SIDE / 3) < 2].any()
+    # All edges: there is nothing else to look at than the flattest quarter.
+    stripes = 0.2 + 0.4 * np.arange(SIDE) / SIDE * (np.arange(SIDE) % 2)
+    assert left(stripes).usable.mean() == pytest.approx(0.25, abs=0.05)

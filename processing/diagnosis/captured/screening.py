@@ -18,7 +18,7 @@ from processing.diagnosis.captured.checked_noise import checked_noise
 from processing.diagnosis.captured.noise_estimate import estimated_noise
 from processing.diagnosis.captured.outliers import outliers_of, without
 from processing.diagnosis.captured.read_capture import without_dark_pixels
-from processing.diagnosis.captured.steep_pixels import without_steep_pixels, without_steep_squares
+from processing.diagnosis.captured.steep_pixels import without_steep_pixels
 from processing.instrument.applied_effects import changes_of
 from processing.instrument.model import InstrumentModel
 
@@ -61,7 +61,7 @@ def _as_fitted(data: CaptureData, say: Callable[[str], None]) -> CaptureData:
         return fitted
     # Again: rims are as wide as the derivatives of the image reach.
     dark = without_dark_pixels(fitted)
-    return without_steep_squares(replace(dark, dark_fraction=max(dark.dark_fraction, data.dark_fraction)))
+    return without_steep_pixels(replace(dark, dark_fraction=max(dark.dark_fraction, data.dark_fraction)))
 
 
 def rows_of(data: CaptureData, model: InstrumentModel) -> Array:

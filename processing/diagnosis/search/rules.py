@@ -51,11 +51,9 @@ FAINTEST = 5.0
 DARK_RIM = 4
 #: [standard deviations of the read-out] Below black, from which on counts of zero are cut off, not noise.
 CUT_OFF = 6.0
-#: [standard deviations of one intensity a pixel of way] Slope from which on there is an edge: an image that moves by a
-#: part of a pixel changes it by more than can be undone.
-STEEPEST = 15.0
-#: [pixels] Around an edge that are left out with it: image derivatives are taken over seven.
-EDGE_RIM = 3
+#: [standard deviations of one intensity] By which a pixel is another one after the image was moved by half a pixel and
+#: back, from which on it is at an edge: what an image that moves does there cannot be undone.
+LOST_BY_MOVING = 0.5
 #: [of the pixels] Near an edge that are left out at most; where the image is all edges the flattest pixels are kept.
 MOST_STEEP = 0.75
 #: [robust standard deviations] From which on an intensity is a hit: the largest of 10^9 normal ones is 6.1.
