@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from processing.diagnosis.instrument.guard import predicted_change, predicted_change_of_part
+from processing.diagnosis.instrument.doubts import OF_THE_SAMPLE, PART_OF_LEFT
+from processing.diagnosis.instrument.guard import NOTHING, chances, lasts, predicted_change, predicted_change_of_part
 from processing.diagnosis.instrument.least_change import least_change
 
 
@@ -58,3 +59,10 @@ def test_what_is_open_is_used_to_leave_m_as_it_is() -> None:
     assert moved is not None
     np.testing.assert_allclose(moved, [0.0, 0.1], atol=1e-3)
     assert least_change(mean, 0.01**2 * (known + open_), products) is None
+
+
+def test_beside_a_sample_that_changed_nothing_is_kept_for_later_captures() -> None:
+    assert lasts(NOTHING, [PART_OF_LEFT])
+    assert not lasts(NOTHING, [PART_OF_LEFT, OF_THE_SAMPLE])
+    told = [check.name for check in chances(NOTHING, NOTHING, lasting=False)]
+    assert told[-1].endswith("so it is written for these captures alone")

@@ -20,6 +20,9 @@ from processing.instrument.effects.base import FieldEffect, GeneralEffect, Point
 #: The reason for which values for each state are not used either, where an unknown sample takes up a part of them: what
 #: it takes up is then not like the rest, as it is with random values.
 PATTERN = "its values follow one wave or jump over the states, as a beat or a fringe does: they are not random"
+#: The reason for which nothing is written for later captures: the sample or its light changed, and what is found beside
+#: that may be a part of it.
+OF_THE_SAMPLE = "it differs from part to part of the image, which a source does not"
 #: The one reason that leaves a name likely.
 PART_OF_LEFT = "it may be a part of what is left unexplained"
 
@@ -42,7 +45,7 @@ def doubts(
         elif isinstance(first.effect, SourceEffect) and any(
             _uneven(problem, solved, c, cause) for c in cause.candidates
         ):
-            out[cause] = "it differs from part to part of the image, which a source does not"
+            out[cause] = OF_THE_SAMPLE
             uneven = max(uneven, cause.log_odds)
     for cause in causes:
         first = cause.candidates[0]

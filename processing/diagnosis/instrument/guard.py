@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from processing.arrays import Array
+from processing.diagnosis.instrument.doubts import OF_THE_SAMPLE
 from processing.diagnosis.instrument.mueller_slopes import mueller_slopes
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.systematic import ELEMENTS
@@ -162,13 +164,13 @@ def predicted_change(mean: Array, covariance: Array, products: Array) -> Predict
     return PredictedChange(float(np.sqrt(left + square)), float(np.sqrt(left)), size, stderr)
 
 
-def chances(here: PredictedChange, later: PredictedChange) -> tuple[Check, ...]:
+def chances(here: PredictedChange, later: PredictedChange, lasting: bool) -> tuple[Check, ...]:
     """Error of M as the posterior expects it, and the chance that it grows: an explanation may be too vague to use.
 
-    What is too vague for later captures is written for these alone, where it takes part in more.
+    What is too vague for later captures is written for these alone, where it takes part in more (`lasts`).
     """
     grows = "chance that the error of M/m00 grows"
-    alone = "" if lasts(later) else ", so it is written for these captures alone"
+    alone = "" if lasting else ", so it is written for these captures alone"
     return (
         Check(name="predicted error of M/m00, rms", before=here.before, after=here.after, holds=True),
         Check(name=grows, before=0.0, after=here.chance_worse, holds=here.chance_worse <= CHANCE_WORSE),
@@ -176,9 +178,12 @@ def chances(here: PredictedChange, later: PredictedChange) -> tuple[Check, ...]:
     )
 
 
-def lasts(later: PredictedChange) -> bool:
-    """Whether what belongs to the instrument may be used for later captures."""
-    return later.chance_worse <= CHANCE_WORSE
+def lasts(later: PredictedChange, reasons: Collection[str] = ()) -> bool:
+    """Whether what belongs to the instrument may be used for later captures; `reasons` for which names are doubted.
+
+    Where the sample changed, what is found of the instrument may be a part of that.
+    """
+    return later.chance_worse <= CHANCE_WORSE and OF_THE_SAMPLE not in reasons
 
 
 def refusal(found: tuple[Check, ...]) -> str | None:

@@ -106,7 +106,8 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
         found, solved = quiet, solution(bench, quiet, unfit)
         after = tuple(residual(asked, k, solved.space, solved.fit) for k in captures)
         here, later = predicted_changes(asked, found, solved)
-    guard, chance = checks(asked, solved), chances(here, later)
+    lasting = lasts(later, doubt.values())
+    guard, chance = checks(asked, solved), chances(here, later, lasting)
     refused = f"change this first: {wiring.told}" if wiring is not None else refusal((*guard, *chance))
     sure = [c for c in named if c.answer != "unknown" and c not in doubt]
     switched = told_switches(asked, solved)
@@ -125,7 +126,7 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
         unexplained = Unexplained(description=lines, tried=tried, empirical=empirical(found, solved))
     unseen = unobservable(bench.whole, found)
     correction_told = correction(
-        problem, found, solved, bool(named or untold or switched), (*guard, *chance), refused, lasts(later)
+        problem, found, solved, bool(named or untold or switched), (*guard, *chance), refused, lasting
     )
     kept = solved if refused is None else _nothing(solved)
     diagnosis = Diagnosis(

@@ -69,7 +69,7 @@ def test_worse(m: Patch) -> bool:
 
 def determined(size: float) -> bool:
     change = guard.PredictedChange(before=0.005, after=0.001, size=size, stderr=0.001)
-    return guard.refusal(guard.chances(change, change)) is None
+    return guard.refusal(guard.chances(change, change, lasting=True)) is None
 
 
 @decides
