@@ -57,6 +57,16 @@ def test_what_a_fit_leaves_of_the_optics_is_no_noise(configs, tmp_path):
     assert scatter_prefers(problem, Space(()), np.zeros(0), {offset: np.array([-400.0])}, {}) < -REFUTED
 
 
+@pytest.mark.parametrize("stated", [True, False])
+def test_noise_follows_the_light_unless_it_is_stated(configs, tmp_path, stated):
+    model, data = captured(tmp_path, configs, Bench(rows=SIDE, columns=SIDE, electrons=6000.0))
+    if stated:
+        data = replace(data, slope=np.zeros_like(data.slope), noise_source="stated per state")
+    problem = InstrumentProblem(model, [data], folds=1)
+    offset = next(c for c in problem.pool() if c.kind == "detector_offset")
+    assert problem.adopt_noise(Space((offset,)), np.array([400.0])) is not stated
+
+
 def test_pixels_at_an_edge_are_left_out_and_those_of_a_slope_are_not(configs, tmp_path):
     _, data = captured(tmp_path, configs, Bench(rows=SIDE, columns=SIDE))
 
