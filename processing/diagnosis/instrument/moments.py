@@ -63,7 +63,7 @@ class Tiles:
 
     Attributes
     ----------
-    s : (T, L, L); noise : (T, L); x, y : (T,) centres from -1 to 1; fold : (T,).
+    s : (T, L, L); noise : (T, L); x, y : (T,) where its light is, from -1 to 1; fold : (T,).
     index : (rows, columns) tile of each pixel; boxes : rows and columns of each tile.
     pick : (rows, columns) pixels that count; pixels : (T,) how many.
     """
@@ -218,22 +218,33 @@ def _divided(size: int, parts: int) -> tuple[NDArray[np.int64], list[slice], Arr
     """Which part each pixel of a side is in, the pixels of each part, and their mean place from -1 to 1."""
     number = (np.arange(size) * parts) // size
     ends = np.searchsorted(number, np.arange(parts + 1))
-    place = np.linspace(-1, 1, size) if size > 1 else np.zeros(1)
+    place = _places(size)
     slices = [slice(int(first), int(last)) for first, last in pairwise(ends)]
     return number, slices, np.array([place[part].mean() for part in slices])
+
+
+def _places(size: int) -> Array:
+    """Where each pixel of a side is, from -1 to 1."""
+    return np.linspace(-1, 1, size) if size > 1 else np.zeros(1)
 
 
 def _tiles(pixels: Pixels, pick: BoolArray, grid: _Grid, fold: NDArray[np.int64]) -> Tiles:
     rows, count = len(pixels.u), grid.x.size
     left = pixels.shared[:, 0, 0]
     s, noise, number = np.zeros((count, rows, rows)), np.zeros((count, rows)), np.zeros(count)
+    x, y = grid.x.copy(), grid.y.copy()
+    place_y, place_x = np.meshgrid(*(_places(size) for size in pick.shape), indexing="ij")
     for t, (down, across) in enumerate(grid.boxes):
         mine = pick[down, across]
         weight = 1 / pixels.scale[down, across][mine]
         part = pixels.u[:, down, across][:, mine] * np.sqrt(weight)
         s[t], number[t] = part @ part.T, weight.size
         noise[t] = pixels.variance(slice(None), down, across)[:, mine] @ weight * left
-    return Tiles(s, noise, grid.x, grid.y, fold, grid.index, grid.boxes, pick, number)
+        # Of a tile at the rim some pixels count, and of those the bright ones: its centre is not where they are.
+        light = np.sum(part**2, axis=0)
+        if light.any():
+            x[t], y[t] = (np.average(place[down, across][mine], weights=light) for place in (place_x, place_y))
+    return Tiles(s, noise, x, y, fold, grid.index, grid.boxes, pick, number)
 
 
 def _blocks(
