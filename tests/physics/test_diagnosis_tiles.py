@@ -56,7 +56,7 @@ def test_columns_of_every_tile_are_those_of_its_own_retardance(seen, elements):
 
 
 def test_a_tile_is_where_its_light_is():
-    """Pixels at the rim are not used; taken at its centre, the outermost tile made a map over the image 1.6 % too flat."""
+    """Pixels at the rim are not used: taken at its centre, the outermost tile made a map over the image too flat."""
     random = np.random.default_rng(4)
     signal = np.tile(random.uniform(0.2, 0.8, (2, 1, 1)), (1, 40, 40)) * np.linspace(1, 2, 40)
     tiles = moments_of(steady_capture(signal, 1e-3), FOLDS_OF_TILES).tiles
