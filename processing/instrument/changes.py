@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from processing.arrays import Array
 
@@ -26,6 +27,7 @@ class Conditions:
     elapsed : (N,), time since the middle of the capture over its whole length, -0.5 to 0.5; state number
         instead of time where the capture has no clock.
     full_scale : counts at the top of the detector's range.
+    run : (N,) number, from 0, of the run that took each state; the source may jump between them.
     """
 
     angles_deg: Mapping[str, Array]
@@ -33,6 +35,10 @@ class Conditions:
     channels: tuple[str, ...]
     elapsed: Array
     full_scale: float = 1.0
+    run: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, dtype=np.int64))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "run", np.broadcast_to(self.run, (self.states,)))
 
     @classmethod
     def of(cls, angles_deg: Mapping[str, Array], channels: tuple[str, ...] = ("camera",)) -> Conditions:

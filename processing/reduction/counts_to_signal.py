@@ -80,6 +80,12 @@ class Correction:
         lit = None if dark_from else lit_darks(capture)
         if lit is not None:
             warnings.append(f"{lit}. Subtracting them leaves no signal: take the capture again with the light shut off")
+        runs = np.unique(capture.run_of_states[_light(capture)]).size
+        if runs > 1:
+            warnings.append(
+                f"the states were taken in {runs} runs, between which the light may have jumped: `diagnose` tells "
+                "whether it did (source_jump), and `process reduce --instrument` with the file that it writes mends it"
+            )
         top = saturation(capture)
         flat = Flat.of(list(flat_from) or [capture], black, top)
         if flat is not None and flat.lost.any():

@@ -75,7 +75,8 @@ def capture_changes(capture: Capture, model: InstrumentModel, states: NDArray[np
     angles = {name: value[states] for name, value in capture.angles_deg.items()}
     channels = tuple(c.name for c in model.channels)
     when = elapsed(capture.column("host_time_s")[states], len(states))
-    conditions = Conditions(angles, len(states), channels, when, full_scale(capture, states))
+    top, run = full_scale(capture, states), capture.run_of_states[states]
+    conditions = Conditions(angles, len(states), channels, when, top, run)
     return changes_of(model, conditions, capture_name(capture))
 
 

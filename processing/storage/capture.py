@@ -286,6 +286,14 @@ class Capture(OpenH5):
             return segments_of(records, self.column("segment"))
 
     @cached_property
+    def run_of_states(self) -> NDArray[np.int64]:
+        """Number (states done,), from 0, of the run that took each state."""
+        run = np.zeros(len(self.done), dtype=np.int64)
+        for segment in self.segments:
+            run[segment.states] = segment.number
+        return run
+
+    @cached_property
     def closing(self) -> dict[str, Any]:
         """Closing record: end time, time ledger, stream statistics, messages; empty if not sealed."""
         with self._damage():

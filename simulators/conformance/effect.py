@@ -138,11 +138,12 @@ def require_bounds(parameters: tuple[Parameter, ...]) -> None:
 
 
 def small_capture(model: InstrumentModel) -> tuple[InstrumentModel, CaptureData]:
-    """24 states, 12 x 12 noisy pixels of a matrix near the identity; states come from both sides."""
+    """24 states of two runs, 12 x 12 noisy pixels of a matrix near the identity; states come from both sides."""
     random = np.random.default_rng(1)
     n = 24
     angles = {axis: np.sort(random.uniform(0, 360, n))[np.arange(n) ^ 1] for axis in model.axes}
-    conditions = Conditions(angles, n, tuple(c.name for c in model.channels), np.linspace(-0.5, 0.5, n), 4000.0)
+    names, when = tuple(c.name for c in model.channels), np.linspace(-0.5, 0.5, n)
+    conditions = Conditions(angles, n, names, when, 4000.0, np.arange(n) // 12)
     m = np.eye(4).reshape(16) + 0.1 * random.normal(size=(144, 16))
     signal = np.einsum("ncj,pj->ncp", model.rows(angles), m).reshape(n, -1, 12, 12) + 0.2
     signal += 0.003 * random.normal(size=signal.shape)

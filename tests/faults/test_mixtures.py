@@ -13,6 +13,7 @@ from acquisition.errors import Differs
 from acquisition.rig.config import load_rig
 from drivers.camera import CameraSettings
 from drivers.errors import DeviceError
+from processing.reduction.counts_to_signal import Correction
 from processing.reports.report import write_report
 from processing.storage.capture import Capture
 
@@ -161,6 +162,8 @@ def test_a_resume_is_a_recorded_segment_and_nothing_is_forgotten(run_with, tmp_p
         first, second = capture.segments
         closing = capture.closing
         assert [*first.states, *second.states] == list(range(19))
+        assert list(capture.run_of_states) == [0] * len(first.states) + [1] * len(second.states)
+        assert any("taken in 2 runs" in text for text in Correction.of(capture).warnings)
     assert (first.status, second.status) == ("failed", "complete")
     assert first.begun < first.ended <= second.begun < second.ended
     assert "process" in second.by

@@ -55,7 +55,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     data = CaptureData(
         name=f"{capture.header.title} ({capture.path.name})",
         signal=np.nan_to_num(raw / np.float32(top)),
-        conditions=Conditions(angles, len(states), names, when, top),
+        conditions=Conditions(angles, len(states), names, when, top, capture.run_of_states[states]),
         exposure=exposure,
         sample=None if kind == "unknown" else known_mueller(capture.header.sample).reshape(16),
         slope=np.zeros(len(states)),

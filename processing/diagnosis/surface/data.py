@@ -132,7 +132,7 @@ def read_surface(
         state_slope, state_floor = np.array([data.slope.mean() / n]), np.array([data.floor.mean() / n + dark])
         exposure = np.array([total / n])
         # A rig records the angles of its axes all the same.
-        conditions = replace(conditions, angles_deg={}, states=1, elapsed=np.zeros(1))
+        conditions = replace(conditions, angles_deg={}, states=1, elapsed=np.zeros(1), run=np.zeros(1, dtype=np.int64))
     y = states.reshape(-1, len(where)).T
     channels = signal.shape[1]
     share = np.tile(share, conditions.states)
