@@ -39,7 +39,8 @@ FITTABLE = {
     "t_min": (0.01, 0.0, np.inf),
     "ratio": (0.001, -np.inf, np.inf),
 }
-#: Fields that belong to a mount: by how much they differ from the file is the same at every wavelength.
+#: Fields that belong to a mount, where the instrument's `belongs_to` says nothing else: by how much they differ from the
+#: file is the same at every wavelength.
 MECHANICAL = ("azimuth_deg", "ratio")
 #: A residual above this part of the mean signal is no fit.
 POOR_FIT = 0.05
@@ -147,25 +148,13 @@ class Part:
         return np.asarray((self.data - shape[:, None] * throughput).reshape(-1) / np.mean(self.data))
 
 
-def fit_train(
-    model: InstrumentModel,
-    angles_deg: dict[str, NDArray[np.float64]],
-    signal: NDArray[np.float64],
-    sample: NDArray[np.float64],
-    free: Sequence[str],
-    exposure: NDArray[np.float64] | None = None,
-) -> Calibration:
-    """`fit_trains` of a single capture; for the parameters see `Part`."""
-    return fit_trains([Part(model, angles_deg, signal, sample, exposure)], free)[0]
-
-
 def fit_trains(parts: Sequence[Part], free: Sequence[str]) -> list[Calibration]:
     """Fit the free parameters to signals of known samples; the search starts from the values of the models.
 
     Parameters
     ----------
-    free : "element.field", fields as in FITTABLE. Those in MECHANICAL change by the same amount in all parts, the
-        others take a value of their own at each wavelength.
+    free : "element.field", fields as in FITTABLE. Those of a mount (MECHANICAL, or `belongs_to` of the instrument)
+        change by the same amount in all parts, the others take a value of their own at each wavelength.
 
     Returns
     -------
@@ -177,7 +166,7 @@ def fit_trains(parts: Sequence[Part], free: Sequence[str]) -> list[Calibration]:
     NotDetermined : the data leave a combination of parameters open; the message names them.
     """
     names = _checked(parts[0].model, free)
-    mounted = np.array([name.rpartition(".")[2] in MECHANICAL for name in names])
+    mounted = np.array([_is_mounted(parts[0].model, name) for name in names])
     # What is searched: a name with its wavelength, or for all of them.
     wanted = [
         [(name, None if shared else part.wavelength_nm) for name, shared in zip(names, mounted, strict=True)]
@@ -238,19 +227,17 @@ def fit_trains(parts: Sequence[Part], free: Sequence[str]) -> list[Calibration]:
     ]
 
 
-def calibrate(
-    capture: Capture, model: InstrumentModel, free: Sequence[str], rows: slice, columns: slice
-) -> Calibration:
-    """Fit to the region means of a capture of a known sample; see `fit_train`."""
-    return fit_trains([part_of(capture, model, rows, columns)], free)[0]
-
-
 def part_of(capture: Capture, model: InstrumentModel, rows: slice, columns: slice) -> Part:
     """The region means of a capture of a known sample, for `fit_trains`; `model` is at its wavelength."""
     sample = known_mueller(capture.header.sample)
     signal, states = region_means(capture, rows, columns)
     angles = {name: values[states] for name, values in capture.angles_deg.items()}
     return Part(model, angles, signal, sample, relative_exposure(capture, states), capture.header.wavelength_nm)
+
+
+def _is_mounted(model: InstrumentModel, name: str) -> bool:
+    rule = "mechanics" if name.rpartition(".")[2] in MECHANICAL else "wavelength"
+    return model.belongs_to.get(name, rule) == "mechanics"
 
 
 def write_fitted(source: Path, target: Path, fitted: Mapping[float, Calibration], note: str) -> None:
@@ -272,7 +259,7 @@ def write_fitted(source: Path, target: Path, fitted: Mapping[float, Calibration]
             node = _node(tree, element)
             digits = 1 - int(np.floor(np.log10(stderr))) if stderr > 0 else 6
             number = round(float(value), max(digits, 0))
-            if len(fitted) > 1 and field not in MECHANICAL and not isinstance(node.get(field), dict):
+            if len(fitted) > 1 and not _is_mounted(calibration.model, name) and not isinstance(node.get(field), dict):
                 node[field] = {}
             if isinstance(node.get(field), dict):
                 key = next((k for k in node[field] if abs(float(k) - wavelength_nm) < 0.5), wavelength_nm)

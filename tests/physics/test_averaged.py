@@ -4,20 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bench_capture import bench_capture, read
 from steady_capture import steady_capture
 
 from processing.diagnosis.captured.averaged import averaged
 from processing.diagnosis.captured.capture_data import SharedNoise
-from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.captured.steep_pixels import without_steep_pixels
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.space import Space
-from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import Sample
-from simulators.blind.suite import state_angles
-from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
+from simulators.blind.undeclared_captures import Bench
 
 SIGMA, SIDE = 2e-3, 3
 
@@ -63,17 +59,11 @@ def test_a_square_counts_if_all_its_pixels_do():
 @pytest.fixture(scope="module")
 def fitted(configs, tmp_path_factory):
     """Azimuth and image drift with their errors: of the pixels, and of means over them."""
-    path = tmp_path_factory.mktemp("averaged") / "capture.h5"
-    bench, random = Bench(rows=96, columns=96), np.random.default_rng(7)
+    bench = Bench(rows=96, columns=96)
     bench.oa += np.deg2rad(0.3)
     bench.shift.append(lambda k, a: (0.02 * k, -0.01 * k))
-    angles = state_angles(24, False, False)
-    counts = digitize(bench, expose(bench, Scene(random), angles), random)
-    text = (configs / "instruments/rgb950.yaml").read_text()
-    write_capture(path, bench, counts, angles, Sample(kind="unknown"), text)
-    model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
-    with Capture(path) as capture:
-        data = read_capture(capture, model)
+    file = configs / "instruments/rgb950.yaml"
+    model, data = read(bench_capture(tmp_path_factory.mktemp("averaged"), file, bench, states=24), file)
     found = []
     for each in (data, averaged(data, 2)):
         problem = InstrumentProblem(model, [each])

@@ -45,12 +45,16 @@ def captures(synthetic_capture, configs):
     return paths
 
 
-def test_mounts_are_shared_and_plates_are_not(captures, configs):
-    model = InstrumentModel.load(configs / "instruments/rgb950.yaml")
+def parts_of(captures, model):
     parts = []
     for path in captures:
         with Capture(path) as capture:
             parts.append(part_of(capture, model.at(capture.header.wavelength_nm), slice(None), slice(None)))
+    return parts
+
+
+def test_mounts_are_shared_and_plates_are_not(captures, configs):
+    parts = parts_of(captures, InstrumentModel.load(configs / "instruments/rgb950.yaml"))
     found = fit_trains(parts, FREE)
     for (nm, off), part, fit in zip(OFF_DEG.items(), parts, found, strict=True):
         nominal = {e.name: e for e in part.model.elements()}
@@ -59,6 +63,14 @@ def test_mounts_are_shared_and_plates_are_not(captures, configs):
         assert change[0] == pytest.approx(found[0].values[0] + 17.02, abs=1e-9)
     # Three captures know the mount better than one.
     assert found[0].stderr[0] < 0.75 * fit_trains(parts[:1], FREE)[0].stderr[0]
+
+
+def test_what_the_file_says_of_an_axis_that_turns_with_the_wavelength_holds(captures, configs):
+    model = InstrumentModel.load(configs / "instruments/rgb950.yaml")
+    declared = model.model_copy(update={"belongs_to": {"psg_retarder.azimuth_deg": "dispersion"}})
+    found = fit_trains(parts_of(captures, declared), FREE)
+    assert len({float(fit.values[0]) for fit in found}) == len(captures)
+    assert found[0].stderr[0] == pytest.approx(fit_trains(parts_of(captures[:1], model), FREE)[0].stderr[0], rel=0.1)
 
 
 def test_command_writes_all_wavelengths(captures, configs, tmp_path):

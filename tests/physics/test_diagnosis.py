@@ -6,6 +6,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from bench_capture import bench_capture
 
 from processing.commands import diagnose as cli
 from processing.diagnosis.captured.read_capture import read_capture
@@ -25,14 +26,7 @@ STATES = 40
 
 
 def capture(folder: Path, configs: Path, bench: Bench, air: bool, seed: int = 7) -> Path:
-    random = np.random.default_rng(seed)
-    scene = Scene(random, np.eye(4) if air else None)
-    angles = state_angles(STATES, bench.mosaic, bench.zigzag)
-    counts = digitize(bench, expose(bench, scene, angles), random)
-    path = folder / "capture.h5"
-    text = (configs / "instruments/rgb950.yaml").read_text()
-    write_capture(path, bench, counts, angles, Sample(kind="air" if air else "unknown"), text)
-    return path
+    return bench_capture(folder, configs / "instruments/rgb950.yaml", bench, air, STATES, seed)
 
 
 def diagnosed(path: Path, configs: Path) -> Diagnosis:

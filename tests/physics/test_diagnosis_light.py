@@ -4,31 +4,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bench_capture import bench_capture, read
 
-from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.captured.steep_pixels import without_steep_pixels
 from processing.diagnosis.instrument.noise_of_light import scatter_prefers
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.rules import REFUTED
 from processing.diagnosis.search.space import Space
-from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import Sample
-from simulators.blind.suite import state_angles
-from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
+from simulators.blind.undeclared_captures import Bench
 
 SIDE = 24
 
 
 def captured(folder, configs, bench):
     """An air capture as `diagnose` reads it."""
-    random = np.random.default_rng(4)
-    angles, file = state_angles(40, False, False), configs / "instruments/rgb950.yaml"
-    counts = digitize(bench, expose(bench, Scene(random, np.eye(4)), angles), random)
-    write_capture(folder / "air.h5", bench, counts, angles, Sample(kind="air"), file.read_text())
-    model = InstrumentModel.load(file).at(662)
-    with Capture(folder / "air.h5") as capture:
-        return model, read_capture(capture, model)
+    file = configs / "instruments/rgb950.yaml"
+    return read(bench_capture(folder, file, bench, air=True, seed=4), file)
 
 
 @pytest.mark.parametrize("leaks", [True, False])

@@ -4,33 +4,23 @@ from collections import defaultdict
 
 import numpy as np
 import pytest
+from bench_capture import bench_capture, read
 from steady_capture import steady_capture
 
-from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.instrument.features import FEATURES
 from processing.diagnosis.instrument.moments import FOLDS_OF_TILES, features_of_tiles, moments_of
 from processing.diagnosis.instrument.projection import add_block
 from processing.diagnosis.instrument.tile_sums import add_tiles, tile_columns
 from processing.diagnosis.search.space import Sums
 from processing.instrument.changes import Changes, field_terms
-from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import Sample
-from simulators.blind.suite import state_angles
-from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
+from simulators.blind.undeclared_captures import Bench
 
 
 @pytest.fixture(scope="module")
 def seen(configs, tmp_path_factory):
-    path = tmp_path_factory.mktemp("tiles") / "capture.h5"
-    bench, random = Bench(rows=32, columns=32), np.random.default_rng(3)
-    angles = state_angles(40, False, False)
-    counts = digitize(bench, expose(bench, Scene(random), angles), random)
-    text = (configs / "instruments/rgb950.yaml").read_text()
-    write_capture(path, bench, counts, angles, Sample(kind="unknown"), text)
-    model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
-    with Capture(path) as capture:
-        data = read_capture(capture, model)
+    file = configs / "instruments/rgb950.yaml"
+    path = bench_capture(tmp_path_factory.mktemp("tiles"), file, Bench(rows=32, columns=32), seed=3)
+    model, data = read(path, file)
     return model, data, moments_of(data, FOLDS_OF_TILES)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processing.calibration.train import calibrate
+from processing.calibration.train import fit_trains, part_of
 from processing.diagnosis.instrument.run import diagnose_captures
 from processing.errors import NotDetermined, ProcessError
 from processing.instrument.determined import determined_basis, determined_elements
@@ -228,7 +228,8 @@ def test_a_known_sample_calibrates_the_train(name, synthetic_capture, configs):
         counts, angles, sample=sample, detector=detector, mosaic=nominal.mosaic, instrument_yaml=dump_yaml(nominal)
     )
     with Capture(path, by_super_pixel=True) as capture:
-        found = calibrate(capture, nominal, [f"{element}.azimuth_deg"], slice(None), slice(None))
+        part = part_of(capture, nominal, slice(None), slice(None))
+    (found,) = fit_trains([part], [f"{element}.azimuth_deg"])
     assert found.values[0] == pytest.approx(1.5, abs=5 * found.stderr[0])
     assert found.stderr[0] < 0.1
 
@@ -238,8 +239,10 @@ def test_a_sample_that_does_not_see_the_train_does_not_calibrate_it(synthetic_ca
     nominal = InstrumentModel.load(configs / "instruments/rotating_retarder_stokes.yaml")
     frames = np.full((8, 1, 8, 8), 5000, dtype=np.uint16)
     path = synthetic_capture(frames, {"psa": 22.5 * np.arange(8)}, sample={"kind": "air"})
-    with Capture(path) as capture, pytest.raises(NotDetermined, match="do not tell apart"):
-        calibrate(capture, nominal, ["psa_retarder.azimuth_deg"], slice(None), slice(None))
+    with Capture(path) as capture:
+        part = part_of(capture, nominal, slice(None), slice(None))
+    with pytest.raises(NotDetermined, match="do not tell apart"):
+        fit_trains([part], ["psa_retarder.azimuth_deg"])
 
 
 def test_as_many_states_as_unknowns_leave_nothing_to_diagnose(noisy):

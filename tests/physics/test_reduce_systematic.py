@@ -3,14 +3,13 @@
 import h5py
 import numpy as np
 import pytest
+from bench_capture import bench_capture
 
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel, SystematicError
 from processing.reduction.mueller import reduce_mueller
 from processing.storage.capture import Capture
-from processing.storage.capture_schema import Sample
 from processing.storage.product import Step
-from simulators.blind.suite import state_angles
-from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
+from simulators.blind.undeclared_captures import Bench
 
 
 def uncertain(kind: str, element: str | None, **values: float) -> SystematicError:
@@ -22,13 +21,8 @@ def uncertain(kind: str, element: str | None, **values: float) -> SystematicErro
 @pytest.fixture
 def air(configs, tmp_path):
     """Air through a generator retarder of 1 degree more than declared."""
-    random, bench = np.random.default_rng(2), Bench(rows=16, columns=16, dg=np.deg2rad(128.12))
-    angles = state_angles(40, False, False)
-    path = tmp_path / "air.h5"
-    counts = digitize(bench, expose(bench, Scene(random, np.eye(4)), angles), random)
-    text = (configs / "instruments/rgb950.yaml").read_text()
-    write_capture(path, bench, counts, angles, Sample(kind="air"), text)
-    return path
+    bench = Bench(rows=16, columns=16, dg=np.deg2rad(128.12))
+    return bench_capture(tmp_path, configs / "instruments/rgb950.yaml", bench, air=True, seed=2)
 
 
 def reduced(air, model, out):

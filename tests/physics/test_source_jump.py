@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
+from bench_capture import bench_capture
 
 from processing.diagnosis.instrument.run import diagnose_captures
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture import Capture
-from processing.storage.capture_schema import Sample
-from simulators.blind.suite import state_angles
-from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
+from simulators.blind.undeclared_captures import Bench
 
 STATES, RESUMED = 40, 22
 
@@ -16,18 +15,13 @@ STATES, RESUMED = 40, 22
 @pytest.mark.parametrize("air", [True, False])
 @pytest.mark.parametrize("fraction", [-0.04, 0.0])
 def test_a_jump_between_two_runs_is_found_and_none_where_there_is_none(configs, tmp_path, monkeypatch, air, fraction):
-    bench, random = Bench(rows=16, columns=16), np.random.default_rng(11)
+    bench, file = Bench(rows=16, columns=16), configs / "instruments/rgb950.yaml"
     bench.level.append(lambda k, a: 1 + fraction * (k >= RESUMED))
-    angles = state_angles(STATES, False, False)
-    counts = digitize(bench, expose(bench, Scene(random, np.eye(4) if air else None), angles), random)
-    file = configs / "instruments/rgb950.yaml"
-    write_capture(
-        tmp_path / "capture.h5", bench, counts, angles, Sample(kind="air" if air else "unknown"), file.read_text()
-    )
-    with Capture(tmp_path / "capture.h5") as capture:
+    path = bench_capture(tmp_path, file, bench, air, STATES, seed=11)
+    with Capture(path) as capture:
         resumed = (np.arange(len(capture.done)) >= len(capture.done) - STATES + RESUMED).astype(np.int64)
     monkeypatch.setattr(Capture, "run_of_states", resumed)
-    found = diagnose_captures([tmp_path / "capture.h5"], InstrumentModel.load(file))[0].diagnosis
+    found = diagnose_captures([path], InstrumentModel.load(file))[0].diagnosis
     if fraction:
         assert found.verdict == "explained"
         assert [e.kind for e in found.effects if e.confident] == ["source_jump"]

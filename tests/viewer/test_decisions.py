@@ -13,6 +13,22 @@ from viewer.diagnoses import Diagnoses
 from viewer.library import Library, NotHere
 
 ORIGIN = {"origin": "http://127.0.0.1:8000"}
+ERROR = Error(rms_percent=2.0, chi2_reduced=1.5, held_out="every other tile")
+#: What every verdict here says.
+FOUND = {
+    "verdict": "explained",
+    "error_before": ERROR,
+    "error_after": ERROR,
+    "noise_floor_percent": None,
+    "unobservable": (),
+    "unexplained": None,
+    "calibrated": {},
+    "ranking": (),
+    "captures": (),
+    "instrument": "RGB950",
+    "wavelengths_nm": (662.0,),
+    "simulated": True,
+}
 
 
 @pytest.fixture
@@ -20,25 +36,13 @@ def diagnosed(lab, drr_capture):
     """A diagnosis that has found a rotated analyzer, as its command would have left it; returns its name."""
     diagnoses = Diagnoses(Library(lab))
     name, folder = diagnoses.begin([drr_capture("one.h5")], None)
-    error = Error(rms_percent=2.0, chi2_reduced=1.5, held_out="every other tile")
     effect = AppliedEffect.model_validate(
         {"kind": "psa_azimuth", "element": "psa_retarder", "parameters": {"azimuth": {"value": 0.5, "unit": "degree"}}}
     )
     found = Diagnosis(
-        verdict="explained",
-        error_before=error,
-        error_after=error,
-        noise_floor_percent=None,
+        **FOUND,
         effects=(),
-        unobservable=(),
         recommendation="Capture <b>air</b>.",
-        unexplained=None,
-        calibrated={},
-        ranking=(),
-        captures=(),
-        instrument="RGB950",
-        wavelengths_nm=(662.0,),
-        simulated=True,
         correction=Correction(effects=(effect,)),
     )
     (folder / "diagnosis.json").write_text(found.model_dump_json())
@@ -121,7 +125,6 @@ def surface_diagnosed(lab, drr_capture, configs):
     diagnoses = Diagnoses(Library(lab))
     surface = (configs / "materials/red_print.yaml", configs / "geometries/one_inch_sphere.yaml")
     name, folder = diagnoses.begin([drr_capture("one.h5")], None, surface)
-    error = Error(rms_percent=2.0, chi2_reduced=1.5, held_out="every other tile")
     found = {"evidence": 900.0, "indistinguishable_from": (), "scope": "instrument", "removal_chance": 0.0}
     arm = {"arm": {"value": 0.7, "unit": "degree"}}
     effects = (
@@ -129,20 +132,9 @@ def surface_diagnosed(lab, drr_capture, configs):
         FoundEffect(kind="refractive_index", element=None, parameters={}, confident=True, **found),
     )
     diagnosis = SurfaceDiagnosis(
-        verdict="explained",
-        error_before=error,
-        error_after=error,
-        noise_floor_percent=None,
+        **FOUND,
         effects=effects,
-        unobservable=(),
         recommendation="",
-        unexplained=None,
-        calibrated={},
-        ranking=(),
-        captures=(),
-        instrument="RGB950",
-        wavelengths_nm=(662.0,),
-        simulated=True,
         material="red 3D print",
         constants={"n": 1.4, "k": 0.1, "a": 0.2, "b": 2.0},
         quantities_before=(),

@@ -1,0 +1,30 @@
+"""Captures of a bench made by other physics than the model's, as a file and as `diagnose` reads it."""
+
+from pathlib import Path
+
+import numpy as np
+
+from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captured.read_capture import read_capture
+from processing.instrument.model import InstrumentModel
+from processing.storage.capture import Capture
+from processing.storage.capture_schema import Sample
+from simulators.blind.suite import state_angles
+from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
+
+
+def bench_capture(folder: Path, file: Path, bench: Bench, air: bool = False, states: int = 40, seed: int = 7) -> Path:
+    """A capture file of so many states of the instrument `file`: of air, which it tells, or of an unknown sample."""
+    random = np.random.default_rng(seed)
+    angles = state_angles(states, bench.mosaic, bench.zigzag)
+    counts = digitize(bench, expose(bench, Scene(random, np.eye(4) if air else None), angles), random)
+    path = folder / "capture.h5"
+    write_capture(path, bench, counts, angles, Sample(kind="air" if air else "unknown"), file.read_text())
+    return path
+
+
+def read(path: Path, file: Path) -> tuple[InstrumentModel, CaptureData]:
+    """The instrument at 662 nm, and the capture as `diagnose` reads it."""
+    model = InstrumentModel.load(file).at(662)
+    with Capture(path) as capture:
+        return model, read_capture(capture, model)
