@@ -17,7 +17,8 @@ from processing.errors import NotDetermined, ProcessError
 from processing.instrument.model import InstrumentModel
 from processing.reduction.counts_to_signal import BlockReader, Correction
 from processing.reduction.mosaic.layout import MosaicLayout
-from processing.reduction.mueller import relative_exposure, sample_states
+from processing.reduction.mueller import relative_exposure
+from processing.reduction.sample_states import sample_states
 from processing.reduction.solvers.inversion import multiply_tiles
 from processing.storage.capture import Capture
 from processing.storage.pixel_mask import Mask

@@ -25,7 +25,8 @@ from processing.instrument.model import Element, InstrumentModel
 from processing.polarization import mueller
 from processing.reduction.counts_to_signal import Correction
 from processing.reduction.flat import FEW
-from processing.reduction.mueller import relative_exposure, sample_states
+from processing.reduction.mueller import relative_exposure
+from processing.reduction.sample_states import sample_states
 from processing.storage.capture import Capture
 from processing.storage.capture_schema import Sample
 
@@ -39,7 +40,7 @@ FITTABLE = {
     "t_min": (0.01, 0.0, np.inf),
     "ratio": (0.001, -np.inf, np.inf),
 }
-#: Fields that belong to a mount, where the instrument's `belongs_to` says nothing else: by how much they differ from the
+#: Fields that belong to a mount, unless the instrument's `belongs_to` says otherwise: by how much they differ from the
 #: file is the same at every wavelength.
 MECHANICAL = ("azimuth_deg", "ratio")
 #: A residual above this part of the mean signal is no fit.

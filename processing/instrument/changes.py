@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,6 +100,27 @@ class Changes:
     def __post_init__(self) -> None:
         self.gain = np.ones((self.conditions.states, len(self.conditions.channels)))
         self.shift_px = np.zeros((self.conditions.states, 2))
+
+    def of_states(self, chosen: NDArray[np.int64]) -> Changes:
+        """The same for some of the states, by their positions."""
+        states, c = self.conditions.states, self.conditions
+
+        def among(x: Array) -> Array:
+            return x[chosen] if np.ndim(x) and len(x) == states else x
+
+        out = copy(self)
+        out.conditions = replace(
+            c,
+            angles_deg={axis: angle[chosen] for axis, angle in c.angles_deg.items()},
+            states=len(chosen),
+            elapsed=c.elapsed[chosen],
+            run=c.run[chosen],
+        )
+        out.gain, out.shift_px = self.gain[chosen], self.shift_px[chosen]
+        for name in ("azimuth_rad", "retardance_rad", "response"):
+            of_all = getattr(self, name)
+            setattr(out, name, defaultdict(of_all.default_factory, {key: among(x) for key, x in of_all.items()}))
+        return out
 
     def key(self, element: str, azimuth_rad: Array) -> tuple[str, bytes]:
         """What the Mueller matrices of an element depend on, its own values left out."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from processing.instrument.applied_effects import changes_of
 from processing.instrument.changes import Changes, Conditions, elapsed, field_terms
 from processing.instrument.model import InstrumentModel
+from processing.reduction.sample_states import states_of_sample
 from processing.storage.capture import Capture
 
 #: Signals below this part of full scale have the logarithm of this.
@@ -72,12 +73,15 @@ def capture_changes(capture: Capture, model: InstrumentModel, states: NDArray[np
     """
     if not model.effects:
         return None
-    angles = {name: value[states] for name, value in capture.angles_deg.items()}
+    # An effect counts the states of the sample as `diagnose` saw them, also where some of them are left out here.
+    of_sample = states_of_sample(capture)
+    seen = of_sample if np.isin(states, of_sample).all() else states
+    angles = {name: value[seen] for name, value in capture.angles_deg.items()}
     channels = tuple(c.name for c in model.channels)
-    when = elapsed(capture.column("host_time_s")[states], len(states))
-    top, run = full_scale(capture, states), capture.run_of_states[states]
-    conditions = Conditions(angles, len(states), channels, when, top, run)
-    return changes_of(model, conditions, capture_name(capture))
+    when = elapsed(capture.column("host_time_s")[seen], len(seen))
+    top, run = full_scale(capture, seen), capture.run_of_states[seen]
+    conditions = Conditions(angles, len(seen), channels, when, top, run)
+    return changes_of(model, conditions, capture_name(capture)).of_states(np.searchsorted(seen, states))
 
 
 def extra_retardance(changes: Changes, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -31,6 +31,7 @@ from processing.reduction.effects_of_capture import (
 from processing.reduction.facts import mueller_facts
 from processing.reduction.left_out import LeftOut
 from processing.reduction.noise import NoiseModel, noise_of
+from processing.reduction.sample_states import sample_states
 from processing.reduction.sent_light import PLANES as SENT_PLANES
 from processing.reduction.sent_light import SentLight
 from processing.reduction.solvers.field import Field, FieldSolver
@@ -113,16 +114,6 @@ class Choice:
         if self.physical:
             planes["mueller_physical"] = PHYSICAL[self.physical]
         return planes
-
-
-def sample_states(capture: Capture) -> NDArray[np.int64]:
-    """Positions (states,) of the states that look at the sample, or at air where a capture has no others."""
-    states = capture.states_with("sample")
-    if states.size == 0:
-        states = capture.states_with("air")
-    if states.size == 0:
-        raise CaptureError(f"{capture.path} has no state of the sample that is done; there is nothing to reduce.")
-    return states
 
 
 def angles_of(capture: Capture, model: InstrumentModel, states: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:

@@ -22,8 +22,9 @@ from processing.reduction.mosaic.merge import MergedFrame, merge
 from processing.reduction.mosaic.methods import demosaic
 from processing.reduction.mosaic.noise import neighbour_correlation, stokes_covariance
 from processing.reduction.mosaic.pixel_response import corrected_frame
-from processing.reduction.mueller import Progress, sample_states
+from processing.reduction.mueller import Progress
 from processing.reduction.noise import NoiseModel
+from processing.reduction.sample_states import sample_states
 from processing.storage.capture import Capture, CaptureError
 from processing.storage.pixel_mask import Mask
 from processing.storage.product import LIT_ERRORS, Plane, ProductWriter, Step

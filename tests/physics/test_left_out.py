@@ -10,7 +10,7 @@ from processing.diagnosis.captured import averaged
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.captured.screening import screened
-from processing.instrument.model import InstrumentModel
+from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
 from processing.reduction.left_out import LeftOut
 from processing.reduction.mueller import reduce_mueller
 from processing.steps.reduction import Reduction
@@ -198,3 +198,28 @@ def test_stokes_of_a_mosaic_leave_out_states_and_struck_pixels(synthetic_capture
     np.testing.assert_array_equal(mask == Mask.BAD, lost)
     np.testing.assert_array_equal(np.isnan(s0), lost)
     assert np.ptp(s0[~lost]) < 1e-3 * s0[~lost].mean()
+
+
+def test_effects_count_the_states_that_a_diagnosis_saw(configs, tmp_path):
+    """A slip from state 9 on, a level of the source in each state: without state 4 they stay where they are."""
+    gains = 0.05 * np.random.default_rng(1).standard_normal(STATES)
+    bench = Bench(rows=8, columns=8)
+    bench.angles.append(lambda k, a: a | {"psg": a["psg"] + np.deg2rad(2.0) * (k >= 9)})
+    bench.level.append(lambda k, a: 1 + gains[k])
+    path = taken(tmp_path, configs, bench, 5, air=True)
+    slip, flicker = (
+        AppliedEffect(kind=kind, element=element, parameters={name: EffectParameter(value=value, unit="1")})
+        for kind, element, name, value in (
+            ("rotation_slip", "psg@9", "slip", 2.0),
+            ("source_flicker", None, "states", tuple(gains.tolist())),
+        )
+    )
+    model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
+    told = model.model_copy(update={"effects": (slip, flicker)})
+    errors = []
+    for left_out in (LeftOut(), LeftOut(states=(4,))):
+        with Capture(path) as capture:
+            reduce_mueller(capture, told, tmp_path / "m.h5", (), left_out=left_out, overwrite=True)
+        image = MuellerImage.load(tmp_path / "m.h5")
+        errors.append(mean_error(image, image.mask == 0))
+    assert errors[1] == pytest.approx(errors[0], abs=1e-3)

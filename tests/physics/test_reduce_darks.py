@@ -10,8 +10,9 @@ from processing.reduction.black import Black
 from processing.reduction.counts_to_signal import Correction
 from processing.reduction.mosaic.layout import MosaicLayout
 from processing.reduction.mosaic.merge import merge
-from processing.reduction.mueller import Choice, reduce_mueller, sample_states
+from processing.reduction.mueller import Choice, reduce_mueller
 from processing.reduction.noise import NoiseModel
+from processing.reduction.sample_states import sample_states
 from processing.reduction.stokes import reduce_stokes
 from processing.storage.capture import Capture, CaptureError
 from processing.storage.images import MuellerImage

@@ -15,8 +15,9 @@ from processing.diagnosis.search.rules import DARK_RIM, FAINTEST
 from processing.instrument.changes import Conditions, elapsed
 from processing.instrument.model import InstrumentModel
 from processing.reduction.counts_to_signal import Correction
-from processing.reduction.mueller import angles_of, relative_exposure, sample_states
+from processing.reduction.mueller import angles_of, relative_exposure
 from processing.reduction.noise import NoiseModel
+from processing.reduction.sample_states import sample_states
 from processing.storage.capture import Capture, CaptureError
 
 #: A state is left out if more than this share of its pixels is cut off.

@@ -19,8 +19,8 @@ from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.changes import Conditions
 from processing.instrument.model import InstrumentModel
 from processing.reduction.counts_to_signal import Correction
-from processing.reduction.mueller import sample_states
 from processing.reduction.noise import NoiseModel
+from processing.reduction.sample_states import sample_states
 from processing.reflectance.base import ReflectanceModel
 from processing.storage.capture import Capture
 
