@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.io
 
-from processing.calibration.train import calibrate
+from processing.calibration.train import fit_trains, part_of
 from processing.instrument.model import InstrumentModel
 from processing.reduction.mueller import reduce_mueller
 from processing.storage.capture import Capture
@@ -77,7 +77,7 @@ def test_mirror_gives_the_train(shared_data: Path, configs: Path, tmp_path: Path
     model = InstrumentModel.load(configs / "instruments/drr_imaging_630nm.yaml").at(630)
     with Capture(path) as capture:
         assert len(capture.role) == 512
-        result = calibrate(capture, model, FREE, slice(150, 330), slice(150, 490))
+        result = fit_trains([part_of(capture, model, slice(150, 330), slice(150, 490))], FREE)[0]
     found = dict(zip(result.names, result.values, strict=True))
     assert found["psg_retarder.retardance_deg"] == pytest.approx(72.4, abs=0.1)
     assert found["psa_retarder.retardance_deg"] == pytest.approx(72.4, abs=0.1)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processing.calibration.train import calibrate
+from processing.calibration.train import fit_trains, part_of
 from processing.instrument.model import InstrumentModel
 from processing.reduction.mueller import reduce_mueller
 from processing.storage.capture import Capture
@@ -53,7 +53,8 @@ def test_two_channels_a_state(wavelength: int, shared_data: Path, configs: Path,
         # The nominal file has the polarizer at 0; the fit finds it across, from another start than the nominal one.
         model = InstrumentModel.load(instrument).at(wavelength)
         free = [f"{e}.{f}" for e in ("psg_retarder", "psa_retarder") for f in ("retardance_deg", "azimuth_deg")]
-        fitted = calibrate(capture, model, [*free, "psg_polarizer.azimuth_deg"], slice(0, 1), slice(0, 1))
+        part = part_of(capture, model, slice(0, 1), slice(0, 1))
+        fitted = fit_trains([part], [*free, "psg_polarizer.azimuth_deg"])[0]
     assert fitted.residual_over_mean < 0.03
     assert abs(abs(fitted.model.generator[0].azimuth_deg % 180) - 90) < 5
     with Capture(tmp_path / "sample.h5") as capture:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processing.calibration.train import calibrate
+from processing.calibration.train import fit_trains, part_of
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
 from processing.reduction.black import Black
@@ -153,7 +153,8 @@ def test_calibration_leaves_out_exposures_that_saturate(synthetic_capture, confi
     with Capture(path) as capture:
         frames = np.stack([capture.frames(k) for k in range(8, 88)])
         assert 0.2 < np.mean(frames >= 4095 - 64) < 0.5
-        found = calibrate(capture, off, ["psg_retarder.retardance_deg"], slice(None), slice(None))
+        part = part_of(capture, off, slice(None), slice(None))
+        found = fit_trains([part], ["psg_retarder.retardance_deg"])[0]
     truth = next(e for e in model.at(662).elements() if e.name == "psg_retarder").retardance_deg
     assert found.values[0] == pytest.approx(truth, abs=5 * found.stderr[0] + 0.01)
     assert found.residual_over_mean < 1e-3
