@@ -103,8 +103,15 @@ def _then(function, act):
 
 def test_a_disc_that_comes_back_is_waited_for(run_with, intact, monkeypatch):
     monkeypatch.setattr(writer, "PATIENCE_S", 0.1)
-    _failing_at(monkeypatch, 5, lambda: time.sleep(0.5))
-    error, path = run_with(plan=SHORT)
+    back = threading.Event()
+
+    class Told(Observer):
+        def warning(self, text):
+            if "the disc takes no data" in text:
+                back.set()
+
+    _failing_at(monkeypatch, 5, lambda: back.wait(60))
+    error, path = run_with(plan=SHORT, observers=(Told(),))
     assert error is None
     assert intact(path) == 19
     with Capture(path) as capture:
