@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 
+import h5py
 import numpy as np
 import pytest
 from bluesky import RunEngine
@@ -13,6 +14,7 @@ from bluesky.protocols import Movable, Pausable, Readable, Triggerable
 from bluesky.utils import FailedStatus, RunEngineInterrupted
 
 from acquisition.bluesky_devices import open_bench
+from acquisition.bluesky_devices.capture_device import COLUMNS
 from acquisition.capture.plan import MeasurementPlan
 from processing.storage.capture import Capture
 
@@ -74,21 +76,7 @@ def test_a_capture_of_40_states_is_paused_and_resumed(bench, engine, tmp_path):
     device = bench.capture(PLAN, tmp_path / "captures")
     assert isinstance(device, Pausable)
 
-    def pause() -> None:
-        # Once states are in the file, so that there is something to go on with.
-        while not any(_states(path) >= 5 for path in (tmp_path / "captures").glob("*.partial")):
-            time.sleep(0.002)
-        run.request_pause()
-
-    thread = threading.Thread(target=pause)
-    thread.start()
-    with pytest.raises(RunEngineInterrupted):
-        run(count([device]))
-    thread.join()
-    (half,) = (tmp_path / "captures").glob("*.h5*")
-    with Capture(half) as capture:
-        assert capture.status == "aborted"
-        assert 5 <= len(capture.done) < capture.planned_states
+    _paused(run, device, tmp_path / "captures")
     run.resume()
     (event,) = _events(documents)
     with Capture(event["capture_file"]) as capture:
@@ -107,11 +95,62 @@ def test_a_capture_of_40_states_is_paused_and_resumed(bench, engine, tmp_path):
     assert len(list((tmp_path / "captures").glob("*.h5"))) == 2
 
 
-def _states(path) -> int:
-    import h5py
+@pytest.mark.third_party
+@pytest.mark.filterwarnings("ignore")
+def test_tiled_reads_a_capture_back_that_was_paused_and_resumed(bench, engine, tmp_path):
+    # Not in CI: Tiled and its server are 69 packages more (tests/third_party/more_clients.txt).
+    tiled = pytest.importorskip("tiled.client")
+    server = pytest.importorskip("tiled.server.simple")
+    writer = pytest.importorskip("bluesky.callbacks.tiled_writer")
+    run, documents = engine
+    captures = tmp_path / "captures"
+    with (
+        server.SimpleTiledServer(tmp_path / "tiled", readable_storage=[captures]) as served,
+        tiled.Context.from_any_uri(served.uri)[0] as context,
+    ):
+        client = tiled.from_context(context)
+        run.subscribe(writer.TiledWriter(client))
+        device = bench.capture(PLAN, captures)
+        _paused(run, device, captures)
+        (uid,) = run.resume()
+        stream = client[uid]["primary"]
+        (event,) = _events(documents)
+        assert list(stream["capture_file"].read()) == [event["capture_file"]]
+        with h5py.File(event["capture_file"]) as file:
+            frames = file["entry/instrument/detector/data"][...]
+        assert frames.shape == (44, 1, 24, 32)
+        _assert_same(stream["capture_frames"].read(), frames)
+        with Capture(event["capture_file"]) as capture:
+            written = {f"{axis}_deg": angles for axis, angles in capture.angles_deg.items()}
+            written |= {name: capture.column(name) for name in COLUMNS}
+        for name, values in written.items():
+            _assert_same(stream[f"capture_{name}"].read()[0], values)
 
-    try:
-        with h5py.File(path, "r", locking=False) as file:
-            return int(np.count_nonzero(file["entry/states/done"][...]))
-    except (OSError, KeyError, RuntimeError):
-        return 0
+
+def _assert_same(read, written) -> None:
+    """Type, shape and every value."""
+    assert read.dtype == written.dtype
+    np.testing.assert_array_equal(read, written)
+
+
+def _paused(run, device, folder) -> None:
+    """Begin a capture, and interrupt it while it moves to its seventh state."""
+    wait, moves = device.rig.wait, 0
+
+    def wait_and_pause(motions):
+        nonlocal moves
+        moves += 1
+        if moves == 7:
+            # The RunEngine answers once the state has ended, so not in the thread that takes it.
+            threading.Thread(target=run.request_pause).start()
+            while not device._stop.requested:
+                time.sleep(0.001)
+        return wait(motions)
+
+    device.rig.wait = wait_and_pause
+    with pytest.raises(RunEngineInterrupted):
+        run(count([device]))
+    (half,) = folder.glob("*.h5*")
+    with Capture(half) as capture:
+        assert capture.status == "aborted"
+        assert 5 <= len(capture.done) < capture.planned_states
