@@ -1,152 +1,116 @@
-"""Fit parameters of an instrument's trains to a capture of a known sample.
+"""Fit parameters of an instrument's trains to captures of known samples, by nonlinear least squares.
 
-The sample is known up to one throughput for each pixel, so the throughput is eliminated: for every trial of the
-parameters it has its least-squares value (variable projection), and only the train's parameters are searched. Captures
-at several wavelengths are fitted at once: what a mount does is the same in all of them, what a plate does is not.
+Captures at several wavelengths are fitted at once: what a mount does is the same in all of them; what a plate does is
+not, or follows a smooth curve.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from io import StringIO
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
-from scipy.optimize import least_squares
+from scipy.optimize import approx_fprime, least_squares
+from scipy.stats import f as f_distribution
 
-from processing.errors import NotDetermined, ProcessError
-from processing.instrument.applied_effects import changes_at
-from processing.instrument.model import Element, InstrumentModel
-from processing.polarization import mueller
-from processing.reduction.counts_to_signal import Correction
-from processing.reduction.flat import FEW
-from processing.reduction.mueller import relative_exposure
-from processing.reduction.sample_states import sample_states
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import Sample
+from processing.calibration.known_sample import CalibrationError, Part
+from processing.calibration.train_values import FITTABLE, TrainValues, checked_names, values_of, with_values
+from processing.calibration.wavenumber_curve import WavenumberCurve
+from processing.errors import NotDetermined
+from processing.instrument.model import InstrumentModel
 
-#: Fields of an element that can be fitted, with the size of a sensible step and the bounds.
-FITTABLE = {
-    "azimuth_deg": (1.0, -np.inf, np.inf),
-    "retardance_deg": (1.0, -np.inf, np.inf),
-    "extinction": (0.01, 0.0, 1.0),
-    "diattenuation": (0.01, -1.0, 1.0),
-    "t_max": (0.01, 0.0, np.inf),
-    "t_min": (0.01, 0.0, np.inf),
-    "ratio": (0.001, -np.inf, np.inf),
-}
-#: Fields that belong to a mount, unless the instrument's `belongs_to` says otherwise: by how much they differ from the
-#: file is the same at every wavelength.
-MECHANICAL = ("azimuth_deg", "ratio")
 #: A residual above this part of the mean signal is no fit.
 POOR_FIT = 0.05
+#: Chance below which curves do not fit.
+UNLIKELY = 1e-3
 #: Other starts turn at most this many azimuths by 45 degrees.
 MOST_TURNED = 5
 #: Parameter directions with a singular value below this, relative to the largest, are not determined.
 UNSEEN = 1e-7
-
-
-class CalibrationError(ProcessError):
-    """A calibration was asked for that cannot be made."""
+#: Part of a sensible step of a parameter over which derivatives are taken.
+DIFFERENCE = 1e-6
+#: Least residual over the mean signal that a wavelength is weighted by: exact data would outweigh all others.
+LEAST_RESIDUAL = 1e-6
 
 
 @dataclass(frozen=True)
-class Calibration:
-    """Result of a fit.
+class FittedValues:
+    """Values at one wavelength.
 
     Attributes
     ----------
     names : of the free parameters, "element.field".
-    values, stderr : (K,), in the unit of each field (degrees for angles).
+    values : (K,), in the unit of each field (degrees for angles).
     covariance : (K, K); scaled with the residual, because noise alone rarely explains it.
-    residual_over_mean : rms of the residual over the mean signal.
-    residual : (N, channels) relative to the mean signal.
-    model : the instrument model with the fitted values.
+    model : the instrument model with these values.
     """
 
     names: tuple[str, ...]
     values: NDArray[np.float64]
-    stderr: NDArray[np.float64]
     covariance: NDArray[np.float64]
-    residual_over_mean: float
-    residual: NDArray[np.float64]
     model: InstrumentModel
 
-
-def known_mueller(sample: Sample) -> NDArray[np.float64]:
-    """Mueller matrix (4, 4) of a known sample, up to its throughput; CalibrationError for an unknown one."""
-    if sample.kind == "air":
-        return np.eye(4)
-    if sample.kind == "mirror":
-        return mueller.IDEAL_MIRROR
-    if sample.kind == "mueller" and sample.mueller is not None:
-        return np.asarray(sample.mueller, dtype=float).reshape(4, 4)
-    raise CalibrationError(
-        "the sample of this capture is not known, and retardances cannot be told from an unknown sample "
-        "(docs/conventions.md). Capture air or a mirror, or import with --sample."
-    )
-
-
-def region_means(capture: Capture, rows: slice, columns: slice) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Mean signal (N, channels) of a region, black subtracted, and the states of the sample that it belongs to.
-
-    States in which the region saturates are left out.
-    """
-    correction = Correction.of(capture)
-    black = correction.black
-    means_of_dark = black.means if black.means.shape[2] == 1 else black.means[:, :, rows, columns]
-    means, used = [], []
-    for k in sample_states(capture):
-        frame = capture.frames(int(k), rows)[:, :, columns]
-        if correction.saturation is None or np.mean(frame >= correction.saturation) <= FEW:
-            means.append(frame.mean(axis=(1, 2)))
-            used.append(int(k))
-    if not means:
-        raise CalibrationError(f"{capture.path}: the region is saturated in every state; take less exposure.")
-    if means[0].size == 0 or not np.all(np.isfinite(means)):
-        raise CalibrationError(f"{capture.path}: the region holds no pixels, or no numbers; choose another one.")
-    share = black.weights(capture.column("exposure_s")[used].astype(float))
-    return np.asarray(means) - np.asarray(share @ means_of_dark.mean(axis=(2, 3))), np.array(used)
+    @property
+    def stderr(self) -> NDArray[np.float64]:
+        """(K,) standard errors."""
+        return np.sqrt(np.diag(self.covariance))
 
 
 @dataclass(frozen=True)
-class Part:
-    """One capture of a joint fit.
+class Calibration(FittedValues):
+    """What was fitted to one capture.
 
     Attributes
     ----------
-    model : resolved at the wavelength of the capture.
-    angles_deg : axis name to (N,), as read back.
-    signal : (N, channels) counts above black, or (N, channels, pixels): one throughput for each pixel.
-    sample : (4, 4) up to a factor.
-    exposure : (N,) relative, default 1.
-    wavelength_nm : parts of one wavelength share all parameters.
+    residual_over_mean : rms of the residual over the mean signal.
+    residual : (N, channels) relative to the mean signal.
     """
 
-    model: InstrumentModel
-    angles_deg: dict[str, NDArray[np.float64]]
-    signal: NDArray[np.float64]
-    sample: NDArray[np.float64]
-    exposure: NDArray[np.float64] | None = None
-    wavelength_nm: float = 0.0
+    residual_over_mean: float
+    residual: NDArray[np.float64]
 
-    @property
-    def data(self) -> NDArray[np.float64]:
-        """(N * channels, pixels)."""
-        return self.signal.reshape(self.signal.shape[0] * self.signal.shape[1], -1)
 
-    def residual(self, model: InstrumentModel) -> NDArray[np.float64]:
-        """(N * channels * pixels,), over the mean signal, with the best throughput of each pixel."""
-        weight = np.ones(self.signal.shape[0]) if self.exposure is None else self.exposure
-        w = model.rows(self.angles_deg, changes_at(model, self.angles_deg)) * weight[:, None, None]
-        shape = w.reshape(-1, 16) @ self.sample.reshape(16)
-        throughput = shape @ self.data / (shape @ shape)
-        return np.asarray((self.data - shape[:, None] * throughput).reshape(-1) / np.mean(self.data))
+@dataclass(frozen=True)
+class CurveFit:
+    """Calibrations whose optics follow a smooth curve over the wavelengths.
+
+    Attributes
+    ----------
+    calibrations : one for each part, in their order.
+    curved : names of the values that follow a curve.
+    residual_over_mean : rms over all parts; separate_residual : that of the fit with a value at each wavelength.
+    chance : that the curves would be worse than that by as much, if they were true (F test in units of the separate
+        fit's residual); None where there are as many coefficients as wavelengths.
+    shared : what the wavelengths have in common; searched : (U,) what was found of it; covariance : (U, U).
+    """
+
+    calibrations: tuple[Calibration, ...]
+    curved: tuple[str, ...]
+    residual_over_mean: float
+    separate_residual: float
+    chance: float | None
+    shared: TrainValues
+    searched: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+    def at(self, model: InstrumentModel, wavelength_nm: float) -> FittedValues:
+        """Values of the curves and mounts at another wavelength inside the range.
+
+        Parameters
+        ----------
+        model : the instrument file's, not yet at a wavelength.
+
+        Raises
+        ------
+        CalibrationError : outside the range, or a value has no curve.
+        WavelengthError : a value that is not fitted is not given there.
+        """
+        matrix = self.shared.matrix(wavelength_nm)
+        nominal = model.model_copy(update={"calibrate": self.shared.names, "wavelengths_nm": None})
+        return _fitted(self.shared, nominal.nominal_at(wavelength_nm), matrix, self.searched, self.covariance)
 
 
 def fit_trains(parts: Sequence[Part], free: Sequence[str]) -> list[Calibration]:
@@ -166,159 +130,210 @@ def fit_trains(parts: Sequence[Part], free: Sequence[str]) -> list[Calibration]:
     CalibrationError : an unknown parameter, or fewer data than parameters.
     NotDetermined : the data leave a combination of parameters open; the message names them.
     """
-    names = _checked(parts[0].model, free)
-    mounted = np.array([_is_mounted(parts[0].model, name) for name in names])
-    # What is searched: a name with its wavelength, or for all of them.
-    wanted = [
-        [(name, None if shared else part.wavelength_nm) for name, shared in zip(names, mounted, strict=True)]
-        for part in parts
-    ]
-    unknown = list(dict.fromkeys(key for keys in wanted for key in keys))
-    where = [np.array([unknown.index(key) for key in keys]) for keys in wanted]
-    throughputs = sum(part.data.shape[1] for part in parts)
-    size = sum(part.data.size for part in parts)
-    if size <= len(unknown) + throughputs:
-        raise CalibrationError(f"{size} intensities cannot fix {len(unknown)} parameters and the throughput")
-    nominal = [np.array([_value(part.model, name) for name in names]) for part in parts]
-    # Of a mount the change is searched, from 0; of a plate the value.
-    base = [np.where(mounted, values, 0.0) for values in nominal]
-    start = np.zeros(len(unknown))
-    for index, values, own in zip(where, nominal, base, strict=True):
-        start[index] = values - own
-    step = np.array([FITTABLE[name.rpartition(".")[2]][0] for name, _ in unknown])
-    lower, upper = np.array([FITTABLE[name.rpartition(".")[2]][1:] for name, _ in unknown]).T
-
-    def residual(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        tried = (_with_values(p.model, names, b + x[i]) for p, b, i in zip(parts, base, where, strict=True))
-        return np.concatenate([part.residual(model) for part, model in zip(parts, tried, strict=True)])
-
-    def search(x0: NDArray[np.float64]) -> Any:
-        inside = np.clip(x0, lower + 1e-9 * step, upper - 1e-9 * step)
-        return least_squares(residual, inside, x_scale=step, bounds=(lower, upper), xtol=1e-12, ftol=1e-12)
-
-    found = search(start)
-    if np.sqrt(np.mean(found.fun**2)) > POOR_FIT:
-        # Azimuths have several valleys; a residual like this is the bottom of a wrong one.
-        others = _other_starts([name for name, _ in unknown], start)
-        found = min([found, *(search(x0) for x0 in others)], key=lambda f: float(f.cost))
-    if not found.success:
-        raise NotDetermined(
-            f"the fit did not converge ({found.message}); start from an instrument file closer to the truth"
-        )
-    jacobian = found.jac * step
-    _, singular, vt = np.linalg.svd(jacobian, full_matrices=False)
-    if singular[-1] <= UNSEEN * singular[0]:
-        open_ones = dict.fromkeys(unknown[k][0] for k in np.flatnonzero(np.abs(vt[-1]) > 0.1))
-        raise NotDetermined(f"the data do not tell apart: {', '.join(open_ones)}. Hold one of them fixed.")
-    freedom = size - throughputs - len(unknown)
-    variance = float(np.sum(found.fun**2)) / max(freedom, 1)
-    covariance = np.linalg.inv(jacobian.T @ jacobian) * variance * np.outer(step, step)
-    left = np.split(found.fun, np.cumsum([part.data.size for part in parts])[:-1])
-    return [
-        Calibration(
-            names=names,
-            values=own + found.x[index],
-            stderr=np.sqrt(np.diag(covariance))[index],
-            covariance=covariance[np.ix_(index, index)],
-            residual_over_mean=float(np.sqrt(np.mean(rest**2))),
-            residual=rest.reshape(*part.signal.shape[:2], -1).mean(axis=2),
-            model=_with_values(part.model, names, own + found.x[index]),
-        )
-        for part, own, index, rest in zip(parts, base, where, left, strict=True)
-    ]
+    names = checked_names(parts[0].model, free)
+    fit = _Fit(parts, TrainValues.shared(parts[0].model, names, _wavelengths(parts), None))
+    found = fit.searched_from(fit.nominal, np.ones(len(parts)))
+    if len(set(_wavelengths(parts))) > 1:
+        found = fit.searched_from(fit.values(found.x), fit.units(found))
+    return fit.calibrations(found)
 
 
-def part_of(capture: Capture, model: InstrumentModel, rows: slice, columns: slice) -> Part:
-    """The region means of a capture of a known sample, for `fit_trains`; `model` is at its wavelength."""
-    sample = known_mueller(capture.header.sample)
-    signal, states = region_means(capture, rows, columns)
-    angles = {name: values[states] for name, values in capture.angles_deg.items()}
-    return Part(model, angles, signal, sample, relative_exposure(capture, states), capture.header.wavelength_nm)
+def fit_curves(parts: Sequence[Part], free: Sequence[str], coefficients: int) -> CurveFit:
+    """`fit_trains`, where values of optics follow a polynomial in 1/wavelength over the parts' wavelengths.
 
-
-def _is_mounted(model: InstrumentModel, name: str) -> bool:
-    rule = "mechanics" if name.rpartition(".")[2] in MECHANICAL else "wavelength"
-    return model.belongs_to.get(name, rule) == "mechanics"
-
-
-def write_fitted(source: Path, target: Path, fitted: Mapping[float, Calibration], note: str) -> None:
-    """Copy an instrument file with the values fitted at some wavelengths put in; comments stay. Never overwrites.
+    What `belongs_to` of the instrument declares as "wavelength" keeps a value of its own at each.
 
     Raises
     ------
-    CalibrationError : `target` exists.
+    CalibrationError : as in `fit_trains`; fewer wavelengths than coefficients; no free parameter follows a curve; a
+        curve leaves what its value can be.
+    NotDetermined : as in `fit_trains`.
     """
-    if target.exists():
-        raise CalibrationError(f"{target} exists; a calibration never replaces a file. Give another --write.")
-    yaml = YAML()
-    yaml.indent(mapping=2, sequence=4, offset=2)
-    yaml.width = 120
-    tree = yaml.load(source.read_text(encoding="utf-8"))
-    for wavelength_nm, calibration in fitted.items():
-        for name, value, stderr in zip(calibration.names, calibration.values, calibration.stderr, strict=True):
-            element, _, field = name.rpartition(".")
-            node = _node(tree, element)
-            digits = 1 - int(np.floor(np.log10(stderr))) if stderr > 0 else 6
-            number = round(float(value), max(digits, 0))
-            if len(fitted) > 1 and not _is_mounted(calibration.model, name) and not isinstance(node.get(field), dict):
-                node[field] = {}
-            if isinstance(node.get(field), dict):
-                key = next((k for k in node[field] if abs(float(k) - wavelength_nm) < 0.5), wavelength_nm)
-                node[field][key] = number
-            else:
-                node[field] = number
-    tree["source"] = note
-    text = StringIO()
-    yaml.dump(tree, text)
-    with target.open("x", encoding="utf-8") as file:
-        file.write(text.getvalue())
+    names = checked_names(parts[0].model, free)
+    wavelengths = _wavelengths(parts)
+    curve = WavenumberCurve.over(wavelengths, coefficients)
+    smooth = _Fit(parts, TrainValues.shared(parts[0].model, names, wavelengths, curve))
+    if not smooth.shared.curved:
+        raise CalibrationError(f"none of {', '.join(names)} follows a curve: each belongs to a mount or a wavelength")
+    # First with a value at each wavelength: it tells the noise of each, and the valley in which the curves lie.
+    separate = _Fit(parts, TrainValues.shared(parts[0].model, names, wavelengths, None))
+    first = separate.searched_from(separate.nominal, np.ones(len(parts)))
+    units = separate.units(first)
+    free_fit = separate.searched_from(separate.values(first.x), units)
+    found = smooth.searched_from(separate.values(free_fit.x), units)
+    chance = _chance(found, smooth.freedom, free_fit, separate.freedom)
+    if chance is not None and chance < UNLIKELY:
+        # Some of the values at a wavelength may lie in another valley than the rest.
+        other = smooth.searched_from(smooth.nominal, units)
+        found = min(found, other, key=lambda f: float(f.cost))
+        chance = _chance(found, smooth.freedom, free_fit, separate.freedom)
+    calibrations = smooth.calibrations(found)
+    for part, calibration in zip(parts, calibrations, strict=True):
+        smooth.shared.check_range(part.model, calibration.values, part.wavelength_nm)
+    return CurveFit(
+        calibrations=tuple(calibrations),
+        curved=smooth.shared.curved,
+        residual_over_mean=smooth.rms(found.x),
+        separate_residual=separate.rms(free_fit.x),
+        chance=chance,
+        shared=smooth.shared,
+        searched=found.x,
+        covariance=smooth.covariance(found),
+    )
 
 
-def _checked(model: InstrumentModel, free: Sequence[str]) -> tuple[str, ...]:
-    names = tuple(dict.fromkeys(name.strip() for name in free if name.strip()))
-    offered = [f"{e.name}.{field}" for e in model.elements() for field in FITTABLE if _fits(e, field)]
-    unknown = [name for name in names if name not in offered]
-    if unknown or not names:
-        asked = ", ".join(unknown) or "none given"
-        raise CalibrationError(f"free parameter: {asked}. This instrument has: {', '.join(offered)}.")
-    return names
+class _Fit:
+    """The search over what some captures share."""
+
+    def __init__(self, parts: Sequence[Part], shared: TrainValues) -> None:
+        self.parts, self.shared = parts, shared
+        self.nominal = [values_of(part.model, shared.names) for part in parts]
+        self._bases = [shared.base(values) for values in self.nominal]
+        self._matrices = [shared.matrix(part.wavelength_nm) for part in parts]
+        self._edges = np.cumsum([part.data.size for part in parts])[:-1]
+        throughputs = sum(part.data.shape[1] for part in parts)
+        size = sum(part.data.size for part in parts)
+        self.freedom = size - throughputs - len(shared.unknown)
+        if self.freedom <= 0:
+            raise CalibrationError(f"{size} intensities cannot fix {len(shared.unknown)} parameters and the throughput")
+
+    def values(self, searched: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """(K,) of each part."""
+        return [base + matrix @ searched for base, matrix in zip(self._bases, self._matrices, strict=True)]
+
+    def models(self, searched: NDArray[np.float64]) -> list[InstrumentModel]:
+        """One for each part."""
+        tried = zip(self.parts, self.values(searched), strict=True)
+        return [with_values(part.model, self.shared.names, values) for part, values in tried]
+
+    def rms(self, searched: NDArray[np.float64]) -> float:
+        """Of the residuals of all parts, over the mean signal of each."""
+        each = zip(self.parts, self.models(searched), strict=True)
+        return float(np.sqrt(np.mean(np.concatenate([part.residual(model) for part, model in each]) ** 2)))
+
+    def searched_from(self, values: Sequence[NDArray[np.float64]], units: NDArray[np.float64]) -> Any:
+        """The nearest minimum, or that of other azimuths where it is no fit; in `units` (parts,) of the mean."""
+        step, lower, upper = self.shared.scale
+
+        def residual(x: NDArray[np.float64]) -> NDArray[np.float64]:
+            each = zip(self.parts, self.models(x), units, strict=True)
+            return np.concatenate([part.residual(model) / unit for part, model, unit in each])
+
+        def derivative(x: NDArray[np.float64]) -> NDArray[np.float64]:
+            # By the few values of each part, not by everything that all parts together search.
+            each = zip(self.parts, self.values(x), self._matrices, units, strict=True)
+            return np.concatenate([self._derivative(part, v) @ m / unit for part, v, m, unit in each])
+
+        def search(x0: NDArray[np.float64]) -> Any:
+            inside = np.clip(x0, lower + 1e-9 * step, upper - 1e-9 * step)
+            bounds = (lower, upper)
+            return least_squares(residual, inside, derivative, bounds, x_scale=step, xtol=1e-12, ftol=1e-12)
+
+        wavelengths = _wavelengths(self.parts)
+        start = self.shared.nearest(wavelengths, self.nominal, values)
+        found = search(start)
+        if self.rms(found.x) > POOR_FIT:
+            # Azimuths have several valleys; a residual like this is the bottom of a wrong one.
+            found = min([found, *(search(x0) for x0 in self._other_starts(start))], key=lambda f: float(f.cost))
+        if not found.success:
+            raise NotDetermined(
+                f"the fit did not converge ({found.message}); start from an instrument file closer to the truth"
+            )
+        return found
+
+    def units(self, found: Any) -> NDArray[np.float64]:
+        """(parts,) rms of the residual over the mean signal at the wavelength of each, noise that the fit took added.
+
+        Of a fit in units of the mean signal itself.
+        """
+        # What each intensity pulls the fit to itself: the diagonal of the projection onto the derivatives.
+        u, singular, _ = np.linalg.svd(found.jac * self.shared.scale[0], full_matrices=False)
+        pulled = np.split(np.sum(u[:, singular > UNSEEN * singular[0]] ** 2, axis=1), self._edges)
+        left = np.split(found.fun, self._edges)
+        wavelengths = np.array(_wavelengths(self.parts))
+        out = np.empty(len(self.parts))
+        for nm in np.unique(wavelengths):
+            here = np.flatnonzero(wavelengths == nm).tolist()
+            square = sum(float(np.sum(left[k] ** 2)) for k in here)
+            free = sum(self.parts[k].data.size - self.parts[k].data.shape[1] - float(pulled[k].sum()) for k in here)
+            total = float(np.sum(found.fun**2)) / self.freedom
+            out[here] = max(np.sqrt(square / free if free >= 1 else total), LEAST_RESIDUAL)
+        return out
+
+    def covariance(self, found: Any) -> NDArray[np.float64]:
+        """(U, U) of what is searched.
+
+        Raises
+        ------
+        NotDetermined : a combination of parameters is left open.
+        """
+        step = self.shared.scale[0]
+        jacobian = found.jac * step
+        _, singular, vt = np.linalg.svd(jacobian, full_matrices=False)
+        if singular[-1] <= UNSEEN * singular[0]:
+            open_ones = dict.fromkeys(self.shared.unknown[k].name for k in np.flatnonzero(np.abs(vt[-1]) > 0.1))
+            raise NotDetermined(f"the data do not tell apart: {', '.join(open_ones)}. Hold one of them fixed.")
+        variance = 2 * float(found.cost) / self.freedom
+        return np.asarray(np.linalg.inv(jacobian.T @ jacobian) * variance * np.outer(step, step))
+
+    def calibrations(self, found: Any) -> list[Calibration]:
+        """One for each part."""
+        covariance = self.covariance(found)
+        out = []
+        for part, matrix in zip(self.parts, self._matrices, strict=True):
+            fitted = _fitted(self.shared, part.model, matrix, found.x, covariance)
+            rest = part.residual(fitted.model)
+            out.append(
+                Calibration(
+                    **vars(fitted),
+                    residual_over_mean=float(np.sqrt(np.mean(rest**2))),
+                    residual=rest.reshape(*part.signal.shape[:2], -1).mean(axis=2),
+                )
+            )
+        return out
+
+    def _derivative(self, part: Part, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N * channels * pixels, K) of the residual by the values of a part."""
+        names = self.shared.names
+        small = DIFFERENCE * np.array([FITTABLE[name.rpartition(".")[2]][0] for name in names])
+
+        def residual(tried: NDArray[np.float64]) -> NDArray[np.float64]:
+            return part.residual(with_values(part.model, names, tried))
+
+        return np.asarray(approx_fprime(values, residual, small))
+
+    def _other_starts(self, start: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        azimuths = [
+            k for k, u in enumerate(self.shared.unknown) if u.name.endswith(".azimuth_deg") and u.term in (None, 0)
+        ][:MOST_TURNED]
+        starts = []
+        for turned in product((0.0, 45.0), repeat=len(azimuths)):
+            if any(turned):
+                x0 = start.copy()
+                x0[azimuths] += turned
+                starts.append(x0)
+        return starts
 
 
-def _other_starts(names: Sequence[str], start: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    azimuths = [k for k, name in enumerate(names) if name.endswith(".azimuth_deg")][:MOST_TURNED]
-    starts = []
-    for turned in product((0.0, 45.0), repeat=len(azimuths)):
-        if any(turned):
-            x0 = start.copy()
-            x0[azimuths] += turned
-            starts.append(x0)
-    return starts
+def _fitted(
+    shared: TrainValues,
+    model: InstrumentModel,
+    matrix: NDArray[np.float64],
+    searched: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+) -> FittedValues:
+    values = shared.base(values_of(model, shared.names)) + matrix @ searched
+    return FittedValues(shared.names, values, matrix @ covariance @ matrix.T, with_values(model, shared.names, values))
 
 
-def _fits(element: Element, field: str) -> bool:
-    return hasattr(element, field) and (field != "ratio" or element.axis is not None)
+def _chance(found: Any, freedom: int, free_fit: Any, separate_freedom: int) -> float | None:
+    """F test of the curves against a value at each wavelength; None where both are the same."""
+    held = freedom - separate_freedom
+    if held == 0:
+        return None
+    worse = (found.cost - free_fit.cost) / held / (free_fit.cost / separate_freedom)
+    return float(f_distribution.sf(worse, held, separate_freedom))
 
 
-def _value(model: InstrumentModel, name: str) -> float:
-    element, _, field = name.rpartition(".")
-    return float(next(getattr(e, field) for e in model.elements() if e.name == element))
-
-
-def _with_values(model: InstrumentModel, names: Sequence[str], values: NDArray[np.float64]) -> InstrumentModel:
-    new = {name.rpartition(".")[0]: {} for name in names}  # type: dict[str, dict[str, float]]
-    for name, value in zip(names, values, strict=True):
-        element, _, field = name.rpartition(".")
-        new[element][field] = float(value)
-
-    def swap(elements: Sequence[Any]) -> tuple[Any, ...]:
-        return tuple(e.model_copy(update=new[e.name]) if e.name in new else e for e in elements)
-
-    channels = tuple(c.model_copy(update={"elements": swap(c.elements)}) for c in model.channels)
-    update = {"generator": swap(model.generator), "analyzer": swap(model.analyzer), "channels": channels}
-    return model.model_copy(update=update)
-
-
-def _node(tree: Any, element: str) -> Any:
-    trains = [tree.get("generator") or [], tree.get("analyzer") or []]
-    trains += [c.get("elements") or [] for c in tree.get("channels") or []]
-    return next(node for train in trains for node in train if node.get("name") == element)
+def _wavelengths(parts: Sequence[Part]) -> list[float]:
+    return [part.wavelength_nm for part in parts]

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from processing.commands.product_options import Overwrite, ProductFile
+
+if TYPE_CHECKING:
+    from processing.calibration.train import CurveFit, FittedValues
 
 
 def register(app: typer.Typer) -> None:
@@ -25,16 +28,26 @@ def calibrate_command(
     region: Annotated[
         str | None, typer.Option(help="Pixels to average: r0:r1,c0:c1; default: the middle half of the frame.")
     ] = None,
+    dispersion: Annotated[
+        int | None,
+        typer.Option(help="Optics follow a polynomial in 1/wavelength with so many coefficients, not a value at each."),
+    ] = None,
+    at: Annotated[
+        str | None, typer.Option(help="With --dispersion: further wavelengths inside the range, nm,nm,...")
+    ] = None,
     write: Annotated[Path | None, typer.Option(help="New instrument file with the fitted values.")] = None,
 ) -> None:
     """Fit element parameters (azimuth_deg, retardance_deg, ...) to region means; the throughput is eliminated.
 
     Captures at several wavelengths are fitted at once: azimuths and ratios change by the same amount in all of them.
     """
-    from processing.calibration.train import POOR_FIT, fit_trains, part_of, write_fitted
+    from processing.calibration.fitted_file import write_fitted
+    from processing.calibration.known_sample import part_of
+    from processing.calibration.train import POOR_FIT, fit_curves, fit_trains
     from processing.instrument.model import InstrumentModel
     from processing.storage.capture import Capture
 
+    further = _wavelengths(at, dispersion)
     model = InstrumentModel.load(instrument)
     parts, titles, simulated = [], [], False
     for capture in captures:
@@ -45,21 +58,27 @@ def calibrate_command(
             simulated |= source.simulated
         where = f"rows {rows.start}:{rows.stop}, columns {columns.start}:{columns.stop}"
         titles.append(f"{capture.name}: {where}, {nm:g} nm")
-    found = fit_trains(parts, free.split(","))
+    curves = None if dispersion is None else fit_curves(parts, free.split(","), dispersion)
+    found = fit_trains(parts, free.split(",")) if curves is None else curves.calibrations
+    fitted: dict[float, FittedValues] = {p.wavelength_nm: r for p, r in zip(parts, found, strict=True)}
     if simulated:
         typer.echo("SIMULATED data")
     for title, result in zip(titles, found, strict=True):
-        typer.echo(title)
-        for name, value, stderr in zip(result.names, result.values, result.stderr, strict=True):
-            typer.echo(f"  {name:32s} {value:12.5f} +- {stderr:.5f}")
+        _tell(title, result)
         typer.echo(f"  residual {100 * result.residual_over_mean:.3f} % of the mean signal (rms)")
+    if curves is not None:
+        for nm in further:
+            fitted[nm] = curves.at(model, nm)
+            _tell(f"{nm:g} nm, from the curves", fitted[nm])
+        _tell_curves(curves)
     worst = max(result.residual_over_mean for result in found)
     if worst > POOR_FIT:
         typer.echo("warning: a poor fit; start from values closer to the truth, or free more parameters", err=True)
     if write is not None:
         names = ", ".join(capture.name for capture in captures)
-        note = f"process calibrate of {names}, residual {100 * worst:.2f} % of the mean"
-        write_fitted(instrument, write, {p.wavelength_nm: r for p, r in zip(parts, found, strict=True)}, note)
+        smooth = f", curves of {dispersion} coefficients" if curves else ""
+        note = f"process calibrate of {names}{smooth}, residual {100 * worst:.2f} % of the mean"
+        write_fitted(instrument, write, fitted, note)
         typer.echo(str(write))
 
 
@@ -85,8 +104,45 @@ def calibrate_mosaic_command(
     summary(product)
 
 
+def _tell(title: str, fitted: FittedValues) -> None:
+    typer.echo(title)
+    for name, value, stderr in zip(fitted.names, fitted.values, fitted.stderr, strict=True):
+        typer.echo(f"  {name:32s} {value:12.5f} +- {stderr:.5f}")
+
+
+def _tell_curves(curves: CurveFit) -> None:
+    """How well the curves fit beside a value at each wavelength."""
+    from processing.calibration.train import UNLIKELY
+
+    typer.echo(
+        f"curves of {', '.join(curves.curved)}: residual {100 * curves.residual_over_mean:.3f} % of the mean; "
+        f"with a value at each wavelength {100 * curves.separate_residual:.3f} %"
+    )
+    if curves.chance is None:
+        typer.echo("  as many coefficients as wavelengths: nothing is smoothed")
+    elif curves.chance < UNLIKELY:
+        typer.echo(
+            f"warning: if the curves were true, they would be as much worse with a chance of {curves.chance:.1g} only: "
+            "take more coefficients, or leave --dispersion out",
+            err=True,
+        )
+
+
+def _wavelengths(text: str | None, dispersion: int | None) -> list[float]:
+    from processing.calibration.known_sample import CalibrationError
+
+    if text is None:
+        return []
+    if dispersion is None:
+        raise CalibrationError("--at: other wavelengths follow from curves alone; give --dispersion as well")
+    try:
+        return [float(word) for word in text.split(",")]
+    except ValueError:
+        raise CalibrationError(f"--at {text}: write wavelengths as 500,550.5") from None
+
+
 def _region(text: str | None, shape: tuple[int, int]) -> tuple[slice, slice]:
-    from processing.calibration.train import CalibrationError
+    from processing.calibration.known_sample import CalibrationError
 
     height, width = shape
     if text is None:

@@ -59,6 +59,22 @@ def own_files(
             instrument_yaml=turned,
         )
 
+    def six_wavelengths() -> None:
+        instrument = InstrumentModel.load(configs / "instruments/drr_5to1.yaml")
+        angles = {"psg": 7.5 * np.arange(24), "psa": 37.5 * np.arange(24)}
+        for nm in (450, 500, 550, 600, 650, 700):
+            plate = {"azimuth_deg": 0.4, "retardance_deg": 127 * 550 / nm}
+            model = instrument.with_values({"psg_retarder": plate, "psa_retarder": plate})
+            light = 100 + 20_000 * model.rows(angles) @ np.eye(4).ravel()
+            synthetic_capture(
+                np.random.default_rng(nm).poisson(np.broadcast_to(light[..., None, None], (24, 1, 8, 8))).astype("<u2"),
+                angles,
+                name=f"air{nm}.h5",
+                wavelength_nm=nm,
+                sample={"kind": "air"},
+                detector={"black_level_counts": 100, "bits": 16},
+            )
+
     def frames_of_another_lab() -> None:
         instrument = InstrumentModel.load(configs / "instruments/drr_imaging_630nm.yaml")
         psg = 9.0 * np.arange(40)
@@ -86,6 +102,7 @@ def own_files(
     return {
         "with a capture of a colour sensor": colour_sensor,
         "with a capture of a turned polarizer": turned_polarizer,
+        "with captures of air at six wavelengths": six_wavelengths,
         "with data of another lab": frames_of_another_lab,
         "with a capture that a power cut ended, and your rig": power_cut,
     }

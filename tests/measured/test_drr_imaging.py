@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import scipy.io
 
-from processing.calibration.train import fit_trains, part_of
+from processing.calibration.known_sample import part_of
+from processing.calibration.train import fit_trains
 from processing.instrument.model import InstrumentModel
 from processing.reduction.mueller import reduce_mueller
 from processing.storage.capture import Capture

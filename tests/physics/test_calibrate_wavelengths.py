@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from processing.calibration.train import fit_trains, part_of
+from processing.calibration.known_sample import part_of
+from processing.calibration.train import fit_trains
 from processing.commands.application import app
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from processing.calibration.train import fit_trains, part_of
+from processing.calibration.known_sample import part_of
+from processing.calibration.train import fit_trains
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
 from processing.reduction.black import Black

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from processing.calibration.train import known_mueller
+from processing.calibration.known_sample import known_mueller
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.noise_estimate import estimated_noise
 from processing.diagnosis.captured.read_frames import read_frames
