@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from processing.maps.coherency_noise import coherency_noise
 from processing.maps.extrapolation import EXTRAPOLATED, ExtrapolatedImage
 from processing.maps.first_order_limits import limit
 from processing.maps.partial_quantities import Pairs, determined_maps, partial_block, partial_facts
+from processing.maps.sent_back import sent_back_block, sent_back_facts, sent_back_planes
 from processing.polarization import gradients
 from processing.polarization.decompositions.differential import differential
 from processing.polarization.decompositions.lu_chipman import lu_chipman
@@ -24,7 +25,7 @@ from processing.polarization.quantities import PAPER_PAIRS
 from processing.polarization.scalar_files import scalar_quantities
 from processing.reduction.mueller import Progress
 from processing.storage.images import MuellerImage, require_all_elements, seen_elements
-from processing.storage.product import LIT_ERRORS, Plane, Product, ProductWriter, Step
+from processing.storage.product import LIT_ERRORS, Plane, Product, ProductError, ProductWriter, Step
 
 #: Pixels of a block: gradients take 128 bytes a pixel and quantity.
 BLOCK_PIXELS = 1 << 14
@@ -120,27 +121,60 @@ def quantities_of_mueller(
     """
     require_decompositions(extra)
     with Product(source) as product:
-        product.require("mueller", EXTRAPOLATED)
-        maps = _planes(extra, pairs)
-        partial = _determined(product, extra, pairs)
-        if partial:
-            maps = {name: maps[name] for name in [*partial, "lit"]}
-        planes = _with_errors(maps) | ({} if partial else _NOISE)
+        maps = _maps(product, extra, pairs)
         steps = (*product.steps, step)
-        with ProductWriter(out, "quantities", product.header, product.shape, planes, steps, overwrite) as writer:
+        with ProductWriter(out, "quantities", product.header, product.shape, maps.planes, steps, overwrite) as writer:
             for rows in product.row_blocks(BLOCK_PIXELS):
                 if rows.stop > writer.rows_done:
-                    block = (
-                        partial_block(MuellerImage.of(product, rows), partial, pairs)
-                        if partial
-                        else quantities_block(_image(product, rows), extra, pairs)
-                    )
-                    writer.write(rows, **block)
+                    writer.write(rows, **maps.block(rows))
                 if progress:
                     progress(rows.stop, product.shape[0])
-            facts = partial_facts(writer, partial) if partial else _facts(writer, maps)
+            facts = maps.facts(writer)
             writer.seal(facts)
     return facts
+
+
+class _Maps(NamedTuple):
+    """What a product determines: planes of the new one, their values for some rows, what it says of itself."""
+
+    planes: dict[str, Plane]
+    block: Callable[[slice], dict[str, NDArray[Any]]]
+    facts: Callable[[ProductWriter], dict[str, Any]]
+
+
+def _maps(product: Product, extra: Sequence[str], pairs: Pairs) -> _Maps:
+    """Of whole matrices, of the elements of a partial polarimeter, or of the light that one polarized state sends back.
+
+    Raises
+    ------
+    ProductError : the product holds none of these, or decompositions were asked for that need whole matrices.
+    """
+    if product.kind == "stokes":
+        raise ProductError(
+            f"{product.path} is a linear Stokes image and holds what follows from it: dolp, aolp_deg and their errors. "
+            "With a model of the surface, `process xi0` and `process extrapolate` take it."
+        )
+    product.require("mueller", EXTRAPOLATED)
+    sent = {} if extra else sent_back_planes(product)
+    if sent:
+        return _Maps(
+            _with_errors(sent),
+            lambda rows: sent_back_block(product, rows, sent),
+            lambda writer: sent_back_facts(writer, sent),
+        )
+    maps = _planes(extra, pairs)
+    partial = _determined(product, extra, pairs)
+    if partial:
+        return _Maps(
+            _with_errors({name: maps[name] for name in [*partial, "lit"]}),
+            lambda rows: partial_block(MuellerImage.of(product, rows), partial, pairs),
+            lambda writer: partial_facts(writer, partial),
+        )
+    return _Maps(
+        _with_errors(maps) | _NOISE,
+        lambda rows: quantities_block(_image(product, rows), extra, pairs),
+        lambda writer: _facts(writer, maps),
+    )
 
 
 def require_decompositions(extra: Sequence[str]) -> None:

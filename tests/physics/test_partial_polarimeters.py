@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from processing.calibration.train import fit_trains, part_of
+from processing.calibration.known_sample import part_of
+from processing.calibration.train import fit_trains
 from processing.diagnosis.instrument.run import diagnose_captures
 from processing.errors import NotDetermined, ProcessError
 from processing.instrument.determined import determined_basis, determined_elements
@@ -158,7 +159,7 @@ def test_polarized_light_gives_the_stokes_vector_that_is_sent_back_and_xi0(name,
     count = facts["rank"]
     assert facts["determined"].startswith(", ".join(f"S{k}" for k in range(count)) + " of the light")
     with pytest.raises(ProductError, match=r"needs all 16 elements\. With a model"):
-        quantities_of_mueller(tmp_path / "m.h5", tmp_path / "q.h5", Step("quantities", {}))
+        quantities_of_mueller(tmp_path / "m.h5", tmp_path / "q.h5", Step("quantities", {}), ["symmetric"])
     light = np.array([0.5, 0.5 * np.cos(np.deg2rad(40)), 0.5 * np.sin(np.deg2rad(40)), 0])
     with Product(tmp_path / "m.h5") as product:
         stokes, errors = (product.get(plane).reshape(4, -1) for plane in ("stokes", "stokes_errors"))
@@ -173,6 +174,30 @@ def test_polarized_light_gives_the_stokes_vector_that_is_sent_back_and_xi0(name,
     with Product(tmp_path / "x.h5") as product:
         pulls = (product.get("xi0") - xi0) / product.get("xi0_errors")
     assert pulls.std() == pytest.approx(1, abs=5 / np.sqrt(2 * pulls.size))
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("name", ["rotating_retarder_stokes", "rotating_analyzer"])
+def test_polarized_light_has_maps_of_what_the_sample_sends_back(name, weighted, noisy, tmp_path):
+    sample = np.asarray(mueller_matrix(normalized_mueller(np.array([[1.0, 0.1], [0.2j, -0.6]])), 0.6, 1.0))
+    path, model, _ = noisy(name, INSTRUMENTS[name][1], sample=sample, sent_deg=20.0)
+    with Capture(path) as capture:
+        reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),), choice=Choice(weighted=weighted))
+    facts = quantities_of_mueller(tmp_path / "m.h5", tmp_path / "q.h5", Step("quantities", {}))
+    assert "lit in one polarized state" in facts["warnings"][0]
+    s = sample @ [1, np.cos(np.deg2rad(40)), np.sin(np.deg2rad(40)), 0]
+    dolp = np.hypot(s[1], s[2]) / s[0]
+    truth = {"dolp": dolp, "aolp_deg": np.rad2deg(np.arctan2(s[2], s[1])) / 2 % 180}
+    if name == "rotating_retarder_stokes":
+        truth |= {"dop": np.hypot(dolp, s[3] / s[0]), "docp": s[3] / s[0]}
+    with Product(tmp_path / "q.h5") as product:
+        assert set(product.names) == {"lit", *truth, *(f"{map_}_errors" for map_ in truth)}
+        assert product.get("lit").all()
+        for map_, true in truth.items():
+            pulls = (product.get(map_) - true) / product.get(f"{map_}_errors")
+            assert abs(pulls.mean()) < 5 / np.sqrt(pulls.size), map_
+            assert pulls.std() == pytest.approx(1, abs=5 / np.sqrt(2 * pulls.size)), map_
+        assert product_figure(product)
 
 
 def test_states_that_see_less_than_the_instrument_can_are_refused(noisy, tmp_path):
