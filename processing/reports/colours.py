@@ -21,7 +21,7 @@ ALL = (SIGNED, CYCLIC, LIGHT, ERROR, PLAIN)
 
 #: Parts of names that tell what is drawn how; the first that fits decides.
 _ORIENTATIONS = ("orientation", "aolp", "fast_axis", "axis_or_90")
-_SIGNED = ("deviation", "circular", "vector", "s1", "s2", "mueller", "covariance")
+_SIGNED = ("deviation", "circular", "docp", "vector", "s1", "s2", "mueller", "covariance")
 _FLAGS = ("flags", "valid", "lit", "defined", "negative_determinant", "flip")
 _LIGHT = ("s0", "m00")
 #: Percentile of the values at which a scale ends.

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from processing.polarization.quantities import PAPER_PAIRS
 from processing.polarization.scalar_files import scalar_quantities
-from processing.reports.colours import SIGNED
+from processing.reports.colours import SIGNED, colours_of
 from processing.reports.figure_style import CYCLIC, WORST_ORIENTATION_DEG, grid_figure, percentile, thin
 from processing.storage.product import Product
 
@@ -79,11 +79,12 @@ def _partial_figure(product: Product, title: str) -> Figure:
         if name == "lit" or name.endswith("_errors"):
             continue
         shown = np.where(lit, thin(product.get(name)), np.nan)
-        if name.endswith("_orientation_deg"):
+        colours = colours_of(name, product.units(name))
+        if colours == CYCLIC["cmap"]:
             shown = np.where(thin(product.get(f"{name}_errors")) > WORST_ORIENTATION_DEG, np.nan, shown)
             panels.append((name.replace("_", " "), shown, CYCLIC))
         else:
-            signed = max(percentile(np.abs(shown), 99), 1e-6)
-            diverging = {"cmap": SIGNED, "vmin": -signed, "vmax": signed}
-            panels.append((name.replace("_", " "), shown, diverging if name.endswith("circular") else {"vmin": 0}))
+            most = max(percentile(np.abs(shown), 99), 1e-6)
+            limits = {"cmap": SIGNED, "vmin": -most, "vmax": most} if colours == SIGNED else {"vmin": 0}
+            panels.append((name.replace("_", " "), shown, limits))
     return grid_figure(panels, title, product.simulated)

@@ -189,9 +189,6 @@ def expose(bench: Bench, scene: Scene, angles_deg: dict[str, Array]) -> Array:
     n = next(iter(angles_deg.values())).size
     ys, xs = np.mgrid[0 : bench.rows, 0 : bench.columns].astype(float)
     out = np.zeros((n, bench.rows, bench.columns))
-    if bench.mosaic:
-        # The lens is assumed to blur over a super-pixel: its four pixels see the same spot of the scene.
-        ys, xs = ys // 2 * 2, xs // 2 * 2
     still = (
         None if bench.shift or bench.material_level or bench.turned else scene.at(xs / bench.columns, ys / bench.rows)
     )

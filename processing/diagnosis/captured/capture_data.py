@@ -89,6 +89,8 @@ class CaptureData:
     shared : what pixels have of their noise in common; slope and floor are those of wide patterns.
     noise_told : sentences about the noise where it is not what is declared.
     left_out : frames, hits and pixels that are no measurement of the sample.
+    place_px : (channels, 2) where in a super-pixel each channel looks, from its middle to the right and down; pixels
+        here. None: all look at the same place.
     binned : side of the squares over which pixels were averaged.
     pitch : pixels of the sensor from one pixel here to the next.
     """
@@ -115,6 +117,7 @@ class CaptureData:
     noise_estimated: bool = False
     true_variance: NDArray[np.float32] | None = None
     moved_px: Array | None = None
+    place_px: Array | None = None
     left_out: LeftOut = field(default_factory=LeftOut)
     shared: SharedNoise = field(default_factory=SharedNoise)
     noise_told: tuple[str, ...] = ()
@@ -138,9 +141,15 @@ class CaptureData:
 
     @property
     def row_moved_px(self) -> Array:
-        """`moved_px` (values_per_pixel, 2) of each row of W; zero where nothing was moved."""
-        moved = np.zeros((self.conditions.states, 2)) if self.moved_px is None else self.moved_px
-        return np.repeat(moved, self.signal.shape[1], axis=0)
+        """By how much the frame of each row of W was moved back, (values_per_pixel, 2); zero where it was not."""
+        if self.moved_px is None:
+            return np.zeros((self.values_per_pixel, 2))
+        return self._frame_px(self.moved_px).reshape(-1, 2)
+
+    def _frame_px(self, shift_px: Array) -> Array:
+        """(N, channels, 2) by how much each frame has moved against the middle of its super-pixels."""
+        place = np.zeros((self.signal.shape[1], 2)) if self.place_px is None else self.place_px
+        return np.asarray(shift_px[:, None] - place)
 
     def variance(self, rows: slice = slice(None)) -> Array:
         """Variance (N, channels, rows, columns) in full scale squared; right on average over noisy signals.
@@ -171,12 +180,16 @@ class CaptureData:
         return replace(self, signal=signal, true_variance=variance)
 
     def moved_back(self, shift_px: Array) -> CaptureData:
-        """The capture with every frame moved back by what it had moved to the right and down, (N, 2) pixels here."""
+        """The capture with every frame moved back by what it had moved to the right and down, (N, 2) pixels here.
+
+        Channels that look at places apart are moved to one: so far as the image is smooth, they then see the same.
+        """
+        frame_px = self._frame_px(shift_px)
         return replace(
             self,
-            signal=_moved_back(self.signal, shift_px),
+            signal=_moved_back(self.signal, frame_px),
             # What is a line in the counts stays one.
-            true_variance=None if self.true_variance is None else _moved_back(self.true_variance, shift_px),
+            true_variance=None if self.true_variance is None else _moved_back(self.true_variance, frame_px),
             moved_px=shift_px,
         )
 
@@ -196,11 +209,10 @@ class CaptureData:
         return np.asarray(self.slope.reshape(shape) * np.maximum(signal, 0) / slope**2 + self.floor.reshape(shape))
 
 
-def _moved_back(frames: NDArray[np.float32], shift_px: Array) -> NDArray[np.float32]:
+def _moved_back(frames: NDArray[np.float32], frame_px: Array) -> NDArray[np.float32]:
     out = np.empty_like(frames)
-    for n, (x, y) in enumerate(shift_px):
-        for channel in range(frames.shape[1]):
-            out[n, channel] = shifted_back(frames[n, channel], x, y)
+    for n, channel in np.ndindex(frames.shape[:2]):
+        out[n, channel] = shifted_back(frames[n, channel], *frame_px[n, channel])
     return out
 
 

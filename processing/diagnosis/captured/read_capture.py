@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
+from processing.arrays import Array
 from processing.calibration.known_sample import known_mueller
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.noise_estimate import estimated_noise
@@ -70,6 +71,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
         wavelength_nm=capture.header.wavelength_nm,
         binned=side,
         pitch=model.pitch * side,
+        place_px=_places_px(capture.seen(model), side),
         cut_off=tuple(np.flatnonzero(cut_off).tolist()),
     )
     repeats = np.maximum(capture.column("repeats")[states].astype(float), 1)
@@ -87,6 +89,15 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     if not data.noise_known and data.usable.sum() >= FEWEST_PIXELS:
         data = estimated_noise(data)
     return without_dark_pixels(data) if data.noise_known else data
+
+
+def _places_px(model: InstrumentModel, side: int) -> Array | None:
+    """Where each channel of a mosaic looks (channels, 2), from the middle of a super-pixel, in pixels as read."""
+    if model.mosaic is None:
+        return None
+    where = {name: (c, r) for r, line in enumerate(model.mosaic) for c, name in enumerate(line)}
+    places = np.array([where[channel.name] for channel in model.channels], dtype=float)
+    return np.asarray((places - places.mean(axis=0)) / (model.pitch * side))
 
 
 def without_dark_pixels(data: CaptureData) -> CaptureData:

@@ -324,5 +324,7 @@ class InstrumentProblem:
 
 
 def _moved_back(captures: Sequence[CaptureData], shifts_px: Sequence[Array]) -> tuple[CaptureData, ...]:
-    """Every frame moved back by so many pixels (N, 2) of its capture."""
-    return tuple(c.moved_back(s) if s.any() else c for c, s in zip(captures, shifts_px, strict=True))
+    """Every frame moved back by so many pixels (N, 2) of its capture, and channels that look at places apart to one."""
+    return tuple(
+        c.moved_back(s) if s.any() or c.place_px is not None else c for c, s in zip(captures, shifts_px, strict=True)
+    )

@@ -1,0 +1,61 @@
+"""A polarization camera behind a turning plate: the four polarizers of a super-pixel look at places apart.
+
+On an object whose light changes from pixel to pixel that alone is no fault of the instrument.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from processing.diagnosis.instrument.run import diagnose_captures
+from processing.diagnosis.search.result import Diagnosis
+from processing.instrument.model import InstrumentModel
+
+RAW, ELECTRONS, READ, GAIN, BLACK = 96, 60_000.0, 2.3, 4.0, 100
+ANGLES = {"psa": np.arange(0, 180, 22.5)}
+
+
+def curved_light() -> np.ndarray:
+    """(4, rows, columns) Stokes vectors of a small ball: brightness and polarization change over a few pixels."""
+    y, x = (np.indices((RAW, RAW)) - (RAW - 1) / 2) / (RAW / 2.5)
+    radius, around = np.hypot(x, y), np.arctan2(y, x)
+    s0, degree = 0.02 + np.exp(-(radius**2)), 0.4 * radius**2 / (1 + radius**2)
+    return np.stack([s0, s0 * degree * np.cos(2 * around), s0 * degree * np.sin(2 * around), 0.1 * s0 * x])
+
+
+@pytest.fixture
+def diagnosed(synthetic_capture, configs):
+    """What `diagnose` says of a capture of the curved light by a camera whose channel at 45 degrees has some gain."""
+    model = InstrumentModel.load(configs / "instruments/polarization_camera_retarder.yaml")
+
+    def diagnose(gain: float) -> Diagnosis:
+        random, light = np.random.default_rng(5), curved_light()
+        analyzers = model.analyzer_states(ANGLES) * np.array([1, gain, 1, 1])[:, None]
+        frames = np.empty((len(ANGLES["psa"]), 1, RAW, RAW))
+        for k, channel in enumerate(model.channels):
+            (r, c), *_ = np.argwhere(np.array(model.mosaic) == channel.name)
+            here = (slice(None), slice(r, None, 2), slice(c, None, 2))
+            frames[:, 0, *here[1:]] = np.einsum("ns,syx->nyx", analyzers[:, k], light[here])
+        electrons = random.poisson(ELECTRONS * frames) + random.normal(0, READ, frames.shape)
+        detector = {"gain_e_per_count": GAIN, "read_noise_e": READ, "black_level_counts": BLACK, "bits": 16}
+        path = synthetic_capture(
+            np.round(electrons / GAIN + BLACK).astype(np.uint16), ANGLES, mosaic=model.mosaic, detector=detector
+        )
+        return diagnose_captures([path], model)[0].diagnosis
+
+    return diagnose
+
+
+def test_places_apart_are_no_fault(diagnosed):
+    assert diagnosed(1.0).verdict == "consistent"
+
+
+def test_a_fault_beside_them_is_found(diagnosed):
+    found = diagnosed(1.01)
+    assert found.verdict == "explained"
+    (gain,) = found.effects
+    assert gain.kind == "channel_gain"
+    told = gain.parameters["channel_45"]
+    assert told.value == pytest.approx(0.01, abs=4 * told.stderr)
+    assert told.stderr < 3e-4
