@@ -135,7 +135,8 @@ def _tree(text: str, source: str) -> CommentedMap:
         tree = yaml.load(text)
     except MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else "?"
-        raise ConfigError(f"{source}:{line}: {one_line(error.problem)}") from error
+        what = "a tab; YAML is indented with spaces" if "'\\t'" in str(error.problem) else one_line(error.problem)
+        raise ConfigError(f"{source}:{line}: {what}") from error
     except (YAMLError, ValueError, TypeError, AttributeError, KeyError, IndexError, AssertionError) as error:
         # The parser's own errors on tags and dates that are none come as Python's.
         raise ConfigError(f"{source}: is not YAML that can be read ({one_line(error)})") from error
@@ -221,23 +222,38 @@ def _described(source: str, tree: CommentedMap, model: type[BaseModel], entries:
     kind = [entry for entry in entries if entry["loc"] == ("kind",)]
     names = names_in(model) if any(entry["type"] == "extra_forbidden" for entry in entries) else ()
     found: dict[str, list[str]] = {}
-    for entry in kind or entries:
-        where = one_line(".".join(_keys(tree, entry["loc"])))
-        place = ": ".join(filter(None, (f"{source}:{_line(tree, entry['loc'])}", where)))
+    for keys, entry in _of_the_type_meant([(_keys(tree, entry), entry) for entry in kind or entries]):
+        place = ": ".join(filter(None, (f"{source}:{_line(tree, entry['loc'])}", one_line(".".join(keys)))))
         found.setdefault(place, []).append(one_line(words_of(entry, names)))
     after = "; is it the right file?" if kind else ""
     return [f"{place}: {', or '.join(dict.fromkeys(texts))}{after}" for place, texts in found.items()]
 
 
-def _keys(tree: Any, location: Sequence[int | str]) -> Iterator[str]:
-    """The keys of a location, without the types that pydantic names where a value could be of several."""
-    node = tree
+def _of_the_type_meant(entries: Sequence[tuple[tuple[str, ...], Any]]) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Leave out that keys or a list are no number, say, where they could be so, and have a mistake of their own."""
+    own = [keys for keys, entry in entries if not _wrong_type(entry)]
+    for keys, entry in entries:
+        if not _wrong_type(entry) or not any(other[: len(keys)] == keys for other in own):
+            yield keys, entry
+
+
+def _wrong_type(entry: Any) -> bool:
+    return entry["type"].endswith("_type") and isinstance(entry["input"], dict | list)
+
+
+def _keys(tree: Any, entry: Any) -> tuple[str, ...]:
+    """The keys of a place as they stand in the file, and one that is missing.
+
+    The library also names the type, where a value could be of several.
+    """
+    node, keys, location = tree, [], entry["loc"]
     for part in location:
         if not isinstance(node, (CommentedMap, CommentedSeq)):
-            return
-        node = node[part] if _has(node, part) else node
-        if "[" not in str(part):
-            yield str(part)
+            break
+        if _has(node, part):
+            node = node[part]
+            keys.append(str(part))
+    return (*keys, str(location[-1])) if entry["type"] == "missing" else tuple(keys)
 
 
 def _line(tree: Any, location: Sequence[int | str]) -> int:

@@ -28,6 +28,7 @@ WORDS = {
     "union_tag_invalid": "{tag} is none of {expected_tags}",
     "union_tag_not_found": "needs the key {discriminator}",
     "recursion_loop": "contains itself",
+    "invalid_key": "unknown key; decimals take a point, not a comma",
 }
 #: By the type that the value should have, the first word of such a name.
 TYPES = {
@@ -45,6 +46,10 @@ TYPES = {
     "none": "nothing",
     "url": "an address such as https://...",
 }
+#: Mistakes that are told without the value.
+NEEDS_NO_VALUE = ("missing", "extra_forbidden", "invalid_key", "union_tag_invalid")
+#: Of names that become parts of file names.
+NAME_PATTERN = r"^[A-Za-z0-9_-]+$"
 #: Longest value that is shown.
 SHOWN = 40
 
@@ -80,7 +85,10 @@ def words_of(entry: Any, names: Sequence[str] = ()) -> str:
     if kind == "extra_forbidden":
         key = str(entry["loc"][-1])
         meant = get_close_matches(key, [name for name in names if name != key], 1, cutoff=0.75)
+        meant += [name for name in names if name.startswith(f"{key}_")]
         return WORDS[kind] + (f"; is {meant[0]!r} meant?" if meant else "")
+    if kind == "string_pattern_mismatch" and entry["ctx"]["pattern"] == NAME_PATTERN:
+        return "may have letters, digits, - and _ only" + _found(kind, entry)
     if kind in WORDS:
         return WORDS[kind].format_map(entry.get("ctx", {})) + _found(kind, entry)
     stem, _, rest = kind.partition("_")
@@ -92,7 +100,9 @@ def words_of(entry: Any, names: Sequence[str] = ()) -> str:
 def _found(kind: str, entry: Any) -> str:
     """The value itself, where it is short and not told already."""
     value = entry.get("input")
-    if kind in ("missing", "extra_forbidden", "union_tag_invalid") or isinstance(value, dict | list | tuple):
+    if kind in NEEDS_NO_VALUE or isinstance(value, dict | list | tuple):
         return ""
+    if value is None:
+        return ", but nothing stands there"
     text = repr(value)
     return f", not {text}" if len(text) <= SHOWN else ""

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_val
 from acquisition.capture.plan import Auto, AutoExposure, MeasurementPlan, Mode, Seconds, exposure_kind
 from processing.storage.capture_schema import Sample
 from processing.yaml_file import load_yaml
+from processing.yaml_words import NAME_PATTERN
 
 
 class _Part(BaseModel):
@@ -64,7 +65,7 @@ class Campaign(_Part):
     """
 
     kind: Literal["campaign"] = "campaign"
-    name: str = Field(pattern=r"^[A-Za-z0-9_-]+$")
+    name: str = Field(pattern=NAME_PATTERN)
     rig: Path | None = None
     plans: dict[Mode, Path] = Field(min_length=1)
     samples: tuple[Sample, ...] = Field(min_length=1)

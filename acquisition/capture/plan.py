@@ -20,10 +20,10 @@ from processing.instrument.states import (
 )
 from processing.storage.capture_schema import Sample
 from processing.yaml_file import ConfigError, load_yaml
-from processing.yaml_words import words_of
+from processing.yaml_words import NAME_PATTERN, words_of
 
 #: Name of a mode of the rig file; file names of captures hold it.
-Mode = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
+Mode = Annotated[str, Field(pattern=NAME_PATTERN)]
 
 #: The axis that sets Omega, where the rig has one.
 ARM = "arm"

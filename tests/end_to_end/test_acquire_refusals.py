@@ -46,7 +46,7 @@ def test_wrong_key_of_an_exposure_speaks_of_that_kind_alone(refused, tmp_path):
     plan.write_text("kind: plan\nexposure_s: {kind: auto, taget: 0.5}\n")
     code, err = refused("--plan", plan)
     assert code == 2
-    assert err.strip() == f"error: {plan}:2: exposure_s.auto.taget: unknown key; is 'target' meant?"
+    assert err.strip() == f"error: {plan}:2: exposure_s.taget: unknown key; is 'target' meant?"
 
 
 def test_unknown_key_of_an_axis_is_named_with_its_line(refused, small_rig):
