@@ -257,7 +257,11 @@ class Features:
             raise self._refused(f"set {name} to {value:g}", f"its limits are {low:g} to {high:g} now")
 
     def _check_increment(self, name: str, value: int, low: int) -> None:
-        step = max(1, round(self._camera.get_integer_increment(name)))
+        try:
+            step = max(1, round(self._camera.get_integer_increment(name)))
+        except self._glib_error:
+            # Aravis' error for a bit field whose description states no step.
+            step = 1
         below = low + (value - low) // step * step
         if below != value:
             raise self._refused(f"set {name} to {value}", f"it goes in steps of {step}: {below} or {below + step}")

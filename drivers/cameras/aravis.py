@@ -173,14 +173,17 @@ class AravisCamera(Camera):
         return stream
 
     def _restart(self) -> None:
-        """After a frame that never came: stop, drain and start, so that it cannot come later."""
+        """After a frame that never came: stop, drain and start, so that it cannot come later.
+
+        With a new stream: many cameras number their frames from 1 again, and Aravis throws away what comes in one
+        stream with a number that is up to 100 before the last.
+        """
         self._outstanding = False
         with self._features.asking("restart the acquisition"):
             self._camera.stop_acquisition()
-            self._drain()
-            self._camera.start_acquisition()
-        self._last_id = None
-        self._camera_clock.forget()
+        self._drain()
+        let_go([self._forget_stream()])
+        self._start()
 
     def _live_stream(self) -> FrameStream:
         if self._stream is None:

@@ -10,72 +10,27 @@ with `ip addr add 127.0.0.2/8 dev lo`.
 from __future__ import annotations
 
 import ctypes
+import struct
 import tempfile
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
-
-import numpy as np
-from numpy.typing import NDArray
 
 from drivers.aravis_library import load_aravis
 from drivers.errors import CameraError
 from drivers.pixel_formats import PixelFormat, pixel_format, pixel_format_of
 from simulators.camera import gige_features as features
 from simulators.camera.camera_memory import CameraMemory
-from simulators.camera.chunk_stream import ChunkFrame, send
+from simulators.camera.exposure import ExposureInfo, PixelSource, counts_of
+from simulators.camera.frame_packets import FramePackets, send, with_chunks
 from simulators.camera.loopback_address import LoopbackAddress
 from simulators.camera.node_map import node_map
 
 _FillPattern = ctypes.CFUNCTYPE(
     None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32
 )
-
-
-@dataclass(frozen=True, slots=True)
-class ExposureInfo:
-    """What the camera is set to for one exposure.
-
-    Attributes
-    ----------
-    exposure_s, gain_db, black_level :
-        As the driver set them; `black_level` in counts. `gain_db` holds GainRaw on the "aravis" description.
-    frame_id : int
-        1 to 65535, then again 1.
-    width, height, offset_x, offset_y, binning, decimation : int
-        Region in pixels as they are sent, after binning and decimation.
-    reverse_x, reverse_y : bool
-        Mirrored before the region is cut out.
-    """
-
-    exposure_s: float
-    gain_db: float
-    black_level: float
-    frame_id: int
-    width: int
-    height: int
-    offset_x: int
-    offset_y: int
-    binning: int
-    decimation: int = 1
-    reverse_x: bool = False
-    reverse_y: bool = False
-
-    def region_of(self, sensor: NDArray[np.uint16]) -> NDArray[np.uint16]:
-        """What is sent of the counts of the whole sensor; binned pixels are averaged, whatever stands before them."""
-        b, d = self.binning, self.decimation
-        rows, columns = (size // b * b for size in sensor.shape)
-        blocks = sensor[:rows, :columns].reshape(rows // b, b, columns // b, b)
-        pixels = blocks.mean(axis=(1, 3)).round().astype(np.uint16) if b > 1 else sensor
-        pixels = pixels[::d, ::d][:: -1 if self.reverse_y else 1, :: -1 if self.reverse_x else 1]
-        cut = pixels[self.offset_y : self.offset_y + self.height, self.offset_x : self.offset_x + self.width]
-        return np.ascontiguousarray(cut)
-
-
-PixelSource = Callable[[ExposureInfo], NDArray[np.uint16]]
 
 
 class GigeCamera:
@@ -260,16 +215,16 @@ class GigeCamera:
             self.ignored_triggers += 1
             camera.set_property("gvsp-lost-ratio", 1.0)
             return
-        chunked: ChunkFrame | None = None
+        chunked: FramePackets | None = None
         try:
             info = self._info(buffer, exposure_us, gain_raw)
             fmt = self._format(code)
-            data = fmt.encode(self._checked(self._source(info), info, fmt))
+            data = fmt.encode(counts_of(self._source, info, fmt, self.bits))
             if self._sends_chunks():
-                region = (info.offset_x, info.offset_y, info.width, info.height)
-                chunked = ChunkFrame(
-                    info.frame_id, time.time_ns(), code & 0xFFFFFFFF, region, data.tobytes(), self.timeless_frames <= 0
-                )
+                time_ns = time.time_ns()
+                times = {features.TIMESTAMP_CHUNK: struct.pack(">Q", time_ns)} if self.timeless_frames <= 0 else {}
+                payload = with_chunks(data.tobytes(), times)
+                chunked = FramePackets(info.frame_id, time_ns, code & 0xFFFFFFFF, info.region, payload, True)
                 self.timeless_frames -= 1
             else:
                 ctypes.memmove(self._library.arv_buffer_get_data(buffer, None), data.ctypes.data, data.nbytes)
@@ -286,7 +241,7 @@ class GigeCamera:
         self._gone.wait(max(0.0, start_s + exposure_us * 1e-6 + delay_s - time.monotonic()))
         if chunked is not None and self._memory is not None and not self._gone.is_set():
             self.chunk_times_ns.append(chunked.time_ns)
-            send(chunked, self._memory, self.address, self._lost_ratio)
+            send(chunked, self._memory.read, self.address, self._lost_ratio)
 
     def _sends_chunks(self) -> bool:
         offers = self._table is not None and self._table.chunk_timestamp
@@ -335,14 +290,3 @@ class GigeCamera:
             return pixel_format(code)
         names = {value: name for name, value in self._table.codes().items()}
         return pixel_format_of(code, names[code & 0xFFFFFFFF])
-
-    def _checked(self, pixels: NDArray[np.uint16], info: ExposureInfo, fmt: PixelFormat) -> NDArray[np.uint16]:
-        if pixels.shape != (fmt.scale * info.height, fmt.scale * info.width) or pixels.dtype != np.uint16:
-            raise ValueError(
-                f"the pixel source gave {pixels.dtype} {pixels.shape}, not uint16 {(info.height, info.width)}"
-            )
-        if self.bits < fmt.bits and int(pixels.max()) >> self.bits:
-            raise ValueError(f"the pixel source gave {int(pixels.max())}, more than {self.bits} bits hold")
-        if fmt.bits < self.bits:
-            return pixels >> np.uint16(self.bits - fmt.bits)
-        return pixels

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from xml.sax.saxutils import quoteattr
 
 from simulators.camera.node_map import NodeMap
 
@@ -128,7 +129,8 @@ def description(table: NodeMap, width: int, height: int) -> str:
     names = re.findall(r'<\w+ Name="(\w+)" NameSpace="Standard">', "".join(features))
     listed = "".join(f"<pFeature>{name}</pFeature>" for name in names)
     return (
-        f'<?xml version="1.0" encoding="utf-8"?>\n<RegisterDescription ModelName="{table.model}" VendorName="umov"'
+        f'<?xml version="1.0" encoding="utf-8"?>\n<RegisterDescription'
+        f" ModelName={quoteattr(table.model)} VendorName={quoteattr(table.vendor)}"
         ' StandardNameSpace="None" SchemaMajorVersion="1" SchemaMinorVersion="0" SchemaSubMinorVersion="1"'
         ' MajorVersion="1" MinorVersion="0" SubMinorVersion="0" ProductGuid="0" VersionGuid="0"'
         ' xmlns="http://www.genicam.org/GenApi/Version_1_0">\n'

@@ -13,7 +13,8 @@ from drivers.camera import Camera, CameraSettings
 from drivers.errors import CameraBusy, CameraError, CameraLost, CameraNotFound, DeviceError, FrameLost
 from drivers.pixel_formats import pixel_format
 from drivers.registry import device_kinds, open_camera
-from simulators.camera.gige_camera import ExposureInfo, GigeCamera
+from simulators.camera.exposure import ExposureInfo
+from simulators.camera.gige_camera import GigeCamera
 from simulators.camera.node_map import node_map
 from simulators.camera.pixel_stamp import read_stamp, stamp
 from simulators.clock import patient_clock

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from processing.storage.capture_schema import Detector
 from simulators.bench.bench import DARK_CURRENT_E_PER_S, DETECTOR
 from simulators.bench.effects import AnyBenchEffect
+from simulators.camera.played.description_file import is_description
 
 #: A device whose port reads `sim:NAME` stands at the emulator of that name.
 SCHEME = "sim:"
@@ -58,7 +59,8 @@ class SimulatorConfig(_Part):
     effects: tuple[AnyBenchEffect, ...] = ()
     camera: str = Field(
         default="loopback",
-        description="feature table of a maker's camera: a name in simulators/camera/node_maps, or a file (.yaml)",
+        description="feature table of a maker's camera: a name in simulators/camera/node_maps, or a file (.yaml); or "
+        "the GenICam description of a camera itself (.xml, .zip), which is played as it is",
     )
     camera_address: str = Field(
         default="127.0.0.1",
@@ -70,10 +72,10 @@ class SimulatorConfig(_Part):
 
     def below(self, folder: Path) -> SimulatorConfig:
         """The same with its relative paths made absolute, from `folder`."""
-        own_table = self.camera.endswith(".yaml")
+        own_file = self.camera.endswith(".yaml") or is_description(self.camera)
         return self.model_copy(
             update={
-                "camera": str(folder / self.camera) if own_table else self.camera,
+                "camera": str(folder / self.camera) if own_file else self.camera,
                 "samples": {name: folder / path for name, path in self.samples.items()},
                 "truth": {name: folder / path for name, path in self.truth.items()},
             }

@@ -5,12 +5,15 @@ environment takes every table.
 """
 
 import os
+from pathlib import Path
 
 import pytest
 
+from simulators.camera.gige_features import description
 from simulators.camera.node_map import node_map, node_maps
+from simulators.camera.played.played_camera import PlayedCamera
 from simulators.conformance import CameraConformance
-from simulators.conformance.camera import CameraTwin, GigeTwin, Show
+from simulators.conformance.camera import CameraTwin, GigeTwin, Show, pixel_source
 
 ONE_OF_EACH = ["lucid_tri050s_p", "flir_bfs_pge_51s5p", "basler_aca2440_20gm"]
 TABLES = [name for name in node_maps() if name != "loopback"] if os.environ.get("UMOV_EVERY_TABLE") else ONE_OF_EACH
@@ -35,3 +38,32 @@ class TestAravisOnTablesOfMakers(CameraConformance):
 
     def make_twin(self, show: Show) -> CameraTwin:
         return GigeTwin(show, self._table)
+
+
+STYLE = Path(__file__).parent / "descriptions" / "in_the_style_of_makers.xml"
+
+
+class PlayedTwin(GigeTwin):
+    """A GigE Vision camera that plays a description."""
+
+    def __init__(self, show: Show, path: Path) -> None:
+        super().__init__(show)
+        # It sends lost packets again, as a real camera does, and what the kit loses is to stay lost.
+        self.entry |= {"settings": {"pixel_format": "Mono12p"}, "resend": False}
+        self._camera = PlayedCamera("TWIN-1", *self.size, pixel_source(show), path=path, bits=self.bits)
+
+
+class TestAravisOnPlayedDescriptions(CameraConformance):
+    """On a description in the style of makers, and with `UMOV_EVERY_TABLE` on those of the tables."""
+
+    kind = "aravis"
+
+    @pytest.fixture(autouse=True, params=["style", *(TABLES if os.environ.get("UMOV_EVERY_TABLE") else ())])
+    def _described(self, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+        self._path = STYLE
+        if request.param != "style":
+            self._path = tmp_path / "maker.xml"
+            self._path.write_text(description(node_map(request.param), 128, 64))
+
+    def make_twin(self, show: Show) -> CameraTwin:
+        return PlayedTwin(show, self._path)

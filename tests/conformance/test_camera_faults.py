@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from drivers.camera import CameraSettings
 from drivers.cameras import aravis
 from drivers.errors import CameraError, FrameLost
-from simulators.camera.gige_camera import ExposureInfo, GigeCamera
+from simulators.camera.exposure import ExposureInfo
+from simulators.camera.gige_camera import GigeCamera
 from simulators.camera.pixel_stamp import read_stamp
 from simulators.clock import patient_clock
 from simulators.conformance.camera import Scene, pixel_source

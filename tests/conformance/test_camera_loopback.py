@@ -18,7 +18,8 @@ from drivers.camera import CameraSettings
 from drivers.cameras import aravis
 from drivers.errors import CameraError, CameraNotFound, FrameLost, SettingRefused, UnknownPixelFormat
 from simulators.camera import gige_features
-from simulators.camera.gige_camera import ExposureInfo, GigeCamera
+from simulators.camera.exposure import ExposureInfo
+from simulators.camera.gige_camera import GigeCamera
 from simulators.clock import patient_clock
 
 Loopback = Callable[..., tuple[GigeCamera, aravis.AravisCamera]]

@@ -1,9 +1,15 @@
-"""The driver on the feature tables of makers' cameras: names, steps, formats and arming differ, the promises do not."""
+"""The driver on the feature tables of makers' cameras: names, steps, formats and arming differ, the promises do not.
+
+Once more on descriptions written from tables that are played as a maker's file would be: the tables' own camera and the
+player know nothing of each other. ``UMOV_EVERY_TABLE=1`` in the environment plays every table.
+"""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import ExitStack
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +19,11 @@ from drivers.camera import CameraSettings
 from drivers.cameras import aravis
 from drivers.errors import FrameLost, SettingRefused
 from drivers.pixel_formats import pixel_format
-from simulators.camera.gige_camera import ExposureInfo, GigeCamera
+from simulators.camera.exposure import ExposureInfo
+from simulators.camera.gige_camera import GigeCamera
+from simulators.camera.gige_features import description
 from simulators.camera.node_map import NodeMap, node_map, node_maps
+from simulators.camera.played.played_camera import PlayedCamera
 from simulators.clock import patient_clock
 
 SIZE = (64, 48)
@@ -23,10 +32,16 @@ SIZE = (64, 48)
 class MakersCamera:
     """A simulated camera of a maker and the driver that opened it; `bits` are those of the format that it shows."""
 
-    def __init__(self, name: str, stack: ExitStack) -> None:
+    def __init__(self, name: str, stack: ExitStack, played_from: Path | None = None) -> None:
         self.table: NodeMap = node_map(name)
         self.scale = 1
-        self.simulated = stack.enter_context(GigeCamera("MAKER1", *SIZE, self.show, bits=16, description=name))
+        camera: GigeCamera | PlayedCamera
+        if played_from is None:
+            camera = GigeCamera("MAKER1", *SIZE, self.show, bits=16, description=name)
+        else:
+            played_from.write_text(description(self.table, *SIZE))
+            camera = PlayedCamera("MAKER1", *SIZE, self.show, path=played_from, bits=16)
+        self.simulated = stack.enter_context(camera)
         self._stack = stack
 
     def show(self, info: ExposureInfo) -> NDArray[np.uint16]:
@@ -48,10 +63,14 @@ class MakersCamera:
         )
 
 
-@pytest.fixture(params=node_maps())
-def maker(request: pytest.FixtureRequest) -> Iterator[MakersCamera]:
+PLAYED = node_maps() if os.environ.get("UMOV_EVERY_TABLE") else ["basler_aca2440_20gm", "lucid_tri050s_p"]
+
+
+@pytest.fixture(params=[*node_maps(), *(f"played {name}" for name in PLAYED)])
+def maker(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[MakersCamera]:
+    played, _, name = request.param.rpartition(" ")
     with ExitStack() as stack:
-        yield MakersCamera(request.param, stack)
+        yield MakersCamera(name, stack, tmp_path / "maker.xml" if played else None)
 
 
 def test_the_table_names_its_sources_and_known_formats(maker: MakersCamera) -> None:

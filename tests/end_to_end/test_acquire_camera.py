@@ -21,6 +21,7 @@ Acquire = Callable[..., tuple[int, str, str]]
 
 SENSOR = (("90", "45"), ("135", "0"))
 CAMERA = {"kind": "aravis", "bits": 12, "packet_size": 9000}
+STYLE = Path(__file__).parents[1] / "conformance" / "descriptions" / "in_the_style_of_makers.xml"
 THROUGH = ("--sample", "air", "--omega", 180)
 
 
@@ -232,6 +233,32 @@ def test_a_feature_table_of_one_s_own_is_a_camera(
         assert capture.camera_nodes["DeviceModelName"] == "Own-5MP-P"
         assert capture.frame_shape == (32, 48)
     assert_horizontal(path)
+
+
+def test_the_description_of_a_camera_itself_is_played(
+    acquire: Acquire, small_rig: Rig, short_plan: Callable[[str], Path], tmp_path: Path
+) -> None:
+    settings = {"pixel_format": "Mono12p", "width": 48, "height": 32, "offset_x": 4, "offset_y": 5}
+    rig = small_rig(top={"camera": CAMERA | {"settings": settings}}, camera="maker.xml")
+    (rig.parent / "maker.xml").write_bytes(STYLE.read_bytes())
+    out = tmp_path / "captures"
+    code, _, err = acquire("--rig", rig, "--plan", short_plan("drr"), *THROUGH, "--out", out)
+    assert code == 0, err
+    (path,) = out.glob("*.h5")
+    with Capture(path) as capture:
+        assert capture.camera_nodes["DeviceModelName"] == "Style-3k"
+        assert capture.frame_shape == (32, 48)
+        assert capture.closing["stream"]["retakes"] == 0
+    run_process("reduce", path, "--out", tmp_path / "air.h5")
+
+
+def test_a_description_that_cannot_be_played_is_told_in_a_line(acquire: Acquire, small_rig: Rig) -> None:
+    rig = small_rig(camera="maker.xml")
+    (rig.parent / "maker.xml").write_text(STYLE.read_text().replace('"AcquisitionStop"', '"AcquisitionHalt"'))
+    code, out, err = acquire("doctor", "--rig", rig)
+    assert code != 0
+    assert "feature AcquisitionStop is missing" in out + err
+    assert "Traceback" not in out + err
 
 
 def test_a_feature_table_that_is_not_there_is_named_with_those_that_are(acquire: Acquire, small_rig: Rig) -> None:

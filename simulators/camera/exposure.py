@@ -1,0 +1,76 @@
+"""What a simulated camera is set to for an exposure, and what it sends of the counts that its pixel source gives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.pixel_formats import PixelFormat
+
+
+@dataclass(frozen=True, slots=True)
+class ExposureInfo:
+    """What the camera is set to for one exposure.
+
+    Attributes
+    ----------
+    exposure_s, gain_db, black_level :
+        As the driver set them; `black_level` in counts. `gain_db` holds GainRaw on the "aravis" description.
+    frame_id : int
+        1 to 65535, then again 1.
+    width, height, offset_x, offset_y, binning, decimation : int
+        Region in pixels as they are sent, after binning and decimation.
+    reverse_x, reverse_y : bool
+        Mirrored before the region is cut out.
+    """
+
+    exposure_s: float
+    gain_db: float
+    black_level: float
+    frame_id: int
+    width: int
+    height: int
+    offset_x: int
+    offset_y: int
+    binning: int
+    decimation: int = 1
+    reverse_x: bool = False
+    reverse_y: bool = False
+
+    @property
+    def region(self) -> tuple[int, int, int, int]:
+        """Left, top, width and height."""
+        return self.offset_x, self.offset_y, self.width, self.height
+
+    def region_of(self, sensor: NDArray[np.uint16]) -> NDArray[np.uint16]:
+        """What is sent of the counts of the whole sensor; binned pixels are averaged, whatever stands before them."""
+        b, d = self.binning, self.decimation
+        rows, columns = (size // b * b for size in sensor.shape)
+        blocks = sensor[:rows, :columns].reshape(rows // b, b, columns // b, b)
+        pixels = blocks.mean(axis=(1, 3)).round().astype(np.uint16) if b > 1 else sensor
+        pixels = pixels[::d, ::d][:: -1 if self.reverse_y else 1, :: -1 if self.reverse_x else 1]
+        cut = pixels[self.offset_y : self.offset_y + self.height, self.offset_x : self.offset_x + self.width]
+        return np.ascontiguousarray(cut)
+
+
+#: Called at the start of each exposure; gives counts, uint16 of shape (height, width) of the info.
+PixelSource = Callable[[ExposureInfo], NDArray[np.uint16]]
+
+
+def counts_of(source: PixelSource, info: ExposureInfo, fmt: PixelFormat, bits: int) -> NDArray[np.uint16]:
+    """Counts that a pixel source of so many bits gives for an exposure, cut to the bits of a format.
+
+    Raises
+    ------
+    ValueError
+        The source gave another shape or type, or counts of more bits.
+    """
+    pixels = source(info)
+    if pixels.shape != (fmt.scale * info.height, fmt.scale * info.width) or pixels.dtype != np.uint16:
+        raise ValueError(f"the pixel source gave {pixels.dtype} {pixels.shape}, not uint16 {(info.height, info.width)}")
+    if bits < fmt.bits and int(pixels.max()) >> bits:
+        raise ValueError(f"the pixel source gave {int(pixels.max())}, more than {bits} bits hold")
+    return pixels >> np.uint16(bits - fmt.bits) if fmt.bits < bits else pixels

@@ -1,0 +1,76 @@
+"""A frame in packets as GigE Vision has it: a leader, its bytes, a trailer; with or without chunks behind the image.
+
+Aravis' fake camera sends images alone. Each chunk ends with its number and its length.
+"""
+
+from __future__ import annotations
+
+import random
+import socket
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+# Bootstrap registers of the stream channel.
+HOST_PORT, PACKET_SIZE, HOST_ADDRESS = 0xD00, 0xD04, 0xD18
+IMAGE, IMAGE_WITH_CHUNKS = 0x0001, 0x4001
+LEADER, TRAILER, DATA = 1, 2, 3
+# Of IP and UDP, and of GVSP behind them.
+TRANSPORT_BYTES, STREAM_BYTES = 20 + 8, 8
+IMAGE_CHUNK = 1
+
+
+def with_chunks(image: bytes, chunks: dict[int, bytes]) -> bytes:
+    """Image and chunks by their numbers, each followed by its number and length."""
+    parts = {IMAGE_CHUNK: image, **chunks}
+    return b"".join(data + struct.pack(">II", number, len(data)) for number, data in parts.items())
+
+
+@dataclass(frozen=True, slots=True)
+class FramePackets:
+    """One frame: its number, when its exposure began (ns of the camera's clock), format code, region and bytes.
+
+    `region` is left, top, width and height; `chunked` says that the bytes are those of `with_chunks`.
+    """
+
+    frame_id: int
+    time_ns: int
+    code: int
+    region: tuple[int, int, int, int]
+    payload: bytes
+    chunked: bool = False
+
+    def packets(self, packet_bytes: int) -> Iterator[bytes]:
+        """The packets, without their IP and UDP headers."""
+        left, top, width, height = self.region
+        kind = IMAGE_WITH_CHUNKS if self.chunked else IMAGE
+        numbers = (self.time_ns, self.code, width, height, left, top, 0, 0)
+        yield self._packet(LEADER, 0, struct.pack(">HHQIIIIIHH", 0, kind, *numbers))
+        size = packet_bytes - TRANSPORT_BYTES - STREAM_BYTES
+        count = -(-len(self.payload) // size)
+        for k in range(count):
+            yield self._packet(DATA, k + 1, self.payload[k * size : (k + 1) * size])
+        yield self._packet(TRAILER, count + 1, struct.pack(">II", kind, height))
+
+    def _packet(self, kind: int, number: int, content: bytes) -> bytes:
+        return struct.pack(">HHI", 0, self.frame_id, kind << 24 | number) + content
+
+
+def send(
+    frame: FramePackets, register: Callable[[int], int], address: str, lost_ratio: float, numbers: range | None = None
+) -> None:
+    """Send a frame from an address to where the controlling host wants it; loses that part of the packets.
+
+    Parameters
+    ----------
+    register : callable
+        Value of a bootstrap register of 32 bits.
+    numbers : range, optional
+        The packets to send, by their numbers in the frame; all where it is left out.
+    """
+    host = socket.inet_ntoa(struct.pack(">I", register(HOST_ADDRESS)))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as channel:
+        channel.bind((address, 0))
+        for number, packet in enumerate(frame.packets(register(PACKET_SIZE) & 0xFFFF)):
+            if (numbers is None or number in numbers) and random.random() >= lost_ratio:
+                channel.sendto(packet, (host, register(HOST_PORT) & 0xFFFF))

@@ -1,0 +1,1 @@
+"""A GigE Vision camera that plays the GenICam description of a maker as it is."""

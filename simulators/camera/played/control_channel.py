@@ -1,0 +1,150 @@
+"""The control protocol of GigE Vision (GVCP) as a camera answers it: discovery, registers, memory, who controls.
+
+Numbers of commands and registers are those that Aravis and Wireshark's dissector have in public.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+import threading
+import time
+from typing import Protocol
+
+PORT = 3956
+_KEY, _ACK_WANTED = 0x42, 0x01
+_DISCOVERY, _RESEND, _READ_REGISTERS, _WRITE_REGISTERS, _READ_MEMORY, _WRITE_MEMORY = (
+    0x0002,
+    0x0040,
+    0x0080,
+    0x0082,
+    0x0084,
+    0x0086,
+)
+_DONE, _NOT_IMPLEMENTED, _ACCESS_DENIED = 0, 0x8001, 0x8006
+# What a discovery tells are the first registers, as they stand.
+_DISCOVERY_BYTES = 0xF8
+HEARTBEAT_MS, CONTROL = 0x0938, 0x0A00
+_SLICE_S = 0.2
+
+_Address = tuple[str, int]
+
+
+class Device(Protocol):
+    """The camera behind the channel; called from the channel's thread."""
+
+    def read(self, address: int, count: int) -> bytes:
+        """Bytes from an address on."""
+
+    def write(self, address: int, data: bytes) -> None:
+        """Take bytes from an address on, and do what they command."""
+
+    def resend(self, frame_id: int, first: int, last: int) -> None:
+        """Send packets of a frame once more."""
+
+    def released(self) -> None:
+        """Nobody controls the camera any more."""
+
+
+class ControlChannel:
+    """Answers at one address from `open` to `close`, in a thread of its own."""
+
+    def __init__(self, device: Device) -> None:
+        self._device = device
+        self._socket: socket.socket | None = None
+        self._thread: threading.Thread | None = None
+        self._controller: _Address | None = None
+        self._heard_s = 0.0
+
+    def open(self, address: str) -> None:
+        """Begin to answer. Raises OSError where the address cannot be had."""
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind((address, PORT))
+        except OSError:
+            self._socket.close()
+            raise
+        self._socket.settimeout(_SLICE_S)
+        self._controller = None
+        self._thread = threading.Thread(target=self._serve, args=(self._socket,), name=f"camera {address}", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Answer no more; closing twice is harmless."""
+        channel, self._socket = self._socket, None
+        if channel is not None and self._thread is not None:
+            self._thread.join()
+            channel.close()
+
+    def _serve(self, channel: socket.socket) -> None:
+        while self._socket is channel:
+            self._let_go_of_the_silent()
+            try:
+                packet, sender = channel.recvfrom(2048)
+            except TimeoutError:
+                continue
+            except OSError:
+                # The port of somebody who is gone; the next packet is another's.
+                continue
+            # A packet that is too short for what it says is nobody's command.
+            with contextlib.suppress(struct.error, OSError):
+                self._answer(channel, packet, sender)
+
+    def _let_go_of_the_silent(self) -> None:
+        (allowed_ms,) = struct.unpack(">I", self._device.read(HEARTBEAT_MS, 4))
+        if self._controller is not None and time.monotonic() - self._heard_s > allowed_ms * 1e-3:
+            self._release()
+
+    def _release(self) -> None:
+        self._controller = None
+        self._device.write(CONTROL, bytes(4))
+        self._device.released()
+
+    def _answer(self, channel: socket.socket, packet: bytes, sender: _Address) -> None:
+        key, flags, command, size, number = struct.unpack_from(">BBHHH", packet)
+        if key != _KEY:
+            return
+        if sender == self._controller:
+            self._heard_s = time.monotonic()
+        status, content = self._do(command, packet[8 : 8 + size], sender)
+        if flags & _ACK_WANTED:
+            channel.sendto(struct.pack(">HHHH", status, command + 1, len(content), number) + content, sender)
+
+    def _do(self, command: int, content: bytes, sender: _Address) -> tuple[int, bytes]:
+        device = self._device
+        if command == _DISCOVERY:
+            return _DONE, device.read(0, _DISCOVERY_BYTES)
+        if command == _READ_REGISTERS:
+            addresses = struct.unpack(f">{len(content) // 4}I", content)
+            return _DONE, b"".join(device.read(address, 4) for address in addresses)
+        if command == _READ_MEMORY:
+            address, count = struct.unpack(">I2xH", content)
+            return _DONE, content[:4] + device.read(address, count)
+        if command == _RESEND:
+            frame_id, first, last = struct.unpack_from(">2xHII", content)
+            device.resend(frame_id, first & 0xFFFFFF, last & 0xFFFFFF)
+            return _DONE, b""
+        if command == _WRITE_REGISTERS:
+            written = [(content[at : at + 4], content[at + 4 : at + 8]) for at in range(0, len(content) - 7, 8)]
+            return self._write([(struct.unpack(">I", where)[0], data) for where, data in written], sender)
+        if command == _WRITE_MEMORY:
+            return self._write([(struct.unpack_from(">I", content)[0], content[4:])], sender)
+        return _NOT_IMPLEMENTED, b""
+
+    def _write(self, written: list[tuple[int, bytes]], sender: _Address) -> tuple[int, bytes]:
+        for address, data in written:
+            if address == CONTROL and self._controller in (None, sender):
+                self._take_control(data, sender)
+            elif self._controller == sender:
+                self._device.write(address, data)
+            else:
+                return _ACCESS_DENIED, b""
+        return _DONE, struct.pack(">2xH", len(written))
+
+    def _take_control(self, data: bytes, sender: _Address) -> None:
+        if any(data):
+            self._controller, self._heard_s = sender, time.monotonic()
+            self._device.write(CONTROL, data)
+        elif self._controller == sender:
+            self._release()

@@ -1,0 +1,300 @@
+"""A simulated camera that serves a maker's GenICam description as it is and does what its features say.
+
+Registers are memory; a few features are played by their standard (SFNC) names: region, pixel format, exposure, gain,
+triggers, acquisition, status, time stamps behind the image. What a description says beyond them, a program can set
+and read back. Control and stream protocol are our own here: Aravis' fake camera has 64 KiB of registers, and those of
+the makers stand all over 32 bits.
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+import threading
+import time
+from collections import deque
+from pathlib import Path
+from typing import Self
+
+from drivers.errors import CameraError
+from drivers.pixel_formats import pixel_format_of
+from simulators.camera.exposure import PixelSource, counts_of
+from simulators.camera.frame_packets import (
+    HOST_ADDRESS,
+    HOST_PORT,
+    PACKET_SIZE,
+    TRANSPORT_BYTES,
+    FramePackets,
+    send,
+    with_chunks,
+)
+from simulators.camera.loopback_address import LoopbackAddress
+from simulators.camera.played.bootstrap import boot
+from simulators.camera.played.control_channel import ControlChannel
+from simulators.camera.played.description_file import read_description
+from simulators.camera.played.features import START, STOP, TRIGGER, Features
+from simulators.camera.played.node_tree import REGISTERS, NodeError, NodeTree
+from simulators.camera.played.power_up import power_up
+from simulators.camera.played.register import RegisterMemory
+
+# Set by a program that wants one packet of the size to see whether it gets through.
+_TEST_PACKET = 1 << 31
+_MOST_XML_BYTES = 1 << 24
+_KEPT_FRAMES = 4
+# Between two frames of a camera that runs without triggers.
+_FREE_RUN_S = 0.05
+
+
+class PlayedCamera:
+    """A simulated camera; a context manager that runs it.
+
+    Parameters
+    ----------
+    serial, width, height, pixel_source, bits, lost_ratio, address, wait_s, elsewhere :
+        As of `GigeCamera`.
+    path : Path
+        The description: XML, or the zip archive that holds it.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be used; NodeError where a feature that a capture needs cannot be played.
+    """
+
+    def __init__(
+        self,
+        serial: str,
+        width: int,
+        height: int,
+        pixel_source: PixelSource,
+        path: Path,
+        bits: int = 12,
+        lost_ratio: float = 0.0,
+        address: str = "127.0.0.1",
+        wait_s: float = 60.0,
+        elsewhere: bool = False,
+    ) -> None:
+        self.serial = serial
+        self.address = address
+        self.bits = bits
+        self.lost_ratio = lost_ratio
+        #: Triggers that came while the camera exposed.
+        self.ignored_triggers = 0
+        self._sensor = (width, height)
+        self._source = pixel_source
+        self._path = path
+        self._wait_s = wait_s
+        self._description = read_description(path)
+        self._loopback = LoopbackAddress(address, elsewhere)
+        self._error: BaseException | None = None
+        # Control answers in one thread, exposures run in another; both look at the registers.
+        self._lock = threading.RLock()
+        self._wake = threading.Condition(self._lock)
+        self._channel = ControlChannel(self)
+        self._worker: threading.Thread | None = None
+        self._plugged_in = self._acquiring = self._triggered = self._busy = False
+        self._frame_id = 0
+        self._sent: deque[FramePackets] = deque(maxlen=_KEPT_FRAMES)
+        self._prepare()
+
+    def _prepare(self) -> None:
+        root = self._description.root
+        texts = {
+            "DeviceVendorName": root.get("VendorName") or "unknown",
+            "DeviceModelName": root.get("ModelName") or "unknown",
+            "DeviceVersion": "simulated",
+            "DeviceID": self.serial,
+        }
+        self._memory = RegisterMemory()
+        self._nodes = NodeTree(root, self._memory, self._path)
+        try:
+            power_up(self._nodes, self._sensor, {**texts, "DeviceSerialNumber": self.serial})
+            self._features = Features(self._nodes, self._sensor)
+        except RecursionError as error:
+            raise NodeError(f"{self._path}: its features refer to each other without an end") from error
+        self._xml_at = self._free_address()
+        xml = (self._description.name, self._xml_at, len(self._description.served))
+        boot(self._memory, self.address, texts, xml)
+
+    def _free_address(self) -> int:
+        taken = []
+        for name in self._nodes:
+            if self._nodes.node(name).tag in REGISTERS:
+                try:
+                    taken.append(self._nodes.register(name))
+                except NodeError:
+                    continue
+        tops = range(0xFF00_0000, 0, -_MOST_XML_BYTES)
+        return next(at for at in tops if not any(register.overlaps(at, _MOST_XML_BYTES) for register in taken))
+
+    # --- life --------------------------------------------------------------------------------------------
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        self.stop()
+        if error is None:
+            self.check()
+
+    def start(self) -> None:
+        """Start the camera, also again after `vanish`, when it is as after being switched on.
+
+        Raises
+        ------
+        CameraError
+            The address is taken or does not exist.
+        """
+        self._loopback.take(self._wait_s)
+        self.address = self._loopback.address
+        self._prepare()
+        self._plugged_in = True
+        try:
+            self._channel.open(self.address)
+        except OSError as error:
+            self._loopback.release()
+            raise CameraError(
+                f"start a simulated camera at {self.address}", str(error), "Is it running already?"
+            ) from error
+        self._worker = threading.Thread(target=self._run, name=f"exposures of camera {self.address}", daemon=True)
+        self._worker.start()
+
+    def stop(self) -> None:
+        """End the camera and let the next one have its address."""
+        self.vanish()
+        self._loopback.release()
+
+    def vanish(self) -> None:
+        """End the camera at once, as if its plug was pulled; `start` plugs it in again."""
+        with self._wake:
+            self._plugged_in = self._acquiring = False
+            self._wake.notify_all()
+        self._channel.close()
+        worker, self._worker = self._worker, None
+        if worker is not None:
+            worker.join()
+
+    def check(self) -> None:
+        """Raise what went wrong in an exposure, if anything did."""
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
+    def fire(self) -> None:
+        """Start an exposure from outside, as a pulse on the trigger line does."""
+        self._trigger(by_program=False)
+
+    # --- what the control channel asks for ---------------------------------------------------------------
+
+    def read(self, address: int, count: int) -> bytes:
+        """Bytes of the registers, or of the description behind them."""
+        start = address - self._xml_at
+        if 0 <= start < _MOST_XML_BYTES:
+            return self._description.served[start : start + count].ljust(count, b"\0")
+        with self._lock:
+            return self._memory.read(address, count)
+
+    def write(self, address: int, data: bytes) -> None:
+        """Write registers, and do what was commanded by it."""
+        with self._wake:
+            self._memory.write(address, data)
+            if address == PACKET_SIZE and self._bootstrap(PACKET_SIZE) & _TEST_PACKET:
+                self._send_test_packet()
+            try:
+                commands = self._features.heard(address, len(data))
+                self._features.follow()
+                if TRIGGER in commands:
+                    self._trigger(by_program=True)
+            except NodeError as error:
+                self._error = self._error or error
+                return
+            if START in commands:
+                self._acquiring, self._triggered, self._frame_id = True, False, 0
+            if STOP in commands:
+                self._acquiring = self._triggered = False
+            self._wake.notify_all()
+
+    def resend(self, frame_id: int, first: int, last: int) -> None:
+        """Send packets once more, while the frame is kept."""
+        for frame in list(self._sent):
+            if frame.frame_id == frame_id:
+                send(frame, self._bootstrap, self.address, self.lost_ratio, range(first, last + 1))
+
+    def released(self) -> None:
+        """Without anybody who controls it a camera stops."""
+        with self._wake:
+            self._acquiring = self._triggered = False
+
+    def _bootstrap(self, address: int) -> int:
+        return int(struct.unpack(">I", self._memory.read(address, 4))[0])
+
+    def _send_test_packet(self) -> None:
+        size = self._bootstrap(PACKET_SIZE)
+        self._memory.write(PACKET_SIZE, struct.pack(">I", size & ~_TEST_PACKET))
+        host = socket.inet_ntoa(self._memory.read(HOST_ADDRESS, 4))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as channel:
+            channel.bind((self.address, 0))
+            channel.sendto(
+                bytes(max(0, (size & 0xFFFF) - TRANSPORT_BYTES)), (host, self._bootstrap(HOST_PORT) & 0xFFFF)
+            )
+
+    # --- exposures ---------------------------------------------------------------------------------------
+
+    def _trigger(self, *, by_program: bool) -> None:
+        with self._wake:
+            source = self._features.trigger_source()
+            if not self._acquiring or source is None or by_program != (source == "Software"):
+                return
+            if self._busy or self._triggered:
+                self.ignored_triggers += 1
+                return
+            self._triggered = True
+            self._wake.notify_all()
+
+    def _run(self) -> None:
+        while self._plugged_in:
+            try:
+                if self._wait_for_start():
+                    self._expose()
+            except BaseException as error:  # noqa: BLE001 - check() raises it where it is seen
+                self._error = self._error or error
+            finally:
+                self._busy = False
+
+    def _wait_for_start(self) -> bool:
+        with self._wake:
+            self._wake.wait_for(lambda: self._acquiring or not self._plugged_in)
+            if self._acquiring and self._features.trigger_source() is None:
+                self._wake.wait_for(lambda: not self._acquiring, _FREE_RUN_S)
+                self._triggered = self._acquiring
+            self._wake.wait_for(lambda: self._triggered or not self._acquiring, _FREE_RUN_S)
+            if not (self._triggered and self._acquiring):
+                return False
+            self._triggered, self._busy = False, True
+            self._frame_id = self._frame_id % 65535 + 1
+            return True
+
+    def _expose(self) -> None:
+        start_s, time_ns = time.monotonic(), time.time_ns()
+        with self._lock:
+            info = self._features.info(self._frame_id)
+            fmt = pixel_format_of(*self._features.pixel_format())
+            self._features.show(exposing=True, armed=False)
+        try:
+            data = fmt.encode(counts_of(self._source, info, fmt, self.bits)).tobytes()
+            with self._wake:
+                left_s = start_s + info.exposure_s - time.monotonic()
+                self._wake.wait_for(lambda: not self._acquiring, max(0.0, left_s))
+                if not self._acquiring:
+                    return
+                code, _ = self._features.pixel_format()
+                chunks = self._features.time_chunk(time_ns)
+        finally:
+            with self._lock:
+                self._busy = False
+                self._features.show(exposing=False, armed=True)
+        payload = data if chunks is None else with_chunks(data, chunks)
+        frame = FramePackets(info.frame_id, time_ns, code & 0xFFFF_FFFF, info.region, payload, chunks is not None)
+        self._sent.append(frame)
+        send(frame, self._bootstrap, self.address, self.lost_ratio)
