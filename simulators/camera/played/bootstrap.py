@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import struct
 
-from simulators.camera.played.control_channel import HEARTBEAT_MS
+from simulators.camera.played.control_channel import CONTROL, HEARTBEAT_MS
 from simulators.camera.played.register import RegisterMemory
 
 # Version 1.2; big-endian registers and UTF-8 texts; writing memory, several registers at once, and packets again.
@@ -49,7 +49,10 @@ def boot(memory: RegisterMemory, address: str, texts: dict[str, str], xml: tuple
         (HEARTBEAT_MS, 3000),
         (0x093C, _TICKS_PER_S >> 32),
         (0x0940, _TICKS_PER_S & 0xFFFF_FFFF),
+        (CONTROL, 0),
+        (0x0D00, 0),
         (0x0D04, 1500),
+        (0x0D18, 0),
     ):
         memory.write(register, struct.pack(">I", value))
     for name, (register, length) in _TEXTS.items():

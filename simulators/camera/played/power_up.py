@@ -106,17 +106,19 @@ def tell(nodes: NodeTree, name: str, value: Number) -> bool:
 def _make(nodes: NodeTree, name: str, good: Callable[[Number], bool], candidates: Sequence[Number]) -> bool:
     if good(nodes.value(name)):
         return True
-    for register in sorted(nodes.inputs(name)):
-        if not nodes.is_the_cameras_own(register):
-            continue
-        before = nodes.value(register)
+    own = [register for register in sorted(nodes.inputs(name)) if nodes.is_the_cameras_own(register)]
+    # One after another, and all of them together for a formula that wants several.
+    for registers in (*([register] for register in own), own):
+        before = {register: nodes.value(register) for register in registers}
         for candidate in candidates:
-            nodes.set_value(register, candidate)
+            for register in registers:
+                nodes.set_value(register, candidate)
             # In the wrong register it may leave a formula without a value.
             with contextlib.suppress(NodeError):
                 if good(nodes.value(name)):
                     return True
-        nodes.set_value(register, before)
+        for register, value in before.items():
+            nodes.set_value(register, value)
     return False
 
 
