@@ -93,6 +93,8 @@ class PlayedCamera:
         self._channel = ControlChannel(self)
         self._worker: threading.Thread | None = None
         self._plugged_in = self._acquiring = self._triggered = self._busy = False
+        # Which start of the acquisition this is: an exposure of an earlier one is thrown away.
+        self._run_number = 0
         self._frame_id = 0
         self._sent: deque[FramePackets] = deque(maxlen=_KEPT_FRAMES)
         self._prepare()
@@ -168,8 +170,8 @@ class PlayedCamera:
     def vanish(self) -> None:
         """End the camera at once, as if its plug was pulled; `start` plugs it in again."""
         with self._wake:
-            self._plugged_in = self._acquiring = False
-            self._wake.notify_all()
+            self._plugged_in = False
+            self._begin(acquiring=False)
         self._channel.close()
         worker, self._worker = self._worker, None
         if worker is not None:
@@ -209,11 +211,8 @@ class PlayedCamera:
             except NodeError as error:
                 self._error = self._error or error
                 return
-            if START in commands:
-                self._acquiring, self._triggered, self._frame_id = True, False, 0
-            if STOP in commands:
-                self._acquiring = self._triggered = False
-            self._wake.notify_all()
+            if START in commands or STOP in commands:
+                self._begin(acquiring=START in commands)
 
     def resend(self, frame_id: int, first: int, last: int) -> None:
         """Send packets once more, while the frame is kept."""
@@ -223,8 +222,15 @@ class PlayedCamera:
 
     def released(self) -> None:
         """Without anybody who controls it a camera stops."""
+        self._begin(acquiring=False)
+
+    def _begin(self, *, acquiring: bool) -> None:
+        """Start or stop: whatever was under way ends, and frames are numbered anew."""
         with self._wake:
-            self._acquiring = self._triggered = False
+            self._acquiring, self._triggered, self._frame_id = acquiring, False, 0
+            self._run_number += 1
+            self._features.show(exposing=False, armed=True)
+            self._wake.notify_all()
 
     def _bootstrap(self, address: int) -> int:
         return int(struct.unpack(">I", self._memory.read(address, 4))[0])
@@ -250,6 +256,8 @@ class PlayedCamera:
                 self.ignored_triggers += 1
                 return
             self._triggered = True
+            # Before the command is answered: whoever asks then is told that it exposes.
+            self._features.show(exposing=True, armed=False)
             self._wake.notify_all()
 
     def _run(self) -> None:
@@ -267,7 +275,8 @@ class PlayedCamera:
             self._wake.wait_for(lambda: self._acquiring or not self._plugged_in)
             if self._acquiring and self._features.trigger_source() is None:
                 self._wake.wait_for(lambda: not self._acquiring, _FREE_RUN_S)
-                self._triggered = self._acquiring
+                if self._acquiring:
+                    self._triggered = True
             self._wake.wait_for(lambda: self._triggered or not self._acquiring, _FREE_RUN_S)
             if not (self._triggered and self._acquiring):
                 return False
@@ -278,6 +287,7 @@ class PlayedCamera:
     def _expose(self) -> None:
         start_s, time_ns = time.monotonic(), time.time_ns()
         with self._lock:
+            run_number = self._run_number
             info = self._features.info(self._frame_id)
             fmt = pixel_format_of(*self._features.pixel_format())
             self._features.show(exposing=True, armed=False)
@@ -285,15 +295,16 @@ class PlayedCamera:
             data = fmt.encode(counts_of(self._source, info, fmt, self.bits)).tobytes()
             with self._wake:
                 left_s = start_s + info.exposure_s - time.monotonic()
-                self._wake.wait_for(lambda: not self._acquiring, max(0.0, left_s))
-                if not self._acquiring:
+                self._wake.wait_for(lambda: self._run_number != run_number, max(0.0, left_s))
+                if self._run_number != run_number:
                     return
                 code, _ = self._features.pixel_format()
                 chunks = self._features.time_chunk(time_ns)
         finally:
             with self._lock:
                 self._busy = False
-                self._features.show(exposing=False, armed=True)
+                if self._run_number == run_number:
+                    self._features.show(exposing=False, armed=True)
         payload = data if chunks is None else with_chunks(data, chunks)
         frame = FramePackets(info.frame_id, time_ns, code & 0xFFFF_FFFF, info.region, payload, chunks is not None)
         self._sent.append(frame)
