@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import approx_fprime, least_squares
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from processing.calibration.known_sample import CalibrationError, Part
 from processing.calibration.train_values import FITTABLE, TrainValues, checked_names, values_of, with_values
@@ -332,7 +332,7 @@ def _chance(found: Any, freedom: int, free_fit: Any, separate_freedom: int) -> f
     if held == 0:
         return None
     worse = (found.cost - free_fit.cost) / held / (free_fit.cost / separate_freedom)
-    return float(f_distribution.sf(worse, held, separate_freedom))
+    return float(fdtrc(held, separate_freedom, worse))
 
 
 def _wavelengths(parts: Sequence[Part]) -> list[float]:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import least_squares
 
 from processing.arrays import Array, ComplexArray
 from processing.errors import NotDetermined
@@ -156,6 +155,9 @@ def _some(good: NDArray[np.bool_], limit: int) -> NDArray[np.int64]:
 
 
 def _search(residual: Callable[[Array], Array]) -> tuple[Array, Array]:
+    # Every module of this folder is imported when a material file is read, the optimizer only where it is needed.
+    from scipy.optimize import least_squares
+
     def flat(p: Array) -> Array:
         return residual(p).reshape(-1)
 
