@@ -18,6 +18,8 @@ LEADER, TRAILER, DATA = 1, 2, 3
 # Of IP and UDP, and of GVSP behind them.
 TRANSPORT_BYTES, STREAM_BYTES = 20 + 8, 8
 IMAGE_CHUNK = 1
+# Smaller packets than this are nobody's wish, and would hold nothing.
+_LEAST_PACKET_BYTES = 64
 
 
 def with_chunks(image: bytes, chunks: dict[int, bytes]) -> bytes:
@@ -71,6 +73,6 @@ def send(
     host = socket.inet_ntoa(struct.pack(">I", register(HOST_ADDRESS)))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as channel:
         channel.bind((address, 0))
-        for number, packet in enumerate(frame.packets(register(PACKET_SIZE) & 0xFFFF)):
+        for number, packet in enumerate(frame.packets(max(register(PACKET_SIZE) & 0xFFFF, _LEAST_PACKET_BYTES))):
             if (numbers is None or number in numbers) and random.random() >= lost_ratio:
                 channel.sendto(packet, (host, register(HOST_PORT) & 0xFFFF))

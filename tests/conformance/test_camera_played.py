@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import socket
+import struct
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -151,6 +153,35 @@ def test_what_cannot_be_played_is_refused_with_the_name_of_the_feature(
     with pytest.raises(ConfigError, match=says) as refused:
         PlayedCamera("PLAYED1", *SIZE, Shown(), path=path)
     assert str(path) in str(refused.value)
+
+
+def test_spoilt_descriptions_are_played_or_refused(tmp_path: Path) -> None:
+    path, text = tmp_path / "maker.xml", STYLE.read_text()
+    values = [found.span(1) for found in re.finditer(r">([^<>\n]+)<", text)]
+    spoilt = ["", "0", "-1", "nan", "1e400", "0xFFFFFFFFFFFFFFFF", "9" * 40, "2.5", "GainReg", "Width", "A/0"]
+    rng = np.random.default_rng(5)
+    refused = 0
+    for start, end in rng.choice(values, 60):
+        path.write_text(text[:start] + str(rng.choice(spoilt)) + text[end:])
+        try:
+            PlayedCamera("PLAYED1", *SIZE, Shown(), path=path)
+        except ConfigError:
+            refused += 1
+    assert 10 < refused < 50
+
+
+def test_packets_of_strangers_and_nonsense_leave_the_camera_as_it_was(stack: ExitStack) -> None:
+    played(stack)
+    camera = opened(stack)
+    camera.configure(CameraSettings(exposure_s=1e-3))
+    camera.capture()
+    rng = np.random.default_rng(6)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        for command in rng.choice([0x02, 0x40, 0x80, 0x82, 0x84, 0x86, 0x99], 200):
+            content = rng.bytes(int(rng.integers(0, 24)))
+            packet = struct.pack(">BBHHH", 0x42, 1, command, len(content), 7) + content
+            stranger.sendto(packet[: int(rng.integers(1, len(packet) + 1))], ("127.0.0.1", 3956))
+    assert camera.capture(2)[1].frame_id == 3
 
 
 BOMB = "<!DOCTYPE x [" + "".join(f'<!ENTITY e{k + 1} "{f"&e{k};" * 10}">' for k in range(9)) + "]><x>&e9;</x>"

@@ -123,7 +123,10 @@ class Formula:
         """Value with the variables that `look_up` knows by name. Raises FormulaError where it has none."""
         try:
             found = self._term(look_up)
-            return int(found) if self._whole else float(found)
+            value = int(found) if self._whole else float(found)
+            if not math.isfinite(value):
+                raise ValueError(f"it is {value}")
+            return value
         except (ArithmeticError, ValueError, TypeError) as why:
             raise FormulaError(f"{self._text[:80]!r} has no value ({why})") from why
 

@@ -6,6 +6,7 @@ them: Integer, Float, Enumeration, Boolean, Command, the registers with computed
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,6 +27,8 @@ _NODES = (*REGISTERS, *_FORMULAS, *_CONVERTERS, *_VARIABLES, "Category", "Port")
 _LONGEST_WAY = 40
 # A hostile file could ask for a register of the whole memory.
 _LONGEST_REGISTER = 1 << 16
+# In place of infinity, which is a limit in some descriptions.
+_LARGEST = 1e300
 
 Limit = Literal["Min", "Max", "Inc"]
 
@@ -370,9 +373,14 @@ class NodeTree:
         try:
             if text[:2].lower() == "0x":
                 return int(text, 16)
-            return int(text) if text.lstrip("+-").isdecimal() else float(text)
+            if text.lstrip("+-").isdecimal():
+                return int(text)
+            number = float(text)
         except ValueError:
-            raise self.error(name, f"has {one_line(text, 40)!r} where a number belongs") from None
+            number = math.nan
+        if math.isnan(number):
+            raise self.error(name, f"has {one_line(text, 40)!r} where a number belongs")
+        return min(max(number, -_LARGEST), _LARGEST)
 
     @contextmanager
     def _passing(self, name: str) -> Iterator[None]:

@@ -208,7 +208,8 @@ class PlayedCamera:
                 self._features.follow()
                 if TRIGGER in commands:
                     self._trigger(by_program=True)
-            except NodeError as error:
+            except (NodeError, ArithmeticError, ValueError) as error:
+                # Registers hold whatever is written: no program may end the thread that answers.
                 self._error = self._error or error
                 return
             if START in commands or STOP in commands:
