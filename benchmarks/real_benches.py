@@ -26,18 +26,22 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def one(task: tuple[str, int, str], folder: Path, pixels: int, again: bool, oracle: bool) -> dict[str, Any]:
+def one(
+    task: tuple[str, int, str], folder: Path, pixels: int, again: bool, oracle: bool, polarimeter: dict[str, Any]
+) -> dict[str, Any]:
     """Judge one bench as (group, seed, captures given); from its file if it was judged before."""
     from simulators.blind.bench_oracle import known_oracle
     from simulators.blind.bench_run import judge_bench
-    from simulators.blind.real_bench import make_bench, read_truth
+    from simulators.blind.real_bench import Polarimeter, make_bench, read_truth
 
     group, seed, given = task
     name = f"{group}_{seed:04d}"
     kept = folder / "results" / f"{name}_{given}.json"
     if kept.exists() and not again:
         return dict(json.loads(kept.read_text(encoding="utf-8"))["judgement"])
-    truth = next(read_truth(folder, name), None) or make_bench(folder, seed, ROOT / "configs", group, pixels)
+    truth = next(read_truth(folder, name), None) or make_bench(
+        folder, seed, ROOT / "configs", group, pixels, Polarimeter(**polarimeter)
+    )
     judgement, result = judge_bench(folder, truth, ROOT / "configs", given)
     if oracle:
         judgement = replace(judgement, oracle=known_oracle(folder, truth, ROOT / "configs", given))
@@ -66,6 +70,10 @@ def main() -> None:
     parser.add_argument("--group", nargs="+", choices=list(GROUPS), default=["real"])
     parser.add_argument("--given", nargs="+", choices=list(GIVEN), default=["joint"], help="captures that are given")
     parser.add_argument("--pixels", type=int, default=PIXELS, help="side of the images that are made")
+    parser.add_argument("--instrument", help="another file of configs/instruments, in a DIR of its own")
+    parser.add_argument("--states", type=int, help="of one capture")
+    parser.add_argument("--step", dest="step_deg", type=float, help="of the generator's plate, degrees")
+    parser.add_argument("--ratio", type=float, help="the analyzer's plate turns so many times as far")
     parser.add_argument("--again", action="store_true", help="diagnose anew what was judged before")
     parser.add_argument("--no-oracle", action="store_true", help="without the fit of the true set")
     parser.add_argument("--figure", type=Path, help="reliability diagram of all that is judged")
@@ -73,7 +81,14 @@ def main() -> None:
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     tasks = list(product(options.group, options.seeds, options.given))
-    more = {"pixels": options.pixels, "again": options.again, "oracle": not options.no_oracle}
+    named = {name: getattr(options, name) for name in ("instrument", "states", "step_deg", "ratio")}
+    polarimeter = {name: value for name, value in named.items() if value is not None}
+    more = {
+        "pixels": options.pixels,
+        "again": options.again,
+        "oracle": not options.no_oracle,
+        "polarimeter": polarimeter,
+    }
     run = partial(one, folder=options.folder, **more)
     found = []
     with ProcessPoolExecutor(options.workers) as workers:

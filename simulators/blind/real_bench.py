@@ -30,11 +30,9 @@ from simulators.blind.undeclared_captures import Bench, Scene, counted, digitize
 from simulators.blind.undeclared_faults import LISTED, UNLISTED, Fault, Truth
 from simulators.blind.wiring import MOSAIC_WIRING, WIRING
 
-INSTRUMENTS = {False: "rgb950.yaml", True: "mosaic_polarimeter.yaml"}
 #: Of even and of odd seeds.
 WAVELENGTHS_NM = (662.0, 451.0)
 MOSAIC_NM = 662.0
-STATES = {False: 40, True: 16}
 PIXELS = 64
 FITTED = ("sphere", "flat", "air")
 VALIDATION = "validation"
@@ -58,6 +56,28 @@ GROUPS: dict[str, dict[str, Fault]] = {
 ONCE = frozenset({"rotation_slip", "bad_frame"})
 #: Side of the squares of pixels whose mean decides whether a fault matters.
 PATCH = 8
+
+
+@dataclass(frozen=True)
+class Polarimeter:
+    """Whose bench it is.
+
+    Attributes
+    ----------
+    instrument : file with the plates "psg" and "psa" (of a mosaic "psg" alone) and a polarizer named "analyzer".
+    states : of one capture.
+    step_deg : of the generator's plate from state to state; by default they divide its turn.
+    ratio : the analyzer's plate turns so many times as far.
+    """
+
+    instrument: str = "rgb950.yaml"
+    states: int = 40
+    step_deg: float | None = None
+    ratio: float = 4.91
+
+
+RGB950 = Polarimeter()
+MOSAIC = Polarimeter("mosaic_polarimeter.yaml", 16)
 
 
 class Disc(Scene):
@@ -109,12 +129,13 @@ ONE_THING: dict[str, Fault] = {name: fault for group in GROUPS.values() for name
 
 @dataclass(frozen=True)
 class _Draw:
-    """Kind, seed and axis of one fault, before it is applied to a capture."""
+    """Kind, seed and axis of one fault, before it is applied to a capture of so many states."""
 
     kind: str
     seed: int
     axis: str
     once: str
+    states: int
 
     def apply(self, bench: Bench, capture: str) -> TrueFault | None:
         own = self.kind in OF_THE_CAPTURE
@@ -123,37 +144,52 @@ class _Draw:
             return None
         bench.axis = self.axis
         random = np.random.default_rng([self.seed, FITTED.index(capture)] if own else self.seed)
-        states = STATES[bench.mosaic]
         if self.kind in PRIORS:
-            truth: Truth = LISTED[self.kind](bench, random, states, PRIORS[self.kind].sizes)
+            truth: Truth = LISTED[self.kind](bench, random, self.states, PRIORS[self.kind].sizes)
         else:
-            truth = ONE_THING[self.kind](bench, random, states)
+            truth = ONE_THING[self.kind](bench, random, self.states)
         return TrueFault(truth.kind, truth.place, truth.parameters, capture if own else None)
 
 
-def make_bench(folder: Path, seed: int, configs: Path, group: str = "real", pixels: int = PIXELS) -> RealBench:
+def make_bench(
+    folder: Path,
+    seed: int,
+    configs: Path,
+    group: str = "real",
+    pixels: int = PIXELS,
+    polarimeter: Polarimeter = RGB950,
+) -> RealBench:
     """Write the captures of one bench under `folder` and its truth under `folder/truth`; same seed, same files.
 
     Parameters
     ----------
     group : one of `GROUPS`.
     pixels : side of the images.
+    polarimeter : for all groups but "mosaic_wiring".
     """
     random = np.random.default_rng([seed, 8128])
     name, mosaic = f"{group}_{seed:04d}", group == "mosaic_wiring"
     own, away = folder / name, folder / "truth" / name
     own.mkdir(parents=True, exist_ok=True)
     away.mkdir(parents=True, exist_ok=True)
-    file = configs / "instruments" / INSTRUMENTS[mosaic]
+    polarimeter = MOSAIC if mosaic else polarimeter
+    file = configs / "instruments" / polarimeter.instrument
     text, model = file.read_text(encoding="utf-8"), InstrumentModel.load(file)
     nm = MOSAIC_NM if mosaic else WAVELENGTHS_NM[seed % 2]
     electrons = float(random.uniform(10_000, 25_000))
     draws = [
-        _Draw(kind, int(random.integers(1 << 31)), str(random.choice(["psg", "psa"])), str(random.choice(FITTED)))
+        _Draw(
+            kind,
+            int(random.integers(1 << 31)),
+            str(random.choice(["psg", "psa"])),
+            str(random.choice(FITTED)),
+            polarimeter.states,
+        )
         for kind in _kinds(group, seed, random)
     ]
     scenes = _scenes(random)
-    angles = state_angles(STATES[mosaic], mosaic, any(d.kind == "rotation_backlash" for d in draws))
+    zigzag = any(d.kind == "rotation_backlash" for d in draws)
+    angles = state_angles(polarimeter.states, mosaic, zigzag, polarimeter.step_deg, polarimeter.ratio)
     if mosaic:
         del angles["psa"]
 

@@ -146,12 +146,14 @@ def _radians(value_deg: float | dict[float, float]) -> float:
     return float(np.deg2rad(value_deg))
 
 
-def state_angles(states: int, mosaic: bool, zigzag: bool) -> dict[str, Array]:
-    """Angles of both axes in degrees; `zigzag` reaches states from both sides."""
-    step = 360.0 / states if not mosaic else 180.0 / states
+def state_angles(
+    states: int, mosaic: bool, zigzag: bool, step_deg: float | None = None, ratio: float = 4.91
+) -> dict[str, Array]:
+    """Angles of both axes in degrees; `zigzag` reaches states from both sides. Steps divide a turn, or half of it."""
+    step = step_deg or (180.0 if mosaic else 360.0) / states
     psg = np.asarray(step * np.arange(states), dtype=np.float64)
     order = np.arange(states)
     if zigzag:
         # Every third step goes back: states are reached from both sides.
         order = np.concatenate([g[::-1] for g in np.array_split(order, max(states // 3, 1))])
-    return {"psg": np.asarray(psg[order]), "psa": np.asarray(4.91 * psg[order])}
+    return {"psg": np.asarray(psg[order]), "psa": np.asarray(ratio * psg[order])}

@@ -10,12 +10,22 @@ import numpy as np
 import pytest
 
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel, SystematicError
+from processing.storage.capture import Capture
 from simulators.blind.bench_judge import WIRING_WORDS, Judgement, names_of, told_of, wiring_of
 from simulators.blind.bench_oracle import known_oracle
 from simulators.blind.bench_run import judge_bench
 from simulators.blind.bench_table import is_worse, reliability, sure_and_wrong, table
 from simulators.blind.mueller_error import Reduced, coverage_of, error_of
-from simulators.blind.real_bench import GROUPS, INSTRUMENTS, STATES, RealBench, TrueFault, make_bench, read_truth
+from simulators.blind.real_bench import (
+    GROUPS,
+    MOSAIC,
+    RGB950,
+    Polarimeter,
+    RealBench,
+    TrueFault,
+    make_bench,
+    read_truth,
+)
 from simulators.blind.suite import declared_bench, state_angles
 from simulators.blind.undeclared_captures import Scene, digitize, expose
 
@@ -113,12 +123,13 @@ def test_true_values_mend_the_validation_sample(bench, configs):
 )
 def test_every_fault_changes_what_a_capture_file_says(group, kind, configs):
     mosaic = group == "mosaic_wiring"
-    model = InstrumentModel.load(configs / "instruments" / INSTRUMENTS[mosaic]).at(662)
-    angles = state_angles(STATES[mosaic], mosaic, False)
+    polarimeter = MOSAIC if mosaic else RGB950
+    model = InstrumentModel.load(configs / "instruments" / polarimeter.instrument).at(662)
+    angles = state_angles(polarimeter.states, mosaic, False)
 
     def stored(faults):
         bench = declared_bench(model, 662.0, 16, mosaic, 15_000.0)
-        truths = [fault(bench, np.random.default_rng(3), STATES[mosaic]) for fault in faults]
+        truths = [fault(bench, np.random.default_rng(3), polarimeter.states) for fault in faults]
         light = expose(bench, Scene(np.random.default_rng(4)), angles)
         told = angles
         for change in bench.recorded:
@@ -151,6 +162,17 @@ def test_answer_to_a_small_bench_harms_nothing(group, seed, given, configs, tmp_
     assert not any(is_worse(*pair) for pair in judgement.own.values())
     if group == "none":
         assert result["verdict"] == "consistent"
+
+
+def test_bench_of_another_polarimeter_is_mended_too(configs, tmp_path):
+    """Two quarter-wave plates at 5 to 1, steps of its own: nothing in the search knows the lab's own instrument."""
+    made = Polarimeter("drr_5to1.yaml", states=30, step_deg=6.0, ratio=5.0)
+    truth = make_bench(tmp_path, 500, configs, pixels=SMALL, polarimeter=made)
+    with Capture(tmp_path / truth.name / "sphere.h5") as capture:
+        assert capture.angles_deg["psg"].tolist() == [6.0 * k for k in range(30)]
+    judgement, _ = judge_bench(tmp_path, truth, configs, "joint")
+    assert not sure_and_wrong(judgement)
+    assert judgement.corrected < judgement.declared / 3
 
 
 def test_what_cannot_be_reduced_has_an_infinite_error(tmp_path, configs):
