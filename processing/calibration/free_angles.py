@@ -16,6 +16,7 @@ from scipy.optimize import minimize
 
 from processing.arrays import Array
 from processing.calibration.state_design import Noise
+from processing.computing.blas import one_blas_thread
 from processing.errors import ProcessError
 from processing.instrument.determined import DRAWN, determined_basis
 from processing.instrument.model import InstrumentModel, Retarder
@@ -172,6 +173,7 @@ class Cost:
         return float(np.log(cost)), np.concatenate([gradient.reshape(-1), by_retardance]) / cost
 
 
+@one_blas_thread()
 def free_design(
     model: InstrumentModel,
     states: int,

@@ -57,7 +57,6 @@ def executor(workers: int = 1, scheduler: str | None = None) -> Iterator[Executo
 
 def _one_thread() -> None:
     os.environ[THREADS_VARIABLE] = "1"
-    os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 
 def _cluster(scheduler: str) -> Iterator[Executor]:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.campaign.tasks import CaptureMeasure, CaptureTask, locate, measure, task_view
+from processing.computing.blas import one_blas_thread
 from processing.doors import read_json
 from processing.errors import NotDetermined, ProcessError
 from processing.geometry.viewing import ViewingGeometry
@@ -181,6 +182,7 @@ class Campaign:
     border_px: int = BORDER_PX
     instrument: Path | None = None
 
+    @one_blas_thread()
     def run(self, pool: Executor, progress: Progress | None = None) -> CampaignResult:
         """Work on the captures in `pool` and compare.
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
+from processing.computing.blas import one_blas_thread
 from processing.geometry.errors import OutlineNotFound
 from processing.geometry.frames import GeometryImage
 from processing.geometry.outline import find_sphere, registered
@@ -76,6 +77,7 @@ class CaptureMeasure:
     eigenvalue_noise: float = np.nan
 
 
+@one_blas_thread()
 def measure(task: CaptureTask) -> CaptureMeasure:
     """Reduce a capture, unless its product is there, and measure it."""
     product = reduced_product(task)
@@ -83,6 +85,7 @@ def measure(task: CaptureTask) -> CaptureMeasure:
     return (_measure_mueller if task.kind == "mueller" else _measure_stokes)(task, product, view)
 
 
+@one_blas_thread()
 def locate(task: CaptureTask) -> tuple[float, str] | None:
     """Find the sphere in a capture's image: relative error of its radius and geometry as text; None if not found."""
     product = reduced_product(task)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -33,8 +32,6 @@ def campaign_command(
     scheduler: Annotated[str | None, typer.Option(help="Address of a dask.distributed scheduler.")] = None,
 ) -> None:
     """Reduce everything, compare DRR, Stokes and model: RMSD of psi, |D| and xi0 against Omega."""
-    # As `process reduce` does: the same captures give the same products, to the bit.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from processing.campaign.executors import executor
     from processing.campaign.run import Campaign
     from processing.commands.progress_bar import progress_bar

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -56,7 +55,6 @@ def design_command(
     albedo: Annotated[float, typer.Option(min=0, help="--stokes: M00 at normal incidence that is assumed.")] = 0.5,
 ) -> None:
     """Rank, condition number, equally weighted variance and standard errors of a table, before any motor moves."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from processing.errors import ProcessError
 
     if stokes:

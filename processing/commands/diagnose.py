@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -34,8 +33,6 @@ def diagnose_command(
     version: Version = False,
 ) -> None:
     """Trace the residual between intensities and model to the effects that explain it; say so if none does."""
-    # The problems are many and small: BLAS threads would only wait for one another.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     for target in filter(None, (write, json, report, residuals)):
         require_new(target)
     if reflectance is not None or geometry is not None:

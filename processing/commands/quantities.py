@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
@@ -39,7 +38,6 @@ def quantities_command(
     overwrite: Overwrite = False,
 ) -> None:
     """Eigenvalues, depolarization, diattenuation, polarizance, retardance and their standard errors."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from processing.maps.quantities import require_decompositions
     from processing.polarization.quantities import PAPER_PAIRS
     from processing.steps.maps import Quantities

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -51,8 +50,6 @@ def reduce_command(
     overwrite: Overwrite = False,
 ) -> None:
     """Invert W per pixel: Mueller image, or Stokes image of a polarization mosaic, with standard errors."""
-    # Tiles are spread over our own threads; a second pool inside BLAS would only fight with them.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from processing.steps.reduction import Reduction
 
     step = Reduction(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -35,7 +34,6 @@ def xi0_command(
     overwrite: Overwrite = False,
 ) -> None:
     """xi0 from a Mueller capture (coherency eigenvalues), or from less with a model (two coefficients)."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from processing.steps.maps import Xi0
     from processing.storage.images import seen_elements
     from processing.storage.product import Product

@@ -8,6 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import NamedTuple
 
+from processing.computing.blas import one_blas_thread
 from processing.doors import require_place
 from processing.errors import ProcessError
 from processing.storage.provenance import Step, made_of
@@ -52,6 +53,7 @@ class FileStep(OfFiles, ABC):
     def _write(self, out: Path, record: Step, overwrite: bool, progress: Progress | None) -> None:
         """Write the product that `record` asks for."""
 
+    @one_blas_thread()
     def make(self, out: Path | str | None = None, overwrite: bool = False, progress: Progress | None = None) -> Path:
         """Make the product, whatever is there; `overwrite` replaces a file of that name.
 
@@ -67,6 +69,7 @@ class FileStep(OfFiles, ABC):
         self._write(out, self.record(), overwrite, progress)
         return out
 
+    @one_blas_thread()
     def found_or_made(self, path: Path | str | None = None, progress: Progress | None = None) -> Found:
         """The product, made now unless `path` (default: the usual one) holds exactly it.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from processing.computing.blas import one_blas_thread
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.captured.screening import screened
@@ -15,6 +16,7 @@ from processing.instrument.model import InstrumentModel
 from processing.storage.capture import Capture, CaptureError
 
 
+@one_blas_thread()
 def diagnose_captures(
     captures: Sequence[Path | str], model: InstrumentModel, say: Say = lambda line: None
 ) -> tuple[Judged, InstrumentProblem]:

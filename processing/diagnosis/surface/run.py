@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from processing.computing.blas import one_blas_thread
 from processing.diagnosis.search.posterior import Say
 from processing.diagnosis.surface.data import SurfaceData, read_surface
 from processing.diagnosis.surface.judge import SurfaceJudged, diagnose_surface
@@ -15,6 +16,7 @@ from processing.instrument.model import InstrumentModel
 from processing.storage.capture import Capture, CaptureError
 
 
+@one_blas_thread()
 def diagnose_object(
     captures: Sequence[Path],
     model: InstrumentModel,

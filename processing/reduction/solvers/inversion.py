@@ -2,7 +2,7 @@
 
 The data are planes: frames (N, pixels) of any real type, result (16, pixels) float32. A tile of pixels is
 converted to float32 and multiplied by BLAS while it is in the cache; tiles are spread over Python threads. BLAS
-itself must run one thread (the commands set OPENBLAS_NUM_THREADS=1), or its threads and ours fight for the cores.
+itself must run one thread (`one_blas_thread`), or its threads and ours fight for the cores.
 """
 
 from __future__ import annotations

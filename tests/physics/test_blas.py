@@ -1,0 +1,39 @@
+"""BLAS keeps to one thread where the program computes, whoever calls it."""
+
+import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from processing import InstrumentModel, diagnose_captures
+from processing.computing.blas import one_blas_thread
+from processing.storage.capture import CaptureError
+
+
+def _blas_threads():
+    return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+
+def test_one_thread_within_and_as_before_after():
+    with threadpool_limits(limits=2, user_api="blas"):
+        with one_blas_thread():
+            assert _blas_threads() == {1}
+        assert _blas_threads() == {2}
+
+
+def test_whoever_leaves_first_does_not_take_the_limit_from_others():
+    """Two tasks of a cluster in one process: the first to end left the other with the threads of the machine."""
+    with threadpool_limits(limits=2, user_api="blas"):
+        first, second = one_blas_thread(), one_blas_thread()
+        first.__enter__()
+        second.__enter__()
+        first.__exit__(None, None, None)
+        assert _blas_threads() == {1}
+        second.__exit__(None, None, None)
+        assert _blas_threads() == {2}
+
+
+def test_a_diagnosis_called_from_python_holds_blas_to_one_thread(configs, tmp_path):
+    seen = []
+    model = InstrumentModel.load(configs / "instruments/rgb950.yaml")
+    with threadpool_limits(limits=2, user_api="blas"), pytest.raises(CaptureError):
+        diagnose_captures([tmp_path / "missing.h5"], model, lambda line: seen.append(_blas_threads()))
+    assert seen == [{1}]
