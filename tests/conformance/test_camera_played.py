@@ -131,6 +131,7 @@ def test_a_description_is_served_as_it_is_packed_or_not(stack: ExitStack, tmp_pa
     ("change", "says"),
     [
         (lambda text: text.replace('Name="TriggerSoftware"', 'Name="TriggerSoft"'), "TriggerSoftware is missing"),
+        (lambda text: text.replace('Name="PayloadSize"', 'Name="Payload"'), "PayloadSize is missing"),
         (lambda text: text.replace("<pValue>StartBit</pValue>", "<Value>0</Value>"), "AcquisitionStart .*no register"),
         (lambda text: text.replace("FROM*(2**BITS)", "BESSEL(FROM)"), "ExposureFixed .*cannot be played"),
         (lambda text: text.replace("<pMax>WidthMax</pMax>", "<Max>2448</Max>"), "Width says 2448 .*set `columns`"),

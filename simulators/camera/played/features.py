@@ -44,6 +44,8 @@ class Features:
         self._exposing, self._armed = False, True
         for names in _NEEDED:
             self._require(names)
+        if "PayloadSize" not in nodes:
+            raise nodes.error("PayloadSize", "is missing, and a capture needs it")
         for name in ("Width", "Height", *EXPOSURES, *_NUMBERS, *GAIN_DB, *GAIN_RAW, *BLACK_LEVEL):
             if self._has(name):
                 nodes.value(name)

@@ -92,7 +92,7 @@ class PlayedCamera:
         self._wake = threading.Condition(self._lock)
         self._channel = ControlChannel(self)
         self._worker: threading.Thread | None = None
-        self._plugged_in = self._acquiring = self._triggered = self._busy = False
+        self._was_on = self._plugged_in = self._acquiring = self._triggered = self._busy = False
         # Which start of the acquisition this is: an exposure of an earlier one is thrown away.
         self._run_number = 0
         self._frame_id = 0
@@ -115,8 +115,7 @@ class PlayedCamera:
         except RecursionError as error:
             raise NodeError(f"{self._path}: its features refer to each other without an end") from error
         self._xml_at = self._free_address()
-        xml = (self._description.name, self._xml_at, len(self._description.served))
-        boot(self._memory, self.address, texts, xml)
+        self._texts = texts
 
     def _free_address(self) -> int:
         taken = []
@@ -150,8 +149,11 @@ class PlayedCamera:
         """
         self._loopback.take(self._wait_s)
         self.address = self._loopback.address
-        self._prepare()
-        self._plugged_in = True
+        if self._was_on:
+            self._prepare()
+        self._plugged_in = self._was_on = True
+        xml = (self._description.name, self._xml_at, len(self._description.served))
+        boot(self._memory, self.address, self._texts, xml)
         try:
             self._channel.open(self.address)
         except OSError as error:
