@@ -25,6 +25,7 @@ from pymmcore_plus.experimental.unicore import ShutterDevice, SimpleCameraDevice
 
 from acquisition.rig.config import load_rig
 from acquisition.rig.rig import Rig
+from drivers.errors import DeviceError
 from drivers.source import LightSource
 
 #: Labels of what is no axis; axes have their names in the rig file.
@@ -92,9 +93,18 @@ class RigCamera(SimpleCameraDevice):
         return 1000 * self._exposure_s
 
     def set_exposure(self, exposure: float) -> None:
-        """Take the next frames with this exposure, milliseconds; it becomes what the camera takes it for."""
+        """Take the next frames with this exposure, milliseconds; it becomes what the camera takes it for.
+
+        Raises DeviceError; the exposure stays as it was then.
+        """
         with self._turn:
-            self._exposure_s = self._rig.set_exposure(exposure / 1000, 1).exposure_s or exposure / 1000
+            try:
+                taken_s = self._rig.set_exposure(exposure / 1000, 1).exposure_s
+            except DeviceError:
+                # The refusal has left the camera without settings.
+                self._rig.set_exposure(self._exposure_s, 1)
+                raise
+            self._exposure_s = taken_s or exposure / 1000
 
     def sensor_shape(self) -> tuple[int, int]:
         """Rows and columns."""

@@ -48,6 +48,14 @@ def test_the_light_is_on_for_a_frame_and_shut_afterwards(core, rig):
     assert core.getExposure() == pytest.approx(10.0, rel=0.01)
 
 
+def test_after_an_exposure_that_the_camera_refuses_it_takes_frames_with_the_one_before(core, rig):
+    core.setExposure(10.0)
+    with pytest.raises(Exception, match="ExposureTime"):
+        core.setExposure(1e6)
+    assert core.snap().shape == (24, 32)
+    assert core.getExposure() == pytest.approx(10.0, rel=0.01)
+
+
 def test_its_own_acquisition_engine_steps_a_rotator_and_takes_frames(core, rig):
     core.setFocusDevice("psg")
     taken = []
