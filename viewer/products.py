@@ -55,6 +55,8 @@ def _shown(value: Any) -> str:
         return ", ".join(f"{name.replace('_', ' ')} {_shown(one)}" for name, one in value.items())
     if value is None:
         return "not known"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 

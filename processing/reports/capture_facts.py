@@ -11,8 +11,9 @@ def facts_of(capture: Capture) -> list[tuple[str, str]]:
     header, (rows, columns) = capture.header, capture.frame_shape
     roles = ", ".join(f"{capture.role.count(role)} {role}" for role in dict.fromkeys(capture.role))
     done = f"{len(capture.role)} of {capture.planned_states}, {capture.status}"
+    kind = "" if header.sample.kind == "unknown" else f" ({header.sample.kind})"
     return [
-        ("sample", f"{header.sample.name or header.sample.kind} ({header.sample.kind})"),
+        ("sample", header.sample.name + kind if header.sample.name else header.sample.kind),
         ("mode", header.mode),
         ("wavelength", f"{header.wavelength_nm:g} nm"),
         ("Omega", "not stated" if header.omega_deg is None else f"{header.omega_deg:g} degrees"),

@@ -183,6 +183,10 @@ def _look_and_probe(page: Page, address: str, capture: str) -> None:
     page.mouse.move(box["x"] + box["width"] * 0.6, box["y"] + box["height"] * 0.5, steps=4)
     page.mouse.up()
     expect(page.locator("#pixel")).to_have_text(re.compile(r"\(\d+ pixels\)"))
+    scale = page.locator("#frame .cbaxis")
+    expect(scale).to_contain_text("4000")
+    page.get_by_label("stretch").check()
+    expect(scale).not_to_contain_text("4000")
     page.get_by_role("button", name="Play").click()
     expect(page.get_by_role("button", name="Pause")).to_be_visible()
     page.get_by_role("button", name="Pause").click()
@@ -225,6 +229,8 @@ def _compare_before_and_after(page: Page, lab: Path, address: str, capture: str)
     page.get_by_role("button", name="Compare").click()
     ready(page)
     expect(page.locator("#told")).to_have_text(re.compile(r"rms difference 0\.\d+.*over its error \d"))
+    # At the rim the difference goes beyond its scale.
+    expect(page.locator("#p2 .annotation-text").first).to_have_text(re.compile("[▲▼]"))
     keep(page, "compare")
 
 

@@ -7,16 +7,18 @@ import { accent, at, byId, draw, duration, embedded, getJson, narrow, post, quie
 const run = byId("run"), folder = run.dataset.folder;
 let view = null, shown = {};
 
+/** A time of a file, which names its zone, as the clock on the wall has it. */
+const local = text => { const d = new Date(text); return isNaN(d) ? text : new Date(d - d.getTimezoneOffset() * 60000).toISOString().slice(0, 23); };
+
 function timeline() {
   if (!byId("bars")) return;
   const bars = embedded("bars"), names = [...new Set(bars.map(bar => bar.name))];
   const now = new Date().toISOString();
-  const local = text => { const d = new Date(text); return new Date(d - d.getTimezoneOffset() * 60000).toISOString().slice(0, 23); };
   draw(byId("timeline"), () => bars.map(bar => ({
     type: "scatter", mode: "lines", x: [local(bar.start), local(bar.end ?? now)], y: [bar.name, bar.name], line: { color: statusColour(bar.status), width: 11 },
     hovertemplate: `${bar.name}<br>%{x|%H:%M:%S}: ${bar.status}<extra></extra>`,
   })), () => ({
-    height: Math.max(170, 60 + 20 * names.length), xaxis: { type: "date" },
+    height: Math.max(170, 60 + 20 * names.length), xaxis: { type: "date", title: { text: `local time (${Intl.DateTimeFormat().resolvedOptions().timeZone})` } },
     yaxis: { autorange: "reversed", type: "category", categoryarray: names, showticklabels: !narrow() }, margin: { l: 10, t: 4 },
   }));
 }
@@ -108,6 +110,7 @@ byId("stop").addEventListener("click", async event => {
 
 addEventListener("load", () => {
   timeline();
+  for (const time of document.querySelectorAll("time")) time.textContent = local(time.dateTime).slice(0, 19).replace("T", " ");
   const events = new EventSource(at("events", { folder }));
   events.onmessage = event => show(JSON.parse(event.data));
   document.body.dataset.ready = "yes";

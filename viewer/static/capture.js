@@ -12,12 +12,13 @@ let states = embedded("states"), timer = null;
 channel.hidden = states.channels.length < 2;
 channel.replaceChildren(...states.channels.map((name, k) => new Option(name, k)));
 
+const brightest = plane => plane.planes[0].reduce((most, row) => row.reduce((a, b) => Math.max(a, b), most), states.black + 1);
 const view = new ImageView(byId("frame"), {
   shape: states.shape,
   read: (window, signal) => readPlane("frame", { file, state: slider.value, channel: channel.value || 0, ...window }, signal),
   traces: plane => [
     { type: "heatmap", z: plane.planes[0], ...place(plane), zmin: states.black,
-      zmax: states.saturation ?? undefined, hovertemplate: "column %{x}, row %{y}<br>%{z:.1f} counts<extra></extra>",
+      zmax: byId("stretch").checked ? brightest(plane) : states.saturation ?? undefined, hovertemplate: "column %{x}, row %{y}<br>%{z:.1f} counts<extra></extra>",
       colorscale: [[0, "#000"], [1, "#fff"]], colorbar: { title: { text: "counts", side: "right" }, thickness: 12, outlinewidth: 0, len: 0.9 } },
     ...saturated(plane),
   ],
@@ -35,9 +36,12 @@ async function probe(region) {
     byId("fit").textContent = found.told;
     drawCurve(byId("curve"), found, Number(slider.value));
     history.replaceState(null, "", `#x=${region.x0}&y=${region.y0}`);
-    byId("probe").hidden = !found.fit;
+    // What is known of another pixel goes until this one's is there.
+    byId("probe").hidden = true;
     const matrix = found.fit && (found.fit.stokes ? {} : await matrixOf("matrix", { file, ...region }));
-    if (matrix) showProbe(byId("probe"), { ...found, ...matrix });
+    if (!matrix) return;
+    byId("probe").hidden = false;
+    showProbe(byId("probe"), { ...found, ...matrix });
   });
 }
 
@@ -100,6 +104,7 @@ slider.value = Math.max(states.role.findIndex(role => role !== "dark"), 0);
 slider.addEventListener("input", show);
 channel.addEventListener("change", show);
 byId("play").addEventListener("click", () => play(timer === null));
+byId("stretch").addEventListener("change", () => run(() => view.show()));
 drawsRegions(byId("region"), view.node);
 document.addEventListener("keydown", event => {
   if (/^(input|select|textarea)$/i.test(event.target.tagName) && event.target.type !== "range") return;

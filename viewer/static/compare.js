@@ -1,17 +1,20 @@
 // Two files side by side: four linked maps, read together.
 
 import { ImageView, readPlane } from "./images.js";
-import { mapTraces } from "./maps.js";
+import { arrowsOf, mapTraces } from "./maps.js";
 import { byId, embedded, say } from "./plots.js";
 
 const { a, b } = byId("look").dataset, spec = embedded("spec"), choice = byId("choice");
 choice.replaceChildren(...spec.choices.map((c, k) => new Option(c.label, k)));
 const nodes = [0, 1, 2, 3].map(k => byId(`p${k}`));
 
-const views = nodes.map((node, k) => new ImageView(node, {
-  shape: spec.shape,
-  traces: plane => mapTraces({ ...plane, ...plane.scales[k], units: k === 3 ? "standard errors" : plane.units, planes: [plane.planes[k]] }),
-}));
+const mapOf = (plane, k) => ({ ...plane, ...plane.scales[k], units: k === 3 ? "standard errors" : plane.units, planes: [plane.planes[k]] });
+const views = nodes.map((node, k) => new ImageView(node, { shape: spec.shape, traces: plane => mapTraces(mapOf(plane, k)) }));
+/** Arrows where a scale is left, and the part of the image that all four show. */
+const seen = (view, k, ranges) => () => ({
+  annotations: view.plane ? arrowsOf(mapOf(view.plane, k)) : [], margin: { l: 44, r: 8, t: 16, b: 36 },
+  ...(ranges && { xaxis: { range: [...ranges[0]] }, yaxis: { range: [...ranges[1]] } }),
+});
 // One read fills all four; whichever is zoomed takes the others along.
 const read = async (window, signal) => {
   const { state, name, index } = spec.choices[Number(choice.value)];
@@ -26,9 +29,9 @@ async function refresh(leader = views[0]) {
     const told = v => (v === null ? "not known" : v.toPrecision(3));
     byId("told").textContent = `rms difference ${told(plane.rms)}${plane.units && ` ${plane.units}`}; over its error ${told(plane.rms_over)} (1 is noise alone)`;
     const ranges = leader.node.layout && [leader.node.layout.xaxis.range, leader.node.layout.yaxis.range];
-    for (const view of views) {
+    for (const [k, view] of views.entries()) {
       view.plane = plane;
-      if (ranges && view !== leader) view.more = () => ({ xaxis: { range: [...ranges[0]] }, yaxis: { range: [...ranges[1]] } });
+      view.more = seen(view, k, view !== leader && ranges);
       await view.show();
     }
     byId("problem").replaceChildren();

@@ -14,6 +14,8 @@ const bar = (plane, more = {}) => ({ thickness: 12, outlinewidth: 0, title: { te
 const arrows = (clipped, x) => [["high", "▲", 1, "bottom"], ["low", "▼", 0, "top"]].filter(([end]) => clipped[end]).map(([, text, y, yanchor]) => ({
   text, showarrow: false, xref: "paper", yref: "paper", x, y, xanchor: "left", yanchor, hovertext: "there are values beyond the scale", font: { size: 11 },
 }));
+/** Those of a map: of its first plane, and its limits. */
+export const arrowsOf = plane => arrows(ends(plane, 0), 1.01);
 /** Where nothing is known a map is grey, on paper as on a screen. */
 const UNKNOWN = { plot_bgcolor: "#d9d9d9" };
 
@@ -27,7 +29,7 @@ export const mapTraces = plane => [{
 export function mapView(node, what, query, shape, chosen) {
   const view = new ImageView(node, {
     shape, chosen, read: (window, signal) => readPlane(what, { ...query(), ...window }, signal), traces: mapTraces,
-    more: () => ({ ...UNKNOWN, annotations: view.plane ? arrows(ends(view.plane, 0), 1.01) : [], margin: { l: 44, r: 8, t: 16, b: 36 } }),
+    more: () => ({ ...UNKNOWN, annotations: view.plane ? arrowsOf(view.plane) : [], margin: { l: 44, r: 8, t: 16, b: 36 } }),
   });
   return view;
 }
