@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import socket
 import struct
+import threading
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -88,6 +89,29 @@ def test_the_time_behind_the_image_is_that_of_the_exposure(stack: ExitStack) -> 
     assert camera.node_map()["ChunkModeActive"] == "true"
     times_s = np.array([frame.camera_time_ns for frame in camera.capture(3)]) * 1e-9
     assert np.all(np.diff(times_s) >= 0.02)
+
+
+@pytest.mark.parametrize("behind", ["StatusBit", "StatusReg"])
+def test_the_status_of_the_exposure_is_told(stack: ExitStack, tmp_path: Path, behind: str) -> None:
+    # A bit of many that a formula takes out, or a register in which each selected status appears.
+    path = tmp_path / "maker.xml"
+    path.write_text(STYLE.read_text().replace("<pValue>StatusBit</pValue>", f"<pValue>{behind}</pValue>"))
+    shown, may_end = Shown(), threading.Event()
+
+    def wait_and_show(info: ExposureInfo) -> NDArray[np.uint16]:
+        may_end.wait(60)
+        return shown(info)
+
+    stack.enter_context(PlayedCamera("PLAYED1", *SIZE, wait_and_show, path=path))
+    camera = opened(stack)
+    camera.configure(CameraSettings(exposure_s=1e-3))
+    status = camera._setup.status
+    assert (status.exposing(), status.armed()) == (False, True)
+    exposure = camera.trigger()
+    assert (status.exposing(), status.armed()) == (True, False)
+    may_end.set()
+    exposure.frame()
+    assert (status.exposing(), status.armed()) == (False, True)
 
 
 def test_lost_packets_are_sent_again(stack: ExitStack) -> None:

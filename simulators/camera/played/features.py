@@ -9,7 +9,7 @@ from drivers.genicam import BLACK_LEVEL, GAIN_DB, GAIN_RAW
 from simulators.camera.exposure import ExposureInfo
 from simulators.camera.played.formula import Number
 from simulators.camera.played.node_tree import REGISTERS, NodeError, NodeTree
-from simulators.camera.played.power_up import EXPOSURES, follow, tell
+from simulators.camera.played.power_up import EXPOSURES, follow, tell, tell_flag
 
 START, STOP, TRIGGER = "AcquisitionStart", "AcquisitionStop", "TriggerSoftware"
 # Each by one of its names; a camera without them cannot be triggered by a program.
@@ -191,5 +191,5 @@ class Features:
         end = self._nodes.end(name)
         if self._nodes.node(end).tag in REGISTERS:
             self._nodes.set_value(end, value)
-        elif not tell(self._nodes, name, value):
+        elif not tell_flag(self._nodes, name, value):
             raise self._nodes.error(name, "is calculated in a way that cannot be played")

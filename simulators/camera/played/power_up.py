@@ -103,6 +103,22 @@ def tell(nodes: NodeTree, name: str, value: Number) -> bool:
     return _make(nodes, name, lambda now: now == value, (value,))
 
 
+def tell_flag(nodes: NodeTree, name: str, value: int) -> bool:
+    """The same for a flag that may be one of many in a register: one bit is turned over, and the others stay."""
+    if nodes.value(name) == value:
+        return True
+    for register in sorted(nodes.inputs(name)):
+        if not nodes.is_the_cameras_own(register):
+            continue
+        before = int(nodes.value(register))
+        for bit in range(8 * nodes.register(register).length):
+            nodes.set_value(register, before ^ 1 << bit)
+            if nodes.value(name) == value:
+                return True
+        nodes.set_value(register, before)
+    return False
+
+
 def _make(nodes: NodeTree, name: str, good: Callable[[Number], bool], candidates: Sequence[Number]) -> bool:
     if good(nodes.value(name)):
         return True
