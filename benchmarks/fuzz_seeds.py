@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
+import fuzz_descriptions as descriptions
 import fuzz_mutators as spoil
 import h5py
 import numpy as np
@@ -60,7 +61,7 @@ def _spoil_bytes(rng: random.Random, path: Path) -> None:
 
 
 def _spoil_text(rng: random.Random, path: Path) -> None:
-    if rng.random() < 0.3:
+    if path.suffix == ".zip" or rng.random() < 0.3:
         _spoil_bytes(rng, path)
     else:
         path.write_text(spoil.spoil_text(rng, path.read_text()))
@@ -385,6 +386,7 @@ DOORS: dict[str, Door] = {
     "tensor": Door(_tensor_files, _spoil_bytes, _tensor),
     "axostep": Door(_axostep_files, _spoil_bytes, _axostep),
     "mesh": Door(_mesh_files, _spoil_bytes, _mesh),
+    "description": Door(descriptions.sound_files, _spoil_text, descriptions.read),
 }
 
 

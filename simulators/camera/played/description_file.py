@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import lzma
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
@@ -12,6 +14,9 @@ from xml.parsers import expat
 
 from processing.doors import MOST_DEPTH, MOST_TEXT_BYTES, one_line, require_file
 from processing.yaml_file import ConfigError
+
+# What a damaged archive raises: of the format, of its compressions, and of what this Python has not.
+_DAMAGED = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, NotImplementedError, RuntimeError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +62,7 @@ def _unpacked(path: Path, served: bytes) -> bytes:
             with archive.open(files[0]) as file:
                 # What it says of its size need not be true.
                 text = file.read(MOST_TEXT_BYTES + 1)
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, EOFError, ValueError) as why:
+    except (*_DAMAGED, OSError, ValueError) as why:
         raise ConfigError(f"{path}: is no zip archive that can be read ({one_line(why)})") from why
     if len(text) > MOST_TEXT_BYTES:
         raise ConfigError(f"{path}: unpacks to more than {MOST_TEXT_BYTES:,} bytes. Is it the right one?")
