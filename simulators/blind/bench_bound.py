@@ -220,7 +220,7 @@ def _values(kind: str, random: np.random.Generator, count: int) -> Array:
         out[:2] += circle * (not joint)
     elif kind == "beam_wander":
         out[:] = *circle, -circle[1], circle[0]
-    elif kind in ("path_retardance", "image_drift"):
+    elif kind in ("path_retardance", "image_drift", "retardance_over_turn"):
         out[:] = circle
     else:
         out[0] = size * (1 if kind in POSITIVE else random.choice([-1, 1]))

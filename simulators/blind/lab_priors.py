@@ -43,6 +43,7 @@ PRIORS: dict[str, Prior] = {
     "retarder_transmission": Prior(0.4, (0.001, 0.008), "wedge, dust and tilt of a turning plate"),
     "field_retardance": Prior(0.2, (0.2, 1.5), "degrees at the edge; a field of some degrees through the plate"),
     "retardance_drift": Prior(0.3, (0.2, 1.0), "degrees; 0.1 to 0.5 a kelvin of a polymer or multi-order plate"),
+    "retardance_over_turn": Prior(0.2, (0.1, 1.0), "degrees; a wedged plate beside its axis"),
     "stray_light": Prior(0.3, (0.002, 0.01), "of the light; room and reflections past the analyzer"),
     "path_retardance": Prior(0.3, (0.2, 1.5), "degrees; windows and lenses under stress"),
     "rotation_eccentricity": Prior(0.5, (0.03, 0.3), "degrees; 10 to 100 micrometres on a scale of 20 mm radius"),

@@ -82,7 +82,7 @@ def tilted_plate(bench: Bench, random: np.random.Generator, states: int) -> Trut
     axis, size, phase = draw_axis(bench, random), np.deg2rad(draw_size(random, 0.2, 2.0)), random.uniform(0, 2 * np.pi)
     turn = 2 * np.pi / states * (1 if axis == "psg" else 4.91)
 
-    def nod(k: int) -> tuple[float, float]:
+    def nod(k: int, a: dict[str, float]) -> tuple[float, float]:
         change = float(size * np.cos(2 * turn * k - phase))
         return (change, 0.0) if axis == "psg" else (0.0, change)
 

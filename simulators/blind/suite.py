@@ -18,8 +18,9 @@ from processing.arrays import Array
 from processing.instrument.model import InstrumentModel, Polarizer, Retarder
 from processing.storage.capture_schema import Sample
 from simulators.blind.detectable import evidence, expected
+from simulators.blind.mosaic_faults import MOSAIC
 from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
-from simulators.blind.undeclared_faults import LISTED, MOSAIC, UNLISTED, Fault, Truth
+from simulators.blind.undeclared_faults import LISTED, UNLISTED, Fault, Truth
 
 SHARES = {"single": 0.62, "two": 0.12, "none": 0.1, "unlisted": 0.16}
 INSTRUMENTS = {"drr": "rgb950.yaml", "mosaic": "mosaic_polarimeter.yaml"}

@@ -72,13 +72,13 @@ class Bench:
     gain: float = 0.5
     read_noise: float = 3.0
     full_well: float = 32_000.0
-    # Hooks: (state, angles) -> angles; (state) -> level; (state) -> shift in pixels; (state, electrons) -> electrons.
+    # Hooks: (state, angles) -> angles, level, shift in pixels, retardances to add; (state, electrons) -> electrons.
     angles: list[Callable[[int, dict[str, float]], dict[str, float]]] = field(default_factory=list)
     level: list[Callable[[int, dict[str, float]], float]] = field(default_factory=list)
     shift: list[Callable[[int, dict[str, float]], tuple[Any, Any]]] = field(default_factory=list)
     light: list[Callable[[int, Array], Array]] = field(default_factory=list)
     transfer: list[Callable[[Array], Array]] = field(default_factory=list)
-    retardance: list[Callable[[int], tuple[float, float]]] = field(default_factory=list)
+    retardance: list[Callable[[int, dict[str, float]], tuple[float, float]]] = field(default_factory=list)
     #: Number of a material of the scene, and (state) -> its level.
     material_level: list[tuple[int, Callable[[int], float]]] = field(default_factory=list)
     order: NDArray[np.int64] | None = None
@@ -99,7 +99,7 @@ class Bench:
 
     def generated(self, angles: dict[str, float], state: int) -> Array:
         """Stokes vectors (..., 4) of the light on the sample; leading axes if the retardance varies over the image."""
-        d = self.dg + sum(r(state)[0] for r in self.retardance)
+        d = self.dg + sum(r(state, angles)[0] for r in self.retardance)
         out: Array | float = 0.0
         for k in self.band:
             delta = d * k if self.field_retardance is None else d * k + self.field_retardance
@@ -127,7 +127,7 @@ class Bench:
                 for t, e, g in zip(azimuths, self.channel_extinction, self.channel_gain, strict=True)
             ]
             return np.stack([_analyzer(j) for j in trains])
-        d = self.da + sum(r(state)[1] for r in self.retardance)
+        d = self.da + sum(r(state, angles)[1] for r in self.retardance)
         rows = []
         for k in self.band:
             plate = retarder_jones(angles["psa"] + self.oa, d * k, *self.fast_slow_a)

@@ -107,12 +107,25 @@ def retardance_drift(bench: Bench, random: np.random.Generator, states: int, siz
     # A plate that warms up comes to rest like an exponential.
     axis, size, rate = draw_axis(bench, random), np.deg2rad(draw_signed(random, *sizes)), random.uniform(1, 3)
 
-    def warm(k: int) -> tuple[float, float]:
+    def warm(k: int, a: dict[str, float]) -> tuple[float, float]:
         change = float(size * (1 - np.exp(-rate * k / (states - 1))))
         return (change, 0.0) if axis == "psg" else (0.0, change)
 
     bench.retardance.append(warm)
     return Truth("retardance_drift", f"{axis}_retarder")
+
+
+def retardance_over_turn(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.1, 2.0)) -> Truth:
+    # A wedged plate that the beam meets beside the axis.
+    axis, size, phase = draw_axis(bench, random), draw_size(random, *sizes), random.uniform(0, 2 * np.pi)
+
+    def turned(k: int, a: dict[str, float]) -> tuple[float, float]:
+        change = float(np.deg2rad(size) * np.cos(a[axis] - phase))
+        return (change, 0.0) if axis == "psg" else (0.0, change)
+
+    bench.retardance.append(turned)
+    values = {"cos": size * np.cos(phase), "sin": size * np.sin(phase)}
+    return Truth("retardance_over_turn", f"{axis}_retarder", values)
 
 
 def stray_light(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.003, 0.05)) -> Truth:
@@ -232,35 +245,6 @@ def beam_wander(bench: Bench, random: np.random.Generator, states: int, sizes: S
     return Truth("beam_wander", f"{axis}_retarder", {"x_cos": c, "x_sin": s, "y_cos": -s, "y_sin": c})
 
 
-def channel_gain(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.003, 0.05)) -> Truth:
-    bench.channel_gain = np.append(1.0, 1 + draw_size(random, *sizes) * random.standard_normal(3))
-    names = ("channel_45", "channel_90", "channel_135")
-    return Truth("channel_gain", "", dict(zip(names, (bench.channel_gain[1:] - 1).tolist(), strict=True)))
-
-
-def channel_azimuth(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.2, 2.0)) -> Truth:
-    degrees = draw_size(random, *sizes) * random.standard_normal(4)
-    bench.channel_azimuth = np.deg2rad(degrees)
-    return Truth("channel_azimuth")
-
-
-def channel_extinction(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.003, 0.04)) -> Truth:
-    bench.channel_extinction = draw_size(random, *sizes) * random.uniform(0.2, 1.8, 4)
-    return Truth("channel_extinction")
-
-
-def pixel_crosstalk(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.01, 0.1)) -> Truth:
-    size = draw_size(random, *sizes)
-
-    def spread(k: int, e: Array) -> Array:
-        p = np.pad(e, 1, mode="reflect")
-        around = (p[:-2, 1:-1] + p[2:, 1:-1] + p[1:-1, :-2] + p[1:-1, 2:]) / 4
-        return (1 - size) * e + size * around
-
-    bench.light.append(spread)
-    return Truth("pixel_crosstalk", "", {"fraction": size})
-
-
 def tone_curve(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.01, 0.15)) -> Truth:
     e, top = draw_signed(random, *sizes), 65435.0 * bench.gain
     bench.transfer.append(lambda x: top * (np.maximum(x, 0) / top) ** (1 / (1 + e)))
@@ -280,6 +264,7 @@ LISTED: dict[str, SizedFault] = {
     "retarder_transmission": retarder_transmission,
     "field_retardance": field_retardance,
     "retardance_drift": retardance_drift,
+    "retardance_over_turn": retardance_over_turn,
     "stray_light": stray_light,
     "path_retardance": path_retardance,
     "rotation_eccentricity": rotation_eccentricity,
@@ -295,12 +280,6 @@ LISTED: dict[str, SizedFault] = {
     "image_drift": image_drift,
     "beam_wander": beam_wander,
     "tone_curve": tone_curve,
-}
-MOSAIC: dict[str, SizedFault] = {
-    "channel_gain": channel_gain,
-    "channel_azimuth": channel_azimuth,
-    "channel_extinction": channel_extinction,
-    "pixel_crosstalk": pixel_crosstalk,
 }
 
 

@@ -35,6 +35,12 @@ CASES = [
         "psg_retarder",
         [0, 0, 0, 0.02],
     ),
+    (
+        {"kind": "plate_retardance", "element": "psa_retarder", "amplitude_deg": 0.8, "phase_deg": 30},
+        "retardance_over_turn",
+        "psa_retarder",
+        [0.8 * np.cos(np.pi / 6), 0.4],
+    ),
     ({"kind": "angle_slip", "axis": "psa", "at_index": 7, "slip_deg": 0.3}, "rotation_slip", "psa@7", [0.3]),
     ({"kind": "angle_scale", "axis": "psg", "scale_error": 1e-3}, "rotation_ratio", "psg", [1e-3]),
     ({"kind": "element_error", "element": "psa_retarder", "offset": 0.5}, "psa_retardance", "psa_retarder", [0.5]),

@@ -9,7 +9,14 @@ from pydantic import Field
 from simulators.bench.effects.detector import BlackDrift, BlackOffset, Nonlinearity, PixelResponse, ToneCurve
 from simulators.bench.effects.image import ImageDrift, MosaicCrosstalk, StrayLight, VeilingGlare
 from simulators.bench.effects.motion import AngleJitter, AngleOffset, AnglePlay, AngleScale, AngleSlip, AngleWobble
-from simulators.bench.effects.optics import ChannelError, ElementError, FieldRetardance, PlateTransmission, Window
+from simulators.bench.effects.optics import (
+    ChannelError,
+    ElementError,
+    FieldRetardance,
+    PlateRetardance,
+    PlateTransmission,
+    Window,
+)
 from simulators.bench.effects.source import SourceDrift, SourceFlicker, SourceLevel, SourceStep, UnevenLight
 
 #: Any of them, told apart by `kind`; docs/adding-an-effect.md names the one for each effect of `diagnose`.
@@ -22,6 +29,7 @@ AnyBenchEffect = Annotated[
     | AnglePlay
     | ElementError
     | Window
+    | PlateRetardance
     | PlateTransmission
     | FieldRetardance
     | ChannelError

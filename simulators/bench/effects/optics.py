@@ -66,6 +66,23 @@ class PlateTransmission(BenchEffect):
         return level * (1 + self.amplitude * float(np.cos(angle)))
 
 
+class PlateRetardance(BenchEffect):
+    """A plate with a wedge, met beside its axis: its retardance goes up and down once a turn."""
+
+    kind: Literal["plate_retardance"] = "plate_retardance"
+    element: str
+    amplitude_deg: float = 0.0
+    phase_deg: float = 0.0
+
+    def train(self, model: InstrumentModel, shot: Shot) -> InstrumentModel:
+        declared = _value(model, self.element, "retardance_deg")
+        plate = next(e for e in model.elements() if e.name == self.element)
+        if plate.axis is None:
+            raise KeyError(f"{self.element!r} does not turn")
+        turned = np.deg2rad(plate.ratio * shot.angles_deg[plate.axis] - self.phase_deg)
+        return with_element(model, self.element, retardance_deg=declared + self.amplitude_deg * float(np.cos(turned)))
+
+
 class FieldRetardance(BenchEffect):
     """Rays meet a plate at an angle: its retardance grows with the square of the distance from a centre.
 
