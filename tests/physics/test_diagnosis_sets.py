@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.special import betaln
 
-from processing.diagnosis.instrument.doubts import ONE_PATTERN, patterned
+from processing.diagnosis.instrument.doubts import ONE_PATTERN
+from processing.diagnosis.instrument.source_patterns import patterned
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.likely_set import likely_set
 from processing.diagnosis.search.posterior import descend

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from processing.arrays import Array
 from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.source_patterns import beat_explains_more, patterned
 from processing.diagnosis.instrument.unevenness import unevenness
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause, shown
@@ -20,6 +19,10 @@ from processing.instrument.effects.base import FieldEffect, GeneralEffect, Point
 #: The reason for which values for each state are not used either, where an unknown sample takes up a part of them: what
 #: it takes up is then not like the rest, as it is with random values.
 PATTERN = "its values follow one wave or jump over the states, as a beat or a fringe does: they are not random"
+#: The same of an effect in whose place a source with one wave fits better.
+BEAT = "a source that beats explains more than it does"
+#: Reasons that say that something else is there, of which what the cause explains is left over.
+ELSE = (PATTERN, BEAT)
 #: The reason for which nothing is written for later captures: the sample or its light changed, and what is found beside
 #: that may be a part of it.
 OF_THE_SAMPLE = "it differs from part to part of the image, which a source does not"
@@ -34,25 +37,19 @@ def doubts(
     out: dict[Cause, str] = {}
     uneven, patterned = 0.0, set[int | None]()
     for cause in causes:
-        first = cause.candidates[0]
-        if _at_bound(cause):
-            out[cause] = "a value stands at its bound: the data ask for something else"
-        elif isinstance(first.effect, ValuePerState) and not testable(problem, solved, cause, causes):
-            out[cause] = "as many values as the data have"
-        elif isinstance(first.effect, ValuePerState) and _one_pattern(found, cause):
-            out[cause] = PATTERN
+        reason = _of_itself(problem, found, solved, cause, causes)
+        if reason is not None:
+            out[cause] = reason
+        if reason == PATTERN:
             patterned |= {c.capture for c in cause.candidates if isinstance(c.effect, SourceEffect)}
-        elif isinstance(first.effect, SourceEffect) and any(
-            _uneven(problem, solved, c, cause) for c in cause.candidates
-        ):
-            out[cause] = OF_THE_SAMPLE
+        if reason == OF_THE_SAMPLE:
             uneven = max(uneven, cause.log_odds)
     for cause in causes:
         first = cause.candidates[0]
         if cause not in out and isinstance(first.effect, SourceEffect) and first.capture in patterned:
             out[cause] = "it may be a part of a source that changes as no effect of the list does"
     # What follows a pattern is no effect of the list: what it took away is left over as well.
-    left += sum(2 * cause.log_odds * found.samples.best.unit for cause, why in out.items() if why == PATTERN)
+    left += sum(2 * cause.log_odds * found.samples.best.unit for cause, why in out.items() if why in ELSE)
     for rank, cause in enumerate(causes, 1):
         if problem.noise_known:
             weak = 2 * cause.log_odds * found.samples.best.unit < TIMES * rank**2 * left
@@ -66,6 +63,22 @@ def doubts(
         if cause not in out and cause.log_odds < uneven:
             out[cause] = "it may be a part of what is uneven over the image"
     return out
+
+
+def _of_itself(
+    problem: InstrumentProblem, found: Posterior, solved: Solution, cause: Cause, causes: Sequence[Cause]
+) -> str | None:
+    """The reason that a cause gives by itself, whatever is left of the others."""
+    effect = cause.candidates[0].effect
+    if _at_bound(cause):
+        return "a value stands at its bound: the data ask for something else"
+    if isinstance(effect, ValuePerState):
+        if not testable(problem, solved, cause, causes):
+            return "as many values as the data have"
+        return PATTERN if _one_pattern(found, cause) else None
+    if isinstance(effect, SourceEffect):
+        return OF_THE_SAMPLE if any(_uneven(problem, solved, c, cause) for c in cause.candidates) else None
+    return BEAT if problem.noise_known and beat_explains_more(found, cause) else None
 
 
 def testable(problem: InstrumentProblem, solved: Solution, cause: Cause, causes: Sequence[Cause]) -> bool:
@@ -111,43 +124,6 @@ def _one_pattern(found: Posterior, cause: Cause) -> bool:
         seen = patterned(values, curvature, covariance)
         held, beyond, noise = held + seen.held, beyond + seen.beyond_noise, noise + seen.noise
     return beyond > noise and held > ONE_PATTERN * beyond
-
-
-@dataclass(frozen=True)
-class Patterned:
-    """Chi-square that values explain, as far as one pattern holds it, beyond noise, and what noise alone explains."""
-
-    held: float
-    beyond_noise: float
-    noise: float
-
-
-def patterned(values: Array, information: Array, covariance: Array) -> Patterned:
-    """What of values (N,) one sine over the states explains too, or a jump beside a drift.
-
-    `information` (N, N) is the curvature of the chi-square: patterns that the unknown sample takes up do not count.
-    `covariance` (N, N) is that of the values, which shrink to their prior, and their noise with them.
-    """
-    n = values.size
-    k = np.arange(n)
-    power, vector = np.linalg.eigh(information)
-    root = (vector * np.sqrt(np.maximum(power, 0.0))).T
-    # All about their means: gains that all grow by one factor are taken up by the throughput, so that one constant for
-    # all is seen as these values themselves, with the other sign, and would be a pattern of any values.
-    seen = root @ (values - values.mean())
-    kept = np.clip(np.linalg.eigvalsh(root @ covariance @ root.T), 0.0, 1.0)
-    noise = float(kept @ kept)
-    turns = 2 * np.pi * np.outer(np.linspace(0.5 / n, 0.5, 8 * n), k)
-    waves = np.stack([np.cos(turns), np.sin(turns)], axis=2)
-    drift = np.stack([k / n, (k / n) ** 2], axis=1)
-    drift -= drift.mean(axis=0)
-    jumps = [np.column_stack([(k >= first) - 1 + first / n, drift]) for first in range(2, n - 1)]
-    held = 0.0
-    for pattern in (*waves, *jumps):
-        u, size, _ = np.linalg.svd(root @ pattern, full_matrices=False)
-        along = u[:, size > 1e-6 * size[0]].T @ seen
-        held = max(held, float(along @ along))
-    return Patterned(held, float(seen @ seen) - noise, noise)
 
 
 def _uneven(problem: InstrumentProblem, solved: Solution, candidate: Candidate, cause: Cause) -> bool:

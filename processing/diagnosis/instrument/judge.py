@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.instrument.doubts import PATTERN, doubts, testable
+from processing.diagnosis.instrument.doubts import ELSE, doubts, testable
 from processing.diagnosis.instrument.empirical import empirical
 from processing.diagnosis.instrument.evidence import wanted_for_evidence, would_be_seen
 from processing.diagnosis.instrument.guard import chances, checks, lasts, predicted_changes, refusal
@@ -95,7 +95,7 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
     left += sum(2 * c.log_odds * found.samples.best.unit for c in untold)
     doubt = doubts(asked, found, solved, named, left)
     # Values that are not random, or may be any structure, are wrong where an unknown sample takes up a part of them.
-    patterned = (*untold, *(cause for cause, reason in doubt.items() if reason == PATTERN))
+    patterned = (*untold, *(cause for cause, reason in doubt.items() if reason in ELSE))
     unfit = [c for cause in patterned for c in cause.candidates if _unknown(problem, c)]
     if unfit:
         solved = solution(bench, found, unfit)

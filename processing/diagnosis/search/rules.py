@@ -167,6 +167,9 @@ ALIKE = 1e-3
 # ---- why a name is doubted -----------------------------------------------------------------------------------------
 #: [of the range] How close to the end of a parameter's range a value stands at its bound.
 BOUND = 1e-3
+#: [log odds] By which a source that follows one wave has to fit better in a cause's place, for each capture: its
+#: frequency is free, which costs 7; what turns has two harmonics, two values more, and is the commoner fault.
+ONE_WAVE = 4.5
 #: [of their scatter] What a single wave, or a jump beside a drift, may hold of values that belong to one state each, if
 #: they are to be random.
 ONE_PATTERN = 0.85

@@ -6,11 +6,11 @@ from types import SimpleNamespace as Some
 import numpy as np
 from rule_decisions import Patch, cause, decides, made, one
 
-from processing.diagnosis.instrument import combinations, doubts, judge, telling
+from processing.diagnosis.instrument import combinations, doubts, judge, source_patterns, telling
 from processing.diagnosis.search import causes
 from processing.diagnosis.search.causes import Cause
 from processing.diagnosis.search.space import Space
-from processing.instrument.effects.base import ValuePerState
+from processing.instrument.effects.base import SourceEffect, ValuePerState
 
 
 @decides
@@ -89,7 +89,7 @@ def follows(m: Patch, *seen: tuple[float, float]) -> bool:
     )
     found = Some(space=Space(told.candidates), sets=one(1.0, 0.0, len(seen)), samples=Some(best=Some(unit=1.0)))
     each = iter(seen)
-    m.setattr(doubts, "patterned", lambda *a: doubts.Patterned(*next(each), 10.0))
+    m.setattr(doubts, "patterned", lambda *a: source_patterns.Patterned(*next(each), 10.0))
     return doubts._one_pattern(found, told)
 
 
@@ -165,7 +165,7 @@ def test_captures_that_tell_more_together_test_values_for_each_state():
 
 
 def doubted(odds: float, known: bool, left: float) -> bool:
-    found = Some(samples=Some(best=Some(unit=1.0)), sets=Some(noise=Some(directions=1.0)))
+    found = Some(samples=Some(best=Some(unit=1.0)), sets=Some(noise=Some(directions=1.0)), members=())
     told = cause(odds)
     return told in doubts.doubts(Some(noise_known=known), found, None, [told], left)
 
@@ -173,6 +173,27 @@ def doubted(odds: float, known: bool, left: float) -> bool:
 @decides
 def test_times(m: Patch) -> bool:
     return doubted(48.0, True, 1.0) and not doubted(52.0, True, 1.0)
+
+
+@decides
+def test_one_wave(m: Patch) -> bool:
+    # A wave of the source explains as much as is said, the cause 50.
+    def beats(explained: float) -> bool:
+        m.setattr(source_patterns, "_best", lambda *of: explained)
+        m.setattr(source_patterns, "_explained", lambda *of: 50.0)
+        source = made(type("Source", (SourceEffect, ValuePerState), {}))
+        told = cause()
+        sets = Some(without=lambda *of: None, given_others=lambda *of: {0: (0, 0), 1: (np.eye(1), np.zeros(1))})
+        found = Some(
+            samples=Some(best=Some(tau=np.zeros(2))),
+            sets=sets,
+            members=((0,), (1,)),
+            label=lambda g: [told.candidates[0], source][g],
+            space=Some(candidates=(told.candidates[0], source)),
+        )
+        return source_patterns.beat_explains_more(found, told)
+
+    return not beats(58.5) and beats(59.5)
 
 
 @decides

@@ -1,0 +1,52 @@
+"""A source that beats beside the turn of a plate is not called after the plate."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from processing.diagnosis.instrument.source_patterns import beat_explains_more
+from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.causes import causes
+from processing.diagnosis.search.posterior import Posterior
+from processing.diagnosis.search.sampling import sample
+from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets, State
+from processing.diagnosis.search.space import Space
+from processing.effect import Parameter
+from processing.instrument.applied_effects import instrument_effects
+
+STATES = 40
+
+
+def seen_in(cycles, captures=1, beside=None):
+    """Posterior of a plate's transmission, where the source in truth beats so often in each capture."""
+    effects, k = instrument_effects(), np.arange(STATES)
+    turn = 2 * np.pi * k / STATES
+    plate = np.stack([np.cos(turn), np.sin(turn), np.cos(2 * turn), np.sin(2 * turn)], axis=1)
+    design = np.hstack([np.tile(plate, (captures, 1)), np.eye(captures * STATES)])
+    level = np.concatenate([np.cos(2 * np.pi * cycles * k / STATES + phase) for phase in (0.3 * np.arange(captures))])
+    noise = np.random.default_rng(5).standard_normal(level.size)
+    data = 8 * (level if beside is None else np.tile(plate @ beside, captures)) + noise
+    form = Quadratic(float(data @ data - data.size), -design.T @ data, design.T @ design)
+
+    def parameters(count):
+        return tuple(Parameter("p", "1", -50, 50, 1.0) for _ in range(count))
+
+    flicker = [Candidate(effects["source_flicker"], "", parameters(STATES), n) for n in range(captures)]
+    space = Space((Candidate(effects["retarder_transmission"], "plate", parameters(4)), *flicker))
+    groups = [Group(np.arange(4)), Group(np.arange(4, design.shape[1]))]
+    sets = Sets(form, groups, Noise(known=True, directions=30.0, slack=1e9))
+    samples = sample(sets, State(np.array([3.0, 0.0])), 1)
+    samples = SimpleNamespace(**{**vars(samples), "best": State(np.array([3.0, 0.0])), "any_of": lambda members: 1.0})
+    return Posterior(space, ((0,), tuple(range(1, captures + 1))), sets, samples, np.zeros(space.size), np.eye(1))
+
+
+@pytest.mark.parametrize(("cycles", "beats"), [(2.0, False), (1.0, False), (2.2, True), (1.7, True)])
+def test_a_beat_beside_a_harmonic_of_the_turn_is_told_from_it(cycles, beats):
+    found = seen_in(cycles)
+    assert beat_explains_more(found, causes(found, 0.0)[0]) == beats
+
+
+def test_what_turns_alike_in_all_captures_is_the_plate():
+    found = seen_in(1.0, captures=3, beside=np.array([0.3, 0.4, -0.2, 0.5]))
+    assert not beat_explains_more(found, causes(found, 0.0)[0])
