@@ -34,7 +34,7 @@ def export(source: Path, to: str, out: Path, planes: Sequence[str] = (), overwri
     Parameters
     ----------
     to : one of `FORMATS` or `FIGURES`.
-    out : file name without its ending; TIFF adds the name of the plane.
+    out : file name, with its ending or without; TIFF adds the name of the plane.
     planes : names of planes; all by default, for a capture `counts`. In CSV a capture is its table of states.
 
     Raises
@@ -44,6 +44,8 @@ def export(source: Path, to: str, out: Path, planes: Sequence[str] = (), overwri
     """
     if to not in (*FORMATS, *FIGURES):
         raise ProcessError(f"unknown format {to!r}; there are: {', '.join((*FORMATS, *FIGURES))}")
+    if out.suffix.lower() in (f".{to}", ".tif" if to == "tiff" else None):
+        out = out.with_suffix("")
     if to in FIGURES:
         path = out.with_name(f"{out.name}.{to}")
         require_place(path, overwrite)
@@ -181,27 +183,46 @@ def _to_matlab(dataset: xr.Dataset, names: list[str], out: Path, overwrite: bool
 
 
 def _figure(source: Path, path: Path, planes: Sequence[str]) -> None:
-    """The figure of a product, or maps of some planes, sharp enough to print."""
+    """The figure of a product, or maps of some planes in the same colours, sharp enough to print.
+
+    Elements of a Mueller matrix mean something over m00 alone: they are the product's own figure.
+    """
+    from processing.reports.colours import scale_of
     from processing.reports.figure_style import grid_figure
     from processing.reports.figures import product_figure
 
     if not is_product(source):
         raise ProcessError(f"{source} is a capture; figures are made of products (`process reduce` makes one).")
     with Product(source) as product:
-        if not planes:
+        if not planes or (list(planes) == ["mueller"] and product.kind == "mueller"):
             figure = product_figure(product)
         else:
+            known = _known(product)
             panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = []
             for name in planes:
                 values = product.get(name)
                 unit = f" ({product.units(name)})" if product.units(name) else ""
                 for index in np.ndindex(*values.shape[:-2]):
                     place = "".join(str(k) for k in index)
-                    panels.append((f"{name}{' ' + place if place else ''}{unit}", values[index], {}))
+                    shown = values[index] if name in MASKS else np.where(known, values[index], np.nan)
+                    scale = scale_of(name, product.units(name), shown)
+                    limits = {"cmap": scale.colours, "vmin": scale.low, "vmax": scale.high}
+                    panels.append((f"{name.replace('_', ' ')}{' ' + place if place else ''}{unit}", shown, limits))
             figure = grid_figure(panels, product.header.title, product.simulated)
     figure.savefig(path, dpi=FIGURE_DPI)
 
 
+def _known(product: Product) -> NDArray[np.bool_]:
+    """Where a product's own mask says that its values mean something; everywhere without one."""
+    known = np.ones(product.shape, dtype=bool)
+    for name in MASKS:
+        if name in product.names:
+            known &= product.get(name) > 0
+    return known
+
+
+#: Planes that say where the others hold.
+MASKS = ("valid", "lit")
 #: Formats that are pictures, and those that are numbers.
 FIGURES = ("png", "pdf")
 FORMATS: dict[str, Callable[[Any, list[str], Path, bool], list[Path]]] = {

@@ -52,11 +52,13 @@ class CameraDevice(Device):
     ----------
     exposure_s : of the next frames; change it between plans.
     sample : what an emulated rig shows.
+    tells_frames : whether `read` gives the frame itself; some consumers of documents take no images in events.
     """
 
     _frame: np.ndarray[Any, np.dtype[np.uint16]]
     exposure_s = 0.02
     sample = "red_sphere"
+    tells_frames = True
 
     def stage(self) -> list[Device]:
         """Set the exposure, let light through."""
@@ -89,13 +91,13 @@ class CameraDevice(Device):
 
     def read(self) -> Readings:
         """The frame that was taken last, and its mean in counts."""
-        return readings({f"{self.name}_frame": self._frame, f"{self.name}_mean": float(self._frame.mean())})
+        frame = {f"{self.name}_frame": self._frame} if self.tells_frames else {}
+        return readings(frame | {f"{self.name}_mean": float(self._frame.mean())})
 
     def describe(self) -> Readings:
         """Shapes and units."""
         settings = self.rig.require_camera().settings
         shape = (settings.height or 0, settings.width or 0)
-        return {
-            f"{self.name}_frame": data_key("camera, counts (row, column)", shape, "count"),
-            f"{self.name}_mean": data_key("camera, mean of the frame", (), "count"),
-        }
+        frame = {f"{self.name}_frame": data_key("camera, counts (row, column)", shape, "count")}
+        mean = {f"{self.name}_mean": data_key("camera, mean of the frame", (), "count")}
+        return (frame if self.tells_frames else {}) | mean

@@ -17,7 +17,7 @@ def export_command(
     source: Annotated[Path, typer.Argument(help="Capture or product.")],
     to: Annotated[str, typer.Option(help="tiff, csv, fits, mat, png or pdf.")],
     plane: Annotated[list[str] | None, typer.Option(help="Plane of a product, may be repeated; default: all.")] = None,
-    out: Annotated[Path | None, typer.Option(help="File without its ending; default: beside the source.")] = None,
+    out: Annotated[Path | None, typer.Option(help="File, without or with its ending; default: by the source.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files of that name.")] = False,
 ) -> None:
     """Write a capture or product as TIFF stacks, CSV, FITS, MATLAB, or as a figure for a paper."""

@@ -55,6 +55,15 @@ def test_a_scan_of_an_axis_reads_where_it_is(bench, engine):
     assert not np.array_equal(frames[0], frames[2])
 
 
+def test_a_camera_may_keep_its_frames_to_itself(bench, engine):
+    run, documents = engine
+    bench.camera.tells_frames = False
+    run(count([bench.camera]))
+    (event,) = _events(documents)
+    assert list(event) == ["camera_mean"]
+    assert event["camera_mean"] > BLACK_LEVEL
+
+
 def test_a_scan_sees_the_bench_as_it_is_not_as_it_was_declared(small_rig, dim_instrument, engine):
     run, documents = engine
     means = []

@@ -219,6 +219,26 @@ def test_exported_tables_read_back_exactly(exported, product, capture):
     assert [float(line.split(",")[at]) for line in lines[1:]] == list(open_dataset(capture)["psa_deg"].values)
 
 
+def test_exported_maps_have_the_colours_of_the_reports(exported, monkeypatch):
+    from matplotlib.figure import Figure
+
+    from processing.reports import figure_style
+
+    drawn = []
+    monkeypatch.setattr(figure_style, "grid_figure", lambda panels, *_: drawn.extend(panels) or Figure())
+    exported("product", "--to", "png", "--plane", "mueller", "--plane", "mueller_errors")
+    assert [keywords["cmap"] for _, _, keywords in drawn] == ["RdBu_r"] * 16 + ["magma"] * 16
+    assert all(keywords["vmin"] == -keywords["vmax"] for _, _, keywords in drawn[:16])
+    assert drawn[6][0] == "mueller 12 (count)"
+
+
+def test_a_mueller_image_alone_is_exported_as_its_own_figure(exported, tmp_path):
+    (alone,) = exported("product", "--to", "png", "--plane", "mueller", "--out", f"{tmp_path}/alone.png")
+    assert alone.name == "alone.png"
+    (whole,) = exported("product", "--to", "png", "--out", f"{tmp_path}/whole")
+    assert alone.read_bytes() == whole.read_bytes()
+
+
 def test_figures_are_written_and_nothing_is_replaced(exported, product, tmp_path, capsys):
     from processing.commands.application import main
 
