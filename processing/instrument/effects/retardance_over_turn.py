@@ -27,7 +27,9 @@ class RetardanceOverTurn(OpticsEffect):
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         axes = moving_axes(model, conditions)
-        return tuple(e.name for e in model.elements() if isinstance(e, Retarder) and e.axis in axes)
+        plates = (e for e in model.elements() if isinstance(e, Retarder) and e.axis in axes)
+        # Over less than half a turn this wave is hardly anything else than another retardance with a slope.
+        return tuple(e.name for e in plates if np.ptp(e.ratio * conditions.angles_deg[e.axis or ""]) > 180)
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         # Half a minute of wedge, met 1 mm beside the axis, is 1.3 nm in quartz: a degree in the visible.
