@@ -30,6 +30,8 @@ from simulators.blind.suite import declared_bench, state_angles
 from simulators.blind.undeclared_captures import Scene, digitize, expose
 
 SMALL = 24
+#: Of a bench whose sources drift and flicker.
+SEED = 16
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +39,7 @@ def bench(tmp_path_factory):
     from tests.conftest import ROOT
 
     folder = tmp_path_factory.mktemp("benches")
-    return folder, make_bench(folder, 7, ROOT / "configs", pixels=SMALL)
+    return folder, make_bench(folder, SEED, ROOT / "configs", pixels=SMALL)
 
 
 def counts(path):
@@ -80,7 +82,7 @@ def test_intervals_hold_what_the_instrument_file_leaves_uncertain(bench, configs
 
 def test_same_seed_gives_the_same_bench(bench, tmp_path, configs):
     folder, truth = bench
-    assert make_bench(tmp_path, 7, configs, pixels=SMALL) == truth
+    assert make_bench(tmp_path, SEED, configs, pixels=SMALL) == truth
     np.testing.assert_array_equal(
         counts(tmp_path / truth.name / "sphere.h5"), counts(folder / truth.name / "sphere.h5")
     )
@@ -114,7 +116,8 @@ def test_true_values_mend_the_validation_sample(bench, configs):
     assert before > 3e-3
     assert Reduced.of(away / "validation.h5", mended).error(exact) < before / 20
     covered = Reduced.of(away / "validation_noisy.h5", mended).coverage(exact)
-    assert covered.patches == pytest.approx(0.95, abs=0.04)
+    # Some thousand values; the few means over patches say less.
+    assert covered.pixels == pytest.approx(0.95, abs=0.02)
     assert Reduced.of(away / "validation_noisy.h5", declared).coverage(exact).patches < 0.8
 
 

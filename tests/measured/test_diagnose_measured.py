@@ -176,7 +176,9 @@ def test_the_gain_learnt_on_one_picture_mends_another(shared_data, configs, tmp_
     learnt = diagnose_captures([capture("camera")], model)[0].diagnosis
     assert learnt.captures[0].closure_before_percent == pytest.approx(-2.085, abs=0.01)
     gain = next(e for e in learnt.effects if e.kind == "channel_gain")
-    assert gain.confident
+    # Where the picture is curved, moving the four images to one place leaves something: nothing there is called sure.
+    assert (gain.answer, learnt.verdict) == ("one of", "partly_explained")
+    assert gain.probability > 0.9
     assert "channel_extinction" in gain.indistinguishable_from
     # Clipped pixels belong to the one picture; the gains of the channels belong to the camera.
     carried = extended(model, learnt).at(550)
