@@ -173,16 +173,11 @@ class AravisCamera(Camera):
         return stream
 
     def _restart(self) -> None:
-        """After a frame that never came: stop, drain and start, so that it cannot come later.
-
-        With a new stream: many cameras number their frames from 1 again, and Aravis throws away what comes in one
-        stream with a number that is up to 100 before the last.
-        """
+        """Start anew with a new stream after a frame that never came, so that it cannot come later."""
+        # Many cameras number from 1 again, and Aravis throws away a number up to 100 before the last in one stream.
         self._outstanding = False
-        with self._features.asking("restart the acquisition"):
-            self._camera.stop_acquisition()
         self._drain()
-        let_go([self._forget_stream()])
+        self._stop()
         self._start()
 
     def _live_stream(self) -> FrameStream:

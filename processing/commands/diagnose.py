@@ -9,12 +9,14 @@ from typing import Annotated
 import typer
 
 from processing.commands.command_line import Version, application, run
+from processing.computing.blas import one_blas_thread
 from processing.doors import require_new
 
 app = application("diagnose", "Compare captures with an instrument model and find the effect that the model lacks.")
 
 
 @app.command()
+@one_blas_thread()
 def diagnose_command(
     captures: Annotated[list[Path], typer.Argument(help="Captures of one instrument, at one wavelength or several.")],
     instrument: Annotated[Path, typer.Option(help="Instrument file that the intensities are compared with.")],

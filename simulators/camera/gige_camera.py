@@ -16,7 +16,7 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from drivers.aravis_library import load_aravis
 from drivers.errors import CameraError
@@ -25,15 +25,15 @@ from simulators.camera import gige_features as features
 from simulators.camera.camera_memory import CameraMemory
 from simulators.camera.exposure import ExposureInfo, PixelSource, counts_of
 from simulators.camera.frame_packets import FramePackets, send, with_chunks
-from simulators.camera.loopback_address import LoopbackAddress
 from simulators.camera.node_map import node_map
+from simulators.camera.simulated_camera import SimulatedCamera
 
 _FillPattern = ctypes.CFUNCTYPE(
     None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32
 )
 
 
-class GigeCamera:
+class GigeCamera(SimulatedCamera):
     """A simulated camera; a context manager that runs it.
 
     Parameters
@@ -75,8 +75,8 @@ class GigeCamera:
         arming_s: float | None = None,
         elsewhere: bool = False,
     ) -> None:
+        super().__init__(address, elsewhere)
         self.serial = serial
-        self.address = address
         self._size = (width, height)
         self._source = pixel_source
         self.bits = bits
@@ -93,11 +93,9 @@ class GigeCamera:
         self.timeless_frames = 0
         # Holds frames of exposures that start from now on back, as a busy host or a full link does.
         self.delivery_delay_s = 0.0
-        self._error: BaseException | None = None
         self._gone = threading.Event()
         self._camera: Any = None
         self._memory: CameraMemory | None = None
-        self._loopback = LoopbackAddress(address, elsewhere)
         # First, because its message says what is missing.
         load_aravis()
         self._library = ctypes.CDLL("libaravis-0.8.so.0")
@@ -111,23 +109,7 @@ class GigeCamera:
 
     # --- life --------------------------------------------------------------------------------------------
 
-    def __enter__(self) -> Self:
-        self.start()
-        return self
-
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
-        self.stop()
-        if error is None:
-            self.check()
-
     def start(self) -> None:
-        """Start the camera, also again after `vanish`.
-
-        Raises
-        ------
-        CameraError
-            The address is taken or does not exist.
-        """
         aravis, _ = load_aravis()
         self._loopback.take(self._wait_s)
         self.address = self._loopback.address
@@ -152,16 +134,7 @@ class GigeCamera:
         self._library.arv_fake_camera_set_fill_pattern(self._memory.address, self._callback, None)
         self.lost_ratio = self._lost_ratio
 
-    def stop(self) -> None:
-        """End the camera and let the next one have its address."""
-        self.vanish()
-        self._loopback.release()
-
     def vanish(self) -> None:
-        """End the camera at once, as if its plug was pulled; `start` plugs it in again.
-
-        The address stays ours until `stop`: a driver that does not know yet must not talk to another camera there.
-        """
         if self._camera is None or self._memory is None:
             return
         self._gone.set()
@@ -169,12 +142,6 @@ class GigeCamera:
         self._camera.set_property("gvsp-lost-ratio", 1.0)
         self._library.arv_fake_camera_set_fill_pattern(self._memory.address, _FillPattern(), None)
         self._camera = self._memory = None
-
-    def check(self) -> None:
-        """Raise the error of the pixel source, if it had one."""
-        error, self._error = self._error, None
-        if error is not None:
-            raise error
 
     @property
     def lost_ratio(self) -> float:

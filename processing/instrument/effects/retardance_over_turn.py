@@ -18,10 +18,12 @@ from processing.instrument.effects.base import OpticsEffect, moving_axes, turns
 from processing.instrument.model import InstrumentModel, Retarder
 
 
-#: Twice per turn, which a beam tilted to the axis makes, is not looked for: with an unknown sample a diattenuation
-#: beside it does nearly what a transmission twice per turn does.
 class RetardanceOverTurn(OpticsEffect):
-    """Degrees of retardance: cos and sin of the turned angle."""
+    """Degrees of retardance: cos and sin of the turned angle.
+
+    Twice per turn, which a beam tilted to the axis makes, is not looked for: with an unknown sample a diattenuation
+    beside it does nearly what a transmission twice per turn does.
+    """
 
     belongs_to = "dispersion"
 

@@ -14,7 +14,6 @@ import threading
 import time
 from collections import deque
 from pathlib import Path
-from typing import Self
 
 from drivers.errors import CameraError
 from drivers.pixel_formats import pixel_format_of
@@ -28,7 +27,6 @@ from simulators.camera.frame_packets import (
     send,
     with_chunks,
 )
-from simulators.camera.loopback_address import LoopbackAddress
 from simulators.camera.played.bootstrap import boot
 from simulators.camera.played.control_channel import ControlChannel
 from simulators.camera.played.description_file import read_description
@@ -36,6 +34,7 @@ from simulators.camera.played.features import START, STOP, TRIGGER, Features
 from simulators.camera.played.node_tree import REGISTERS, NodeError, NodeTree
 from simulators.camera.played.power_up import power_up
 from simulators.camera.played.register import RegisterMemory
+from simulators.camera.simulated_camera import SimulatedCamera
 
 # Set by a program that wants one packet of the size to see whether it gets through.
 _TEST_PACKET = 1 << 31
@@ -45,7 +44,7 @@ _KEPT_FRAMES = 4
 _FREE_RUN_S = 0.05
 
 
-class PlayedCamera:
+class PlayedCamera(SimulatedCamera):
     """A simulated camera; a context manager that runs it.
 
     Parameters
@@ -74,8 +73,8 @@ class PlayedCamera:
         wait_s: float = 60.0,
         elsewhere: bool = False,
     ) -> None:
+        super().__init__(address, elsewhere)
         self.serial = serial
-        self.address = address
         self.bits = bits
         self.lost_ratio = lost_ratio
         #: Triggers that came while the camera exposed.
@@ -85,8 +84,6 @@ class PlayedCamera:
         self._path = path
         self._wait_s = wait_s
         self._description = read_description(path)
-        self._loopback = LoopbackAddress(address, elsewhere)
-        self._error: BaseException | None = None
         # Control answers in one thread, exposures run in another; both look at the registers.
         self._lock = threading.RLock()
         self._wake = threading.Condition(self._lock)
@@ -130,23 +127,8 @@ class PlayedCamera:
 
     # --- life --------------------------------------------------------------------------------------------
 
-    def __enter__(self) -> Self:
-        self.start()
-        return self
-
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
-        self.stop()
-        if error is None:
-            self.check()
-
     def start(self) -> None:
-        """Start the camera, also again after `vanish`, when it is as after being switched on.
-
-        Raises
-        ------
-        CameraError
-            The address is taken or does not exist.
-        """
+        # After `vanish` it is as after being switched on.
         self._loopback.take(self._wait_s)
         self.address = self._loopback.address
         if self._was_on:
@@ -164,13 +146,7 @@ class PlayedCamera:
         self._worker = threading.Thread(target=self._run, name=f"exposures of camera {self.address}", daemon=True)
         self._worker.start()
 
-    def stop(self) -> None:
-        """End the camera and let the next one have its address."""
-        self.vanish()
-        self._loopback.release()
-
     def vanish(self) -> None:
-        """End the camera at once, as if its plug was pulled; `start` plugs it in again."""
         with self._wake:
             self._plugged_in = False
             self._begin(acquiring=False)
@@ -178,12 +154,6 @@ class PlayedCamera:
         worker, self._worker = self._worker, None
         if worker is not None:
             worker.join()
-
-    def check(self) -> None:
-        """Raise what went wrong in an exposure, if anything did."""
-        error, self._error = self._error, None
-        if error is not None:
-            raise error
 
     def fire(self) -> None:
         """Start an exposure from outside, as a pulse on the trigger line does."""
