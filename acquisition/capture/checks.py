@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from processing.instrument.applied_effects import changes_at
 from processing.instrument.determined import determined_basis
 from processing.instrument.model import InstrumentModel, WavelengthError, rank
 from processing.instrument.states import StateTable
+from processing.yaml_file import ConfigError
 
 #: Reads an instrument file.
 ReadInstrument: TypeAlias = Callable[[Path], InstrumentModel]
@@ -134,8 +136,14 @@ def _free_ways(rig: RigConfig, poses: Sequence[Mapping[str, float]]) -> list[Che
 
 def load_instrument(plan: MeasurementPlan, rig: RigConfig, read: ReadInstrument) -> InstrumentModel:
     """The declared instrument of the plan's mode at its wavelength. Raises ConfigError, PlanRefused."""
+    file = rig.modes[plan.mode].instrument
+    if not file.exists():
+        raise ConfigError(
+            f"modes.{plan.mode}.instrument of the rig file: there is no file {os.path.normpath(file)}. A relative path "
+            "counts from the folder of the rig file: correct it where the rig file was copied elsewhere."
+        )
     try:
-        return read(rig.modes[plan.mode].instrument).at(plan.wavelength_nm)
+        return read(file).at(plan.wavelength_nm)
     except WavelengthError as error:
         raise PlanRefused([str(error)]) from error
 

@@ -41,6 +41,14 @@ def test_unknown_key_is_named_with_its_line(refused, small_rig):
     assert f"rig.yaml:{line}: home_at_strat: unknown key" in err
 
 
+def test_rig_file_copied_elsewhere_says_which_path_is_wrong(refused, small_rig, tmp_path):
+    rig = _changed(small_rig(), lambda r: r["modes"]["drr"].update(instrument="../instruments/rgb950.yaml"))
+    code, err = refused("--omega", 35, "--rig", rig)
+    assert code == 2
+    missing = rig.parent.parent / "instruments/rgb950.yaml"
+    assert f"modes.drr.instrument of the rig file: there is no file {missing}" in err
+
+
 def test_wrong_key_of_an_exposure_speaks_of_that_kind_alone(refused, tmp_path):
     plan = tmp_path / "plan.yaml"
     plan.write_text("kind: plan\nexposure_s: {kind: auto, taget: 0.5}\n")
