@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
-from playwright.sync_api import ConsoleMessage, Page, expect, sync_playwright
+from playwright.sync_api import ConsoleMessage, Page, Route, expect, sync_playwright
 from ruamel.yaml import YAML
 
 #: However long a busy machine takes; the limit of a test ends a hang.
@@ -96,6 +96,19 @@ def ready(page: Page) -> None:
 def fits(page: Page) -> bool:
     """Nothing is wider than the window."""
     return bool(page.evaluate("document.documentElement.scrollWidth <= innerWidth"))
+
+
+def test_a_button_waits_for_its_script(address, window):
+    page = window()
+    held: list[Route] = []
+    script = "**/static/start.js"
+    page.route(script, lambda route: held.append(route))
+    with page.expect_request(script):
+        page.goto(f"{address}/", wait_until="commit")
+    # Sent before the script has come, the form would leave the page and start nothing.
+    expect(page.get_by_role("button", name="Start")).to_be_disabled()
+    held[0].continue_()
+    expect(page.get_by_role("button", name="Start")).to_be_enabled()
 
 
 def test_a_whole_evening(lab, address, window):

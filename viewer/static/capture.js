@@ -2,7 +2,7 @@
 
 import "./start.js";
 import { drawsRegions, ImageView, place, readPlane, saturated } from "./images.js";
-import { accent, at, bad, byId, draw, embedded, getJson, ink, narrow, newestJson, say } from "./plots.js";
+import { accent, at, bad, byId, draw, embedded, getJson, ink, narrow, newestJson, pressed, say } from "./plots.js";
 import { drawCurve, showProbe } from "./probe.js";
 
 const file = byId("look").dataset.file;
@@ -103,7 +103,7 @@ slider.max = Math.max(states.number.length - 1, 0);
 slider.value = Math.max(states.role.findIndex(role => role !== "dark"), 0);
 slider.addEventListener("input", show);
 channel.addEventListener("change", show);
-byId("play").addEventListener("click", () => play(timer === null));
+pressed(byId("play"), () => play(timer === null));
 byId("stretch").addEventListener("change", () => run(() => view.show()));
 drawsRegions(byId("region"), view.node);
 document.addEventListener("keydown", event => {

@@ -3,7 +3,7 @@
 import "./start.js";
 import { ImageView, readPlane } from "./images.js";
 import { mapTraces } from "./maps.js";
-import { accent, byId, draw, embedded, newestJson, post, quiet, say } from "./plots.js";
+import { accent, byId, draw, embedded, newestJson, post, pressed, quiet, say } from "./plots.js";
 
 const spec = embedded("spec"), MOMENTS = ["before", "after"];
 const colourOf = moment => (moment === "before" ? quiet() : accent());
@@ -62,14 +62,14 @@ async function pixel(region, k) {
 function decide(fields) {
   return post("decide", { name, note: byId("note").value, ...fields }).then(() => location.reload(), error => say(byId("answer"), error));
 }
-byId("accept")?.addEventListener("click", () => decide({ accept: "yes", file: byId("file").value }));
-byId("reject")?.addEventListener("click", () => decide({}));
+if (byId("accept")) pressed(byId("accept"), () => decide({ accept: "yes", file: byId("file").value }));
+if (byId("reject")) pressed(byId("reject"), () => decide({}));
 
 addEventListener("load", async () => {
   if (spec.captures.length) {
     newViews();
     byId("capture").addEventListener("change", () => { state = null; MOMENTS.forEach(m => Plotly.purge(byId(m))); newViews(); drawStates(); refresh(); });
-    byId("all").addEventListener("click", () => { state = null; refresh(); });
+    pressed(byId("all"), () => { state = null; refresh(); });
     drawStates();
     await refresh();
   }

@@ -1,6 +1,6 @@
 // Pictures of numbers: read from the server in the resolution that the screen shows, and again for what is zoomed into.
 
-import { at, draw } from "./plots.js";
+import { at, draw, pressed } from "./plots.js";
 
 /** Read a picture; its planes as arrays of rows, with where its pixels lie in the image. */
 export async function readPlane(what, query, signal) {
@@ -31,7 +31,7 @@ export const place = plane => ({
 
 /** A button that switches between zooming and drawing a region; it looks pressed once the picture does so. */
 export function drawsRegions(button, node) {
-  button.addEventListener("click", async () => {
+  pressed(button, async () => {
     const on = button.getAttribute("aria-pressed") !== "true";
     await Plotly.relayout(node, { dragmode: on ? "select" : "zoom" });
     button.setAttribute("aria-pressed", on);

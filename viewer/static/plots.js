@@ -30,6 +30,12 @@ export async function post(what, fields) {
   return answer.json();
 }
 
+/** What a button does. Pages send it disabled: one that is pressed before its script has come would do nothing, or leave the page. */
+export function pressed(button, act) {
+  button.addEventListener("click", act);
+  button.disabled = false;
+}
+
 export function say(where, error) {
   const line = document.createElement("p");
   line.className = "error";

@@ -2,11 +2,11 @@
 
 import { post, say } from "./plots.js";
 
-document.querySelectorAll("form[data-start]").forEach(form => form.addEventListener("submit", async event => {
+async function start(event) {
   event.preventDefault();
+  const form = event.target, button = buttonOf(form);
   const fields = { what: form.dataset.start };
   for (const [name, value] of new FormData(form)) fields[name] = name in fields ? `${fields[name]}\n${value}` : value;
-  const button = form.querySelector("button:not([type=button])");
   button.disabled = true;
   try {
     location.href = (await post("start", fields)).address;
@@ -16,4 +16,13 @@ document.querySelectorAll("form[data-start]").forEach(form => form.addEventListe
     place.className = "answer";
     say(place, error);
   }
-}));
+}
+
+const buttonOf = form => form.querySelector("button:not([type=button])");
+const forms = document.querySelectorAll("form[data-start]");
+forms.forEach(form => form.addEventListener("submit", start));
+// Pages send these buttons disabled: a form that is sent before this script has come would leave the page.
+const enable = () => forms.forEach(form => { buttonOf(form).disabled = false; });
+enable();
+// A page that is gone back to is as it was left.
+addEventListener("pageshow", event => { if (event.persisted) enable(); });
