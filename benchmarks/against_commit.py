@@ -43,7 +43,10 @@ COMMANDS = {
     "process calibrate": "calibrate {air} --instrument {instrument} --free {free}",
 }
 #: Of `./lab bench`, what both versions have: the words of --only, and how the line begins where others fit too.
-SAME_NAME = ("drr", "field", "weighted small", "cloude", "eigenvalues", "lu-chipman", "mosaic", "normals")
+SAME_NAME = (
+    *("drr", "field", "weighted small", "weighted large", "cloude", "eigenvalues", "lu-chipman", "mosaic", "normals"),
+    *("capture to disc", "reduce", "diagnose unknown", "diagnose moves", "diagnose air"),
+)
 TASKS = dict.fromkeys(SAME_NAME, "") | {"xi0": "xi0 and M00", "table": "table"}
 FREE = "psg_retarder.retardance_deg,psg_retarder.azimuth_deg,psa_retarder.retardance_deg,psa_retarder.azimuth_deg"
 

@@ -222,8 +222,48 @@ def test_an_error_of_the_disc_is_told_at_once_and_by_the_next_call(create, monke
     heard.wait()
     assert "could not be written ([Errno 5] Input/output error)" in str(told[0])
     for call in (lambda: writer.put(record(1)), writer.settle, lambda: writer.seal("complete", {})):
-        with pytest.raises(AcquisitionError, match="States done before it are intact"):
+        with pytest.raises(AcquisitionError, match=r"Input/output error\). States done before it are intact"):
             call()
+
+
+@pytest.mark.parametrize(
+    ("broken", "call"),
+    [
+        ("write_column", lambda writer: writer.forget()),
+        ("write_closing", lambda writer: writer.seal("complete", {})),
+        ("write_status", lambda writer: writer.seal("complete", {})),
+    ],
+)
+def test_an_error_of_the_disc_beside_the_states_says_which(create, monkeypatch, broken, call):
+    def fail(*_: object) -> None:
+        raise OSError(errno.EDQUOT, "Disk quota exceeded")
+
+    monkeypatch.setattr(StateFile, broken, fail)
+    writer = create()
+    with pytest.raises(AcquisitionError, match=r"could not be written \(\[Errno 122\] Disk quota exceeded\)"):
+        call(writer)
+    assert writer.path.name == "c.h5.partial"
+
+
+def test_the_frame_of_each_channel_is_written(tmp_path):
+    header = HEADER.model_copy(update={"channels": ("ordinary", "extraordinary")})
+    pixels = np.arange(2 * 4 * 5, dtype=np.uint16).reshape(2, 4, 5)
+    writer = CaptureWriter.create(tmp_path / "two.h5", header, table(), SHAPE, "2026-01-01T00:00:00")
+    writer.put(StateRecord(0, pixels, {"psg": Position(0.0, 0, True)}, {"exposure_s": 0.03}))
+    path = writer.seal("failed", {}, keep_partial=True)
+    with h5py.File(path) as h5:
+        np.testing.assert_array_equal(h5["entry/instrument/detector/data"][0], pixels)
+
+
+def test_a_file_that_was_killed_after_its_status_keeps_its_closing_record(create):
+    writer = create()
+    for state in range(3):
+        writer.put(record(state))
+    writer.seal("complete", {"messages": ["as it was"]}, keep_partial=True)
+    final = seal_whole(writer.path)
+    assert final is not None
+    with Capture(final) as capture:
+        assert capture.closing["messages"] == ["as it was"]
 
 
 def test_a_disc_that_takes_nothing_is_given_up_after_a_while_and_the_next_state_waits(create, monkeypatch):
