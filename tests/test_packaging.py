@@ -85,3 +85,14 @@ def test_the_wheel_works_where_there_is_no_checkout(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert "nothing was moved" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [("aquire", "acquire"), ("proces", "process"), ("veiw", "view"), ("reduce", None), ("x", None)],
+)
+def test_lab_asks_whether_a_command_near_by_was_meant(typed: str, meant: str | None) -> None:
+    done = subprocess.run([ROOT / "lab", typed], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    hint = f" Did you mean '{meant}'?" if meant else ""
+    assert done.stderr.splitlines()[-1] == f"lab: there is no command '{typed}'.{hint}"

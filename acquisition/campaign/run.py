@@ -18,6 +18,7 @@ from acquisition.capture.estimate import capture_seconds, last_pose_deg
 from acquisition.capture.identity import require_same
 from acquisition.capture.job import Job, Result, check_with_devices, existing, job_of
 from acquisition.capture.job import prepare as prepare_job
+from acquisition.capture.machine_checks import check_machine
 from acquisition.capture.operator import Operator
 from acquisition.capture.writer import PARTIAL, bytes_needed, check_space, seal_whole
 from acquisition.errors import AcquisitionError, Differs, InterlockOpened, PlanRefused, Stopped
@@ -73,7 +74,8 @@ def check_all(jobs: Sequence[tuple[CampaignCapture, Job]], rig: Rig, folder: Pat
         size = bytes_needed(len(job.table), 1, (settings.height or 0, settings.width or 0))
         planned.append(Planned(capture, job, capture_seconds(job, rig, pose), size))
         pose = pose | last_pose_deg(job)
-    checks = list(seen.values())
+    samples = [job.plan.sample.name or job.plan.sample.kind for _, job in jobs]
+    checks = [*check_machine(rig.config, samples), *seen.values()]
     missing = sum(p.size for p in planned if not (folder / p.capture.name).exists())
     try:
         check_space(existing(folder), missing + BOOKS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -69,8 +70,8 @@ def run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Obs
         held.close()
     typer.echo("\n".join(lines))
     typer.echo(f"in {folder}: captures, {SUMMARY}, {INDEX}, {LOG}")
-    door = os.environ.get("UMOV_DOOR", "")
-    after = f"{door} process campaign {folder} --geometry FILE --material FILE".lstrip()
+    words = ["process", "campaign", str(folder), "--geometry", "FILE", "--material", "FILE"]
+    after = shlex.join(filter(None, [os.environ.get("UMOV_DOOR"), *words]))
     typer.echo(f"next: {after}" if done else "next: the same command goes on where it stopped")
     return 0 if done else INTERRUPTED
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from acquisition.capture.header import versions
+from acquisition.capture.machine_checks import check_machine
 from acquisition.cleanup import run_all
 from acquisition.errors import AcquisitionError
 from acquisition.rig.config import RigConfig
@@ -54,6 +55,8 @@ def examine(config: RigConfig, folder: Path, frames: int = FRAMES) -> Iterator[F
     yield Finding("disc", free > 1e9, f"{free / 1e9:.1f} GB free in {folder.resolve()}")
     for name, mode in config.modes.items():
         yield _guarded(f"mode {name}", lambda mode=mode: _instrument(mode.instrument))  # type: ignore[misc]
+    for check in check_machine(config, config.simulator.samples if config.simulator else ()):
+        yield Finding(check.what, check.passed, check.found)
     rig = Rig(config)
     try:
         yield _guarded("emulators", rig.start_simulation) if config.simulator else Finding("rig", None, config.name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from acquisition.capture.checks import Check, refuse_failed
 from acquisition.capture.estimate import capture_seconds
 from acquisition.capture.header import default_name
 from acquisition.capture.job import Job, Result, check_with_devices, job_of, prepare, stored_plan, stored_rig
+from acquisition.capture.machine_checks import check_machine
 from acquisition.capture.operator import Operator
 from acquisition.capture.plan import MeasurementPlan
 from acquisition.capture.writer import PARTIAL, seal_whole
@@ -62,10 +64,11 @@ def run(options: Options, stop: StopRequest) -> int:
         typer.echo(f"every state was there already; sealed as {sealed}")
         return 0
     job, path, resuming = _job(options)
+    sample = job.plan.sample.name or job.plan.sample.kind
     say_simulated(console, job.rig)
     operator = Operator(console.print, stop, options.yes, job.rig.simulated)
     with Rig(job.rig, ask=operator.confirm) as rig:
-        checks = check_with_devices(job, rig, path.parent)
+        checks = [*check_machine(job.rig, [sample]), *check_with_devices(job, rig, path.parent)]
         if options.dry_run:
             show_checks(Console(), (*job.checks, *checks))
             refuse_failed(checks)
@@ -210,7 +213,7 @@ def summarize(job: Job, result: Result) -> None:
         *(("note", message) for message in result.messages[-5:]),
         ("figure", figure),
         ("capture", str(result.path)),
-        ("next", next_command(job, result)),
+        ("next", next_command(result)),
     ]
     for label, text in lines:
         typer.echo(f"{label:<11} {text}")
@@ -227,9 +230,7 @@ def _overhead(ledger: dict[str, float]) -> list[str]:
     ]
 
 
-def next_command(job: Job, result: Result) -> str:
+def next_command(result: Result) -> str:
     """What to do with the file now, as the user started this program: `UMOV_DOOR` is set by ./lab."""
-    door = os.environ.get("UMOV_DOOR", "")
-    if result.status != "complete":
-        return f"{door} acquire --resume {result.path}".lstrip()
-    return f"{door} process reduce {result.path}".lstrip()
+    words = ["process", "reduce"] if result.status == "complete" else ["acquire", "--resume"]
+    return shlex.join(filter(None, [os.environ.get("UMOV_DOOR"), *words, str(result.path)]))

@@ -7,7 +7,6 @@ from __future__ import annotations
 import difflib
 import os
 import re
-import shutil
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -46,7 +45,6 @@ def find_mistakes(rig: RigSections) -> list[Mistake]:
         _wavelengths,
         _detector,
         _interlocks,
-        _alert,
         _solids,
         _ways,
     )
@@ -185,11 +183,6 @@ def _detector(rig: RigSections) -> Iterator[Mistake]:
     black, top = detector.black_level_counts, 2 ** (detector.bits or 32) - 1
     if not 0 <= black < top:
         yield ("detector", "black_level_counts"), f"{black:g} lies outside the counts, 0 to {top}"
-
-
-def _alert(rig: RigSections) -> Iterator[Mistake]:
-    if rig.alert and shutil.which(rig.alert[0]) is None:
-        yield ("alert",), f"there is no program {rig.alert[0]!r} here: nobody would be called"
 
 
 def _interlocks(rig: RigSections) -> Iterator[Mistake]:

@@ -2,11 +2,16 @@
 
 import os
 import pty
+import shlex
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from ruamel.yaml import YAML
+
+from acquisition.capture.job import Result
+from acquisition.commands.single import next_command
 
 
 def _changed(path, change):
@@ -47,6 +52,45 @@ def test_rig_file_copied_elsewhere_says_which_path_is_wrong(refused, small_rig, 
     assert code == 2
     missing = rig.parent.parent / "instruments/rgb950.yaml"
     assert f"modes.drr.instrument of the rig file: there is no file {missing}" in err
+
+
+@pytest.mark.parametrize(
+    ("change", "row", "why"),
+    [
+        ({"alert": ["/no/such/program"]}, "alert", "no program '/no/such/program'"),
+        ({"notify": {"command": ["/no/such/teller"]}}, "notify", "no program '/no/such/teller'"),
+        ({"samples": {"red_sphere": "nowhere.yaml"}}, "scene red_sphere", "nowhere.yaml"),
+        ({"truth": {"drr": "nowhere.yaml"}}, "truth of drr", "nowhere.yaml"),
+    ],
+    ids=["alert", "notify", "scene", "truth"],
+)
+def test_what_is_not_on_this_machine_is_told_beside_the_rest(refused, acquire, small_rig, change, row, why):
+    """A rig file of the bench on the desk of somebody else: its checks run, its runs do not."""
+    parts = {key: change.pop(key) for key in ("samples", "truth") & change.keys()}
+    rig = _changed(
+        small_rig(top=change), lambda r: [r["simulator"].setdefault(k, {}).update(v) for k, v in parts.items()]
+    )
+    code, out, err = acquire("--omega", 35, "--rig", rig, "--dry-run")
+    assert code == 2
+    assert f"REFUSED  {row}" in out
+    assert "ok  disc" in out
+    assert why in err
+    assert refused("--omega", 35, "--rig", rig)[0] == 2
+
+
+def test_doctor_and_stop_do_without_who_is_called(acquire, small_rig):
+    rig = small_rig(top={"alert": ["/no/such/program"]})
+    code, out, _ = acquire("doctor", "--rig", rig)
+    assert code == 1
+    assert [line.split()[1] for line in out.splitlines() if "BAD" in line] == ["alert"]
+    assert acquire("stop", "--rig", rig)[0] == 0
+
+
+def test_next_command_can_be_pasted():
+    path = Path("my captures/it's one.h5")
+    for status, door in (("complete", "process"), ("aborted", "acquire")):
+        words = shlex.split(next_command(Result(path, status, 44, 44)))
+        assert (words[0], words[-1]) == (door, str(path))
 
 
 def test_wrong_key_of_an_exposure_speaks_of_that_kind_alone(refused, tmp_path):

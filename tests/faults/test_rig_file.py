@@ -76,7 +76,6 @@ MISTAKES = {
     "network port without number": ({"axes.arm.port": "socket://10.0.0.5"}, ("axes.arm.port", "ADDRESS:NUMBER")),
     "axis called detector": ({"axes.detector": {**ZABER, "address": 3}}, ("axes.detector", "another name")),
     "axis as a path": ({"axes.a/b": {**ZABER, "address": 3}}, ("axes.a/b", "no name for an axis")),
-    "nobody to call": ({"alert": ["/no/such/program"]}, ("alert", "no program")),
     "a million axes": ({"simulator.ports.rotators.axes": 10**6}, ("rotators.axes", "99")),
     "emulator nowhere": ({"axes.arm.port": "sim:amr"}, ("axes.arm.port", "simulator.ports")),
 }  # fmt: skip

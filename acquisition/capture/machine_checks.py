@@ -1,0 +1,47 @@
+"""What a rig file names on the machine that it is used on: programs to call somebody, files of the emulated bench.
+
+The rig file is sound without them, and can be read, resumed from and stopped by on another machine; no run begins.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from acquisition.capture.checks import Check
+from acquisition.rig.config import RigConfig
+from processing.errors import ProcessError
+from processing.instrument.model import InstrumentModel
+from simulators.bench.scene import Scene
+
+
+def check_machine(rig: RigConfig, samples: Iterable[str]) -> list[Check]:
+    """Programs of `alert` and `notify`, scenes of samples, and the instruments that an emulated bench truly is.
+
+    Parameters
+    ----------
+    samples : names as in `simulator.samples`.
+    """
+    checks = []
+    commands = {"alert": rig.alert, "notify": rig.notify.command if rig.notify else ()}
+    for key, command in commands.items():
+        if command:
+            found = shutil.which(command[0])
+            lacking = f"there is no program {command[0]!r} here: nobody would be called"
+            checks.append(Check(key, found is not None, found or lacking))
+    if rig.simulator is not None:
+        for name in dict.fromkeys(samples):
+            if name in rig.simulator.samples:
+                checks.append(_check_file(f"scene {name}", rig.simulator.samples[name], Scene.load))
+        for mode, path in rig.simulator.truth.items():
+            checks.append(_check_file(f"truth of {mode}", path, InstrumentModel.load))
+    return checks
+
+
+def _check_file(what: str, path: Path, load: Callable[[Path], object]) -> Check:
+    try:
+        load(path)
+    except ProcessError as error:
+        return Check(what, False, str(error))
+    return Check(what, True, str(path))
