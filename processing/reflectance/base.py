@@ -89,11 +89,25 @@ def kinds() -> dict[str, type[BaseModel]]:
 def load_reflectance(path: Path | str) -> Any:
     """The ReflectanceModel that a material file describes. Raises ConfigError with file, line and key."""
     header = load_yaml(path, _Header)
-    if header.kind not in kinds():
+    model = _model_here(header.kind) or kinds().get(header.kind)
+    if model is None:
         raise ConfigError(
             f"{path}: kind: no reflectance model {header.kind!r}; there are: {', '.join(sorted(kinds()))}"
         )
-    return load_yaml(path, kinds()[header.kind])
+    return load_yaml(path, model)
+
+
+def _model_here(kind: str) -> type[BaseModel] | None:
+    """The model of one module of this folder; its neighbours, some slow to import, stay where they are.
+
+    None where there is none, and for a name that a plug-in offers as well, of which `kinds` complains.
+    """
+    import processing.reflectance as folder
+
+    here = {info.name for info in pkgutil.iter_modules(folder.__path__)}
+    if kind not in here or kind in entry_points(group=ENTRY_POINT_GROUP).names:
+        return None
+    return getattr(importlib.import_module(f"processing.reflectance.{kind}"), "Model", None)
 
 
 def constants_at(constants: dict[float, Any], wavelength_nm: float, name: str) -> Any:

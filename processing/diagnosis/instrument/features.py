@@ -5,6 +5,7 @@ Powers and logarithms need the pixel alone, derivatives of the image the pixels 
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -87,6 +88,8 @@ def derivatives_of_part(u: NDArray[np.floating], rows: slice, columns: slice) ->
     return out
 
 
+# Frames that did not move, or moved together, share one answer.
+@lru_cache(maxsize=1024)
 def shared_noise(x_px: float, y_px: float, mixed: SharedNoise = NOTHING_SHARED) -> Array:
     """Covariance (6, 6) of the noise of a pixel and its derivatives in a frame that was moved back by so many pixels.
 
@@ -94,7 +97,9 @@ def shared_noise(x_px: float, y_px: float, mixed: SharedNoise = NOTHING_SHARED) 
     """
     across = np.stack([np.convolve(kernel, noise_taps(x_px, mixed.right)) for _, kernel in PATTERNS])
     down = np.stack([np.convolve(kernel, noise_taps(y_px, mixed.down)) for kernel, _ in PATTERNS])
-    return np.asarray((across @ across.T) * (down @ down.T) / mixed.wide)
+    out = np.asarray((across @ across.T) * (down @ down.T) / mixed.wide)
+    out.flags.writeable = False
+    return out
 
 
 def feature_noise(slopes: NDArray[Any], share: NDArray[Any], shared: Array) -> Array:
