@@ -66,7 +66,7 @@ def import_command(
         overwrite=overwrite,
     )
     with progress_bar("importing", "states") as tick:
-        header = import_capture(request, tick)
+        header = import_capture(request, tick, lambda text: typer.echo(f"warning: {text}", err=True))
     typer.echo(f"{request.out}: {header.title}, {header.wavelength_nm:g} nm, sample {header.sample.kind}")
 
 

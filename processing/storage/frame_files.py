@@ -15,8 +15,17 @@ from processing.storage.h5_door import damage_as, open_h5, read_npy, require_dat
 from processing.storage.state_csv import ImportFailed
 
 
-def read_picture(file: Path) -> NDArray[Any]:
-    """Raw grey values (rows, columns) of a PNG or TIFF file. Raises ImportFailed."""
+def read_frame(file: Path) -> NDArray[Any]:
+    """Raw grey values (rows, columns) of a PNG, TIFF or .npy file. Raises ImportFailed."""
+    if file.suffix != ".npy":
+        return _read_picture(file)
+    values = read_npy(file, ImportFailed)
+    if values.ndim != 2 or not 0 < values.size <= MOST_PIXELS:
+        raise ImportFailed(f"{file}: shape {values.shape}; a frame has rows and columns. Frames of all states: --stack")
+    return values
+
+
+def _read_picture(file: Path) -> NDArray[Any]:
     import cv2
 
     require_picture(file, ImportFailed)

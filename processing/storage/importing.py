@@ -21,7 +21,8 @@ from processing.doors import one_line, read_text, require_place
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture_schema import CaptureHeader, Detector, Sample, create_layout, write_closing
 from processing.storage.checksums import row_crc32, write_checksums
-from processing.storage.frame_files import check_stack, open_stack, read_picture
+from processing.storage.doubtful_units import doubtful_units
+from processing.storage.frame_files import check_stack, open_stack, read_frame
 from processing.storage.h5_door import read_npy
 from processing.storage.nexus import attach
 from processing.storage.state_csv import ImportFailed, StatesFile, read_states
@@ -61,8 +62,12 @@ class ImportRequest:
     overwrite: bool = False
 
 
-def import_capture(request: ImportRequest, progress: Progress | None = None) -> CaptureHeader:
+def import_capture(
+    request: ImportRequest, progress: Progress | None = None, warn: Callable[[str], None] | None = None
+) -> CaptureHeader:
     """Write a capture file from states.csv and its frames; returns the header that was written.
+
+    `warn` is told what looks like numbers in other units than are asked for.
 
     Raises
     ------
@@ -75,6 +80,9 @@ def import_capture(request: ImportRequest, progress: Progress | None = None) -> 
         model = InstrumentModel.load(request.instrument)
         model.at(request.wavelength_nm)
     states = read_states(request.states, model.axes if model else ())
+    for doubt in doubtful_units(states, request.wavelength_nm):
+        if warn is not None:
+            warn(doubt)
     source = _source(request, states, model)
     detector = request.detector
     if detector.bits is None and source.dtype.kind == "u":
@@ -181,11 +189,11 @@ def _images(states: StatesFile, names: tuple[str, ...]) -> FrameSource:
         line, file = absent[0]
         more = f" (and {len(absent) - 1} more)" if len(absent) > 1 else ""
         raise ImportFailed(f"{states.path}:{line}: column file: no such frame: {file}{more}")
-    first = read_picture(files[0])
+    first = read_frame(files[0])
 
     def load(item: tuple[int, Path]) -> Frame:
         line, file = item
-        image = read_picture(file)
+        image = read_frame(file)
         if image.shape != first.shape or image.dtype != first.dtype:
             raise ImportFailed(
                 f"{states.path}:{line}: {file.name} is {_kind(image)}, but the first frame is {_kind(first)}; "

@@ -22,6 +22,8 @@ CHANNEL_PREFIX = "channel_"
 KNOWN = ("state", "role", "file", "time_s", "exposure_s", "sigma")
 #: What a column must look like, as a name in the capture file.
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_ .-]{0,63}")
+#: What may stand between columns; a spreadsheet takes semicolons where the comma is in the numbers.
+DELIMITERS = ",;\t"
 MOST_COLUMNS = 200
 MOST_STATES = 100_000
 
@@ -63,6 +65,9 @@ class StatesFile:
 def read_states(path: Path, axes: Sequence[str]) -> StatesFile:
     """Read a states file (CSV with a header line).
 
+    Columns are apart by commas, semicolons or tabs, as the header has them. Beside semicolons numbers may have decimal
+    commas; then none has a point.
+
     Parameters
     ----------
     axes : names that must have a column (the instrument's axes), with or without a suffix `_deg`; any other column
@@ -73,7 +78,7 @@ def read_states(path: Path, axes: Sequence[str]) -> StatesFile:
     ------
     ImportFailed : not readable, a column is missing, unknown or given twice, a number is none, a state is repeated.
     """
-    header, rows = _table(path)
+    header, rows, delimiter = _table(path)
     names = [_axis_name(h) for h in header]
     _check_names(path, names)
     twice = sorted({n for n in names if names.count(n) > 1})
@@ -97,7 +102,9 @@ def read_states(path: Path, axes: Sequence[str]) -> StatesFile:
     lines = [lines[k] for k in order]
     columns = {name: [values[k] for k in order] for name, values in columns.items()}
     role = _roles(path, lines, columns)
-    numbers = {n: _numbers(path, lines, n, columns[n], role) for n in names if n not in ("state", "role", "file")}
+    cells = {n: columns[n] for n in names if n not in ("state", "role", "file")}
+    decimal_commas = delimiter == ";" and any("," in text for texts in cells.values() for text in texts)
+    numbers = {n: _numbers(path, lines, n, texts, role, decimal_commas) for n, texts in cells.items()}
     files = _files(path, lines, columns["file"]) if "file" in columns else None
     _check_sigma(path, lines, numbers.get("sigma"))
     return StatesFile(
@@ -113,9 +120,12 @@ def read_states(path: Path, axes: Sequence[str]) -> StatesFile:
     )
 
 
-def _table(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+def _table(path: Path) -> tuple[list[str], list[tuple[int, list[str]]], str]:
+    """Header, rows with their line numbers, and what stands between the columns."""
+    text = read_text(path, ImportFailed)
+    delimiter = max(DELIMITERS, key=text.partition("\n")[0].count)
     try:
-        reader = csv.reader(read_text(path, ImportFailed).splitlines(keepends=True))
+        reader = csv.reader(text.splitlines(keepends=True), delimiter=delimiter)
         header = [h.strip() for h in next(reader, [])]
         rows = [(reader.line_num, [c.strip() for c in row]) for row in reader if any(c.strip() for c in row)]
     except csv.Error as error:
@@ -129,7 +139,7 @@ def _table(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     for line, row in rows:
         if len(row) != len(header):
             raise ImportFailed(f"{path}:{line}: {len(row)} columns, the header has {len(header)}")
-    return header, rows
+    return header, rows, delimiter
 
 
 def _check_names(path: Path, names: Sequence[str]) -> None:
@@ -191,14 +201,18 @@ def _roles(path: Path, lines: list[int], columns: dict[str, list[str]]) -> tuple
     return roles
 
 
-def _numbers(path: Path, lines: list[int], name: str, texts: list[str], role: tuple[str, ...]) -> NDArray[np.float64]:
+def _numbers(
+    path: Path, lines: list[int], name: str, texts: list[str], role: tuple[str, ...], decimal_commas: bool
+) -> NDArray[np.float64]:
+    # A point among decimal commas could only part thousands: as a comma it is no number.
+    points = str.maketrans(",.", ".,") if decimal_commas else {}
     out = np.empty(len(texts))
     for k, text in enumerate(texts):
         if not text and role[k] in ("dark", "flat"):
             out[k] = np.nan
             continue
         try:
-            out[k] = float(text)
+            out[k] = float(text.translate(points))
         except ValueError:
             out[k] = np.nan
         if not math.isfinite(out[k]):

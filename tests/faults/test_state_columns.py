@@ -84,3 +84,53 @@ def test_an_unknown_column_is_refused(tmp_path, column):
 def test_axes_may_be_called_by_their_bare_name_where_the_instrument_has_them(tmp_path):
     path = written(tmp_path, "state,psg,stage_deg,channel_left", ["0,0,1,2", "1,4,1,2"])
     assert set(read_states(path, ("psg",)).angles_deg) == {"psg", "stage"}
+
+
+ANALYZER = ("state", "psa_deg", "channel_camera")
+
+
+def spreadsheet(folder, delimiter, numbers):
+    """A states file as a spreadsheet saves it, byte order mark and all."""
+    lines = [delimiter.join(ANALYZER), *(delimiter.join(row) for row in numbers)]
+    path = folder / "states.csv"
+    path.write_bytes("\r\n".join([*lines, ""]).encode("utf-8-sig"))
+    return path
+
+
+@pytest.mark.parametrize("delimiter", [";", "\t", ","])
+def test_states_as_spreadsheets_save_them(tmp_path, delimiter):
+    numbers = [("0", "-7.5", "1000.25"), ("1", "372.5", "900")]
+    if delimiter == ";":
+        numbers = [tuple(text.replace(".", ",") for text in row) for row in numbers]
+    states = read_states(spreadsheet(tmp_path, delimiter, numbers), ["psa"])
+    assert states.angles_deg["psa"].tolist() == [-7.5, 372.5]
+    assert states.channels["camera"].tolist() == [1000.25, 900.0]
+
+
+@pytest.mark.parametrize(("delimiter", "angle", "cell"), [(";", "7,5", "1.000"), ("\t", "7.5", "1,5")])
+def test_a_number_that_could_be_two_is_refused(tmp_path, delimiter, angle, cell):
+    path = spreadsheet(tmp_path, delimiter, [("0", angle, "3"), ("1", "15", cell)])
+    with pytest.raises(ImportFailed, match=f"states.csv:3: column channel_camera: '{cell}' is not a finite number"):
+        read_states(path, ["psa"])
+
+
+@pytest.mark.parametrize(("unit", "asked"), [(np.deg2rad, True), (np.asarray, False)], ids=["radians", "degrees"])
+def test_units_that_are_hardly_meant_are_asked_about(tmp_path, unit, asked):
+    numbers = [(str(k), f"{angle:.6f}", "1000") for k, angle in enumerate(unit(np.arange(0.0, 360.0, 15.0)))]
+    told = []
+    request = ImportRequest(spreadsheet(tmp_path, ",", numbers), tmp_path / "c.h5", 0.55 if asked else 550)
+    import_capture(request, warn=told.append)
+    assert [text.split(".")[0] for text in told] == (["axis psa turns by 6", "a wavelength of 0"] if asked else [])
+
+
+def test_frames_may_be_npy_files(tmp_path):
+    frames = np.random.default_rng(1).normal(1000, 5, (3, 4, 5))
+    for k, frame in enumerate(frames):
+        np.save(tmp_path / f"{k}.npy", frame)
+    path = written(tmp_path, "state,psa_deg,file", [f"{k},{30 * k},{k}.npy" for k in range(3)])
+    import_capture(ImportRequest(path, tmp_path / "c.h5", 550))
+    with Capture(tmp_path / "c.h5") as capture:
+        assert np.array_equal([capture.frames(k)[0] for k in range(3)], frames)
+    np.save(tmp_path / "0.npy", frames)
+    with pytest.raises(ImportFailed, match=r"0.npy: shape \(3, 4, 5\); a frame has rows and columns"):
+        import_capture(ImportRequest(path, tmp_path / "d.h5", 550))
