@@ -1,6 +1,6 @@
 """Pull, bias and coverage of every quoted error bar: quantity x light level x sample, by Monte Carlo.
 
-    python benchmarks/error_bars.py [--pixels 1500] [--out table.md]
+    python benchmarks/error_bars.py [--pixels 1000] [--out table.md]
 
 Each of five samples is measured many times at 20, 200 and 20 000 electrons a state with own Poisson and read noise
 (`noisy_images.py`), and goes through the same functions as `process quantities` and `process xi0`. An entry is
@@ -111,7 +111,7 @@ def _cell(e: Entry) -> str:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--pixels", type=int, default=1500)
+    parser.add_argument("--pixels", type=int, default=1000)
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
     text = table(arguments.pixels)

@@ -13,7 +13,6 @@ from processing.reduction.black import Black
 from processing.reduction.effects_of_capture import CountsCorrection
 from processing.reduction.flat import Flat
 from processing.reduction.lit_darks import lit_darks
-from processing.reduction.move_image import REACH, shifted_back
 from processing.storage.capture import Capture, CaptureError
 from processing.storage.pixel_mask import Mask
 
@@ -199,6 +198,8 @@ class BlockReader:
 
         The black is moved with them, which matters only where it differs from pixel to pixel.
         """
+        from processing.reduction.move_image import REACH, shifted_back
+
         margin = (math.ceil(float(np.abs(shift_px).max()) / pitch) + REACH) * pitch
         height = self.capture.frame_shape[0]
         first, last = max(rows.start - margin, 0), min(rows.stop + margin, height)

@@ -253,9 +253,10 @@ class Capture(OpenH5):
                 out[k] = self.frames(int(state), rows)
             return
         with self._damage():
+            packed = is_packed(self._frames)
             for k, state in enumerate(states):
                 number = int(self.done[state])
-                if is_packed(self._frames):
+                if packed:
                     out[k] = read_rows(self._frames, rows, (number,), self._kept)
                 else:
                     self._frames.read_direct(out, np.s_[number, :, rows, :], np.s_[k])
