@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import stat
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -68,6 +70,27 @@ def require_folder(path: Path) -> None:
         raise ProcessError(f"{path} is a folder. Give the name of a file.")
     if not path.parent.is_dir():
         raise ProcessError(f"{path}: there is no folder {path.parent}. Make it, or give another name.")
+
+
+def require_room(path: Path, needed: int, error: type[ProcessError] = ProcessError) -> None:
+    """Raise `error` unless the disc has room for a file of so many bytes: HDF5 that runs out of it ends the process."""
+    replaced = path.stat().st_blocks * 512 if path.exists() else 0
+    free = shutil.disk_usage(path.parent).free + replaced
+    if needed > free:
+        raise error(f"{path} needs {needed:,} bytes, {free:,} are free in {path.parent}. Make room, or give --out.")
+
+
+def require_distinct(paths: Iterable[Path]) -> None:
+    """Raise ProcessError where a file is given twice: what it says would count twice, and errors come out too small."""
+    seen: dict[tuple[int, int], Path] = {}
+    for path in paths:
+        # What is not there is told by its reader.
+        if path.exists():
+            found = path.stat()
+            first = seen.setdefault((found.st_dev, found.st_ino), path)
+            if first is not path:
+                also = "" if first == path else f", also as {first}"
+                raise ProcessError(f"{path} is given twice{also}; it would count twice.")
 
 
 def require_picture(path: Path, error: type[ProcessError] = ProcessError) -> None:

@@ -26,8 +26,10 @@ def camera_command(
     """Photon transfer: gain and read noise from states that repeat each other, bad pixels from dark states."""
     from processing.calibration.photon_transfer import write_camera
     from processing.commands.summary import summary
+    from processing.doors import require_distinct
     from processing.storage.product import Step, file_identity
 
+    require_distinct(captures)
     product = out or captures[0].with_suffix(".camera.h5")
     identities = tuple(file_identity(p, "capture") for p in captures if p.exists())
     step = Step("camera", {"captures": [p.name for p in captures]}, identities)

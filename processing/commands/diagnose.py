@@ -10,7 +10,7 @@ import typer
 
 from processing.commands.command_line import Version, application, run
 from processing.computing.blas import one_blas_thread
-from processing.doors import require_new
+from processing.doors import require_distinct, require_new
 
 app = application("diagnose", "Compare captures with an instrument model and find the effect that the model lacks.")
 
@@ -37,6 +37,7 @@ def diagnose_command(
     """Trace the residual between intensities and model to the effects that explain it; say so if none does."""
     for target in filter(None, (write, json, report, residuals)):
         require_new(target)
+    require_distinct(captures)
     if reflectance is not None or geometry is not None:
         from processing.commands.loaded_late.diagnose_surface import diagnose_reflectance
 

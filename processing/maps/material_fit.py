@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
+from processing.doors import require_distinct
 from processing.errors import ProcessError
 from processing.geometry.frames import ScatteringGeometry
 from processing.geometry.viewing import ViewingGeometry
@@ -34,6 +35,7 @@ def fit_products(sources: Sequence[Path], geometry_file: Path) -> tuple[Material
     ------
     ProcessError : products of several kinds or wavelengths, simulated and measured mixed, no arm angle.
     """
+    require_distinct(sources)
     kinds, simulated, wavelengths = set(), set(), set()
     for source in sources:
         with Product(source) as product:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
 from itertools import islice
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.computing.threads import thread_count
-from processing.doors import one_line, read_text, require_place
+from processing.doors import one_line, read_text, require_place, require_room
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture_schema import CaptureHeader, Detector, Sample, create_layout, write_closing
 from processing.storage.checksums import row_crc32, write_checksums
@@ -32,6 +33,8 @@ Progress = Callable[[int, int], None]
 
 Frame = NDArray[Any]
 
+#: Room for what is beside the frames, bytes.
+BOOKS = 1 << 18
 #: Most bytes of a file of 16 numbers.
 MOST_SAMPLE_BYTES = 1 << 16
 
@@ -101,6 +104,7 @@ def import_capture(
         versions={"umov": version("umov"), "numpy": np.__version__, "h5py": h5py.__version__},
     )
     partial = request.out.with_name(request.out.name + ".partial")
+    require_room(partial, len(states) * prod(source.shape) * source.dtype.itemsize + BOOKS, ImportFailed)
     try:
         with h5py.File(partial, "w") as h5:
             _write(h5, header, states, source, progress)

@@ -12,6 +12,7 @@ import shutil
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.doors import require_place
+from processing.doors import require_place, require_room
 from processing.errors import ProcessError
 from processing.storage.capture_schema import CaptureHeader
 from processing.storage.h5_door import (
@@ -41,6 +42,8 @@ from processing.storage.unpacked import KeptChunks, read_rows
 PRODUCT_VERSION = 1
 #: Environment variable that switches compression of products off where it is 0.
 COMPRESS_VARIABLE = "UMOV_COMPRESS"
+#: Room for what is beside the planes: names, provenance, the measurement matrix; bytes.
+BOOKS = 1 << 18
 #: Part of a product that compression has to save to be worth a second writing.
 WORTH_SAVING = 0.2
 
@@ -130,10 +133,15 @@ class ProductWriter(OpenH5):
         return True
 
     def _create(self) -> None:
+        values = sum(
+            prod((*plane.leading, *self._shape)) * np.dtype(plane.dtype).itemsize for plane in self._planes.values()
+        )
+        require_room(self._partial, values + BOOKS, ProductError)
         try:
             self._h5 = h5py.File(self._partial, "w")
             self._lay_out(self._h5, _early)
             self._h5.flush()
+            _take_space(self._partial)
         except OSError as error:
             raise ProductError(f"{self._partial} cannot be written ({error}). Free space, or give --out.") from error
 
@@ -337,6 +345,16 @@ def leading_dimensions(name: str, leading: tuple[int, ...]) -> tuple[str, ...]:
 def is_product(path: Path) -> bool:
     """Whether a file is a product of `process` (and not a capture, or anything else)."""
     return mark_of(path, "umov_product") is not None
+
+
+def _take_space(path: Path) -> None:
+    """Have the disc hold the file as long as it is: one that is only said to be long can still find it full."""
+    # For reading too: where the file system cannot do it, the C library looks at every block.
+    file = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+    try:
+        os.posix_fallocate(file, 0, os.fstat(file).st_size)
+    finally:
+        os.close(file)
 
 
 def _early(parent: h5py.Group, name: str, shape: tuple[int, ...], dtype: Any) -> h5py.Dataset:
