@@ -80,12 +80,12 @@ class ScatteringGeometry:
             s = np.where(alike[..., None], up - self.half * dot(up, self.half)[..., None], s)
         return unit(s)
 
-    @property
+    @cached_property
     def axes_in(self) -> tuple[Array, Array]:
         """x, y of the generator's beam, each (..., 3); ki = -wi."""
         return transverse_axes(-self.to_source, self.up)
 
-    @property
+    @cached_property
     def axes_out(self) -> tuple[Array, Array]:
         """x, y of the analyzer's beam, each (..., 3); ko = wo."""
         return transverse_axes(self.to_camera, self.up)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import astuple, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +27,12 @@ from processing.reflectance.changes import ReflectanceChanges
 SUPPORT_PARTS, SUPPORT_DEG, SUPPORT_DEPTH = 16, 35.0, 2.0
 #: It is computed at one in so many pixels of a sphere.
 EVERY = 13
-#: Patterns of its light that are kept; a fit changes one value at a time.
+#: Answers that are kept of each kind; a fit changes one value at a time.
 KEPT = 8
 #: Steps of theta_h in which the polarized light of a surface is learnt from its own pixels.
 BINS = 16
+
+Kept = TypeVar("Kept")
 
 
 class SurfaceView:
@@ -58,6 +62,12 @@ class SurfaceView:
         # What is not a sphere stands as its file says; an error of the arm moves the source alone.
         _, self.points, self.normal = view.shape.intersect(self.eye, self.rays, omega_deg)
         self._theta_h, self._alpha_0 = np.zeros(1), np.zeros(1)
+        self._forget()
+
+    def _forget(self) -> None:
+        self._geometries: dict[tuple[object, ...], ScatteringGeometry] = {}
+        self._dominant: dict[tuple[object, ...], Array] = {}
+        self._parts: dict[tuple[object, ...], list[ScatteringGeometry]] = {}
         self._below: dict[tuple[object, ...], Array] = {}
         self._between: Between | None = None
 
@@ -65,11 +75,15 @@ class SurfaceView:
         """The same with some of the pixels alone."""
         out = copy(self)
         out.rays, out.points, out.normal = self.rays[pixels], self.points[pixels], self.normal[pixels]
-        out._below, out._between = {}, None
+        out._forget()
         return out
 
     def geometry(self, changes: ReflectanceChanges) -> ScatteringGeometry:
         """Directions at the pixels, for the sphere and the source where the changes put them."""
+        key = changes.centre_mm, changes.scale, changes.arm_rad
+        return _once(self._geometries, key, lambda: self._geometry(changes))
+
+    def _geometry(self, changes: ReflectanceChanges) -> ScatteringGeometry:
         points, normal = self.points, self.normal
         if isinstance(self.view.shape, Sphere) and (any(changes.centre_mm) or changes.scale):
             points, normal = self._on_sphere(self.view.shape, changes)
@@ -88,7 +102,12 @@ class SurfaceView:
 
     def dominant(self, changes: ReflectanceChanges) -> Array:
         """Dominant process (P, 4, 4), element 00 equal to 1, in the instrument frames."""
-        return self._complete(changes).dominant(self.geometry(changes), self.index)
+        # Of an effect of the optics the surface knows nothing.
+        return _once(
+            self._dominant,
+            astuple(changes),
+            lambda: self._complete(changes).dominant(self.geometry(changes), self.index),
+        )
 
     def _complete(self, changes: ReflectanceChanges) -> ReflectanceChanges:
         log_b = changes.diffuse_log_b + float(np.log(self.b))
@@ -119,13 +138,9 @@ class SurfaceView:
             support_rad=changes.support_rad,
             support_log_depth=changes.support_log_depth,
         )
-        key = astuple(one)
-        if key not in self._below:
-            if len(self._below) >= KEPT:
-                self._below.clear()
-            self._below[key] = self._from_below(one)
+        below = _once(self._below, astuple(one), lambda: self._from_below(one))
         slope = 1 + _disc(0.0, 1.0)[:, ::2] @ np.array(changes.support_slope)
-        column = np.einsum("l,t,ltpi->pi", [1.0, changes.support_law], slope, self._below[key])
+        column = np.einsum("l,t,ltpi->pi", [1.0, changes.support_law], slope, below)
         out = np.zeros((len(self.points), 4, 4))
         # The support's light is not polarized.
         out[..., 0] = changes.support * (column if self._between is None else self._between(column))
@@ -142,19 +157,31 @@ class SurfaceView:
         half_width = shape.radius_mm if isinstance(shape, Sphere) else float(np.ptp(self.points[:, 0])) / 2
         depth = SUPPORT_DEPTH * half_width * np.exp(changes.support_log_depth)
         columns = np.zeros((2, SUPPORT_PARTS, len(points), 4))
-        disc = middle + _disc(depth, depth * np.tan(np.deg2rad(SUPPORT_DEG) + changes.support_rad))
-        for k, part in enumerate(disc):
-            way = part - points
-            square = dot(way, way)
-            below = ScatteringGeometry(g.normal, unit(way), g.to_camera)
+        radius = depth * np.tan(np.deg2rad(SUPPORT_DEG) + changes.support_rad)
+        ways = [part - points for part in middle + _disc(depth, radius)]
+        parts = _once(
+            self._parts,
+            (changes.support_rad, changes.support_log_depth),
+            lambda: [ScatteringGeometry(g.normal, unit(way), g.to_camera) for way in ways],
+        )
+        for k, (way, below) in enumerate(zip(ways, parts, strict=True)):
             # A part shines and is seen under the same angle.
             weight = np.maximum(dot(g.normal, below.to_source), 0.0) * np.maximum(-below.to_source[:, 1], 0.0)
-            weight = weight * depth**2 / square / SUPPORT_PARTS
+            weight = weight * depth**2 / dot(way, way) / SUPPORT_PARTS
             theta_h = below.angles.theta_h
             weight = weight * np.interp(theta_h, self._theta_h, self._alpha_0)
             columns[0, k] = weight[:, None] * complete.dominant(below, self.index)[..., 0]
             columns[1, k] = (theta_h / (np.pi / 2))[:, None] * columns[0, k]
         return columns
+
+
+def _once(kept: dict[tuple[object, ...], Kept], key: tuple[object, ...], make: Callable[[], Kept]) -> Kept:
+    """What is kept of a key, made where it is not there yet."""
+    if key not in kept:
+        if len(kept) >= KEPT:
+            kept.clear()
+        kept[key] = make()
+    return kept[key]
 
 
 class Between:
