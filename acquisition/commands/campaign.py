@@ -29,11 +29,13 @@ from acquisition.screen.progress import ConsoleProgress
 from acquisition.screen.rows import print_rows
 from acquisition.screen.run_file import RunFile
 from acquisition.stop_request import StopRequest
+from processing.yaml_file import ConfigError
 
 
 def run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Observer] = ()) -> int:
     """Run a campaign or, with --dry-run, only check it; returns the exit code."""
     console = Console(stderr=True)
+    _refuse_with_campaign(options, file)
     campaign = Campaign.load(file)
     rig_file = options.rig or campaign.rig or DEFAULT_RIG
     rig_config = seeded(load_rig(rig_file), options.seed)
@@ -74,6 +76,16 @@ def run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Obs
     after = shlex.join(filter(None, [os.environ.get("UMOV_DOOR"), *words]))
     typer.echo(f"next: {after}" if done else "next: the same command goes on where it stopped")
     return 0 if done else INTERRUPTED
+
+
+def _refuse_with_campaign(options: Options, file: Path) -> None:
+    """A campaign has its captures in its file: an option that changed none of them would only seem to be heard."""
+    given = options.given("omega", "mode", "wavelength", "sample", "exposure", "plan", "resume")
+    if given:
+        raise ConfigError(
+            f"--{given[0]} has no meaning with --campaign: what is taken is in {file}, and what is missing of it is "
+            "gone on with. Leave one of the two out."
+        )
 
 
 def _sum_up(held: CampaignFolder, names: Sequence[str]) -> list[str]:

@@ -56,6 +56,10 @@ class Options:
     live: bool
     yes: bool
 
+    def given(self, *names: str) -> list[str]:
+        """Those of these options that are there."""
+        return [name for name in names if getattr(self, name) is not None]
+
 
 def run(options: Options, stop: StopRequest) -> int:
     """Take or go on with one capture; returns the exit code. Raises the errors that `main` prints."""
@@ -111,8 +115,7 @@ def _sealed(path: Path) -> Path | None:
 
 def _refuse_with_resume(options: Options) -> None:
     """A capture that is gone on with has its plan in its file."""
-    given = [name for name in ("omega", "mode", "wavelength", "sample", "exposure", "plan", "seed") if
-             getattr(options, name) is not None]  # fmt: skip
+    given = options.given("omega", "mode", "wavelength", "sample", "exposure", "plan", "seed")
     if given:
         raise ConfigError(
             f"--{given[0]} has no meaning with --resume: the plan is in {options.resume}. Leave it out, or take a new "

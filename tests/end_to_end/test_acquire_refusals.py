@@ -86,6 +86,13 @@ def test_doctor_and_stop_do_without_who_is_called(acquire, small_rig):
     assert acquire("stop", "--rig", rig)[0] == 0
 
 
+@pytest.mark.parametrize("option", [("--omega", 50), ("--plan", "p.yaml"), ("--resume", "c.h5"), ("--exposure", 1)])
+def test_option_that_a_campaign_would_not_hear_is_refused(refused, configs, option):
+    code, err = refused("--campaign", configs / "campaigns/red_sphere.yaml", *option)
+    assert code == 2
+    assert f"{option[0]} has no meaning with --campaign" in err
+
+
 def test_next_command_can_be_pasted():
     path = Path("my captures/it's one.h5")
     for status, door in (("complete", "process"), ("aborted", "acquire")):

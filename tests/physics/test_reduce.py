@@ -175,10 +175,12 @@ def test_saturated_states_are_left_out_pixel_by_pixel(rgb950: InstrumentModel, s
     assert any("saturated" in w for w in image.facts["warnings"])
 
 
-def test_pixels_without_enough_states_are_not_determined(rgb950: InstrumentModel, synthetic_capture) -> None:
+@pytest.mark.parametrize("left", [5, 0])
+@pytest.mark.filterwarnings("error")
+def test_pixels_without_enough_states_are_not_determined(rgb950: InstrumentModel, synthetic_capture, left) -> None:
     m = scene(np.random.default_rng(6), (4, 6))
     frames = np.rint(signals(rgb950, table(), m)).astype(np.uint16)
-    frames[5:, 0, 1, 2] = 4095
+    frames[left:, 0, 1, 2] = 4095
     image = reduced(synthetic_capture(frames, table(), detector=detector(bits=12, black_level_counts=0)), rgb950)
     assert image.mask[1, 2] == Mask.SATURATED | Mask.NOT_DETERMINED
     assert np.all(np.isnan(image.values[..., 1, 2]))

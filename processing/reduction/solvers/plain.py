@@ -129,7 +129,8 @@ def solve_with_the_sound(
         keep = solver.reader.sound(raw, part).reshape(n, -1).T.astype(float)
         normal = np.einsum("pn,ni,nj->pij", keep, w, w, optimize=True)
         eigenvalues = np.linalg.eigvalsh(normal)
-        ill = eigenvalues[:, 0] < WORST_CONDITION**-2 * eigenvalues[:, -1]
+        # Of a pixel that is cut off in every state nothing is left: all eigenvalues are 0.
+        ill = eigenvalues[:, 0] <= WORST_CONDITION**-2 * eigenvalues[:, -1]
         normal[ill] = np.eye(rank)
         solve = basis @ np.linalg.solve(normal, w.T * keep[:, None, :])
         y = signal.reshape(n, -1).T.astype(float)
@@ -147,7 +148,7 @@ def solve_with_the_sound(
                 found["mueller_errors"][:, part] = errors
                 found["reduced_chi_square"][part] = np.where(free > 0, rss / expected, np.nan)
         found["mueller"][:, part] = m.T
-        found["residual_rms"][part] = np.sqrt(rss / keep.sum(axis=1))
+        found["residual_rms"][part] = np.sqrt(rss / np.maximum(keep.sum(axis=1), 1))
         found["pixel_flags"][part[ill]] |= np.uint8(Mask.NOT_DETERMINED)
 
 
