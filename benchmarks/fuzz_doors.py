@@ -1,6 +1,7 @@
 """Hostile and damaged files at every door: how many were refused in words, and what was not.
 
-Run: .venv/bin/python benchmarks/fuzz_doors.py [--door capture] [--seconds 3600 | --inputs 120] [--seed 1] [--keep DIR]
+Run: .venv/bin/python benchmarks/fuzz_doors.py [--door capture] [--seconds 3600 | --inputs 120] [--seed 1] [--jobs 2]
+     [--keep DIR]
 
 Each input is read in a process of its own kind, with 1 GiB of memory beside what the program itself has and 5 s of
 processor time. Counted are: refused (an error of the user's, exit code 2, in lines of a bearable length), accepted
@@ -21,6 +22,8 @@ import tempfile
 import time
 import traceback
 from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -130,15 +133,18 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, help="for each door")
     parser.add_argument("--inputs", type=int, default=None, help="for each door; default 120 without --seconds")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=1, help="doors at a time")
     parser.add_argument("--keep", type=Path, help="folder for the inputs that must not be")
     options = parser.parse_args()
     inputs = options.inputs or (None if options.seconds else 120)
     total: Counter[str] = Counter()
     print(f"{'door':<11} {'inputs':>7} {'refused':>8} {'accepted':>9} " + " ".join(f"{what:>9}" for what in BAD))
-    for name in DOORS if options.door == "all" else [options.door]:
-        found = fuzz(name, options.seed, inputs, options.seconds, options.keep)
-        total += found
-        _print(name, found)
+    names = list(DOORS) if options.door == "all" else [options.door]
+    one = partial(fuzz, seed=options.seed, inputs=inputs, seconds=options.seconds, keep=options.keep)
+    with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("fork")) as pool:
+        for name, found in zip(names, pool.map(one, names), strict=True):
+            total += found
+            _print(name, found)
     _print("all", total)
     return int(any(total[what] for what in BAD))
 
