@@ -17,6 +17,7 @@ from acquisition.capture import writer as writer_module
 from acquisition.capture.state_file import StateFile
 from acquisition.capture.writer import (
     DEAD_S,
+    LOOK_S,
     CaptureWriter,
     StateRecord,
     as_partial,
@@ -266,14 +267,15 @@ def test_a_file_that_was_killed_after_its_status_keeps_its_closing_record(create
         assert capture.closing["messages"] == ["as it was"]
 
 
+class Passing(ManualClock):
+    """Time goes by when it is looked at."""
+
+    def now_s(self) -> float:
+        self.sleep_s(DEAD_S / 8)
+        return super().now_s()
+
+
 def test_a_disc_that_takes_nothing_is_given_up_after_a_while_and_the_next_state_waits(create, monkeypatch):
-    class Passing(ManualClock):
-        """Time goes by when it is looked at."""
-
-        def now_s(self) -> float:
-            self.sleep_s(0.4)
-            return super().now_s()
-
     going_on = threading.Event()
     write = StateFile.write_state
     monkeypatch.setattr(StateFile, "write_state", lambda *arguments: (going_on.wait(), write(*arguments)))
@@ -285,3 +287,23 @@ def test_a_disc_that_takes_nothing_is_given_up_after_a_while_and_the_next_state_
     writer.abandon()
     with Capture(writer.path) as capture:
         assert capture.done.tolist() == [0]
+
+
+def test_a_disc_that_blocks_while_nobody_hands_over_a_state_is_told_of(create, monkeypatch):
+    told: list[AcquisitionError] = []
+    heard, going_on = threading.Event(), threading.Event()
+    write = StateFile.write_state
+    monkeypatch.setattr(StateFile, "write_state", lambda *arguments: (going_on.wait(), write(*arguments)))
+    writer = create(clock=Passing())
+    writer.on_failure = lambda error: (told.append(error), heard.set())
+    writer.put(record(0))
+    assert heard.wait(60)
+    assert f"the disc has not taken a state for {DEAD_S:g} s" in str(told[0])
+    going_on.set()
+
+
+def test_a_long_time_without_a_state_is_no_failure_of_the_disc(create):
+    heard, clock = threading.Event(), ManualClock()
+    clock.sleep_s(10 * DEAD_S)
+    create(clock=clock).on_failure = lambda _: heard.set()
+    assert not heard.wait(3 * LOOK_S)
