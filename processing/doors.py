@@ -70,6 +70,8 @@ def require_folder(path: Path) -> None:
         raise ProcessError(f"{path} is a folder. Give the name of a file.")
     if not path.parent.is_dir():
         raise ProcessError(f"{path}: there is no folder {path.parent}. Make it, or give another name.")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise ProcessError(f"{path}: nothing can be written into {path.parent}. Give a name in another folder.")
 
 
 def require_room(path: Path, needed: int, error: type[ProcessError] = ProcessError) -> None:

@@ -67,6 +67,8 @@ def check_space(folder: Path, needed: int) -> None:
     """Refuse a disc that is too small. Raises AcquisitionError with the bytes needed and free, or for no folder."""
     if not folder.is_dir():
         raise AcquisitionError(f"{folder} is a file, and captures need a folder. Choose another with --out.")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise AcquisitionError(f"nothing can be written into {folder}. Nothing was moved. Choose another with --out.")
     free = shutil.disk_usage(folder).free
     if needed > free:
         raise AcquisitionError(

@@ -22,5 +22,6 @@ def print_rows(rows: Iterable[Sequence[str]], console: Console | None = None) ->
     table = Table(box=None, show_header=False, pad_edge=False)
     for row in rows:
         style = "bold red" if row[0] in ("BAD", "REFUSED") else ""
-        table.add_row(*(Text(cell, style) for cell in row))
+        # Folded where it is too long: of a path that is cut short nobody can tell what is wrong.
+        table.add_row(*(Text(cell, style, overflow="fold") for cell in row))
     console.print(table)

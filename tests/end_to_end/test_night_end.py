@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.server
 import io
 import json
+import re
 import sys
 import threading
 
@@ -164,3 +165,9 @@ def test_piped_rows_are_not_padded_and_no_color_is_honoured(monkeypatch):
     print_rows([("BAD", "disc", "full")], Console(file=coloured, force_terminal=True))
     assert "\x1b[31" not in coloured.getvalue()
     assert "\x1b[1;31" not in coloured.getvalue()
+
+
+def test_no_part_of_a_long_path_is_cut_off_a_narrow_terminal():
+    out, path = io.StringIO(), "/home/lab/rigs/../scenes/" + "a_long_name" * 6 + ".yaml"
+    print_rows([("BAD", "scene mirror", path)], Console(file=out, force_terminal=True, width=60, no_color=True))
+    assert path in re.sub(r"\x1b\[[0-9;]*m|\s|BAD|scene mirror", "", out.getvalue())

@@ -8,9 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from acquisition.capture.writer import check_space
+from acquisition.errors import AcquisitionError
 from processing import doors
 from processing.commands.application import main as process
 from processing.commands.diagnose import main as diagnose
+from processing.errors import ProcessError
 from processing.storage.capture_schema import CaptureHeader, Detector
 from processing.storage.importing import ImportRequest, import_capture
 from processing.storage.product import Plane, ProductError, ProductWriter
@@ -71,3 +74,12 @@ def test_a_product_that_is_made_has_its_space(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "posix_fallocate", full)
     with pytest.raises(ProductError, match="No space left on device"):
         product(tmp_path / "n.h5")
+
+
+def test_a_folder_that_takes_no_files_is_told_before_the_work(tmp_path, monkeypatch):
+    """A medium that is read-only: `acquire --dry-run` passed, and the run was refused."""
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    with pytest.raises(ProcessError, match=rf"m\.h5: nothing can be written into {tmp_path}"):
+        product(tmp_path / "m.h5")
+    with pytest.raises(AcquisitionError, match=f"nothing can be written into {tmp_path}"):
+        check_space(tmp_path, 1)
