@@ -25,8 +25,8 @@ _TO_COHERENCY = np.linalg.inv(_TO_MUELLER)
 
 
 def _assemble(rows: list[list[Array]]) -> Array:
-    shape = np.broadcast_shapes(*(np.shape(x) for row in rows for x in row))
-    out = np.empty((*shape, 4, 4))
+    """Matrices (..., 4, 4) of elements of one shape (...)."""
+    out = np.empty((*np.shape(rows[1][1]), 4, 4))
     for i, row in enumerate(rows):
         for j, x in enumerate(row):
             out[..., i, j] = x

@@ -208,7 +208,9 @@ class Sets:
         log_odds = np.full(len(self.groups), np.inf)
         weights = np.zeros((len(self.groups), self.taus.size))
         for members, s, q in self._cavities(state, fit, inverse, right):
-            value, vector = np.linalg.eigh((s + s.transpose(0, 2, 1)) / 2)
+            # Most groups are one value, which is its own axis: LAPACK would take as long for each as for a matrix.
+            alone = s.shape[1] == 1
+            value, vector = (s[:, 0], np.ones_like(s)) if alone else np.linalg.eigh((s + s.transpose(0, 2, 1)) / 2)
             value = np.maximum(value, 0.0)[:, None]
             along = (vector.transpose(0, 2, 1) @ q[:, :, None])[:, None, :, 0] ** 2
             t2 = (self.taus**2)[:, None]
