@@ -6,23 +6,49 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from processing.diagnosis.instrument.edges import at_edges
+from processing.diagnosis.instrument.nameless import NamelessWaves
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.source_patterns import beat_explains_more, patterned
 from processing.diagnosis.instrument.unevenness import unevenness
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause, shown
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import BOUND, ONE_PATTERN, TESTABLE, TIMES, UNEVEN, UNEVEN_SHARE, UNKNOWN_NOISE
+from processing.diagnosis.search.rules import (
+    BOUND,
+    EDGES,
+    LIMIT,
+    ONE_PATTERN,
+    TESTABLE,
+    TIMES,
+    UNEVEN,
+    UNEVEN_SHARE,
+    UNKNOWN_NOISE,
+)
 from processing.diagnosis.search.solution import Solution
-from processing.instrument.effects.base import FieldEffect, GeneralEffect, PointwiseEffect, SourceEffect, ValuePerState
+from processing.instrument.effects.base import (
+    CountsEffect,
+    FieldEffect,
+    GeneralEffect,
+    ImageShift,
+    PointwiseEffect,
+    SourceEffect,
+    ValuePerState,
+)
 
 #: The reason for which values for each state are not used either, where an unknown sample takes up a part of them: what
 #: it takes up is then not like the rest, as it is with random values.
 PATTERN = "its values follow one wave or jump over the states, as a beat or a fringe does: they are not random"
 #: The same of an effect in whose place a source with one wave fits better.
 BEAT = "a source that beats explains more than it does"
+#: The same where a plate that turns has a wave of its own that is not in the list.
+WAVE = "a plate that changes two to four times a turn explains more than it does"
+#: The image does not move where that would be seen best.
+STANDS = "the edges, which were left out of the fit, do not move as it says"
+#: Optics and mechanics are the same for the whole image.
+NOT_ALIKE = "it differs from part to part of the image, which nothing in the train does"
 #: Reasons that say that something else is there, of which what the cause explains is left over.
-ELSE = (PATTERN, BEAT)
+ELSE = (PATTERN, BEAT, WAVE, STANDS, NOT_ALIKE)
 #: The reason for which nothing is written for later captures: the sample or its light changed, and what is found beside
 #: that may be a part of it.
 OF_THE_SAMPLE = "it differs from part to part of the image, which a source does not"
@@ -36,8 +62,14 @@ def doubts(
     """Reasons by cause; a cause without one may be called by its name. `left` is the chi-square of structure."""
     out: dict[Cause, str] = {}
     uneven, patterned = 0.0, set[int | None]()
+    waves = NamelessWaves.beside(problem, found) if causes else None
+    still = _standing(problem, solved, causes)
     for cause in causes:
-        reason = _of_itself(problem, found, solved, cause, causes)
+        reason = STANDS if cause in still else _of_itself(problem, found, solved, cause, causes)
+        # What is told as one of several is no name yet.
+        named = not cause.alternatives and not isinstance(cause.candidates[0].effect, ValuePerState)
+        if reason is None and waves is not None and named:
+            reason = WAVE if waves.explain_more(cause) else None
         if reason is not None:
             out[cause] = reason
         if reason == PATTERN:
@@ -78,7 +110,22 @@ def _of_itself(
         return PATTERN if _one_pattern(found, cause) else None
     if isinstance(effect, SourceEffect):
         return OF_THE_SAMPLE if any(_uneven(problem, solved, c, cause) for c in cause.candidates) else None
+    # Channels that look at places apart leave something where the image is curved: that is not alike either.
+    alike = isinstance(effect, CountsEffect) or any(c.place_px is not None for c in problem.captures)
+    if not alike and any(_uneven(problem, solved, c, cause) for c in cause.candidates):
+        return NOT_ALIKE
     return BEAT if problem.noise_known and beat_explains_more(found, cause) else None
+
+
+def _standing(problem: InstrumentProblem, solved: Solution, causes: Sequence[Cause]) -> list[Cause]:
+    """Shifts of which the edges show too little: an image that moves does so at its edges too."""
+    shifts = [c for c in causes if isinstance(c.candidates[0].effect, ImageShift)]
+    shifts = [c for c in shifts if all(one in solved.space.candidates for one in c.candidates)]
+    if not shifts or not problem.noise_known:
+        return []
+    edges = at_edges(problem, solved.space, solved.fit.values, [c.candidates for c in shifts])
+    most = edges.share + LIMIT * edges.error
+    return [c for c, share in zip(shifts, most, strict=True) if share < EDGES or edges.explained < EDGES]
 
 
 def testable(problem: InstrumentProblem, solved: Solution, cause: Cause, causes: Sequence[Cause]) -> bool:
@@ -127,7 +174,7 @@ def _one_pattern(found: Posterior, cause: Cause) -> bool:
 
 
 def _uneven(problem: InstrumentProblem, solved: Solution, candidate: Candidate, cause: Cause) -> bool:
-    """A source that changes does so by the same share in the whole image; what differs from part to part is none."""
+    """A source, or a train, that changes does so alike in the whole image; what differs from part to part is none."""
     if candidate not in solved.space.candidates or any(isinstance(c.effect, FieldEffect) for c in solved.effects):
         return False
     excess, terms = unevenness(problem, candidate, solved.space, solved.fit.values)

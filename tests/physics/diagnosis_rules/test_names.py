@@ -10,7 +10,7 @@ from processing.diagnosis.instrument import combinations, doubts, judge, source_
 from processing.diagnosis.search import causes
 from processing.diagnosis.search.causes import Cause
 from processing.diagnosis.search.space import Space
-from processing.instrument.effects.base import SourceEffect, ValuePerState
+from processing.instrument.effects.base import ImageShift, SourceEffect, ValuePerState
 
 
 @decides
@@ -115,6 +115,19 @@ def uneven(m: Patch, excess: float, odds: float) -> bool:
 
 
 @decides
+def test_edges(m: Patch) -> bool:
+    told = cause(candidate=made(ImageShift))
+    solved = Some(space=Space(told.candidates), fit=Some(values=None))
+
+    def stands(share: float, explained: float) -> bool:
+        seen = Some(share=np.array([share]), error=np.array([0.01]), explained=explained)
+        m.setattr(doubts, "at_edges", lambda *of: seen)
+        return doubts._standing(Some(noise_known=True), solved, [told]) == [told]
+
+    return stands(0.28, 1.0) and stands(1.0, 0.33) and not stands(0.32, 0.37)
+
+
+@decides
 def test_uneven(m: Patch) -> bool:
     return not uneven(m, 11.5, 0.0) and uneven(m, 12.5, 0.0)
 
@@ -164,15 +177,17 @@ def test_captures_that_tell_more_together_test_values_for_each_state():
     assert doubts.testable(problem, Some(before=Some(excess=0.0)), found, [found])
 
 
-def doubted(odds: float, known: bool, left: float) -> bool:
+def doubted(m: Patch, odds: float, known: bool, left: float) -> bool:
+    m.setattr(doubts.NamelessWaves, "beside", lambda *of: None)
     found = Some(samples=Some(best=Some(unit=1.0)), sets=Some(noise=Some(directions=1.0)), members=())
     told = cause(odds)
-    return told in doubts.doubts(Some(noise_known=known), found, None, [told], left)
+    solved = Some(space=Space(()))
+    return told in doubts.doubts(Some(noise_known=known, captures=()), found, solved, [told], left)
 
 
 @decides
 def test_times(m: Patch) -> bool:
-    return doubted(48.0, True, 1.0) and not doubted(52.0, True, 1.0)
+    return doubted(m, 48.0, True, 1.0) and not doubted(m, 52.0, True, 1.0)
 
 
 @decides
@@ -198,4 +213,4 @@ def test_one_wave(m: Patch) -> bool:
 
 @decides
 def test_unknown_noise(m: Patch) -> bool:
-    return doubted(24.0, False, 0.0) and not doubted(26.0, False, 0.0)
+    return doubted(m, 24.0, False, 0.0) and not doubted(m, 26.0, False, 0.0)

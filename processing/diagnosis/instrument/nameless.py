@@ -1,0 +1,104 @@
+"""Waves of a turning plate that no effect of the list is, asked in a cause's place.
+
+A plate that is tilted in its mount has a retardance that changes twice a turn; bearings and windings make three or four
+periods of it. With an unknown sample such a wave may look like something else (a transmission twice a turn, in the
+light of a depolarizing sphere), and to the noise: then nothing in the data tells which of the two it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from processing.arrays import Array
+from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.causes import Cause
+from processing.diagnosis.search.posterior import Posterior, quadratic
+from processing.diagnosis.search.sets import Group, Sets, State
+from processing.diagnosis.search.space import Space
+from processing.effect import Parameter
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import FieldEffect, OpticsEffect, moving_axes
+from processing.instrument.model import InstrumentModel, Retarder
+
+#: Periods a turn that no effect of the list has, of what a turning plate does.
+PERIODS = {"retardance": (2, 3, 4), "azimuth": (3, 4), "transmission": (3, 4)}
+
+
+class WaveOfAPlate(OpticsEffect):
+    """A wave of so many periods a turn of a retarder: in degrees, or relative transmission."""
+
+    def __init__(self, what: str, periods: int) -> None:
+        self.what, self.periods = what, periods
+        self.kind = f"{what}_{periods}_a_turn"
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        """Retarders that turn by more than half a turn: over less a wave is hardly anything but a slope."""
+        axes = moving_axes(model, conditions)
+        plates = (e for e in model.elements() if isinstance(e, Retarder) and e.axis in axes)
+        return tuple(e.name for e in plates if np.ptp(e.ratio * conditions.angles_deg[e.axis or ""]) > 180)
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        """Cosine and sine."""
+        unit, size = ("1", 0.01) if self.what == "transmission" else ("degree", 0.5)
+        return tuple(Parameter(n, unit, -20 * size, 20 * size, size) for n in ("cos", "sin"))
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        """Add the wave to what the plate does."""
+        plate = next(e for e in model.elements() if e.name == place)
+        t = self.periods * np.deg2rad(plate.ratio * changes.conditions.angles_deg[plate.axis or ""])
+        wave = values[0] * np.cos(t) + values[1] * np.sin(t)
+        if self.what == "transmission":
+            changes.gain = changes.gain * (1 + wave)[:, None]
+        else:
+            target = changes.retardance_rad if self.what == "retardance" else changes.azimuth_rad
+            target[place] = target[place] + np.deg2rad(wave)
+
+
+class NamelessWaves:
+    """Every such wave beside the sets of a posterior, linearized about its values."""
+
+    def __init__(self, problem: InstrumentProblem, found: Posterior) -> None:
+        self._labels = [found.label(g) for g in range(len(found.members))]
+        waves = _waves(problem)
+        space = Space((*found.space.candidates, *waves))
+        values = np.append(found.values, np.zeros(space.size - found.space.size))
+        form = quadratic(problem, space, values, problem.sums(space, values))
+        own = [Group(np.r_[part].astype(np.int64)) for part in space.slices[len(found.space.candidates) :]]
+        self._sets = Sets(form, (*found.sets.groups, *own), found.sets.noise)
+        best = found.samples.best
+        self._state = State(np.append(best.tau, np.zeros(len(own))), best.unit)
+
+    @classmethod
+    def beside(cls, problem: InstrumentProblem, found: Posterior) -> NamelessWaves | None:
+        """None where no plate turns far, or the waves could not be told from others.
+
+        What varies over the image would need slopes in every part of it.
+        """
+        fields = any(isinstance(c.effect, FieldEffect) for c in found.space.candidates)
+        few = problem.holds_out_states or not problem.noise_known
+        return None if fields or few or not _waves(problem) else cls(problem, found)
+
+    def explain_more(self, cause: Cause) -> bool:
+        """Whether in a cause's place one of the waves fits better, every value of either costing two of chi-square."""
+        own = self._labels.index(cause.candidates[0])
+        given = self._sets.given_others(self._sets.without(self._state, own))
+        most = max(_explained(*given[g]) for g in range(len(self._labels), len(self._sets.groups)))
+        return bool(most > _explained(*given[own]))
+
+
+def _waves(problem: InstrumentProblem) -> list[Candidate]:
+    conditions = problem.captures[0].conditions
+    return [
+        Candidate(effect, place, effect.parameters(problem.model, conditions, place))
+        for what, periods in PERIODS.items()
+        for effect in (WaveOfAPlate(what, h) for h in periods)
+        for place in effect.places(problem.model, conditions)
+    ]
+
+
+def _explained(curvature: Array, gradient: Array) -> float:
+    """Chi-square that values explain, less two for each (Akaike's criterion)."""
+    return float(gradient @ np.linalg.pinv(curvature, hermitian=True) @ gradient) - 2 * gradient.size

@@ -1,0 +1,72 @@
+"""What no effect of the list has a name for is not called after one that looks like it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from processing.diagnosis.instrument.run import diagnose_captures
+from processing.diagnosis.search.result import Diagnosis
+from processing.instrument.model import InstrumentModel
+from processing.storage.capture_schema import Sample
+from simulators.blind.outside_list import ghost
+from simulators.blind.real_bench import Disc
+from simulators.blind.suite import declared_bench, state_angles
+from simulators.blind.undeclared_captures import Bench, digitize, expose, write_capture
+
+STATES, PIXELS, NM = 40, 32, 662.0
+
+
+@pytest.fixture
+def bench(configs: Path) -> Bench:
+    model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(NM)
+    return declared_bench(model, NM, PIXELS, False, 20_000.0)
+
+
+def diagnosed(folder: Path, configs: Path, bench: Bench) -> Diagnosis:
+    """A bright disc before a dark background, of unknown Mueller matrix."""
+    file, random = configs / "instruments/rgb950.yaml", np.random.default_rng(4)
+    angles = state_angles(STATES, False, False)
+    counts = digitize(bench, expose(bench, Disc(random), angles), random)
+    path = folder / "capture.h5"
+    write_capture(path, bench, counts, angles, Sample(kind="unknown"), file.read_text())
+    return diagnose_captures([path], InstrumentModel.load(file))[0].diagnosis
+
+
+def sure(found: Diagnosis) -> list[str]:
+    return [e.kind for e in found.effects if e.answer == "sure"]
+
+
+def test_an_image_that_moves_is_told_from_a_ghost_that_goes_round(configs, tmp_path, bench):
+    """To first order both move what is smooth; at the rim of the disc only one does."""
+    turn = 2 * np.pi / STATES
+    bench.shift.append(lambda k, a: (0.1 * np.cos(turn * k), 0.1 * np.sin(turn * k)))
+    assert sure(diagnosed(tmp_path, configs, bench)) == ["beam_wander"]
+    bench.shift.clear()
+    ghost(bench, np.random.default_rng(6), STATES)
+    found = diagnosed(tmp_path, configs, bench)
+    assert "beam_wander" in [e.kind for e in found.effects]
+    assert not sure(found)
+    assert not found.applied()
+
+
+def test_a_plate_whose_retardance_changes_twice_a_turn_is_not_called_a_transmission(configs, tmp_path, bench):
+    turn = 4.91 * 2 * np.pi / STATES
+    bench.retardance.append(lambda k, a: (0.0, np.deg2rad(1.5) * np.cos(2 * turn * k - 0.4)))
+    found = diagnosed(tmp_path, configs, bench)
+    assert "retarder_transmission" in [e.kind for e in found.effects]
+    assert not sure(found)
+    assert "retarder_transmission" not in [e.kind for e in found.applied()]
+    bench.retardance.clear()
+    bench.level.append(lambda k, a: 1 + 0.01 * np.cos(turn * k - 0.4) + 0.005 * np.cos(2 * turn * k))
+    found = diagnosed(tmp_path, configs, bench)
+    assert sure(found) == ["retarder_transmission"]
+
+
+def test_optics_that_differ_from_part_to_part_are_not_called_by_their_name(configs, tmp_path, bench):
+    """A magnification that follows the plate moves the rim alone; nothing of a train does."""
+    y, x = np.mgrid[:PIXELS, :PIXELS] - (PIXELS - 1) / 2
+    bench.shift.append(lambda k, a: tuple(0.01 * np.cos(2 * a["psg"]) * place for place in (x, y)))
+    found = diagnosed(tmp_path, configs, bench)
+    assert not sure(found)
+    assert not found.applied()
