@@ -82,6 +82,8 @@ def run(app: typer.Typer, argv: Sequence[str] | None = None) -> None:
     except OSError as error:
         typer.echo(f"error: {error}", err=True)
         sys.exit(1)
-    except KeyboardInterrupt:
-        typer.echo("interrupted; nothing that was finished is lost", err=True)
-        sys.exit(INTERRUPTED)
+    except SystemExit as ended:
+        # Typer turns Ctrl-C into this exit code, without a word.
+        if ended.code == INTERRUPTED:
+            typer.echo("interrupted; nothing that was finished is lost", err=True)
+        raise

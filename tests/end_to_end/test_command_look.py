@@ -7,6 +7,7 @@ from typer.testing import CliRunner
 
 from acquisition.commands.application import app as acquire
 from processing.commands.application import app as process
+from processing.commands.command_line import application, run
 from processing.commands.diagnose import app as diagnose
 from simulators.cli import app as simulate
 from viewer.command import app as view
@@ -64,3 +65,17 @@ def test_a_wrong_option_is_told_as_every_mistake(name, words, message, capsys):
     assert message in said.err
     assert "-h tells more" in said.err
     assert "Input should" not in said.err
+
+
+def test_ctrl_c_is_answered(capfd):
+    """Typer ends a program that is interrupted without a word."""
+    app = application("sample", "A command that somebody interrupts.")
+
+    @app.command()
+    def wait() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit) as end:
+        run(app, [])
+    assert end.value.code == 130
+    assert capfd.readouterr().err == "interrupted; nothing that was finished is lost\n"
