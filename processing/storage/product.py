@@ -307,11 +307,16 @@ class Product(OpenH5):
 
     def units(self, name: str) -> str:
         """Unit of a dataset."""
-        return str(self._dataset(name).attrs["units"])
+        return self._said(name, "units")
 
     def long_name(self, name: str) -> str:
         """What a dataset is, in one line."""
-        return str(self._dataset(name).attrs["long_name"])
+        return self._said(name, "long_name")
+
+    def _said(self, name: str, attribute: str) -> str:
+        dataset = self._dataset(name)
+        with damage_as(ProductError, f"{self.path} is damaged"):
+            return text_attribute(dataset, attribute)
 
     def array(self, name: str) -> NDArray[Any]:
         """An array of /entry/reduction that is not per pixel, such as the measurement matrix."""

@@ -13,8 +13,10 @@ import pytest
 
 from processing.doors import MOST_PIXELS, ProcessError, parse_json, read_text, require_picture
 from processing.instrument.states import rotating_retarders
+from processing.reduction.mueller import choose_model, reduce_mueller
 from processing.reflectance.pbsdf import load as load_pbsdf
 from processing.storage.capture import Capture, CaptureError
+from processing.storage.product import Product, ProductError, Step
 from processing.storage.tensor_file import create_tensor_file
 from processing.yaml_file import MOST_BYTES, ConfigError, load_yaml
 
@@ -371,6 +373,17 @@ def test_stack(states, tmp_path, process_refuses, name):
     arguments = ("--states", states(files=False), "--wavelength-nm", 662, "--instrument", INSTRUMENT)
     said = process_refuses("import", *arguments, "--stack", f"{path}{inside}")
     assert re.search(word, said), said
+
+
+@pytest.mark.parametrize("attribute", ["units", "long_name"])
+def test_a_plane_that_does_not_say_what_it_is(capture, tmp_path, attribute):
+    path = tmp_path / "image.h5"
+    with Capture(capture) as opened:
+        reduce_mueller(opened, choose_model(opened, None), path, (Step("reduce", {}),))
+    with h5py.File(path, "r+") as h5:
+        del h5["entry/data/mueller"].attrs[attribute]
+    with Product(path) as product, pytest.raises(ProductError, match="is damaged"):
+        getattr(product, attribute)("mueller")
 
 
 def test_pbsdf_of_other_shapes(tmp_path):
