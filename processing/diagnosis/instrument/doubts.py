@@ -66,9 +66,7 @@ def doubts(
     still = _standing(problem, solved, causes)
     for cause in causes:
         reason = STANDS if cause in still else _of_itself(problem, found, solved, cause, causes)
-        # What is told as one of several is no name yet.
-        named = not cause.alternatives and not isinstance(cause.candidates[0].effect, ValuePerState)
-        if reason is None and waves is not None and named:
+        if reason is None and waves is not None and _is_one_name(cause):
             reason = WAVE if waves.explain_more(cause) else None
         if reason is not None:
             out[cause] = reason
@@ -114,7 +112,12 @@ def _of_itself(
     alike = isinstance(effect, CountsEffect) or any(c.place_px is not None for c in problem.captures)
     if not alike and any(_uneven(problem, solved, c, cause) for c in cause.candidates):
         return NOT_ALIKE
-    return BEAT if problem.noise_known and beat_explains_more(found, cause) else None
+    return BEAT if problem.noise_known and _is_one_name(cause) and beat_explains_more(found, cause) else None
+
+
+def _is_one_name(cause: Cause) -> bool:
+    """What is told as one of several is no name yet, and random values have no wave in their place."""
+    return not cause.alternatives and not isinstance(cause.candidates[0].effect, ValuePerState)
 
 
 def _standing(problem: InstrumentProblem, solved: Solution, causes: Sequence[Cause]) -> list[Cause]:

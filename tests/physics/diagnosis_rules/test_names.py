@@ -211,6 +211,16 @@ def test_one_wave(m: Patch) -> bool:
     return not beats(58.5) and beats(59.5)
 
 
+def test_what_is_one_of_several_is_not_asked_whether_a_source_beats(monkeypatch):
+    """A weak one would take all stronger names with it, for what it explains would count as left."""
+    monkeypatch.setattr(doubts, "beat_explains_more", lambda *of: True)
+    told, problem = cause(), Some(noise_known=True, captures=())
+    solved = Some(space=Space(()))
+    either = replace(told, alternatives=(made(),))
+    reasons = [doubts._of_itself(problem, None, solved, c, [c]) for c in (told, either)]
+    assert reasons == [doubts.BEAT, None]
+
+
 @decides
 def test_unknown_noise(m: Patch) -> bool:
     return doubted(m, 24.0, False, 0.0) and not doubted(m, 26.0, False, 0.0)
