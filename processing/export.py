@@ -192,7 +192,7 @@ def _figure(source: Path, path: Path, planes: Sequence[str]) -> None:
     from processing.reports.figures import product_figure
 
     if not is_product(source):
-        raise ProcessError(f"{source} is a capture; figures are made of products (`process reduce` makes one).")
+        raise ProcessError(f"{source} is no image; figures are made of products (`process reduce` makes one).")
     with Product(source) as product:
         if not planes or (list(planes) == ["mueller"] and product.kind == "mueller"):
             figure = product_figure(product)
