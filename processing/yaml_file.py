@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -167,11 +168,10 @@ def named_files(path: Path) -> Iterator[tuple[str, Path]]:
 
 
 def _named_files(path: Path, before: tuple[Any, ...], seen: set[Path]) -> Iterator[tuple[str, Path]]:
-    if path.suffix not in (".yaml", ".yml") or not path.is_file():
+    if path.suffix not in (".yaml", ".yml") or not os.path.isfile(path):
         return
     for where, value in _scalars(_tree(path.read_text(encoding="utf-8"), str(path))):
-        # No file system has longer names.
-        if not isinstance(value, str) or len(value) > 255 or not (file := path.parent / value).is_file():
+        if not isinstance(value, str) or not os.path.isfile(file := path.parent / value):
             continue
         if file.resolve() not in seen:
             seen.add(file.resolve())

@@ -16,6 +16,7 @@ from acquisition.rig.config import RigConfig
 from acquisition.rig.rig import Rig
 from acquisition.rig.way import find_obstacle
 from drivers.errors import LimitError
+from processing.doors import one_line
 from processing.instrument.applied_effects import changes_at
 from processing.instrument.determined import determined_basis
 from processing.instrument.model import InstrumentModel, WavelengthError, rank
@@ -137,10 +138,10 @@ def _free_ways(rig: RigConfig, poses: Sequence[Mapping[str, float]]) -> list[Che
 def load_instrument(plan: MeasurementPlan, rig: RigConfig, read: ReadInstrument) -> InstrumentModel:
     """The declared instrument of the plan's mode at its wavelength. Raises ConfigError, PlanRefused."""
     file = rig.modes[plan.mode].instrument
-    if not file.exists():
+    if not os.path.exists(file):
         raise ConfigError(
-            f"modes.{plan.mode}.instrument of the rig file: there is no file {os.path.normpath(file)}. A relative path "
-            "counts from the folder of the rig file: correct it where the rig file was copied elsewhere."
+            f"modes.{plan.mode}.instrument of the rig file: there is no file {one_line(os.path.normpath(file))}. "
+            "A relative path counts from the folder of the rig file: correct it where that was copied elsewhere."
         )
     try:
         return read(file).at(plan.wavelength_nm)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -82,7 +83,7 @@ def files_of(config: RigConfig, mode: str) -> dict[str, str]:
     for key, path in _paths(tree, ""):
         named = ((f"{key}.{name}", file) for name, file in named_files(path))
         for name, file in ((key, path), *named):
-            if file.is_file():
+            if os.path.isfile(file):
                 found[name] = hashlib.sha256(file.read_bytes()).hexdigest()
     return found
 

@@ -66,7 +66,10 @@ class Mesh(BaseModel):
                 index, face, flat, origin, world.triangles, world.face_normals, corners, points, normal, start, stop
             ),
         )
-        return hit.reshape(rays.shape[:-1]), points, normal
+        sound = np.isfinite(points).all(axis=1) & np.isfinite(normal).all(axis=1)
+        # What has no normal sends no light back that could be told.
+        hit[index[~sound]] = False
+        return hit.reshape(rays.shape[:-1]), points[sound], normal[sound]
 
     def occluded(self, points_mm: Array, towards: Array) -> NDArray[np.bool_]:
         """Whether the mesh itself stands between points (N, 3) and the directions (N, 3) towards the source."""

@@ -7,9 +7,12 @@ import numpy as np
 from processing.computing.compiling import njit
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def meet(index, face, rays, origin, triangles, face_normals, corner_normals, points, normals, start, stop):  # type: ignore[no-untyped-def]
-    """Points and unit normals where rays[index[start:stop]] meet their triangles; writes `points` and `normals`."""
+    """Points and unit normals where rays[index[start:stop]] meet their triangles; writes `points` and `normals`.
+
+    Not finite where a face has no area, or the normals of its corners cancel.
+    """
     # Meet the plane of the triangle in double precision (embree's own distance is single), then weigh the normals
     # of its corners with barycentric coordinates, which are ratios of areas.
     for k in range(start, stop):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tokenize
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -55,7 +56,7 @@ class OpenH5:
 
 def mark_of(path: Path, name: str) -> Any:
     """An attribute of an HDF5 file; None if the file is none, is damaged, or has no such attribute."""
-    if not path.is_file():
+    if not os.path.isfile(path):
         return None
     try:
         with h5py.File(path, "r") as h5:

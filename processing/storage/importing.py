@@ -188,11 +188,11 @@ def _images(states: StatesFile, names: tuple[str, ...]) -> FrameSource:
             "give a --stack (states, channels, rows, columns) or channel columns."
         )
     files = states.files or ()
-    absent = [(line, file) for line, file in zip(states.line, files, strict=True) if not file.is_file()]
+    absent = [(line, file) for line, file in zip(states.line, files, strict=True) if not os.path.isfile(file)]
     if absent:
         line, file = absent[0]
         more = f" (and {len(absent) - 1} more)" if len(absent) > 1 else ""
-        raise ImportFailed(f"{states.path}:{line}: column file: no such frame: {file}{more}")
+        raise ImportFailed(f"{states.path}:{line}: column file: no such frame: {one_line(file)}{more}")
     first = read_frame(files[0])
 
     def load(item: tuple[int, Path]) -> Frame:

@@ -54,6 +54,14 @@ def test_rig_file_copied_elsewhere_says_which_path_is_wrong(refused, small_rig, 
     assert f"modes.drr.instrument of the rig file: there is no file {missing}" in err
 
 
+def test_path_longer_than_any_file_has_is_told_in_a_line(refused, small_rig):
+    rig = _changed(small_rig(), lambda r: r["modes"]["drr"].update(instrument="x" * 5000))
+    code, err = refused("--omega", 35, "--rig", rig)
+    assert code == 2
+    assert "modes.drr.instrument of the rig file: there is no file" in err
+    assert max(map(len, err.splitlines())) < 700
+
+
 @pytest.mark.parametrize(
     ("change", "row", "why"),
     [

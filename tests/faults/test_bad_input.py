@@ -304,6 +304,7 @@ STATES = {
     "one file twice": (lambda rows: rows[7].__setitem__(3, "f2.png"), "f2.png is given already in line 4"),
     "state of 400 digits": (lambda rows: rows[3].__setitem__(0, "9" * 400), "whole number"),
     "state in other digits": (lambda rows: rows[3].__setitem__(0, "²"), "whole number"),
+    "a name that no file has": (lambda rows: rows[3].__setitem__(3, "9" * 5000), "no such frame"),
     "no file": (lambda rows: rows[3].__setitem__(3, ""), "no name"),
 }
 

@@ -1,10 +1,13 @@
 """What no effect of the list has a name for is not called after one that looks like it."""
 
+import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from processing.diagnosis.instrument.nameless import NamelessWaves
 from processing.diagnosis.instrument.run import diagnose_captures
 from processing.diagnosis.search.result import Diagnosis
 from processing.instrument.model import InstrumentModel
@@ -70,3 +73,19 @@ def test_optics_that_differ_from_part_to_part_are_not_called_by_their_name(confi
     found = diagnosed(tmp_path, configs, bench)
     assert not sure(found)
     assert not found.applied()
+
+
+@pytest.mark.parametrize(("wave", "more"), [(120.0, True), (93.0, True), (90.0, False)])
+def test_no_name_is_sure_beside_a_wave_that_explains_nearly_as_much(wave, more):
+    def explaining(chi_square):
+        return np.eye(1), np.array([math.sqrt(chi_square)])
+
+    cause = SimpleNamespace(candidates=("named",))
+    waves = NamelessWaves.__new__(NamelessWaves)
+    waves._labels, waves._state = ["named"], None
+    waves._sets = SimpleNamespace(
+        groups=("named", "wave"),
+        without=lambda state, group: state,
+        given_others=lambda state: [explaining(100.0), explaining(wave)],
+    )
+    assert waves.explain_more(cause) is more

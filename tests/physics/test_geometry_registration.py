@@ -208,3 +208,18 @@ def test_camera_pose_command_writes_a_camera_file(tmp_path, capsys):
         main(["camera-pose", *files, "--squares", "eight", *given[2:], "--out", str(out)])
     assert end.value.code == 2
     assert "8x6" in capsys.readouterr().err
+
+
+def test_a_ray_that_meets_no_normal_meets_nothing(tmp_path):
+    import trimesh
+
+    box = trimesh.creation.box((10, 10, 10))
+    # Corners as far away as a flipped bit of a number puts them.
+    box.vertices[1] = (-5, -5, 1e10)
+    box.vertices[2] = (1e10, 3.4588234, -5)
+    box.export(tmp_path / "far.ply")
+    rays = np.tile((0.0, 0.0, -1.0), (4, 1))
+    hit, points, normals = Mesh(file=str(tmp_path / "far.ply")).intersect(np.array([0.0, 0.0, 100.0]), rays, 0.0)
+    assert len(points) == len(normals) == hit.sum()
+    assert np.isfinite(points).all()
+    assert np.isfinite(normals).all()

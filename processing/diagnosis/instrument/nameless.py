@@ -16,6 +16,7 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause
 from processing.diagnosis.search.posterior import Posterior, quadratic
+from processing.diagnosis.search.rules import SURE
 from processing.diagnosis.search.sets import Group, Sets, State
 from processing.diagnosis.search.space import Space
 from processing.effect import Parameter
@@ -82,11 +83,14 @@ class NamelessWaves:
         return None if fields or few or not _waves(problem) else cls(problem, found)
 
     def explain_more(self, cause: Cause) -> bool:
-        """Whether in a cause's place one of the waves fits better, every value of either costing two of chi-square."""
+        """Whether in a cause's place one of the waves fits better, or so well that no name is sure beside it.
+
+        Every value of either costs two of chi-square.
+        """
         own = self._labels.index(cause.candidates[0])
         given = self._sets.given_others(self._sets.without(self._state, own))
         most = max(_explained(*given[g]) for g in range(len(self._labels), len(self._sets.groups)))
-        return bool(most > _explained(*given[own]))
+        return bool(most > _explained(*given[own]) - 2 * np.log(SURE / (1 - SURE)))
 
 
 def _waves(problem: InstrumentProblem) -> list[Candidate]:
