@@ -152,5 +152,7 @@ def test_ctrl_c_stops_a_move(served):
         _wait_until(lambda: axis.homed and axis.is_moving(), running)
         os.kill(running.pid, signal.SIGINT)
         assert running.wait() == 130
-        assert not axis.is_moving()
+        # The stop was sent before the end; a busy emulator reads it later.
+        while axis.is_moving():
+            time.sleep(0.02)
         assert axis.position_deg() < FAR_DEG / 2
