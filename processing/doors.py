@@ -22,6 +22,8 @@ from processing.errors import ProcessError
 MOST_TEXT_BYTES = 16 << 20
 #: Most bytes of a JSON file: an index of 10,000 captures has about 5 MB.
 MOST_JSON_BYTES = 16 << 20
+#: Room for what a file has beside its values (names, provenance, the measurement matrix), bytes.
+BOOKS = 1 << 18
 #: Most pixels of a frame (8192 x 8192).
 MOST_PIXELS = 1 << 26
 #: Deepest nesting of lists and mappings; our own files have 8.
@@ -74,8 +76,9 @@ def require_folder(path: Path) -> None:
         raise ProcessError(f"{path}: nothing can be written into {path.parent}. Give a name in another folder.")
 
 
-def require_room(path: Path, needed: int, error: type[ProcessError] = ProcessError) -> None:
-    """Raise `error` unless the disc has room for a file of so many bytes: HDF5 that runs out of it ends the process."""
+def require_room(path: Path, values: int, error: type[ProcessError] = ProcessError) -> None:
+    """Raise `error` unless the disc has room for a file of so many bytes of values: HDF5 would end the process."""
+    needed = values + BOOKS
     replaced = path.stat().st_blocks * 512 if path.exists() else 0
     free = shutil.disk_usage(path.parent).free + replaced
     if needed > free:

@@ -33,8 +33,6 @@ Progress = Callable[[int, int], None]
 
 Frame = NDArray[Any]
 
-#: Room for what is beside the frames, bytes.
-BOOKS = 1 << 18
 #: Most bytes of a file of 16 numbers.
 MOST_SAMPLE_BYTES = 1 << 16
 
@@ -104,7 +102,7 @@ def import_capture(
         versions={"umov": version("umov"), "numpy": np.__version__, "h5py": h5py.__version__},
     )
     partial = request.out.with_name(request.out.name + ".partial")
-    require_room(partial, len(states) * prod(source.shape) * source.dtype.itemsize + BOOKS, ImportFailed)
+    require_room(partial, len(states) * prod(source.shape) * source.dtype.itemsize, ImportFailed)
     try:
         with h5py.File(partial, "w") as h5:
             _write(h5, header, states, source, progress)

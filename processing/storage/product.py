@@ -42,8 +42,6 @@ from processing.storage.unpacked import KeptChunks, read_rows
 PRODUCT_VERSION = 1
 #: Environment variable that switches compression of products off where it is 0.
 COMPRESS_VARIABLE = "UMOV_COMPRESS"
-#: Room for what is beside the planes: names, provenance, the measurement matrix; bytes.
-BOOKS = 1 << 18
 #: Part of a product that compression has to save to be worth a second writing.
 WORTH_SAVING = 0.2
 
@@ -136,7 +134,7 @@ class ProductWriter(OpenH5):
         values = sum(
             prod((*plane.leading, *self._shape)) * np.dtype(plane.dtype).itemsize for plane in self._planes.values()
         )
-        require_room(self._partial, values + BOOKS, ProductError)
+        require_room(self._partial, values, ProductError)
         try:
             self._h5 = h5py.File(self._partial, "w")
             self._lay_out(self._h5, _early)

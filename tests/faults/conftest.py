@@ -182,3 +182,45 @@ def run_with(quick_rig: Callable[..., Path], tmp_path: Path) -> Callable[..., tu
         return error, next(path for path in sorted(folder.glob("run.h5*")) if path.suffix != ".png")
 
     return run
+
+
+@pytest.fixture
+def refused(tmp_path):
+    """Runs a command and asks that it refuses its input as promised; returns what it said."""
+
+    def run(main, *arguments):
+        start_s = time.process_time()
+        with pytest.raises(SystemExit) as end:
+            main([str(argument) for argument in arguments])
+        assert end.value.code == 2
+        assert time.process_time() - start_s < 5
+
+    return run
+
+
+@pytest.fixture
+def acquire_refuses(refused, capfd):
+    from acquisition.commands.application import main
+
+    def run(*arguments):
+        refused(main, *arguments)
+        said = capfd.readouterr().err
+        assert "Traceback" not in said
+        assert all(len(line) < 1000 for line in said.splitlines())
+        return said
+
+    return run
+
+
+@pytest.fixture
+def process_refuses(refused, capfd):
+    from processing.commands.application import main
+
+    def run(*arguments):
+        refused(main, *arguments)
+        said = capfd.readouterr().err
+        assert "Traceback" not in said
+        assert len(said.splitlines()) == 1, said
+        return said
+
+    return run

@@ -75,8 +75,8 @@ def test_optics_that_differ_from_part_to_part_are_not_called_by_their_name(confi
     assert not found.applied()
 
 
-@pytest.mark.parametrize(("wave", "more"), [(120.0, True), (93.0, True), (90.0, False)])
-def test_no_name_is_sure_beside_a_wave_that_explains_nearly_as_much(wave, more):
+@pytest.mark.parametrize(("wave", "doubted"), [(120.0, True), (93.0, True), (90.0, False)])
+def test_no_name_is_sure_beside_a_wave_that_explains_nearly_as_much(wave, doubted):
     def explaining(chi_square):
         return np.eye(1), np.array([math.sqrt(chi_square)])
 
@@ -88,4 +88,4 @@ def test_no_name_is_sure_beside_a_wave_that_explains_nearly_as_much(wave, more):
         without=lambda state, group: state,
         given_others=lambda state: [explaining(100.0), explaining(wave)],
     )
-    assert waves.explain_more(cause) is more
+    assert waves.explain_as_well(cause) is doubted

@@ -42,7 +42,7 @@ PATTERN = "its values follow one wave or jump over the states, as a beat or a fr
 #: The same of an effect in whose place a source with one wave fits better.
 BEAT = "a source that beats explains more than it does"
 #: The same where a plate that turns has a wave of its own that is not in the list.
-WAVE = "a plate that changes two to four times a turn explains more than it does"
+WAVE = "a plate that changes two to four times a turn explains as much as it does"
 #: The image does not move where that would be seen best.
 STANDS = "the edges, which were left out of the fit, do not move as it says"
 #: Optics and mechanics are the same for the whole image.
@@ -67,7 +67,7 @@ def doubts(
     for cause in causes:
         reason = STANDS if cause in still else _of_itself(problem, found, solved, cause, causes)
         if reason is None and waves is not None and _is_one_name(cause):
-            reason = WAVE if waves.explain_more(cause) else None
+            reason = WAVE if waves.explain_as_well(cause) else None
         if reason is not None:
             out[cause] = reason
         if reason == PATTERN:

@@ -82,7 +82,7 @@ class NamelessWaves:
         few = problem.holds_out_states or not problem.noise_known
         return None if fields or few or not _waves(problem) else cls(problem, found)
 
-    def explain_more(self, cause: Cause) -> bool:
+    def explain_as_well(self, cause: Cause) -> bool:
         """Whether in a cause's place one of the waves fits better, or so well that no name is sure beside it.
 
         Every value of either costs two of chi-square.

@@ -1,0 +1,144 @@
+"""Promise 20 for what comes from other labs: states files, pictures, stacks, measured tensors."""
+
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from processing.doors import MOST_PIXELS, ProcessError, require_picture
+from processing.reflectance.pbsdf import load as load_pbsdf
+from processing.storage.tensor_file import create_tensor_file
+
+ROOT = Path(__file__).resolve().parents[2]
+INSTRUMENT = ROOT / "configs" / "instruments" / "rgb950.yaml"
+
+
+@pytest.fixture
+def states(tmp_path):
+    """Writes states.csv, with 18 frames beside it."""
+    for k in range(18):
+        cv2.imwrite(str(tmp_path / f"f{k}.png"), np.full((4, 6), 100 + k, np.uint16))
+    rows = [["state", "psg_deg", "psa_deg", "file"], *([k, 20 * k, 98.2 * k, f"f{k}.png"] for k in range(18))]
+
+    def write(change=lambda rows: None, files=True):
+        change(rows)
+        path = tmp_path / "states.csv"
+        kept = rows if files else [row[:-1] for row in rows]
+        path.write_text("\n".join(",".join(map(str, row)) for row in kept) + "\n")
+        return path
+
+    return write
+
+
+def _column(name):
+    def add(rows):
+        for k, row in enumerate(rows):
+            row.insert(1, name if k == 0 else 0.0)
+
+    return add
+
+
+STATES = {
+    "axis called detector": (_column("detector"), "detector"),
+    "axis called beam": (_column("beam_deg"), "beam"),
+    "axis without a name": (_column(""), "empty name"),
+    "axis with a path": (_column("../x"), "letters"),
+    "axis twice": (_column("psg"), "given twice"),
+    "a row missing": (lambda rows: rows.pop(5), "state 4 is missing"),
+    "one file twice": (lambda rows: rows[7].__setitem__(3, "f2.png"), "f2.png is given already in line 4"),
+    "state of 400 digits": (lambda rows: rows[3].__setitem__(0, "9" * 400), "whole number"),
+    "state in other digits": (lambda rows: rows[3].__setitem__(0, "²"), "whole number"),
+    "a name that no file has": (lambda rows: rows[3].__setitem__(3, "9" * 5000), "no such frame"),
+    "no file": (lambda rows: rows[3].__setitem__(3, ""), "no name"),
+}
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_states_csv(states, process_refuses, name):
+    change, word = STATES[name]
+    arguments = ("--states", states(change), "--wavelength-nm", 662, "--instrument", INSTRUMENT)
+    assert word in process_refuses("import", *arguments)
+
+
+def _png(path, wide, high):
+    def chunk(kind, data):
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = struct.pack(">IIBBBBB", wide, high, 16, 0, 0, 0, 0)
+    body = chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(b"\0" * 100_000)) + chunk(b"IEND", b"")
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + body)
+
+
+def test_picture_that_promises_terabytes(states, tmp_path, process_refuses):
+    _png(tmp_path / "f0.png", 12_000, 12_000)
+    _png(tmp_path / "terabytes.png", 1_000_000, 1_000_000)
+    arguments = ("--states", states(), "--wavelength-nm", 662, "--instrument", INSTRUMENT)
+    assert f"at most {MOST_PIXELS:,} pixels" in process_refuses("import", *arguments)
+    with pytest.raises(ProcessError, match="pixels"):
+        require_picture(tmp_path / "terabytes.png")
+
+
+def test_picture_cut_short(states, tmp_path, process_refuses):
+    whole = tmp_path / "f3.png"
+    cv2.imwrite(str(whole), np.random.default_rng(1).integers(0, 4000, (4, 6)).astype(np.uint16))
+    whole.write_bytes(whole.read_bytes()[:-30])
+    arguments = ("--states", states(), "--wavelength-nm", 662, "--instrument", INSTRUMENT)
+    assert "f3.png" in process_refuses("import", *arguments)
+
+
+def _stack_h5(path):
+    with h5py.File(path, "w") as h5:
+        h5["group/frames"] = np.zeros((18, 4, 6), "u2")
+        h5["group/text"] = "x"
+        h5.create_dataset("huge", (18, 1 << 20, 1 << 20), "u2", chunks=(1, 64, 64))
+
+
+STACKS = {
+    "group": (_stack_h5, "::/group", "no dataset"),
+    "text": (_stack_h5, "::/group/text", "shape|holds"),
+    "nothing": (_stack_h5, "::/nothing", "no dataset"),
+    "terabytes": (_stack_h5, "::/huge", "bytes"),
+    "npy of a number": (lambda path: np.save(path, np.float64(3)), "", "shape"),
+    "npy of objects": (lambda path: np.save(path, np.array([{}], dtype=object), allow_pickle=True), "", "read|holds"),
+    "npy of complex": (lambda path: np.save(path, np.zeros((18, 4, 6), "c8")), "", "holds"),
+    "npy without pixels": (lambda path: np.save(path, np.zeros((18, 0, 6))), "", "pixels|read"),
+    "npy cut short": (lambda path: path.write_bytes(b"\x93NUMPY\x01\x00v\x00{'descr'z"), "", "read"),
+    "npy without a number": (lambda path: np.save(path, np.full((18, 4, 6), np.nan)), "", "no finite value"),
+    "empty": (lambda path: path.write_bytes(b""), "", "read"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", STACKS)
+def test_stack(states, tmp_path, process_refuses, name):
+    import re
+
+    make, inside, word = STACKS[name]
+    path = tmp_path / ("stack.h5" if inside else "stack.npy")
+    make(path)
+    arguments = ("--states", states(files=False), "--wavelength-nm", 662, "--instrument", INSTRUMENT)
+    said = process_refuses("import", *arguments, "--stack", f"{path}{inside}")
+    assert re.search(word, said), said
+
+
+def test_pbsdf_of_other_shapes(tmp_path):
+    shapes = {"theta_h": (1, 91), "theta_d": (1, 91), "phi_d": (1, 361), "wvls": (5,), "M": (3, 3, 3, 5, 4, 4)}
+    path = tmp_path / "x.pbsdf"
+    fields = create_tensor_file(path, {name: (shape, np.float32) for name, shape in shapes.items()})
+    fields["theta_h"][0] = np.deg2rad(90 * (np.arange(91) / 90) ** 2)
+    fields["theta_d"][0] = np.deg2rad(np.arange(91))
+    fields["phi_d"][0] = np.deg2rad(np.arange(-180, 181))
+    for field in fields.values():
+        field.flush()
+    with pytest.raises(ProcessError, match="M is float32"):
+        load_pbsdf(path)
+    # A shape whose product overflows 64 bits.
+    data = bytearray(path.read_bytes())
+    at = data.index(b"M") + 1 + 11
+    data[at : at + 48] = struct.pack("<6Q", *[1 << 40] * 6)
+    path.write_bytes(data)
+    with pytest.raises(ProcessError, match="truncated"):
+        load_pbsdf(path)
