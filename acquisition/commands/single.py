@@ -204,14 +204,13 @@ def summarize(job: Job, result: Result) -> None:
         figure = f"not drawn ({error.strerror or error}); the capture is whole"
     plan, ledger = job.plan, result.ledger
     darks = sum(role == "dark" for role in job.table.role)
-    parts = [f"{name.removesuffix('_s')} {ledger[name]:.1f}" for name in ledger if name.endswith("_s")]
     what = f"{plan.mode}, {plan.wavelength_nm:g} nm, Omega {plan.omega_deg:g} deg, {plan.sample.name}"
     lines = [
         ("what", ("SIMULATED " if job.rig.simulated else "") + what),
         ("states", f"{result.states_done} of {result.states} ({darks} dark), {result.status}"),
         ("angles", f"read back at every state, at most {result.worst_angle_deg:.4f} deg from the target"),
         ("saturation", f"worst state {100 * result.saturated_fraction:.3f} % of pixels"),
-        ("seconds", ", ".join(parts)),
+        ("seconds", f"{ledger['total_s']:.1f} in all: {', '.join(_steps(ledger))}"),
         *(("overhead", text) for text in _overhead(ledger)),
         *(("note", message) for message in result.messages[-5:]),
         ("figure", figure),
@@ -220,6 +219,13 @@ def summarize(job: Job, result: Result) -> None:
     ]
     for label, text in lines:
         typer.echo(f"{label:<11} {text}")
+
+
+def _steps(ledger: dict[str, float]) -> list[str]:
+    """Seconds of each kind of step that took 0.1 or more, the longest first."""
+    sums = ("total_s", "unavoidable_s", "of_it_readout_s")
+    spent = {name.removesuffix("_s"): ledger[name] for name in ledger if name.endswith("_s") and name not in sums}
+    return [f"{name} {spent[name]:.1f}" for name in sorted(spent, key=lambda n: -spent[n]) if spent[name] >= 0.05]
 
 
 def _overhead(ledger: dict[str, float]) -> list[str]:
