@@ -6,6 +6,7 @@ from pathlib import Path
 
 from acquisition.capture import session
 from acquisition.capture.checks import refuse_failed
+from acquisition.capture.free_name import free_name
 from acquisition.capture.header import default_name
 from acquisition.capture.job import check_with_devices, prepare
 from acquisition.capture.plan import MeasurementPlan
@@ -33,10 +34,10 @@ def take_capture(plan: MeasurementPlan, rig: RigConfig, folder: Path | str, home
         It was refused, failed or was stopped; the message names what is left to go on with.
     """
     job = prepare(plan, rig)
-    path = Path(folder) / default_name(plan)
     with StopRequest() as stop, Rig(rig) as devices:
-        refuse_failed(check_with_devices(job, devices, path.parent))
-        result = session.take(job, devices, path, stop, home=home)
+        refuse_failed(check_with_devices(job, devices, Path(folder)))
+        with free_name(Path(folder) / default_name(plan)) as path:
+            result = session.take(job, devices, path, stop, home=home)
     if result.status != "complete":
         raise AcquisitionError(f"{result.path} was stopped ({result.status}); `acquire --resume` goes on with it.")
     return result.path

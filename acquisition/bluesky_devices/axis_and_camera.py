@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from acquisition.bluesky_devices.device import Device, Readings, data_key, readings
+from acquisition.bluesky_devices.frames_in_files import FRAME, Documents, asset_documents, in_file, write_frame
 from acquisition.bluesky_devices.status import Status, in_background
 
 
@@ -52,10 +54,14 @@ class CameraDevice(Device):
     ----------
     exposure_s : of the next frames; change it between plans.
     sample : what an emulated rig shows.
-    tells_frames : whether `read` gives the frame itself; some consumers of documents take no images in events.
+    folder : where frames are put, each in a file of its own that documents point to, as Tiled and everybody else who
+        takes no images in events wants it; None: the events hold the frames.
+    tells_frames : False for the mean alone.
     """
 
     _frame: np.ndarray[Any, np.dtype[np.uint16]]
+    _path: Path
+    folder: Path | str | None = None
     exposure_s = 0.02
     sample = "red_sphere"
     tells_frames = True
@@ -86,18 +92,33 @@ class CameraDevice(Device):
         def expose() -> None:
             with self.turn:
                 self._frame = self.rig.require_camera().capture(1)[0].pixels
+                if self._in_files:
+                    self._path = write_frame(Path(self.folder or ""), self.name, self._frame, self.exposure_s)
 
         return in_background(expose)
 
+    @property
+    def _in_files(self) -> bool:
+        return self.tells_frames and self.folder is not None
+
     def read(self) -> Readings:
-        """The frame that was taken last, and its mean in counts."""
-        frame = {f"{self.name}_frame": self._frame} if self.tells_frames else {}
+        """The frame that was taken last, unless it is in a file, and its mean in counts."""
+        told = self.tells_frames and not self._in_files
+        frame = {f"{self.name}_frame": self._frame} if told else {}
         return readings(frame | {f"{self.name}_mean": float(self._frame.mean())})
 
     def describe(self) -> Readings:
         """Shapes and units."""
         settings = self.rig.require_camera().settings
         shape = (settings.height or 0, settings.width or 0)
-        frame = {f"{self.name}_frame": data_key("camera, counts (row, column)", shape, "count")}
-        mean = {f"{self.name}_mean": data_key("camera, mean of the frame", (), "count")}
-        return (frame if self.tells_frames else {}) | mean
+        keys = {f"{self.name}_mean": data_key("camera, mean of the frame", (), "count")}
+        if self._in_files:
+            keys[f"{self.name}_frame"] = in_file(data_key("camera, counts (1, row, column)", (1, *shape), "count"))
+        elif self.tells_frames:
+            keys[f"{self.name}_frame"] = data_key("camera, counts (row, column)", shape, "count")
+        return keys
+
+    def collect_asset_docs(self, index: int | None = None) -> Documents:
+        """Where the frame that was taken last is."""
+        if self._in_files:
+            yield from asset_documents(f"{self.name}_frame", self._path, FRAME, (1, *self._frame.shape))

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import threading
-import uuid
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from acquisition.bluesky_devices.device import Device, Readings, data_key, readings
+from acquisition.bluesky_devices.frames_in_files import Documents, asset_documents, in_file
 from acquisition.bluesky_devices.status import Status, in_background
 from acquisition.capture import session
 from acquisition.capture.checks import refuse_failed
+from acquisition.capture.free_name import free_name
 from acquisition.capture.header import default_name
-from acquisition.capture.job import check_with_devices, job_of, prepare
+from acquisition.capture.job import Job, Result, check_with_devices, job_of, prepare
 from acquisition.capture.plan import MeasurementPlan
 from acquisition.capture.writer import PARTIAL
 from acquisition.errors import AcquisitionError
@@ -62,31 +63,26 @@ class CaptureDevice(Device):
     def _take(self) -> None:
         with self.turn:
             half = self._half
-            job = self._job if half is None else job_of(half, self.rig.config, self.plan)
-            path = self._free_name() if half is None else half
-            refuse_failed(check_with_devices(job, self.rig, path.parent))
-            run = session.take if half is None else session.resume
-            try:
-                result = run(job, self.rig, path, self._stop, (), self._home)
-            except BaseException:
-                # What is there already is gone on with, should the plan be run again.
-                partial = path if path.name.endswith(PARTIAL) else path.with_name(path.name + PARTIAL)
-                self._half = partial if partial.exists() else None
-                raise
+            if half is not None:
+                result = self._run(session.resume, job_of(half, self.rig.config, self.plan), half)
+            else:
+                with free_name(self.folder / default_name(self.plan)) as path:
+                    result = self._run(session.take, self._job, path)
         if result.status == "complete":
             self._half, self._path = None, result.path
             self._documents = list(self._asset_documents(result.path))
         else:
             self._half = result.path
 
-    def _free_name(self) -> Path:
-        """A name that is not taken: several captures may begin in one second."""
-        first = self.folder / default_name(self.plan)
-        number, path = 1, first
-        while path.exists():
-            number += 1
-            path = first.with_stem(f"{first.stem}-{number}")
-        return path
+    def _run(self, run: Callable[..., Result], job: Job, path: Path) -> Result:
+        refuse_failed(check_with_devices(job, self.rig, path.parent))
+        try:
+            return run(job, self.rig, path, self._stop, (), self._home)
+        except BaseException:
+            # What is there already is gone on with, should the plan be run again.
+            partial = path if path.name.endswith(PARTIAL) else path.with_name(path.name + PARTIAL)
+            self._half = partial if partial.exists() else None
+            raise
 
     def pause(self) -> None:
         """Finish the state that is being taken; called by the RunEngine."""
@@ -123,34 +119,14 @@ class CaptureDevice(Device):
         keys |= {f"{self.name}_{c}": data_key(c, states, COLUMN_UNITS.get(c, "")) for c in COLUMNS}
         settings = self.rig.require_camera().settings
         frames = data_key("counts", (*states, 1, settings.height or 0, settings.width or 0), "count")
-        return keys | {f"{self.name}_frames": frames | {"external": "STREAM:", "dtype_numpy": "<u2"}}
+        return keys | {f"{self.name}_frames": in_file(frames)}
 
-    def collect_asset_docs(self, index: int | None = None) -> Iterator[tuple[str, dict[str, Any]]]:
+    def collect_asset_docs(self, index: int | None = None) -> Documents:
         """Where the frames of the last capture are; each file once."""
         documents, self._documents = self._documents, []
         yield from documents
 
-    def _asset_documents(self, path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-        resource = str(uuid.uuid4())
+    def _asset_documents(self, path: Path) -> Documents:
         with Capture(path) as capture:
             chunk = (1, 1, *capture.stored_shape)
-        yield (
-            "stream_resource",
-            {
-                "uid": resource,
-                "data_key": f"{self.name}_frames",
-                "mimetype": "application/x-hdf5",
-                "uri": path.resolve().as_uri().replace("file:///", "file://localhost/"),
-                "parameters": {"dataset": "/entry/instrument/detector/data", "swmr": False, "chunk_shape": chunk},
-            },
-        )
-        yield (
-            "stream_datum",
-            {
-                "uid": f"{resource}/0",
-                "stream_resource": resource,
-                "descriptor": "",
-                "indices": {"start": 0, "stop": 1},
-                "seq_nums": {"start": 0, "stop": 0},
-            },
-        )
+        return asset_documents(f"{self.name}_frames", path, "/entry/instrument/detector/data", chunk)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from rich.console import Console
 from acquisition.capture import session
 from acquisition.capture.checks import Check, refuse_failed
 from acquisition.capture.estimate import capture_seconds
+from acquisition.capture.free_name import free_name
 from acquisition.capture.header import default_name
 from acquisition.capture.job import Job, Result, check_with_devices, job_of, prepare, stored_plan, stored_rig
 from acquisition.capture.machine_checks import check_machine
@@ -84,6 +85,7 @@ def run(options: Options, stop: StopRequest) -> int:
         take = session.resume if resuming else session.take
         told = RunFile(path.parent, job.rig.simulated)
         with (
+            nullcontext(path) if resuming else free_name(path) as path,
             notifying(job.rig.notify, path, job.rig.simulated) as notifier,
             guarded(job.rig, path.parent),
             live_page(options.live, job.rig, stop, console) as page,
@@ -96,7 +98,7 @@ def run(options: Options, stop: StopRequest) -> int:
 
 
 def _job(options: Options) -> tuple[Job, Path, bool]:
-    """The job, its file, and whether the file is gone on with."""
+    """The job, its file or the name that a new one would like, and whether the file is gone on with."""
     if options.resume is None:
         job = prepare(plan_of(options), rig_of(options))
         return job, options.out / default_name(job.plan), False
@@ -106,7 +108,7 @@ def _job(options: Options) -> tuple[Job, Path, bool]:
         return job_of(options.resume, rig), options.resume, True
     with Capture(options.resume) as capture:
         plan, rig = stored_plan(capture), rig or stored_rig(capture)
-    return prepare(plan, rig), beside(options.resume), False
+    return prepare(plan, rig), options.resume.with_name(options.resume.name.removesuffix(PARTIAL)), False
 
 
 def _sealed(path: Path) -> Path | None:
@@ -121,15 +123,6 @@ def _refuse_with_resume(options: Options) -> None:
             f"--{given[0]} has no meaning with --resume: the plan is in {options.resume}. Leave it out, or take a new "
             "capture without --resume."
         )
-
-
-def beside(path: Path) -> Path:
-    """A name for a new capture beside one that is kept: NAME-2.h5, or the next number that is free."""
-    stem = path.name.removesuffix(PARTIAL).removesuffix(".h5")
-    number = 2
-    while any((path.parent / f"{stem}-{number}.h5{end}").exists() for end in ("", PARTIAL)):
-        number += 1
-    return path.parent / f"{stem}-{number}.h5"
 
 
 def plan_of(options: Options) -> MeasurementPlan:

@@ -1,14 +1,19 @@
-"""An unmodified RunEngine drives the emulated rig: scans, and a whole capture that it pauses and resumes."""
+"""An unmodified RunEngine drives the emulated rig: scans, and a whole capture that it pauses and resumes.
+
+Tiled reads back what it was told, through its own server.
+"""
 
 from __future__ import annotations
 
 import threading
 import time
+import warnings
 
 import h5py
 import numpy as np
 import pytest
 from bluesky import RunEngine
+from bluesky import plan_stubs as bps
 from bluesky.plans import count, scan
 from bluesky.protocols import Movable, Pausable, Readable, Triggerable
 from bluesky.utils import FailedStatus, RunEngineInterrupted
@@ -64,6 +69,48 @@ def test_a_camera_may_keep_its_frames_to_itself(bench, engine):
     assert event["camera_mean"] > BLACK_LEVEL
 
 
+def test_a_camera_puts_its_frames_into_files(bench, engine, tmp_path):
+    run, documents = engine
+    bench.camera.folder = tmp_path / "frames"
+    (uid,) = run(count([bench.camera], num=2))
+    assert [list(event) for event in _events(documents)] == [["camera_mean"]] * 2
+    resources = [document for name, document in documents if name == "stream_resource"]
+    assert [document["run_start"] for document in resources] == [uid, uid]
+    for resource, event in zip(resources, _events(documents), strict=True):
+        with h5py.File(resource["uri"].removeprefix("file://localhost")) as file:
+            frame = file[resource["parameters"]["dataset"]]
+            assert frame.shape == (1, 24, 32)
+            assert frame[...].mean() == event["camera_mean"]
+            assert file["entry/data/exposure_s"][()] == bench.camera.exposure_s
+    assert len(list((tmp_path / "frames").iterdir())) == 2
+
+
+def test_a_frame_that_a_pause_has_lost_is_not_counted(bench, engine, tmp_path):
+    run, documents = engine
+    bench.camera.folder = tmp_path / "frames"
+
+    def paused_between_reading_and_saving():
+        yield from bps.stage(bench.camera)
+        yield from bps.open_run()
+        yield from bps.checkpoint()
+        yield from bps.trigger(bench.camera, wait=True)
+        yield from bps.create()
+        yield from bps.read(bench.camera)
+        if not (tmp_path / "was").exists():
+            (tmp_path / "was").touch()
+            yield from bps.pause()
+        yield from bps.save()
+        yield from bps.close_run()
+        yield from bps.unstage(bench.camera)
+
+    with pytest.raises(RunEngineInterrupted):
+        run(paused_between_reading_and_saving())
+    run.resume()
+    assert len(list((tmp_path / "frames").iterdir())) == 2
+    datums = [document for name, document in documents if name == "stream_datum"]
+    assert len(_events(documents)) == len(datums) == 1
+
+
 def test_a_scan_sees_the_bench_as_it_is_not_as_it_was_declared(small_rig, dim_instrument, engine):
     run, documents = engine
     means = []
@@ -104,36 +151,54 @@ def test_a_capture_of_40_states_is_paused_and_resumed(bench, engine, tmp_path):
     assert len(list((tmp_path / "captures").glob("*.h5"))) == 2
 
 
+@pytest.fixture
+def tiled(engine, tmp_path):
+    """A client of a Tiled server that may read this test's folder and is told what the engine does."""
+    # Here, for they take seconds; what they import warns of what is deprecated elsewhere.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from bluesky.callbacks.tiled_writer import TiledWriter
+        from tiled.client import Context, from_context
+        from tiled.server.simple import SimpleTiledServer
+    with (
+        SimpleTiledServer(tmp_path / "tiled", readable_storage=[tmp_path]) as served,
+        Context.from_any_uri(served.uri)[0] as context,
+    ):
+        client = from_context(context)
+        engine[0].subscribe(TiledWriter(client))
+        yield client
+
+
 @pytest.mark.third_party
 @pytest.mark.filterwarnings("ignore")
-def test_tiled_reads_a_capture_back_that_was_paused_and_resumed(bench, engine, tmp_path):
-    # Not in CI: Tiled and its server are 69 packages more (tests/third_party/more_clients.txt).
-    tiled = pytest.importorskip("tiled.client")
-    server = pytest.importorskip("tiled.server.simple")
-    writer = pytest.importorskip("bluesky.callbacks.tiled_writer")
+def test_tiled_reads_back_what_it_was_told(bench, engine, tiled, tmp_path):
     run, documents = engine
     captures = tmp_path / "captures"
-    with (
-        server.SimpleTiledServer(tmp_path / "tiled", readable_storage=[captures]) as served,
-        tiled.Context.from_any_uri(served.uri)[0] as context,
-    ):
-        client = tiled.from_context(context)
-        run.subscribe(writer.TiledWriter(client))
-        device = bench.capture(PLAN, captures)
-        _paused(run, device, captures)
-        (uid,) = run.resume()
-        stream = client[uid]["primary"]
-        (event,) = _events(documents)
-        assert list(stream["capture_file"].read()) == [event["capture_file"]]
-        with h5py.File(event["capture_file"]) as file:
-            frames = file["entry/instrument/detector/data"][...]
-        assert frames.shape == (44, 1, 24, 32)
-        _assert_same(stream["capture_frames"].read(), frames)
-        with Capture(event["capture_file"]) as capture:
-            written = {f"{axis}_deg": angles for axis, angles in capture.angles_deg.items()}
-            written |= {name: capture.column(name) for name in COLUMNS}
-        for name, values in written.items():
-            _assert_same(stream[f"capture_{name}"].read()[0], values)
+    device = bench.capture(PLAN, captures)
+    _paused(run, device, captures)
+    (uid,) = run.resume()
+    stream = tiled[uid]["primary"]
+    (event,) = _events(documents)
+    assert list(stream["capture_file"].read()) == [event["capture_file"]]
+    with h5py.File(event["capture_file"]) as file:
+        frames = file["entry/instrument/detector/data"][...]
+    assert frames.shape == (44, 1, 24, 32)
+    _assert_same(stream["capture_frames"].read(), frames)
+    with Capture(event["capture_file"]) as capture:
+        written = {f"{axis}_deg": angles for axis, angles in capture.angles_deg.items()}
+        written |= {name: capture.column(name) for name in COLUMNS}
+    for name, values in written.items():
+        _assert_same(stream[f"capture_{name}"].read()[0], values)
+
+    # The same server, for it takes seconds to start: a scan of the camera alone.
+    camera, taken = bench.camera, []
+    camera.folder = tmp_path / "frames"
+    run.subscribe(lambda *_: taken.append(camera._frame.copy()), "event")
+    (uid,) = run(scan([camera], bench.axes["psg"], 10, 40, 4))
+    stream = tiled[uid]["primary"]
+    _assert_same(stream["camera_frame"].read(), np.stack(taken))
+    _assert_same(stream["camera_mean"].read(), np.array([frame.mean() for frame in taken]))
+    assert not np.array_equal(taken[0], taken[2])
 
 
 def _assert_same(read, written) -> None:

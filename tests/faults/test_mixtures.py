@@ -186,3 +186,16 @@ def test_the_lamp_is_held_against_the_light_before_the_resume(run_with):
     _, path = run_with(broken_at(6), plan=SHORT, top=top)
     error, path = run_with(resume=path, plan=SHORT, top=top, flux_e_per_s=8e4)
     assert "of that of the first state" in str(error)
+
+
+def test_a_capture_begun_in_the_same_second_gets_the_next_name(acquire, quick_rig, intact, monkeypatch, tmp_path):
+    plan = tmp_path / "plan.yaml"
+    YAML().dump({"omega_deg": 35} | SHORT, plan)
+    monkeypatch.setattr("acquisition.commands.single.default_name", lambda plan: "same.h5")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/same.h5").write_bytes(b"of this second")
+    code, out, err = acquire("--plan", plan, "--rig", quick_rig(), "--out", tmp_path / "out")
+    assert code == 0, err
+    assert "same-2.h5" in out
+    assert intact(tmp_path / "out/same-2.h5") == 19
+    assert (tmp_path / "out/same.h5").read_bytes() == b"of this second"

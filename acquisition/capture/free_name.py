@@ -1,0 +1,57 @@
+"""A file name for a new capture that nobody else gets, should several begin in the same second."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from acquisition.capture.synced import make_folder
+from acquisition.capture.writer import NEW, PARTIAL
+from acquisition.errors import AcquisitionError
+
+
+@contextmanager
+def free_name(path: Path) -> Iterator[Path]:
+    """The path, or NAME-2.h5, NAME-3.h5 ... where that is taken; it is nobody else's until the end of the block.
+
+    Raises
+    ------
+    AcquisitionError
+        The folder cannot be written.
+    """
+    try:
+        make_folder(path.parent)
+        free = next(name for name in _numbered(path) if _taken_hold_of(name))
+    except OSError as error:
+        raise AcquisitionError(f"{path} cannot be created ({error}). Choose another folder with --out.") from error
+    try:
+        yield free
+    finally:
+        # Not there any more once the capture has begun.
+        with suppress(OSError):
+            _with(free, NEW).unlink(missing_ok=True)
+
+
+def _numbered(path: Path) -> Iterator[Path]:
+    yield path
+    yield from (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
+
+
+def _taken_hold_of(path: Path) -> bool:
+    """Whether the capture may have this name; if so, its first file stands for it from now on."""
+    try:
+        os.close(os.open(_with(path, NEW), os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666))
+    except FileExistsError:
+        return False
+    # Looked at in the order in which a capture changes its name, so that none slips through between two looks.
+    if _with(path, PARTIAL).exists() or path.exists():
+        _with(path, NEW).unlink()
+        return False
+    return True
+
+
+def _with(path: Path, ending: str) -> Path:
+    return path.with_name(path.name + ending)
