@@ -1,13 +1,16 @@
 """Several wavelengths in one fit: mounts are shared, optics are not, and a free source counts for nothing."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.starts import along_wavelengths
+from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.instrument_file import extended
-from processing.diagnosis.search.fit import minimize
+from processing.diagnosis.search.fit import Fit, held_out, minimize
 from processing.diagnosis.search.result import Correction, Diagnosis, Error
 from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets
 from processing.diagnosis.search.space import Space
@@ -116,6 +119,33 @@ def test_a_free_source_leaves_no_residual():
     assert left[True] < 1e-5
     assert left[False] > 0.1
     assert not any(c.kind.startswith("source") for c in problem.pool())
+
+
+def one_run(wavelengths) -> InstrumentProblem:
+    """Of a spectrograph: the angles of its states are the same at all wavelengths."""
+    model = train(free_source=True).model_copy(update={"calibrate": (), "belongs_to": {"angle_per_state": "mechanics"}})
+    return InstrumentProblem([model.at(w) for w in wavelengths], [captured(model, w) for w in wavelengths])
+
+
+@pytest.mark.parametrize(("wavelengths", "doubted"), [(WAVELENGTHS, False), (WAVELENGTHS[:2], False), ((600.0,), True)])
+def test_angles_that_wavelengths_share_are_told_by_all_of_their_ratios(wavelengths, doubted):
+    """One angle for one ratio of two channels explains anything; one for three of them does not."""
+    problem = one_run(wavelengths)
+    angles = tuple(c for c in problem.pool() if c.kind == "angle_per_state")
+    assert len(angles) == 1
+    bench = WholeBench(problem, lambda line: None)
+    found = SimpleNamespace(space=Space(angles), members=((0,),), samples=SimpleNamespace(probability=np.ones(1)))
+    assert bench.as_many_as_intensities(found, 0.5) == (set(angles) if doubted else set())
+
+
+def test_what_shared_angles_take_away_is_taken_from_every_capture():
+    problem = one_run(WAVELENGTHS)
+    space = Space(tuple(c for c in problem.pool() if c.kind == "angle_per_state"))
+    values = np.zeros(space.size)
+    sums = problem.sums(space, values)
+    found = held_out(problem, space, Fit(values, sums, float(sums.excess.sum())))
+    assert found.count < sums.count.sum() - 0.9 * space.size
+    assert found.shares[:, 1].sum() == pytest.approx(found.count)
 
 
 def test_sets_are_weighed_beside_far_steeper_directions():

@@ -150,8 +150,10 @@ def testable(problem: InstrumentProblem, solved: Solution, cause: Cause, causes:
             any(size >= least and c.acts(k, nm) for size, c in zip(sizes, cause.candidates, strict=True)),
         )
     others = len(causes) - 1
+    # What the captures share counts once.
+    all_values = sum(c.size for c in before if isinstance(c.effect, ValuePerState))
     return bool(
-        sum(values) + others < TESTABLE * sum(directions)
+        all_values + others < TESTABLE * sum(directions)
         or np.any((np.array(values) + others < TESTABLE * np.array(directions)) & shows)
     )
 

@@ -218,13 +218,19 @@ class InstrumentProblem:
 
     def columns(self, capture: int, changes: Changes) -> Array:
         """A (L, K), rows in units of their noise."""
+        a = self._columns_of_one_source(capture, changes)
+        if self._free_source(capture):
+            # A throughput of its own for every state: its rows have a column of their own.
+            conditions = self.captures[capture].conditions
+            state = np.arange(len(a)) // len(conditions.channels)
+            a = np.where(state[:, None] == np.arange(conditions.states), a, 0.0)
+        return a
+
+    def _columns_of_one_source(self, capture: int, changes: Changes) -> Array:
+        """A (L, K) where the source has the same level in all states."""
         data = self.captures[capture]
         w = self.models[capture].rows(data.conditions.angles_deg, changes).reshape(-1, 16) * data.row_exposure[:, None]
         a = w if data.sample is None else (w @ data.sample)[:, None]
-        if self._free_source(capture):
-            # A throughput of its own for every state: its rows have a column of their own.
-            state = np.arange(len(a)) // len(data.conditions.channels)
-            a = np.where(state[:, None] == np.arange(data.conditions.states), a, 0.0)
         return np.asarray(a / self.moments[capture].sigma[:, None])
 
     def _free_source(self, capture: int) -> bool:
@@ -284,10 +290,12 @@ class InstrumentProblem:
         return any(isinstance(c.effect, FieldEffect) for c in space.candidates)
 
     def _block_sums(self, k: int, space: Space, values: Array, changes: Changes, out: Sums, derivatives: bool) -> None:
-        a, c = self.columns(k, changes), self.coefficients(k, changes)
+        # With a level of the source in every state each state is projected by itself: one column serves all of them.
+        apart = len(self.captures[k].conditions.channels) if self._free_source(k) else None
+        a, c = self._columns_of_one_source(k, changes), self.coefficients(k, changes)
         da, dc = np.zeros((0, *a.shape)), None
         if derivatives:
-            da = self.slopes(k, space, values, a, partial(self.columns, k))
+            da = self.slopes(k, space, values, a, partial(self._columns_of_one_source, k))
             dc = self.slopes_of_counts(k, space, values, c)
         for block in self.moments[k].blocks:
             if block.clipped and changes.drop_clipped:
@@ -296,7 +304,7 @@ class InstrumentProblem:
                     continue
                 block = replace(block, rows=block.sound)
             if block.rows.size:
-                add_block(block, a, c, da, dc, self.moments[k], out)
+                add_block(block, a, c, da, dc, self.moments[k], out, apart)
 
     def slopes(self, k: int, space: Space, values: Array, a: Array, columns: Columns) -> Array:
         """Derivatives (values, ..., L, K) of the rows a (..., L, K) of a capture, which `columns` makes of changes."""

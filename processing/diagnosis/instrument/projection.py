@@ -42,23 +42,35 @@ def add_response(counts: NDArray[Any], coefficients: Array, a: Array) -> NDArray
     return out
 
 
-def add_block(block: Block, a: Array, c: Array, da: Array, dc: Array | None, moments: Moments, out: Sums) -> None:
-    """Add what a block says of rows a (L, K) and coefficients c (F, L), with their derivatives by each value."""
-    rows = block.rows
+def add_block(
+    block: Block, a: Array, c: Array, da: Array, dc: Array | None, moments: Moments, out: Sums, apart: int | None = None
+) -> None:
+    """Add what a block says of rows a (L, K) and coefficients c (F, L), with their derivatives by each value.
+
+    `apart` : rows of a state, where every state has unknowns of its own; None: all rows have the same unknowns.
+    """
     dc = np.zeros((len(da), *c.shape)) if dc is None else dc
     used = np.flatnonzero(np.any(c, axis=1) | np.any(dc, axis=(0, 2)))
-    # Without corrections of the counts, as few pseudo-pixels as there are rows say the same.
-    z = block.counts[None, rows] if used.tolist() == [0] else block.z[used][:, rows]
-    sigma, noise = moments.sigma[rows], block.noise[rows][:, used][:, :, used]
-    part = Projected(
-        (z / sigma[:, None])[None],
-        (noise / (sigma**2)[:, None, None])[None],
-        a[None, rows],
-        c[used][:, rows],
-        used >= len(FEATURES) - DERIVATIVES,
-    )
-    slopes = da[:, None, rows], dc[:, used][:, :, rows]
-    add_parts(part, *slopes, moments, rows, np.array([float(block.pixels)]), block.fold, out)
+    around = used >= len(FEATURES) - DERIVATIVES
+    for rows in [block.rows[None]] if apart is None else _by_state(block.rows, apart):
+        # Without corrections of the counts, as few pseudo-pixels as there are rows say the same.
+        z = block.counts[None, rows] if used.tolist() == [0] else block.z[used][:, rows]
+        sigma, noise = moments.sigma[rows], block.noise[rows][:, :, used][..., used]
+        part = Projected(
+            z.swapaxes(0, 1) / sigma[:, None, :, None],
+            noise / (sigma**2)[:, :, None, None],
+            a[rows],
+            c[used][:, rows].swapaxes(0, 1),
+            around,
+        )
+        slopes = da[:, rows], dc[:, used][:, :, rows].swapaxes(1, 2)
+        add_parts(part, *slopes, moments, rows, np.full(len(rows), float(block.pixels)), block.fold, out)
+
+
+def _by_state(rows: NDArray[np.int64], apart: int) -> list[NDArray[np.int64]]:
+    """Rows (T, n) of T states each, of states that have the same number n of them."""
+    _, first, number = np.unique(rows // apart, return_index=True, return_counts=True)
+    return [rows[first[number == n][:, None] + np.arange(n)] for n in np.unique(number)]
 
 
 class Projected:
@@ -73,7 +85,7 @@ class Projected:
     """
 
     def __init__(self, z: Array, noise: Array, a: Array, c: Array, around: NDArray[np.bool_]) -> None:
-        """z (T, F, L, R), noise (T, L, F, F), a (T, L, K), c (F, L); `around` (F,) features that are derivatives."""
+        """z (T, F, L, R), noise (T, L, F, F), a (T, L, K), c (T or 1, F, L); `around` (F,): which are derivatives."""
         rows = a.shape[1]
         u, size, vt = np.linalg.svd(a, full_matrices=False)
         keep = size > RANK * size[:, :1]
@@ -86,11 +98,11 @@ class Projected:
         if around.any():
             self._z = z.copy()
             self._z[:, around] = hat[:, None] @ z[:, around]
-        self._y = np.einsum("fl,tflr->tlr", c, self._z)
+        self._y = np.einsum("tfl,tflr->tlr", c, self._z)
         self.residual = self.outside @ self._y
         # What takes the noise of each feature to the rows, and the mean product of the residual's noise with it.
         takes = np.where(around[:, None], hat[:, :, None], np.eye(rows)[:, None])
-        onto = c.T[:, :, None] * takes
+        onto = c.swapaxes(1, 2)[..., None] * takes
         left = (self.outside @ onto.reshape(*hat.shape[:2], -1)).reshape(onto.shape)
         mean = (left.transpose(0, 3, 1, 2) @ noise).transpose(0, 2, 3, 1)
         self.expected = np.sum(mean * left, axis=(1, 2, 3))
@@ -100,16 +112,17 @@ class Projected:
     def slopes(self, da: Array, dc: Array) -> tuple[Array, Array, Array]:
         """Half gradient (K,) of the excess and of its noise, and curvature (K, K) of the excess, summed over the parts.
 
-        From dr = -P dA A+ y + P dB z.
+        Of da (K, T, L, K') and dc (K, T or 1, F, L); from dr = -P dA A+ y + P dB z.
         """
         da = self.outside @ da
         y = self._y.transpose(0, 2, 1)
-        pull = _flat(dc) @ self._of_features.sum(axis=0).T.reshape(-1)
+        of_features = self._of_features.swapaxes(1, 2)
+        pull = _flat(dc) @ (of_features.sum(axis=0) if dc.shape[1] == 1 else of_features).reshape(-1)
         pull -= _flat(da) @ (self._carried @ self._back).reshape(-1)
         gradient = -pull - _flat(da) @ (self.residual @ y @ self._back).reshape(-1)
         unknowns = y @ self._back
         curvature = _flat(da @ (unknowns.transpose(0, 2, 1) @ unknowns)) @ _flat(da).T
-        counted = np.flatnonzero(np.any(dc, axis=(1, 2)))
+        counted = np.flatnonzero(np.any(dc, axis=(1, 2, 3)))
         if counted.size:
             of_counts = np.stack([self.outside @ self._weighted(dc[j]) for j in counted])
             gradient[counted] += _flat(of_counts) @ self.residual.reshape(-1)
@@ -120,9 +133,9 @@ class Projected:
         return gradient, pull, curvature
 
     def _weighted(self, c: Array) -> Array:
-        """Sum (T, L, R) of the features, each times its coefficient (F, L)."""
-        used = np.flatnonzero(np.any(c, axis=1))
-        return np.asarray(np.einsum("fl,tflr->tlr", c[used], self._z[:, used]))
+        """Sum (T, L, R) of the features, each times its coefficient (T or 1, F, L)."""
+        used = np.flatnonzero(np.any(c, axis=(0, 2)))
+        return np.asarray(np.einsum("tfl,tflr->tlr", c[:, used], self._z[:, used]))
 
 
 def add_parts(
@@ -135,15 +148,16 @@ def add_parts(
     fold: int,
     out: Sums,
 ) -> None:
-    """Add what parts of one fold say, with derivatives of their `rows`: da (K, T, L, K'), dc (K, F, L).
+    """Add what parts of one fold say, with derivatives da (K, T, L, K') and dc (K, T or 1, F, L).
 
-    `pixels` (T,) : how many stand behind each.
+    `rows` (T or 1, L) : of each part; `pixels` (T,) : how many stand behind it.
     """
-    squares, left = np.sum(parts.residual**2, axis=(0, 2)), float(parts.expected.sum())
+    squares, left = np.sum(parts.residual**2, axis=2), float(parts.expected.sum())
+    free = pixels[:, None] * np.diagonal(parts.outside, axis1=1, axis2=2)
     out.excess[fold] += squares.sum() - left
     out.freedom[fold] += left
-    out.square[fold] += squares @ moments.sigma[rows] ** 2 * moments.relative
-    out.count[fold] += pixels @ np.diagonal(parts.outside, axis1=1, axis2=2) @ moments.left[rows]
+    out.square[fold] += np.sum(squares * moments.sigma[rows] ** 2) * moments.relative
+    out.count[fold] += np.sum(free * moments.left[rows])
     if len(da):
         gradient, stretch, curvature = parts.slopes(da, dc)
         out.gradient[fold] += gradient

@@ -45,11 +45,11 @@ def add_tiles(
     known, z, noise = features_of_tiles(data, tiles, asked.tolist())
     used, use = np.array(known), np.flatnonzero(moments.counts)
     sigma, around = moments.sigma[use], used >= len(FEATURES) - DERIVATIVES
-    c, dc = c[used][:, use], dc[:, used][:, :, use]
+    c, dc = c[None, used][:, :, use], dc[:, None, used][..., use]
     for fold in range(len(out.excess)):
         mine = np.flatnonzero(tiles.fold == fold)
         for some in np.split(mine, range(TOGETHER, mine.size, TOGETHER)):
             of_noise = noise[some][:, use] / (sigma**2)[:, None, None]
             part = Projected(z[some][:, :, use] / sigma[:, None], of_noise, a[some][:, use], c, around)
             slopes = da.take(some, axis=1).take(use, axis=2)
-            add_parts(part, slopes, dc, moments, use, tiles.pixels[some], fold, out)
+            add_parts(part, slopes, dc, moments, use[None], tiles.pixels[some], fold, out)

@@ -159,14 +159,26 @@ class WholeBench:
             for m in found.members[g]
             if isinstance(found.space.candidates[m].effect, ValuePerState)
         ]
-        doubted = sorted(per_state, key=lambda c: not isinstance(c.effect, SourceEffect))
-        out = set[Candidate]()
-        for k, data in enumerate(self.whole.captures):
+        kept: list[Candidate] = []
+        for candidate in sorted(per_state, key=lambda c: not isinstance(c.effect, SourceEffect)):
+            if all(self._has_room(where, [*kept, candidate]) for where in map(self._seen_by, [*kept, candidate])):
+                kept.append(candidate)
+        return set(per_state) - set(kept)
+
+    def _seen_by(self, candidate: Candidate) -> frozenset[int]:
+        return frozenset(k for k, nm in enumerate(self.whole.wavelengths_nm) if candidate.acts(k, nm))
+
+    def _has_room(self, captures: frozenset[int], values: Sequence[Candidate]) -> bool:
+        """Whether what acts on these captures alone is fewer values for each state than their pixels tell.
+
+        Angles that several captures share are told by all of them.
+        """
+        told = 0
+        for data in (self.whole.captures[k] for k in captures):
             if self.whole.noise_known and data.usable.sum() > 1:
-                continue
-            room = len(self.whole.model.channels) - 1 - (self.whole.model.free_source and data.sample is not None)
-            out |= set([c for c in doubted if c.acts(k, data.wavelength_nm)][room:])
-        return out
+                return True
+            told += len(self.whole.model.channels) - (self.whole.model.free_source and data.sample is not None)
+        return sum(self._seen_by(c) <= captures for c in values) < told
 
     def _posterior(
         self, candidates: Sequence[Candidate], fixed: Sequence[Candidate], old: Posterior | None = None

@@ -98,15 +98,15 @@ def _descend(
             step = np.zeros_like(x)
             step[move] = -np.linalg.solve(hm + damping * np.diag(np.diag(hm)), gm)
             tried = np.clip(x + step, lower, upper)
-            new = problem.sums(space, tried)
-            new_cost = new.excess[use].sum() + weak @ tried**2
+            # Derivatives are most of the work; a step that is refused needs none.
+            new_cost = problem.sums(space, tried, derivatives=False).excess[use].sum() + weak @ tried**2
             if new_cost <= cost or damping > 1e6:
                 break
             damping = max(damping * 10, 1e-4)
         if not new_cost <= cost:
             break
         gain = cost - new_cost
-        x, sums, cost = tried, new, new_cost
+        x, sums, cost = tried, problem.sums(space, tried), new_cost
         damping = max(damping / 10, 1e-9)
         if gain < least_gain + LEAST_RELATIVE * abs(cost):
             break
@@ -218,10 +218,11 @@ def _determined(curvature: Array, weak: Array, local: BoolArray) -> Array:
 
 
 def _count_values(space: Space, spent: Array, shares: Array) -> None:
-    """Values of single states take degrees of freedom of their capture away."""
+    """Values of single states take degrees of freedom of their capture away; what several share, of all alike."""
     for candidate, part in zip(space.candidates, space.slices, strict=True):
-        if isinstance(candidate.effect, ValuePerState) and candidate.capture is not None:
-            shares[candidate.capture, 1] -= spent[part].sum()
+        if isinstance(candidate.effect, ValuePerState):
+            mine = slice(None) if candidate.capture is None else candidate.capture
+            shares[mine, 1] -= spent[part].sum() / np.size(shares[mine, 1])
 
 
 def _in_sample(space: Space, full: Fit, weak: Array) -> HeldOut:

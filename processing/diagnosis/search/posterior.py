@@ -233,30 +233,31 @@ def descend(problem: Problem, space: Space, x: Array, weak: Array, steps: int = 
     """Values at the minimum of chi-square over its stretch, plus weak . x^2, near x (Levenberg-Marquardt, bounds)."""
     lower, upper = space.joined("lower"), space.joined("upper")
     problem.relinearize(space, x)
-    sums = problem.sums(space, x)
-    reference, damping = float(sums.freedom.sum()), 0.0
+    start = problem.sums(space, x, derivatives=False)
+    reference, damping = float(start.freedom.sum()), 0.0
 
     def cost(s: Sums, v: Array) -> float:
         freedom = max(float(s.freedom.sum()), 1e-300)
         return float(s.excess.sum() * reference / freedom + weak @ v**2)
 
-    least = cost(sums, x)
+    least = cost(start, x)
     for _ in range(steps):
+        sums = problem.sums(space, x)
         freedom = max(float(sums.freedom.sum()), 1e-300)
         g = sums.gradient.sum(axis=0) - sums.excess.sum() / freedom * sums.stretch.sum(axis=0) + weak * x
         h = sums.curvature.sum(axis=0) + np.diag(weak)
         for _ in range(8):
             move = np.linalg.solve(h + damping * np.diag(np.diag(h)), g)
             tried = np.where(space.fixed, x, np.clip(x - move, lower, upper))
-            new = problem.sums(space, tried)
-            now = cost(new, tried)
+            # Derivatives are most of the work; a step that is refused needs none.
+            now = cost(problem.sums(space, tried, derivatives=False), tried)
             if now <= least:
                 break
             damping = max(10 * damping, 1e-3)
         # Also where the sum is no number: so far away that the model has no intensities.
         if not now <= least:
             break
-        gain, x, sums, least, damping = least - now, tried, new, now, damping / 10
+        gain, x, least, damping = least - now, tried, now, damping / 10
         if gain < LEAST_GAIN + LEAST_RELATIVE * abs(least):
             break
     return x

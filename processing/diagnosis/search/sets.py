@@ -148,7 +148,9 @@ class Sets:
     def settled(self, state: State) -> State:
         """The state with the unit that goes with what it leaves."""
         for _ in range(4):
-            state.unit = self.noise.unit(self.fitted(state).left)
+            before, state.unit = state.unit, self.noise.unit(self._left(state))
+            if state.unit == before:
+                break
         return state
 
     def without(self, state: State, k: int) -> State:
@@ -188,12 +190,22 @@ class Sets:
         fit = self.fitted(State(state.tau, unit))
         return fit.score - self.noise.log_likelihood(fit.left) - 0.5 * fit.left / unit
 
+    def _left(self, state: State) -> float:
+        """Excess that a set leaves, what the prior takes included."""
+        active, _, lower = self._factored(state)
+        right = solve_triangular(lower, self.form.gradient[active], lower=True) if active.size else np.zeros(0)
+        return self.form.excess - float(right @ right) / state.unit
+
+    def _factored(self, state: State) -> tuple[NDArray[np.int64], Array, Array]:
+        """Parameters (A,) that are there, curvature (A,) of their prior, and the root (A, A) of the posterior one."""
+        on = np.flatnonzero(state.tau > 0)
+        active = np.concatenate([np.zeros(0, dtype=np.int64), *(self.groups[i].index for i in on)])
+        prior = np.concatenate([np.zeros(0), *(np.full(self.groups[i].index.size, state.tau[i] ** -2.0) for i in on)])
+        return active, prior, _root(self.form.curvature[np.ix_(active, active)] / state.unit + np.diag(prior))
+
     def _solved(self, state: State) -> tuple[Fitted, Array, Array]:
         u, tau = state.unit, state.tau
-        on = np.flatnonzero(tau > 0)
-        active = np.concatenate([np.zeros(0, dtype=np.int64), *(self.groups[i].index for i in on)])
-        prior = np.concatenate([np.zeros(0), *(np.full(self.groups[i].index.size, tau[i] ** -2.0) for i in on)])
-        lower = _root(self.form.curvature[np.ix_(active, active)] / u + np.diag(prior))
+        active, prior, lower = self._factored(state)
         inverse = solve_triangular(lower, np.eye(active.size), lower=True) if active.size else lower
         right = inverse @ self.form.gradient[active] / u
         left = self.form.excess - u * float(right @ right)

@@ -93,6 +93,7 @@ class Space:
     candidates: tuple[Candidate, ...]
     slices: tuple[slice, ...] = field(init=False)
     size: int = field(init=False)
+    _acting: dict[tuple[int, float], Acting] = field(init=False, repr=False, compare=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         start, slices = 0, []
@@ -108,6 +109,11 @@ class Space:
 
     def acting(self, capture: int, wavelength_nm: float) -> Acting:
         """What acts on a capture, and where its values stand in the common vector."""
+        if (capture, wavelength_nm) not in self._acting:
+            self._acting[capture, wavelength_nm] = self._of_capture(capture, wavelength_nm)
+        return self._acting[capture, wavelength_nm]
+
+    def _of_capture(self, capture: int, wavelength_nm: float) -> Acting:
         chosen = [k for k, c in enumerate(self.candidates) if c.acts(capture, wavelength_nm)]
         index = [np.zeros(0, dtype=np.int64), *(np.r_[self.slices[k]] for k in chosen)]
         mine = Space(tuple(self.candidates[k].at(wavelength_nm) for k in chosen))

@@ -177,6 +177,14 @@ def test_captures_that_tell_more_together_test_values_for_each_state():
     assert doubts.testable(problem, Some(before=Some(excess=0.0)), found, [found])
 
 
+def test_values_that_captures_share_count_once():
+    problem = Some(powers=lambda: [(36, np.ones(1))] * 3, noise_known=False, wavelengths_nm=(500.0, 600.0, 700.0))
+    shared = cause(2000.0, candidate=made(ValuePerState, 40))
+    shared = replace(shared, values=(np.full(40, 9.0),))
+    assert shared.candidates[0].capture is None
+    assert doubts.testable(problem, Some(before=Some(excess=0.0)), shared, [shared])
+
+
 def doubted(m: Patch, odds: float, known: bool, left: float) -> bool:
     m.setattr(doubts.NamelessWaves, "beside", lambda *of: None)
     found = Some(samples=Some(best=Some(unit=1.0)), sets=Some(noise=Some(directions=1.0)), members=())
