@@ -1,14 +1,17 @@
 """What reading compressed files costs where it is felt: each use of a capture and of its products, against plain ones.
 
-    python benchmarks/packed_uses.py CAPTURE.h5
+    python benchmarks/packed_uses.py CAPTURE.h5 [--folder FOLDER --cold]
 
 The capture is copied plain and compressed (`acquire compress`), its product of quantities is made plain
-(`UMOV_COMPRESS=0`) and as `process` writes it. Processor time of a use, median of the repeats, turn by turn; files in
-memory, where compression gains nothing. `view` is asked as a page asks, over HTTP, and another place at each turn.
+(`UMOV_COMPRESS=0`) and as `process` writes it. Whole commands first, as they are typed, then single steps; by the clock
+and of the processor, medians of the repeats, turn by turn. Files lie in memory, where compression gains nothing, or in
+a folder of a disc; `--cold` has the system forget their contents before each use. `view` is asked as a page asks, over
+HTTP, and another place at each turn.
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import shutil
@@ -31,44 +34,68 @@ REPEATS = 7
 KINDS = ("plain", "packed")
 
 
-def process(*words: object, compress: bool = True) -> None:
+#: Seconds by the clock and of the processor.
+Times = tuple[float, float]
+
+
+def process(*words: object, compress: bool = True) -> Times:
     """Run a command of `process`."""
+    start_s, before = time.perf_counter(), os.times()
     subprocess.run(
         [sys.executable, "-m", "processing.commands.application", *map(str, words)],
         env=os.environ | ({} if compress else {"UMOV_COMPRESS": "0"}),
         stdout=subprocess.DEVNULL,
         check=True,
     )
+    after = os.times()
+    used_s = after.children_user + after.children_system - before.children_user - before.children_system
+    return time.perf_counter() - start_s, used_s
 
 
-def reduce(path: Path) -> float:
-    """The work of `process reduce`, in this process; seconds of processor time."""
-    start_s = time.process_time()
-    reduce_to_dataset(path)
-    return time.process_time() - start_s
+def timed(work: Callable[[], object]) -> Times:
+    """How long something takes in this process."""
+    start_s, before_s = time.perf_counter(), time.process_time()
+    work()
+    return time.perf_counter() - start_s, time.process_time() - before_s
 
 
-def load(path: Path) -> float:
-    """All of a file's default group, by xarray and h5netcdf; seconds of processor time."""
-    start_s = time.process_time()
+def load(path: Path) -> None:
+    """All of a file's default group, by xarray and h5netcdf."""
     with xr.open_dataset(path, engine="h5netcdf", group="entry/data") as file:
         file.load()
-    return time.process_time() - start_s
 
 
-def told(use: str, times: dict[str, list[float]]) -> None:
-    """One line: milliseconds plain and packed, and their ratio."""
-    plain, packed = (1e3 * statistics.median(times[kind]) for kind in KINDS)
-    print(f"{use:<58} {plain:7.1f} ms {packed:7.1f} ms {packed / plain:6.2f}", flush=True)
+def forget(path: Path) -> None:
+    """Have the system forget what it keeps of a file in memory."""
+    file = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(file)
+        os.posix_fadvise(file, 0, 0, os.POSIX_FADV_DONTNEED)
+    finally:
+        os.close(file)
 
 
-def compare(use: str, work: Callable[[str, int], float], repeats: int = REPEATS) -> None:
-    """Time a use of either kind, turn by turn; once before, for what is kept or compiled."""
-    times: dict[str, list[float]] = {kind: [] for kind in KINDS}
-    for turn in range(repeats + 1):
-        for kind in KINDS:
-            times[kind].append(work(kind, turn))
-    told(use, {kind: of[1:] for kind, of in times.items()})
+class Comparison:
+    """Times uses of plain and packed files, turn by turn, and prints a line for each."""
+
+    def __init__(self, cold: bool) -> None:
+        self.cold = cold
+        print(f"{'':<46} {'by the clock':^26}  {'of the processor':^26}")
+        print(f"{'ms':<46}" + 2 * f" {'plain':>8} {'packed':>8} {'ratio':>8} ")
+
+    def of(self, use: str, files: dict[str, Path], work: Callable[[Path, int], Times], repeats: int = REPEATS) -> None:
+        """One use of either kind of file; once before, for what is kept or compiled."""
+        times: dict[str, list[Times]] = {kind: [] for kind in KINDS}
+        for turn in range(repeats + 1):
+            for kind in KINDS:
+                if self.cold:
+                    forget(files[kind])
+                times[kind].append(work(files[kind], turn))
+        line = f"{use:<46}"
+        for clock in (0, 1):
+            plain, packed = (1e3 * statistics.median(one[clock] for one in times[kind][1:]) for kind in KINDS)
+            line += f" {plain:8.1f} {packed:8.1f} {packed / plain:8.2f} "
+        print(line, flush=True)
 
 
 def serve(folder: Path) -> tuple[subprocess.Popen[str], Server]:
@@ -81,31 +108,50 @@ def serve(folder: Path) -> tuple[subprocess.Popen[str], Server]:
     return running, Server(found[0].rstrip("/"), running.pid)
 
 
-def measure(folder: Path, captures: dict[str, Path], products: dict[str, Path]) -> None:
+def measure(folder: Path, captures: dict[str, Path], products: dict[str, Path], cold: bool) -> None:
     """Every use in turn."""
-    compare("reduction to a Mueller image", lambda kind, _: reduce(captures[kind]), 3)
-    compare("all frames, by xarray", lambda kind, _: load(captures[kind]))
-    compare("all planes of the quantities, by xarray", lambda kind, _: load(products[kind]))
+    compare = Comparison(cold).of
+    out = folder / "out"
+    compare(
+        "process reduce", captures, lambda path, _: process("reduce", path, "--overwrite", "--out", out / "image.h5"), 3
+    )
+    compare(
+        "process report of the quantities",
+        products,
+        lambda path, _: process("report", path, "--overwrite", "--out", out / "r.html"),
+        3,
+    )
+    compare(
+        "reduction alone, without start and figure", captures, lambda path, _: timed(lambda: reduce_to_dataset(path))
+    )
+    compare("all frames, by xarray", captures, lambda path, _: timed(lambda: load(path)))
+    compare("all planes of the quantities, by xarray", products, lambda path, _: timed(lambda: load(path)))
     with h5py.File(captures["plain"]) as h5:
         rows, columns = h5["entry/instrument/detector/data"].shape[-2:]
     running, server = serve(folder)
+    # The clock of another process counts in steps of 10 ms; a file that is forgotten is so for one question.
+    questions = 1 if cold else 10
     try:
 
-        def ask(address: str, files: dict[str, Path]) -> Callable[[str, int], float]:
-            def once(kind: str, turn: int) -> float:
-                place = {"state": turn + 4, "x": 97 * turn % columns, "y": 131 * turn % rows}
-                # The clock of a process counts in steps of 10 ms.
-                before_s = server.used_s()
-                for again in range(10):
-                    here = place | {"y": (place["y"] + 37 * again) % rows}
-                    server.asked(address.format(file=files[kind].name, **here))
-                return (server.used_s() - before_s) / 10
+        def ask(address: str) -> Callable[[Path, int], Times]:
+            def once(path: Path, turn: int) -> Times:
+                start_s, before_s = time.perf_counter(), server.used_s()
+                for again in range(questions):
+                    x, y = 97 * turn % columns, (131 * turn + 37 * again) % rows
+                    server.asked(address.format(file=path.name, state=turn + 4, x=x, y=y))
+                return (time.perf_counter() - start_s) / questions, (server.used_s() - before_s) / questions
 
             return once
 
-        compare("view: a frame", ask("frame?file={file}&state={state}&most=700", captures))
-        compare("view: a pixel's curve, another place each time", ask("curve?file={file}&x0={x}&y0={y}", captures))
-        compare("view: a pixel's values of the quantities", ask("probe?file={file}&x0={x}&y0={y}", products))
+        compare("view: a page of a capture", captures, ask("capture?file={file}"))
+        compare("view: a frame", captures, ask("frame?file={file}&state={state}&most=700"))
+        compare(
+            "view: a plane of the quantities",
+            products,
+            ask("plane?file={file}&name=depolarization_index&most=700"),
+        )
+        compare("view: a pixel's curve", captures, ask("curve?file={file}&x0={x}&y0={y}"))
+        compare("view: a pixel's values of the quantities", products, ask("probe?file={file}&x0={x}&y0={y}"))
     finally:
         running.terminate()
         running.wait()
@@ -113,11 +159,17 @@ def measure(folder: Path, captures: dict[str, Path], products: dict[str, Path]) 
 
 def main() -> None:
     """Make both kinds of each file, and measure."""
-    with tempfile.TemporaryDirectory(dir="/dev/shm") as name:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("--folder", type=Path, default=Path("/dev/shm"))
+    parser.add_argument("--cold", action="store_true")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(dir=options.folder) as name:
         folder = Path(name)
+        (folder / "out").mkdir()
         captures = {kind: folder / f"{kind}.h5" for kind in KINDS}
         for path in captures.values():
-            shutil.copy(sys.argv[1], path)
+            shutil.copy(options.capture, path)
         pack_capture(captures["packed"])
         products = {kind: folder / f"{kind}.quantities.h5" for kind in KINDS}
         process("reduce", captures["plain"], "--out", folder / "image.h5")
@@ -126,8 +178,7 @@ def main() -> None:
         for what, files in (("capture", captures), ("quantities", products)):
             sizes = [path.stat().st_size / 1e6 for path in files.values()]
             print(f"{what}: {sizes[0]:.1f} MB plain, {sizes[1]:.1f} MB compressed")
-        print(f"{'processor time':<58} {'plain':>10} {'packed':>10}  ratio")
-        measure(folder, captures, products)
+        measure(folder, captures, products, options.cold)
 
 
 if __name__ == "__main__":

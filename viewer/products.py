@@ -11,6 +11,7 @@ from starlette.responses import HTMLResponse, Response
 
 from processing.errors import ProcessError
 from processing.reports.colours import ALL, LIGHT, SIGNED, Scale, scale_of, steps
+from processing.reports.fact_words import fact_words
 from processing.storage.product import LIT_ERRORS, Product
 from processing.storage.provenance import steps_text
 from viewer.frames import others
@@ -29,7 +30,7 @@ def product(request: Request) -> HTMLResponse:
     entry, entries = library.entry(library.name(path)), library.entries()
     with Product(path) as opened:
         maps = maps_of(opened)
-        facts = [(name.replace("_", " "), _shown(v)) for name, v in opened.facts.items() if name != "warnings"]
+        facts = [(name.replace("_", " "), fact_words(v)) for name, v in opened.facts.items() if name != "warnings"]
         provenance = steps_text(opened.steps)
         shape, kind = opened.shape, opened.kind
     return pages.draw(
@@ -48,16 +49,6 @@ def product(request: Request) -> HTMLResponse:
         made=[(e, pages.shown_at(e)) for e in made_into(entry, entries, library.root)],
         others=others(entry, entries),
     )
-
-
-def _shown(value: Any) -> str:
-    if isinstance(value, dict):
-        return ", ".join(f"{name.replace('_', ' ')} {_shown(one)}" for name, one in value.items())
-    if value is None:
-        return "not known"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
 def maps_of(opened: Product) -> list[dict[str, Any]]:

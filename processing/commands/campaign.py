@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from processing.whole_file import whole_file
+
 if TYPE_CHECKING:
     from processing.campaign.run import CampaignResult
 
@@ -45,7 +47,8 @@ def campaign_command(
     with executor(workers, scheduler) as pool, progress_bar("campaign", "captures") as tick:
         result = step.run(pool, tick)
     write_csv(result, target / "campaign.csv")
-    campaign_figure(result, folder.name).savefig(target / "campaign.png", dpi=150)
+    with whole_file(target / "campaign.png") as new:
+        campaign_figure(result, folder.name).savefig(new, dpi=150)
     if result.simulated:
         typer.echo("SIMULATED data")
     typer.echo("\n".join(lines(result)))
@@ -100,7 +103,7 @@ def write_csv(result: CampaignResult, path: Path) -> None:
     import csv
     from dataclasses import asdict
 
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with whole_file(path) as new, new.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=list(asdict(result.rows[0])))
         writer.writeheader()
         writer.writerows(asdict(row) for row in result.rows)

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from processing.whole_file import write_whole_text
+
 if TYPE_CHECKING:
     from processing.calibration.state_design import Noise, Score
     from processing.instrument.model import InstrumentModel
@@ -188,8 +190,8 @@ def _write(table: StateTable, path: Path, wavelength_nm: float) -> None:
         lines = ["kind: plan", *light, "states:", "  kind: table", "  angles:"]
         for name in names:
             lines.append(f"    {name}: [{', '.join(f'{angle:.4f}' for angle in table.angles_deg[name])}]")
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        write_whole_text(path, "\n".join(lines) + "\n")
         return
     lines = [",".join(names)]
     lines += [",".join(f"{table.angles_deg[name][k]:.6f}" for name in names) for k in range(len(table))]
-    path.write_text("\n".join(lines) + "\n")
+    write_whole_text(path, "\n".join(lines) + "\n")

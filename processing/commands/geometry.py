@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from processing.whole_file import write_whole_text
+
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
@@ -38,7 +40,7 @@ def camera_pose_command(
     result = calibrate(
         [(str(p), read_grey(p)) for p in images], board, pixel_mm, None if at_centre is None else str(at_centre)
     )
-    out.write_text(dump_yaml(result.camera), encoding="utf-8")
+    write_whole_text(out, dump_yaml(result.camera))
     camera = result.camera
     typer.echo(f"  images used: {len(result.used)} of {len(images)}")
     typer.echo(f"  reprojection error: {result.residual_px:.3f} pixels rms")
@@ -89,5 +91,5 @@ def register_command(
             f"{circle.column_stderr:.2f}; radius {circle.radius:.2f} +- {circle.radius_stderr:.2f} pixels"
         )
         typer.echo(f"  {100 * circle.arc:.0f} % of the outline seen")
-    out.write_text(dump_yaml(view), encoding="utf-8")
+    write_whole_text(out, dump_yaml(view))
     typer.echo(str(out))

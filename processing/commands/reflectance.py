@@ -11,6 +11,7 @@ from processing.commands.drawing import FigureFile, NoFigure, draw
 from processing.commands.product_options import Overwrite, ProductFile
 from processing.commands.reduce import reduced_source
 from processing.commands.summary import summary
+from processing.whole_file import whole_file
 
 
 def register(app: typer.Typer) -> None:
@@ -54,7 +55,8 @@ def design_command(
                 f"{p.omega_deg[worst]:g}), pixels lost there {100 * p.lost[worst]:.0f} %"
             )
         typer.echo(f"  recommended: {ranked[nm][0].name}")
-    stokes_design_figure(ranked).savefig(figure, dpi=150)
+    with whole_file(figure) as new:
+        stokes_design_figure(ranked).savefig(new, dpi=150)
     typer.echo(str(figure))
 
 

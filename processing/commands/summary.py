@@ -7,6 +7,8 @@ from typing import Any
 
 import typer
 
+from processing.reports.fact_words import fact_words
+
 #: Endings of the names of facts that are standard errors of other facts.
 ERRORS = ("_error", "_stderr")
 
@@ -21,18 +23,10 @@ def summary(product: Path) -> None:
         typer.echo("SIMULATED data")
     for name, value in facts.items():
         if name not in ("warnings", "masked") and not name.endswith(ERRORS):
-            typer.echo(f"  {name.replace('_', ' ')}: {_shown(value)}{_with_error(name, facts)}")
+            typer.echo(f"  {name.replace('_', ' ')}: {fact_words(value)}{_with_error(name, facts)}")
     for warning in facts["warnings"]:
         typer.echo(f"warning: {warning}", err=True)
     typer.echo(str(product))
-
-
-def _shown(value: Any) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if value is None or value != value:
-        return "none"
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
 def _with_error(name: str, facts: dict[str, Any]) -> str:

@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from processing.whole_file import whole_file
+
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
@@ -83,7 +85,8 @@ def compare_command(
             continue
         xi0, noise = found["xi0_percent"], found["xi0_noise_percent"]
         typer.echo(f"  {angle:5g} {xi0:9.3f} {noise:10.3f} {found['common']:9.3f}")
-    tables_figure(a, b, view, angles[0], (size, size)).savefig(figure, dpi=150)
+    with whole_file(figure) as new:
+        tables_figure(a, b, view, angles[0], (size, size)).savefig(new, dpi=150)
     typer.echo(str(figure))
 
 

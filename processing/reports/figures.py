@@ -22,6 +22,7 @@ from processing.reports.figure_style import (
 )
 from processing.reports.quantities_figures import quantities_figure
 from processing.storage.product import LIT_ERRORS, Product
+from processing.whole_file import whole_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,7 +41,8 @@ def draw_product(path: Path, figure: Path) -> None:
     with Product(path) as product:
         drawn = product_figure(product)
     try:
-        drawn.savefig(figure, dpi=150)
+        with whole_file(figure) as new:
+            drawn.savefig(new, dpi=150)
     except (ValueError, OSError) as error:
         raise ProcessError(f"figure {figure} cannot be written: {error}") from error
 

@@ -18,6 +18,7 @@ from processing.doors import read_text, require_file, require_place
 from processing.errors import ProcessError
 from processing.reflectance.tables import ScatteringTable, is_table
 from processing.reports.capture_facts import facts_of, papers_of
+from processing.reports.fact_words import fact_words
 from processing.reports.figure_style import map_figure, png, thin
 from processing.reports.figures import product_figure
 from processing.reports.mueller_maps import mueller_maps
@@ -27,6 +28,7 @@ from processing.storage.capture import Capture, CaptureError
 from processing.storage.h5_door import DAMAGE
 from processing.storage.product import Product, is_product
 from processing.storage.provenance import read_steps, steps_text
+from processing.whole_file import write_whole_text
 
 #: File types that a report takes in.
 PICTURES = (".png", ".svg")
@@ -106,7 +108,7 @@ def write_report(
         if progress:
             progress(count, len(files))
     made = f"Made by umov {version('umov')} on {datetime.now(UTC).isoformat(timespec='seconds')}, {len(files)} files."
-    out.write_text(render(title, simulated, made, sections), encoding="utf-8")
+    write_whole_text(out, render(title, simulated, made, sections))
     return out
 
 
@@ -192,7 +194,7 @@ def _product(path: Path) -> Section:
     with Product(path) as product:
         facts = {k: v for k, v in product.facts.items() if k not in ("warnings", "masked")}
         summary = [("kind", f"{product.kind} image, {'simulated' if product.simulated else 'measured'}")]
-        summary += [(name.replace("_", " "), _shown(value)) for name, value in facts.items()]
+        summary += [(name.replace("_", " "), fact_words(value)) for name, value in facts.items()]
         figures = []
         # A kind without a figure is reported by its numbers.
         with suppress(ProcessError):
@@ -232,18 +234,12 @@ def _rounded(cell: str) -> str:
 
 
 def _pairs(values: dict[str, Any]) -> list[tuple[str, str]]:
-    return [("", ""), *((_label(name), _shown(value)) for name, value in values.items())]
+    return [("", ""), *((_label(name), fact_words(value)) for name, value in values.items())]
 
 
 def _label(name: str) -> str:
     words = name.removesuffix("_s").replace("_", " ")
     return f"{words} / s" if name.endswith("_s") else words
-
-
-def _shown(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.5g}"
-    return "not known" if value is None else str(value)
 
 
 def _media_type(path: Path) -> str:

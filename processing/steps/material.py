@@ -11,6 +11,7 @@ from processing.reflectance.material_fit import MaterialFit
 from processing.steps.file_step import OfFiles
 from processing.steps.maps import geometry_identities
 from processing.storage.provenance import Step, file_identity, input_text
+from processing.whole_file import write_whole_text
 from processing.yaml_file import dump_yaml
 
 
@@ -30,7 +31,7 @@ class FittedMaterial:
         sources = [Path(i["path"]).name for i in self.record.inputs if i["role"] == "source"]
         notes = [*self.fit.notes(sources), *map(input_text, self.record.inputs), f"made of {self.record.made_of}"]
         header = "".join(f"# {note}\n" for note in notes)
-        out.write_text(header + dump_yaml(self.fit.model(self.name, self.wavelength_nm)), encoding="utf-8")
+        write_whole_text(out, header + dump_yaml(self.fit.model(self.name, self.wavelength_nm)))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,10 @@ import pytest
 import xarray as xr
 
 from acquisition.capture.state_file import StateFile
+from processing.commands.application import main
+from processing.geometry.rusinkiewicz import Angles
 from processing.labelled import open_dataset
+from processing.reflectance.tables import ScatteringTable
 from processing.steps.reduction import Reduction
 from processing.storage.capture import Capture
 from processing.storage.capture_schema import CaptureHeader
@@ -169,7 +172,6 @@ def test_compressed_planes_are_plain_deflate_and_read_the_same(tmp_path):
 @pytest.fixture
 def exported(product, capture, tmp_path, capsys):
     """Runs `process export`; the files it names."""
-    from processing.commands.application import main
 
     def run(which: str, *options: str) -> list[Path]:
         capsys.readouterr()
@@ -219,6 +221,41 @@ def test_exported_tables_read_back_exactly(exported, product, capture):
     assert [float(line.split(",")[at]) for line in lines[1:]] == list(open_dataset(capture)["psa_deg"].values)
 
 
+def test_an_exported_scattering_table_reads_back_exactly(tmp_path, capsys):
+    rng = np.random.default_rng(5)
+    table = ScatteringTable(("xi0", "xi0_variance"), 662, "renderer", simulated=True)
+    angles = Angles(*(rng.uniform(0, most, 400) for most in (0.5, 1.2, 3.0)))
+    table.add(angles, rng.normal(0.8, 0.05, (2, 400)))
+    table.add(Angles(*(angle[:200] for angle in angles)), rng.normal(0.8, 0.05, (2, 200)))
+    table.save(tmp_path / "table.h5")
+    assert _process("export", tmp_path / "table.h5", "--to", "csv") == 0
+    path = tmp_path / "table.csv"
+    assert capsys.readouterr().out.split() == [str(path)]
+    assert "# simulated: True\n" in path.read_text()
+    read = pandas.read_csv(path, comment="#")
+    assert [*read.columns] == [
+        "theta_h_deg", "theta_d_deg", "phi_d_deg", "samples",
+        "xi0", "xi0_sample_variance", "xi0_variance", "xi0_variance_sample_variance",
+    ]  # fmt: skip
+    there = Angles(*(np.deg2rad(read[name]) for name in ("theta_h_deg", "theta_d_deg", "phi_d_deg")))
+    assert len(read) == table.bins.size
+    np.testing.assert_array_equal(table.counts(there), read["samples"])
+    np.testing.assert_array_equal(table.lookup(there), [read["xi0"], read["xi0_variance"]])
+    order = np.argsort(table.bins)
+    np.testing.assert_array_equal(table.variance[:, order][0], read["xi0_sample_variance"])
+
+    assert _process("export", tmp_path / "table.h5", "--to", "csv", "--plane", "xi1", "--overwrite") == 2
+    assert "has no 'xi1'; it has: xi0, xi0_variance" in capsys.readouterr().err
+    assert _process("export", tmp_path / "table.h5", "--to", "fits") == 2
+    assert "is a scattering table: it goes into csv" in capsys.readouterr().err
+
+
+def _process(*words):
+    with pytest.raises(SystemExit) as end:
+        main([str(word) for word in words])
+    return end.value.code or 0
+
+
 def test_exported_maps_have_the_colours_of_the_reports(exported, monkeypatch):
     from matplotlib.figure import Figure
 
@@ -240,8 +277,6 @@ def test_a_mueller_image_alone_is_exported_as_its_own_figure(exported, tmp_path)
 
 
 def test_figures_are_written_and_nothing_is_replaced(exported, product, tmp_path, capsys):
-    from processing.commands.application import main
-
     path = exported("product", "--to", "pdf", "--plane", "mueller_errors")[0]
     assert path.read_bytes().startswith(b"%PDF")
     for options, told in (

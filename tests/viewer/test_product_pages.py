@@ -1,6 +1,7 @@
 """Maps of products in the colours of print, and files held against each other."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -8,7 +9,8 @@ import pytest
 from processing.reports.colours import colours_of, scale_of
 from processing.steps.maps import Quantities
 from processing.steps.reduction import Reduction
-from processing.storage.product import Product
+from processing.storage.capture_schema import CaptureHeader, Detector
+from processing.storage.product import Plane, Product, ProductWriter
 
 
 def plane(answer):
@@ -124,3 +126,13 @@ def test_a_capture_and_a_product_are_not_compared(client, products):
     answer = client.get("/compare", params={"a": "one.h5", "b": "one.mueller.h5"}, headers={"accept": "text/html"})
     assert answer.status_code == 422
     assert "nothing in common" in answer.text
+
+
+def test_a_fact_without_a_value_reads_as_on_the_console(client, lab):
+    header = CaptureHeader(title="", simulated=True, mode="drr", wavelength_nm=662, detector=Detector())
+    with ProductWriter(lab / "p.h5", "mueller", header, (2, 3), {"valid": Plane((), "", "v", "u1")}, ()) as writer:
+        writer.write(slice(0, 2), valid=np.ones((2, 3), np.uint8))
+        writer.seal({"warnings": [], "median_reduced_chi_square": float("nan"), "darks": None})
+    page = client.get("product?file=p.h5").text
+    assert re.search(r"median reduced chi square</t[hd]>\s*<td[^>]*>none</td>", page)
+    assert re.search(r"darks</t[hd]>\s*<td[^>]*>none</td>", page)

@@ -14,9 +14,10 @@ from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.judge import SurfaceJudged
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.diagnosis.surface.quantities import dominant_errors, quantities
-from processing.errors import ProcessError
+from processing.doors import require_new
 from processing.reports.colours import SIGNED
 from processing.reports.template import Figure, Section, render
+from processing.whole_file import write_whole_text
 
 
 def write_surface_report(path: Path, judged: SurfaceJudged, problem: SurfaceProblem) -> None:
@@ -68,11 +69,8 @@ def write_surface_report(path: Path, judged: SurfaceJudged, problem: SurfaceProb
             figures.append(Figure(_png(dominant_figure(judged, problem, k)), caption))
         sections.append(Section(capture.name, facts, figures))
     title = f"diagnose: {d.material} with {d.instrument}"
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(render(title, d.simulated, f"{d.wavelengths_nm[0]:g} nm", sections))
-    except FileExistsError as error:
-        raise ProcessError(f"{path} exists and is not replaced. Give another --report.") from error
+    require_new(path)
+    write_whole_text(path, render(title, d.simulated, f"{d.wavelengths_nm[0]:g} nm", sections))
 
 
 def residual_figure(judged: SurfaceJudged, problem: SurfaceProblem, k: int) -> Any:

@@ -1,0 +1,56 @@
+"""A scattering table as text: a row for each bin that has samples."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from processing.doors import require_place
+from processing.errors import ProcessError
+from processing.export.csv_file import write_csv
+from processing.reflectance.tables import ScatteringTable
+
+#: Of the columns before the quantities.
+ANGLES = ("theta_h_deg", "theta_d_deg", "phi_d_deg")
+
+
+def table_to_csv(source: Path, out: Path, quantities: Sequence[str] = (), overwrite: bool = False) -> list[Path]:
+    """Write a table of `process table` as CSV; returns the file.
+
+    The centre of each bin in degrees, the number of its samples, then of each quantity the mean and the variance of
+    the samples; the variance of a single one is nan.
+
+    Parameters
+    ----------
+    quantities : some of those in the table; all by default.
+
+    Raises
+    ------
+    ProcessError
+        The file exists, or the table has no quantity of a name.
+    """
+    path = out.with_name(f"{out.name}.csv")
+    require_place(path, overwrite)
+    table = ScatteringTable.load(source)
+    unknown = [name for name in quantities if name not in table.quantities]
+    if unknown:
+        raise ProcessError(f"{source} has no {unknown[0]!r}; it has: {', '.join(table.quantities)}")
+    # In the order of the axes, not in that of the first samples.
+    order = np.argsort(table.bins)
+    centres = table.axes.angles(table.bins[order])
+    columns = {name: np.rad2deg(angle).round(9) for name, angle in zip(ANGLES, centres, strict=True)}
+    columns["samples"] = table.count[order]
+    mean, variance = table.mean[:, order], table.variance[:, order]
+    for k, name in enumerate(table.quantities):
+        if not quantities or name in quantities:
+            columns[name], columns[f"{name}_sample_variance"] = mean[k], variance[k]
+    facts = {
+        "wavelength_nm": table.wavelength_nm,
+        "simulated": table.simulated,
+        "layout": table.axes.layout,
+        "frames": table.frames or "none: scalars",
+    }
+    write_csv(path, facts, dict.fromkeys(ANGLES, "degree"), columns)
+    return [path]

@@ -1,0 +1,75 @@
+"""On a full disc nothing is left of a report or an export, and what was there is as it was."""
+
+import resource
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from processing.commands.application import main
+from processing.storage.capture_schema import CaptureHeader, Detector
+from processing.storage.product import Plane, ProductWriter
+from processing.whole_file import write_whole_text
+
+SHAPE = (20, 30)
+WRITERS = {
+    **{to: ("export", "--to", to) for to in ("csv", "tiff", "mat", "fits", "png", "pdf")},
+    "html": ("report",),
+}
+ENDINGS = {"tiff": ".mueller.tif"}
+
+
+@pytest.fixture(scope="module")
+def product(tmp_path_factory):
+    header = CaptureHeader(
+        title="noise", simulated=True, mode="drr", wavelength_nm=662, detector=Detector(), channels=("camera",)
+    )
+    values = np.random.default_rng(1).normal(1000, 1, (4, 4, *SHAPE)).astype(np.float32)
+    planes = {"mueller": Plane((4, 4), "count", "M"), "mueller_errors": Plane((4, 4), "count", "its errors")}
+    path = tmp_path_factory.mktemp("product") / "image.h5"
+    with ProductWriter(path, "mueller", header, SHAPE, planes, ()) as writer:
+        writer.write(slice(0, SHAPE[0]), mueller=values, mueller_errors=values * 0 + 1)
+        return writer.seal({"warnings": []})
+
+
+@contextmanager
+def full_disc(most_bytes=1000):
+    """Files of this process cannot grow further: what a full disc looks like to it."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize(("kind", "there"), [*((kind, False) for kind in WRITERS), ("csv", True), ("html", True)])
+def test_a_full_disc_leaves_nothing_half(product, kind, there, tmp_path, capsys):
+    command, *options = WRITERS[kind]
+    out = tmp_path / f"out{ENDINGS.get(kind, f'.{kind}')}"
+    planes = [] if kind in ("html", "png", "pdf") else ["--plane", "mueller"]
+    if there:
+        out.write_text("of yesterday")
+    words = [command, str(product), *options, *planes, "--out", str(tmp_path / f"out.{kind}"), "--overwrite"]
+    with full_disc(), pytest.raises(SystemExit) as end:
+        main(words)
+    assert end.value.code == 1
+    assert "File too large" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ([out.name] if there else [])
+    if there:
+        assert out.read_text() == "of yesterday"
+    with pytest.raises(SystemExit) as end:
+        main(words)
+    assert end.value.code in (0, None)
+    assert out.stat().st_size > 1000
+
+
+def test_a_link_stays_a_link_and_a_pipe_is_written_to(tmp_path):
+    (tmp_path / "target.txt").write_text("old")
+    (tmp_path / "link.txt").symlink_to("target.txt")
+    write_whole_text(tmp_path / "link.txt", "new")
+    assert (tmp_path / "link.txt").is_symlink()
+    assert (tmp_path / "target.txt").read_text() == "new"
+    write_whole_text(Path("/dev/null"), "gone")
+    assert Path("/dev/null").is_char_device()
