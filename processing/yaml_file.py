@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 from collections.abc import Iterable, Iterator, Sequence
@@ -130,10 +131,8 @@ def _refusal(source: str, lines: list[str]) -> ConfigError:
 def _tree(text: str, source: str) -> CommentedMap:
     if len(text) > MOST_BYTES:
         raise ConfigError(f"{source}: {len(text):,} characters; at most {MOST_BYTES:,} are read")
-    yaml = YAML(typ="rt")
-    yaml.Composer = _BoundedComposer
     try:
-        tree = yaml.load(text)
+        tree = _parsed(text)
     except MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else "?"
         what = "a tab; YAML is indented with spaces" if "'\\t'" in str(error.problem) else one_line(error.problem)
@@ -144,6 +143,14 @@ def _tree(text: str, source: str) -> CommentedMap:
     if not isinstance(tree, CommentedMap):
         raise ConfigError(f"{source}: expected keys and values at the top level, found {type(tree).__name__}")
     return tree
+
+
+@functools.lru_cache(maxsize=64)
+def _parsed(text: str) -> Any:
+    """The tree of a text, which nobody changes: a campaign reads its few files at every capture."""
+    yaml = YAML(typ="rt")
+    yaml.Composer = _BoundedComposer
+    return yaml.load(text)
 
 
 def named_files(path: Path) -> Iterator[tuple[str, Path]]:
