@@ -122,6 +122,7 @@ class Scene:
 
 
 SHORT = CameraSettings(exposure_s=1e-3)
+LONG = CameraSettings(exposure_s=1.0)
 
 
 class CameraConformance:
@@ -304,6 +305,8 @@ class CameraConformance:
         self, scene: Scene, twin: CameraTwin, camera: Camera
     ) -> None:
         camera.capture(2)
+        # Long enough for the camera to vanish before its end on any machine.
+        camera.configure(LONG)
         exposure = camera.trigger()
         twin.vanish()
         gone_s = patient_clock().now_s()
