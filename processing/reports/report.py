@@ -10,7 +10,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,7 +24,7 @@ from processing.reports.mueller_maps import mueller_maps
 from processing.reports.tables import table_section
 from processing.reports.template import Figure, Section, render
 from processing.storage.capture import Capture, CaptureError
-from processing.storage.h5_door import DAMAGE
+from processing.storage.h5_door import DAMAGE, open_h5
 from processing.storage.product import Product, is_product
 from processing.storage.provenance import read_steps, steps_text
 from processing.whole_file import write_whole_text
@@ -70,11 +69,11 @@ def collect(sources: Sequence[Path]) -> list[Path]:
 def _date(path: Path) -> str:
     # As the file itself says (ISO 8601), so that copies keep their order.
     try:
-        with h5py.File(path, "r") as h5:
+        with open_h5(path, ProcessError) as h5:
             steps = read_steps(h5.get("entry", h5))
             started = h5.get("entry/start_time")
             return steps[-1].date if steps else "" if started is None else str(started.asstr()[()])
-    except DAMAGE:
+    except (ProcessError, *DAMAGE):
         # Its section says what is wrong with it.
         return ""
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from processing.doors import one_line, require_file
 from processing.errors import ProcessError
+from processing.storage.text_heaps import endless_heap
 
 #: What h5py and numpy raise over a damaged file, or one with other things in it than its marks promise.
 DAMAGE = (
@@ -29,6 +30,8 @@ MOST_RATIO = 1100
 def open_h5(path: Path, error: type[ProcessError], hint: str = "") -> h5py.File:
     """The file, open for reading. Raises `error` where it is not there or no HDF5; `hint` ends the message."""
     require_file(path, error)
+    if (heap := endless_heap(path)) is not None:
+        raise error(f"{path} cannot be read as HDF5: its texts at byte {heap:,} are damaged. {hint}".strip())
     try:
         return h5py.File(path, "r")
     except DAMAGE as why:
@@ -59,6 +62,8 @@ def mark_of(path: Path, name: str) -> Any:
     if not os.path.isfile(path):
         return None
     try:
+        if endless_heap(Path(path)) is not None:
+            return None
         with h5py.File(path, "r") as h5:
             return h5.attrs.get(name)
     except DAMAGE:

@@ -37,6 +37,7 @@ from processing.storage.packed import create_packed, pack, shrinks_to
 from processing.storage.provenance import Step as Step
 from processing.storage.provenance import file_identity as file_identity
 from processing.storage.provenance import jsonable, read_steps, sign, write_steps
+from processing.storage.text_heaps import endless_heap
 from processing.storage.unpacked import KeptChunks, read_rows
 
 PRODUCT_VERSION = 1
@@ -117,7 +118,7 @@ class ProductWriter(OpenH5):
             self._create()
 
     def _reopen(self) -> bool:
-        if not self._partial.exists():
+        if not self._partial.exists() or endless_heap(self._partial) is not None:
             return False
         try:
             h5 = h5py.File(self._partial, "r+")
