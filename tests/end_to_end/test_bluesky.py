@@ -154,6 +154,7 @@ def test_a_capture_of_40_states_is_paused_and_resumed(bench, engine, tmp_path):
 @pytest.fixture
 def tiled(engine, tmp_path):
     """A client of a Tiled server that may read this test's folder and is told what the engine does."""
+    pytest.importorskip("tiled", reason="Tiled is not installed: .ci/tiled brings it and runs this")
     # Here, for they take seconds; what they import warns of what is deprecated elsewhere.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
