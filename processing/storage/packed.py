@@ -2,7 +2,8 @@
 
 bitshuffle with LZ4 is faster still, but files made with it open only where its plug-in is installed. HDF5's own
 deflate is several times slower than ISA-L's, which writes the same format; chunks are made here, on several threads,
-and put into the file as they are.
+and put into the file as they are. Of each value only those bytes are deflated that shrink: the last ones of a mantissa
+are noise, and go into the same stream as they are.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from struct import pack as in_bytes
 from typing import Any
 
 import h5py
@@ -23,20 +26,46 @@ from processing.computing.threads import thread_count
 CHUNK_PIXELS = 1 << 17
 #: Of deflate; higher ones gain 1 % here and cost a third of the speed.
 LEVEL = 1
-#: What a plane must shrink by to be worth unpacking at each reading: the mantissas of plain noise do not.
+#: What a plane must shrink by to be worth unpacking at each reading.
 WORTH = 1.3
-#: Chunks looked at to tell.
-SAMPLES = 6
+#: What the first (second, ...) bytes of all values must shrink by to be deflated.
+BYTE_WORTH = 1.2
+#: Strips that are looked at to tell, and pixels of each.
+SAMPLES, SAMPLE_PIXELS = 6, 1 << 14
+
+#: Of the stream (RFC 1950 and 1951): its head, for a window of 32 KiB; an empty last block; most bytes of a block that
+#: holds them as they are.
+HEAD, END, MOST_STORED = b"\x78\x01", b"\x01\x00\x00\xff\xff", 0xFFFF
 
 
-def shrinks_to(source: h5py.Dataset) -> int:
-    """Bytes that a dataset will have, from some of its chunks; all of them where packing is not worth it."""
-    size = int(source.size) * source.dtype.itemsize
-    chunk = chunk_shape(source.shape)
-    starts = list(_chunk_starts(source.shape, chunk))
-    blocks = [source[tuple(map(_span, start, chunk))] for start in starts[:: -(-len(starts) // SAMPLES)]]
-    ratio = sum(block.nbytes for block in blocks) / max(sum(len(_deflated(b, b.shape)) for b in blocks), 1)
-    return int(size / ratio) if ratio >= WORTH else size
+@dataclass(frozen=True)
+class Packing:
+    """How a dataset is packed, told from parts of it.
+
+    Attributes
+    ----------
+    ratio : how many times smaller it becomes.
+    deflated : for each byte of a value, whether it is deflated or stored as it is.
+    """
+
+    ratio: float
+    deflated: tuple[bool, ...]
+
+    @classmethod
+    def of(cls, source: h5py.Dataset) -> Packing:
+        """Deflate some strips of a dataset (leading..., rows, columns), byte by byte."""
+        itemsize = source.dtype.itemsize
+        blocks = [source[(*place, rows)] for place, rows in _samples(source.shape)]
+        size, packed = sum(block.size for block in blocks), np.zeros(itemsize)
+        for block in blocks:
+            packed += [len(isal_zlib.compress(plane.data, LEVEL)) for plane in _byte_planes(block)]
+        deflated = size / np.maximum(packed, 1) >= BYTE_WORTH
+        return cls(itemsize * size / max(float(np.where(deflated, packed, size).sum()), 1.0), tuple(deflated.tolist()))
+
+    @property
+    def is_worth_it(self) -> bool:
+        """Whether the dataset should be packed at all."""
+        return self.ratio >= WORTH
 
 
 def chunk_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
@@ -53,36 +82,70 @@ def create_packed(parent: h5py.Group, name: str, shape: tuple[int, ...], dtype: 
     )
 
 
-def pack(source: h5py.Dataset, target: h5py.Dataset) -> None:
-    """Copy every value of a dataset into one made by `create_packed`, some chunks at a time.
+def pack(source: h5py.Dataset, target: h5py.Dataset, packing: Packing | None = None) -> None:
+    """Copy every value of a dataset into one made by `create_packed`, an image at a time.
 
     Raises
     ------
     OSError
         The disc is full, or the source cannot be read.
     """
-    threads = thread_count()
-    starts = _chunk_starts(target.shape, target.chunks)
+    deflated = (packing or Packing.of(source)).deflated
+    height, threads = target.chunks[-2], thread_count()
+    # One reading of an image and one task for each thread cost less than those for each chunk.
+    parts = [part.tolist() for part in np.array_split(np.arange(0, target.shape[-2], height), threads) if part.size]
     with ThreadPoolExecutor(threads) as pool:
-        while batch := list(itertools.islice(starts, 4 * threads)):
-            blocks = [source[tuple(map(_span, start, target.chunks))] for start in batch]
-            for start, raw in zip(batch, pool.map(lambda block: _deflated(block, target.chunks), blocks), strict=True):
-                target.id.write_direct_chunk(start, raw)
+        for place in np.ndindex(target.shape[:-2]):
+            image = source[place]
+
+            def packed(tops: list[int], image: NDArray[Any] = image) -> list[bytes]:
+                return [_stream(image[top : top + height], height, deflated) for top in tops]
+
+            for tops, streams in zip(parts, pool.map(packed, parts), strict=True):
+                for top, raw in zip(tops, streams, strict=True):
+                    target.id.write_direct_chunk((*place, top, 0), raw)
 
 
-def _chunk_starts(shape: tuple[int, ...], chunk: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
-    return itertools.product(*(range(0, size, step) for size, step in zip(shape, chunk, strict=True)))
+def _samples(shape: tuple[int, ...]) -> Iterator[tuple[tuple[int, ...], slice]]:
+    """Strips of rows, from the middles of chunks that are spread over a dataset: index of the image, and rows."""
+    *leading, rows, columns = shape
+    chunk = chunk_shape(shape)[-2]
+    starts = list(itertools.product(np.ndindex(*leading), range(0, rows, chunk)))
+    for place, start in starts[:: -(-len(starts) // SAMPLES)]:
+        height = min(chunk, rows - start)
+        strip = min(max(SAMPLE_PIXELS // max(columns, 1), 1), height)
+        top = start + (height - strip) // 2
+        yield place, slice(top, top + strip)
 
 
-def _span(start: int, size: int) -> slice:
-    return slice(start, start + size)
+def _byte_planes(block: NDArray[Any]) -> NDArray[np.uint8]:
+    """The first bytes of all values, then all second bytes, ...: (bytes of a value, values)."""
+    whole = np.ascontiguousarray(block).reshape(-1).view(f"<u{block.itemsize}")
+    planes, shifted = np.empty((block.itemsize, block.size), np.uint8), np.empty_like(whole)
+    # Shifts and casts of whole numbers run in vector registers, copies of every n-th byte do not.
+    for k, plane in enumerate(planes):
+        np.copyto(plane, np.right_shift(whole, 8 * k, out=shifted) if k else whole, casting="unsafe")
+    return planes
 
 
-def _deflated(block: NDArray[Any], chunk: tuple[int, ...]) -> bytes:
-    """A chunk as HDF5 keeps it: first bytes of all values, then all second bytes, ..., deflated."""
-    if block.shape != chunk:
+def _stream(block: NDArray[Any], height: int, deflated: tuple[bool, ...]) -> bytes:
+    """A chunk (height, columns) as HDF5 keeps it, of a block that may have fewer rows: one zlib stream."""
+    if len(block) < height:
         # The last chunk of a plane is as large as the others in the file.
-        block = np.pad(block, [(0, whole - size) for whole, size in zip(chunk, block.shape, strict=True)])
-    by_value = np.ascontiguousarray(block).reshape(-1).view(np.uint8).reshape(-1, block.itemsize)
-    packed: bytes = isal_zlib.compress(np.ascontiguousarray(by_value.T).data, LEVEL)
-    return packed
+        block = np.pad(block, [(0, height - len(block)), (0, 0)])
+    planes, parts = _byte_planes(block), [HEAD]
+    deflater = isal_zlib.compressobj(LEVEL, isal_zlib.DEFLATED, -isal_zlib.MAX_WBITS)
+    for plane, shrinks in zip(planes, deflated, strict=True):
+        if shrinks:
+            # A full flush ends at a whole byte, and nothing after it refers to what was before.
+            parts += [deflater.compress(plane.data), deflater.flush(isal_zlib.Z_FULL_FLUSH)]
+        else:
+            parts += _stored(memoryview(plane))
+    return b"".join([*parts, END, in_bytes(">I", isal_zlib.adler32(planes.reshape(-1).data))])
+
+
+def _stored(raw: memoryview) -> Iterator[bytes | memoryview]:
+    for start in range(0, len(raw), MOST_STORED):
+        piece = raw[start : start + MOST_STORED]
+        yield in_bytes("<BHH", 0, len(piece), len(piece) ^ 0xFFFF)
+        yield piece

@@ -33,7 +33,7 @@ from processing.storage.h5_door import (
     text_attribute,
 )
 from processing.storage.nexus import PIXEL_AXES, add_group, add_scales, attach, declare, default_plot, describe_light
-from processing.storage.packed import create_packed, pack, shrinks_to
+from processing.storage.packed import Packing, create_packed, pack
 from processing.storage.provenance import Step as Step
 from processing.storage.provenance import file_identity as file_identity
 from processing.storage.provenance import jsonable, read_steps, sign, write_steps
@@ -216,20 +216,22 @@ class ProductWriter(OpenH5):
         if os.environ.get(COMPRESS_VARIABLE) == "0" or shutil.disk_usage(self._partial.parent).free < size:
             return None
         whole = self._h5["entry"]
-        saved = {
-            name: plane.nbytes - shrinks_to(plane) for name, plane in whole["data"].items() if name in self._planes
-        }
-        if sum(saved.values()) < WORTH_SAVING * size:
+        every = {name: Packing.of(plane) for name, plane in whole["data"].items() if name in self._planes}
+        packings = {name: packing for name, packing in every.items() if packing.is_worth_it}
+        saved = sum(whole["data"][name].nbytes * (1 - 1 / packing.ratio) for name, packing in packings.items())
+        if saved < WORTH_SAVING * size:
             return None
+
+        def create(data: h5py.Group, name: str, shape: tuple[int, ...], dtype: Any) -> h5py.Dataset:
+            return (create_packed if name in packings else _early)(data, name, shape, dtype)
+
         path = self._partial.with_name(self._partial.name + ".packed")
         with h5py.File(path, "w") as h5:
-            self._lay_out(
-                h5, lambda data, name, *of: create_packed(data, name, *of) if saved[name] else _early(data, name, *of)
-            )
+            self._lay_out(h5, create)
             entry = h5["entry"]
-            for name, saving in saved.items():
-                if saving:
-                    pack(whole["data"][name], entry["data"][name])
+            for name in self._planes:
+                if name in packings:
+                    pack(whole["data"][name], entry["data"][name], packings[name])
                 else:
                     entry["data"][name][...] = whole["data"][name][...]
             if "reduction" in whole:

@@ -75,3 +75,31 @@ def test_a_damaged_chunk_is_an_error_of_the_file(write):
         with pytest.raises(OSError, match="filter"):
             read_rows(h5["packed"], slice(None))
         read_rows(h5["packed"], slice(None), (0,))
+
+
+def test_bytes_that_are_noise_are_stored_and_every_reader_finds_the_values(write):
+    """Exponents shrink, mantissas do not: to deflate those as well costs most of the time and gains next to nothing."""
+    values = np.random.default_rng(2).normal(1.0, 0.1, (3, 2, 64, 40)).astype(np.float32)
+    with write(values) as h5:
+        packing = packed.Packing.of(h5["plain"])
+        assert packing.deflated == (False, False, False, True)
+        _, stream = h5["packed"].id.read_direct_chunk((1, 1, 16, 0))
+        # The first bytes of the chunk's values stand in its stream as they are.
+        assert values[1, 1, 16:32].tobytes()[::4] in stream
+        every = packed.create_packed(h5, "every", values.shape, np.float32)
+        packed.pack(h5["plain"], every, packed.Packing(1.0, (True,) * 4))
+        for name in ("packed", "every"):
+            np.testing.assert_array_equal(h5[name][...], values)
+            np.testing.assert_array_equal(read_rows(h5[name], slice(None)), values)
+        assert h5["packed"].id.get_storage_size() < 1.05 * every.id.get_storage_size()
+        told = h5["plain"].nbytes / packing.ratio
+        assert h5["packed"].id.get_storage_size() == pytest.approx(told, rel=0.15)
+
+
+def test_a_stored_piece_may_be_longer_than_a_block_of_the_stream(tmp_path):
+    values = np.random.default_rng(3).integers(0, 1 << 16, (1, 400, 400)).astype(np.uint16)
+    with h5py.File(tmp_path / "large.h5", "w") as h5:
+        h5["plain"] = values
+        packed.pack(h5["plain"], packed.create_packed(h5, "packed", values.shape, values.dtype))
+        assert packed.Packing.of(h5["plain"]).deflated == (False, False)
+        np.testing.assert_array_equal(h5["packed"][...], values)
