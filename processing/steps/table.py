@@ -12,7 +12,7 @@ from processing.reflectance.table_axes import Layout
 from processing.reflectance.tables import ScatteringTable, table_steps
 from processing.steps.file_step import FileStep, Progress
 from processing.steps.maps import geometry_identities
-from processing.storage.provenance import MADE_OF, Step, file_identity
+from processing.storage.provenance import Step, content_of, file_identity
 
 
 @dataclass(frozen=True)
@@ -68,11 +68,7 @@ class Tabulation(FileStep):
 
 
 def _refuse_twice(record: Step, before: Sequence[Step]) -> None:
-    known = {_content(i) for step in before for i in step.inputs if i["role"] == "source"}
+    known = {content_of(i) for step in before for i in step.inputs if i["role"] == "source"}
     for source in record.inputs:
-        if source["role"] == "source" and _content(source) in known:
+        if source["role"] == "source" and content_of(source) in known:
             raise ProcessError(f"{source['path']} is in the table already; its samples would count twice.")
-
-
-def _content(identity: dict[str, object]) -> object:
-    return identity.get("sha256") or identity.get(MADE_OF)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
@@ -15,10 +15,17 @@ from typing import Any
 import h5py
 import numpy as np
 
+from processing.storage.content import without_frames_sha256
 from processing.storage.h5_door import mark_of
 
 #: Attribute of a product's root: `Step.made_of` of its last step.
 MADE_OF = "made_of"
+#: By what a file is known, in this order, and how people are told.
+CONTENTS = {
+    "sha256": "SHA-256",
+    "sha256_without_frames": "SHA-256 of all but the frames, with their checksums",
+    MADE_OF: "made of",
+}
 
 
 @cache
@@ -49,7 +56,7 @@ class Step:
 
         Date, and place and time stamp of the files, are not in it.
         """
-        contents = [(i.get("role"), i.get("sha256") or i.get(MADE_OF)) for i in self.inputs]
+        contents = [(i.get("role"), content_of(i)) for i in self.inputs]
         text = json.dumps([self.name, self.arguments, contents, self.program], default=jsonable, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -57,14 +64,23 @@ class Step:
 def file_identity(path: Path, role: str = "") -> dict[str, Any]:
     """What an input file is, as the provenance keeps it: role, path, size, and its content.
 
-    A product is known by what it was made of, any other file by the SHA-256 of its bytes.
+    A product is known by what it was made of, a capture by the SHA-256 of its bytes with the checksums of its frames
+    in place of them, any other file by the SHA-256 of its bytes.
     """
     identity = {"role": role, "path": str(path.resolve()), "bytes": path.stat().st_size}
     known = made_of(path)
     if known is not None:
         return identity | {MADE_OF: known}
+    summed = without_frames_sha256(path)
+    if summed is not None:
+        return identity | {"sha256_without_frames": summed}
     with path.open("rb") as file:
         return identity | {"sha256": hashlib.file_digest(file, "sha256").hexdigest()}
+
+
+def content_of(identity: Mapping[str, Any]) -> str | None:
+    """What stands for the content in an identity; None where it does not say."""
+    return next((str(identity[kind]) for kind in CONTENTS if identity.get(kind)), None)
 
 
 def made_of(path: Path) -> str | None:
@@ -121,7 +137,7 @@ def steps_text(steps: Sequence[Step]) -> str:
 def input_text(identity: dict[str, Any]) -> str:
     """One line for people about an input file: role, path, size and content."""
     role = f"{identity['role']} " if identity.get("role") else ""
-    for kind, words in (("sha256", "SHA-256"), (MADE_OF, "made of")):
+    for kind, words in CONTENTS.items():
         if kind in identity:
             return f"{role}{identity['path']} ({identity['bytes']} bytes, {words} {identity[kind]})"
     return f"{role}{identity['path']} ({identity['bytes']} bytes)"

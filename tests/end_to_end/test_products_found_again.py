@@ -18,8 +18,10 @@ from processing.reflectance.tables import ScatteringTable, table_steps
 from processing.steps.maps import Quantities, Xi0, geometry_identities
 from processing.steps.reduction import Reduction, reduced
 from processing.storage import provenance
+from processing.storage.capture import Capture, CaptureError
+from processing.storage.checksums import row_crc32, write_checksums
 from processing.storage.product import Product
-from processing.storage.provenance import made_of
+from processing.storage.provenance import content_of, file_identity, made_of
 from simulators.bench.bench import SimulatedBench
 from simulators.bench.scene import Scene
 from simulators.bench.virtual_capture import write_virtual_capture
@@ -154,6 +156,45 @@ def test_what_a_step_is_made_of(capture, other, tmp_path, monkeypatch):
     assert Quantities(product).record().made_of == first
     plain_again = replace(plain, weighted=True).make(overwrite=True)
     assert Quantities(plain_again).record().made_of != first
+
+
+def test_the_checksums_of_a_capture_s_frames_stand_for_them(capture):
+    """Products are found without reading every frame of their captures anew: 40 frames of 5 Mpixels are 400 MB."""
+    before = content_of(file_identity(capture))
+    raw = capture.read_bytes()
+    with Capture(capture) as opened:
+        frame = opened.frames(3)
+    at = raw.index(frame.tobytes())
+    # Other counts with the old checksums are no capture that can be read, and nothing is made of them.
+    capture.write_bytes(raw[: at + 9] + bytes([raw[at + 9] ^ 1]) + raw[at + 10 :])
+    assert content_of(file_identity(capture)) == before
+    with pytest.raises(CaptureError, match="changed on the disc"):
+        Reduction(capture).make()
+    # With checksums of their own they are another capture.
+    with provenance.h5py.File(capture, "r+") as h5:
+        write_checksums(h5["entry"], row_crc32(h5["entry/instrument/detector/data"][...]))
+    assert content_of(file_identity(capture)) != before
+
+
+@pytest.mark.parametrize("place", [0.0, 0.25, 0.5, 0.75, 0.999])
+def test_every_byte_beside_the_frames_counts(capture, place):
+    before, raw = content_of(file_identity(capture)), capture.read_bytes()
+    with provenance.h5py.File(capture, "r") as h5:
+        frames = h5["entry/instrument/detector/data"]
+        chunks = [frames.id.get_chunk_info(k) for k in range(frames.id.get_num_chunks())]
+    beside = np.ones(len(raw), dtype=bool)
+    for chunk in chunks:
+        beside[chunk.byte_offset : chunk.byte_offset + chunk.size] = False
+    at = int(np.flatnonzero(beside)[int(place * beside.sum())])
+    capture.write_bytes(raw[:at] + bytes([raw[at] ^ 1]) + raw[at + 1 :])
+    assert content_of(file_identity(capture)) != before
+
+
+def test_a_capture_with_a_state_without_checksum_is_known_by_all_its_bytes(capture):
+    assert "sha256_without_frames" in file_identity(capture)
+    with provenance.h5py.File(capture, "r+") as h5:
+        h5["entry/states/crc32"][5] = -1
+    assert "sha256" in file_identity(capture)
 
 
 def test_the_mesh_of_a_geometry_file_is_an_input(capture, configs, tmp_path):
