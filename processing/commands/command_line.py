@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
+import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -13,6 +16,10 @@ from typer.exceptions import TyperException
 from processing.errors import ProcessError
 
 INTERRUPTED = 130
+# Two things that every start would wait for. None of pydantic's plug-ins is used: looking for them reads the metadata of
+# all that is installed. Before it ends, the interpreter would look for cycles in all that the libraries keep.
+os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")
+atexit.register(gc.freeze)
 
 
 def _tell_version(wanted: bool) -> None:

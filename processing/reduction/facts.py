@@ -19,6 +19,8 @@ from processing.storage.product import LIT_ERRORS, ProductWriter
 SUSPICIOUS_CHI_SQUARE = 1.5
 #: Below this the noise is overstated.
 TOO_SMALL_CHI_SQUARE = 0.5
+#: Medians are taken from about so many rows or pixels, whichever is less: they are plenty, and little is read.
+SOME_ROWS, SOME_PIXELS = 128, 1 << 17
 
 
 def mueller_facts(
@@ -42,8 +44,7 @@ def mueller_facts(
         raise CaptureError(f"no pixel could be reduced: {in_words(counts)} of {mask.size} pixels. Nothing was written.")
     if any(counts.values()):
         warnings.append(f"of {mask.size} pixels: {in_words(counts)} (pixel_flags says where)")
-    # Medians from about 128 rows are plenty, and read little.
-    some = slice(None, None, max(1, mask.shape[0] // 128))
+    some = slice(None, None, max(1, mask.shape[0] // SOME_ROWS, mask.size // SOME_PIXELS))
     residual, elements = product.get("residual_rms", some), product.get("mueller", some)
     signal = np.tensordot(inversion.w.mean(axis=0), np.nan_to_num(elements.reshape(16, *residual.shape)), axes=1)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -6,12 +6,12 @@ few rows need not read the whole frame.
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Mapping
 from typing import Any
 
 import h5py
 import numpy as np
+from isal import isal_zlib
 from numpy.typing import NDArray
 
 #: In the column `crc32`: this state has none (made by an older version, or synthetic).
@@ -23,15 +23,15 @@ UNSUMMED = ("done", "crc32", "role")
 def row_crc32(frame: NDArray[Any]) -> NDArray[np.uint32]:
     """CRC-32 of each row's bytes; `frame` is (..., rows, columns), the result (..., rows)."""
     lines = np.ascontiguousarray(frame).reshape(-1, frame.shape[-1])
-    sums = np.fromiter((zlib.crc32(line.data) for line in lines), dtype=np.uint32, count=len(lines))
+    sums = np.fromiter((isal_zlib.crc32(line) for line in lines), dtype=np.uint32, count=len(lines))
     return sums.reshape(frame.shape[:-1])
 
 
 def state_crc32(row_sums: NDArray[np.uint32], values: Mapping[str, np.generic]) -> int:
     """CRC-32 of a state: the checksums of its rows, then the bytes of its values in the order of their names."""
-    total = zlib.crc32(np.ascontiguousarray(row_sums).data)
+    total = isal_zlib.crc32(np.ascontiguousarray(row_sums).data)
     for name in sorted(values):
-        total = zlib.crc32(values[name].tobytes(), zlib.crc32(name.encode(), total))
+        total = isal_zlib.crc32(values[name].tobytes(), isal_zlib.crc32(name.encode(), total))
     return total
 
 

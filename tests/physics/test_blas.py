@@ -1,5 +1,9 @@
 """BLAS keeps to one thread where the program computes, whoever calls it."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
@@ -29,6 +33,26 @@ def test_whoever_leaves_first_does_not_take_the_limit_from_others():
         assert _blas_threads() == {1}
         second.__exit__(None, None, None)
         assert _blas_threads() == {2}
+
+
+def test_scipy_s_own_blas_is_not_loaded_for_it_and_is_held_too_where_it_comes():
+    """To load SciPy took a fifth of a second of every command, needed or not."""
+    code = """
+import os, sys
+from threadpoolctl import threadpool_info, threadpool_limits
+import numpy
+from processing.computing.blas import one_blas_thread
+threads = lambda: {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+threadpool_limits(limits=2, user_api="blas")
+with one_blas_thread():
+    print("scipy.linalg" in sys.modules, threads())
+    import scipy.linalg
+    print(threads())
+print(threads(), os.environ["OPENBLAS_NUM_THREADS"])
+"""
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "2"}
+    told = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert told.stdout.splitlines() == ["False {1}", "{1}", "{2} 2"]
 
 
 def test_a_diagnosis_called_from_python_holds_blas_to_one_thread(configs, tmp_path):
