@@ -27,6 +27,8 @@ from processing.storage.segments import decode_lines, encode_line
 
 #: Checksum, blank and line break of a line of the journal.
 LINE_BYTES = 10
+#: An image is written in pieces of so many bytes: the disc works on one while the next is copied.
+PIECE = 1 << 20
 #: What a damaged file makes HDF5 and the look-ups in it raise.
 UNREADABLE = (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError)
 
@@ -129,7 +131,7 @@ class StateFile:
         """
         pixels = np.ascontiguousarray(pixels, dtype=self._frame_type)
         for channel, image in enumerate(pixels):
-            self._write(self._frames[state][channel], image)
+            self._write_image(self._frames[state][channel], image)
         sums = row_crc32(pixels)
         self._put(self._row_sums, state, sums)
         for axis, (degrees, counts) in positions.items():
@@ -223,4 +225,18 @@ class StateFile:
         return value
 
     def _write(self, offset: int, values: NDArray[Any]) -> None:
-        write_whole(self._file, offset, np.ascontiguousarray(values).reshape(-1).view(np.uint8).data)
+        write_whole(self._file, offset, _bytes_of(values))
+
+    def _write_image(self, offset: int, image: NDArray[Any]) -> None:
+        """Write an image and have the disc begin with it; that it is there says the sync alone."""
+        raw = _bytes_of(image)
+        for start in range(0, len(raw), PIECE):
+            piece = raw[start : start + PIECE]
+            write_whole(self._file, offset + start, piece)
+            # Pages that are not needed are written at once, and nobody waits for it. Some file systems do not know it.
+            with contextlib.suppress(OSError):
+                os.posix_fadvise(self._file, offset + start, len(piece), os.POSIX_FADV_DONTNEED)
+
+
+def _bytes_of(values: NDArray[Any]) -> memoryview:
+    return np.ascontiguousarray(values).reshape(-1).view(np.uint8).data

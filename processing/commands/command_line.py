@@ -16,8 +16,8 @@ from typer.exceptions import TyperException
 from processing.errors import ProcessError
 
 INTERRUPTED = 130
-# Two things that every start would wait for. None of pydantic's plug-ins is used: looking for them reads the metadata of
-# all that is installed. Before it ends, the interpreter would look for cycles in all that the libraries keep.
+# Two things that everybody would wait for. None of pydantic's plug-ins is used: looking for them reads the metadata of
+# all packages. Before it ends, the interpreter would look for cycles in all that the libraries keep.
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")
 atexit.register(gc.freeze)
 

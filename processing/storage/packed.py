@@ -133,7 +133,8 @@ def _stream(block: NDArray[Any], height: int, deflated: tuple[bool, ...]) -> byt
     if len(block) < height:
         # The last chunk of a plane is as large as the others in the file.
         block = np.pad(block, [(0, height - len(block)), (0, 0)])
-    planes, parts = _byte_planes(block), [HEAD]
+    planes = _byte_planes(block)
+    parts: list[bytes | memoryview] = [HEAD]
     deflater = isal_zlib.compressobj(LEVEL, isal_zlib.DEFLATED, -isal_zlib.MAX_WBITS)
     for plane, shrinks in zip(planes, deflated, strict=True):
         if shrinks:

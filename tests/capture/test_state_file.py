@@ -41,6 +41,42 @@ def file(path: Path):
     opened.close()
 
 
+def test_the_disc_begins_with_an_image_while_it_is_written(path, file, monkeypatch):
+    """In one piece, with all the work left to the sync, a capture took twice as long to be on the disc."""
+    monkeypatch.setattr(state_file, "PIECE", 16)
+    calls = []
+    for name in ("pwrite", "posix_fadvise", "fdatasync"):
+        real = getattr(os, name)
+
+        def watched(*arguments, name=name, real=real):
+            calls.append((name, arguments[1:]))
+            return real(*arguments)
+
+        monkeypatch.setattr(os, name, watched)
+    pixels = np.arange(20, dtype=np.uint16).reshape(1, *SHAPE)
+    file.write_state(1, pixels, {"psg": (9.5, 9500), "psa": (0, 0)}, {})
+    first = calls[0][1][1]
+    for k, size in enumerate((16, 16, 8)):
+        (wrote, (data, offset)), (told, advice) = calls[2 * k : 2 * k + 2]
+        assert (wrote, offset, len(data)) == ("pwrite", first + 16 * k, size)
+        assert (told, advice) == ("posix_fadvise", (first + 16 * k, size, os.POSIX_FADV_DONTNEED))
+    assert "fdatasync" not in [name for name, _ in calls[:6]]
+    file.close()
+    with Capture(path) as there:
+        np.testing.assert_array_equal(there.frames(0), pixels)
+
+
+def test_a_file_system_that_takes_no_advice_gets_the_state_as_well(path, file, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.ENOSYS, "not implemented")
+
+    monkeypatch.setattr(os, "posix_fadvise", refuse)
+    file.write_state(2, np.ones((1, *SHAPE)), {"psg": (9.5, 9500), "psa": (0, 0)}, {})
+    file.close()
+    with Capture(path) as there:
+        assert there.done.tolist() == [2]
+
+
 def test_a_state_is_written_at_its_own_place(path, file):
     for k in (2, 0):
         pixels = np.arange(20).reshape(1, *SHAPE) + 100 * k
