@@ -11,7 +11,8 @@ from pathlib import Path
 
 from paper_study.acquire import BENCH, CONFIGS, SHOWN_DEG
 
-from processing.campaign.run import Campaign, CampaignResult, compare_on_sphere, find_captures
+from processing.campaign.captures import find_captures
+from processing.campaign.run import Campaign, CampaignResult, compare_on_sphere
 from processing.diagnosis.instrument.run import diagnose_captures
 from processing.diagnosis.instrument_file import write_instrument
 from processing.diagnosis.search.result import Diagnosis
@@ -93,7 +94,7 @@ def study_sphere(captures: Path, out: Path, pool: Executor, say: Say) -> SphereS
 def study_body(captures: Path) -> dict[float, BodyProducts]:
     """Mueller image, eigenvalues, extrapolation and polarizer pairs of the body, by wavelength."""
     found: dict[float, dict[str, Path]] = {}
-    for path, kind, nm, _ in find_captures(captures)[0]:
+    for path, kind, nm, *_ in find_captures(captures)[0]:
         found.setdefault(nm, {})[kind] = reduced(path).path
     products = {}
     for nm, image in found.items():
@@ -160,7 +161,7 @@ def _shape(folder: Path) -> tuple[int, int]:
 
 def _fits(captures: Path, products: Path, geometries: Mapping[str, Path]) -> dict[float, dict[str, FittedMaterial]]:
     by_kind: dict[tuple[float, str], list[tuple[float, Path]]] = {}
-    for path, kind, nm, omega in find_captures(captures)[0]:
+    for path, kind, nm, omega, *_ in find_captures(captures)[0]:
         by_kind.setdefault((nm, kind), []).append((omega, products / f"{path.stem}.{kind}.h5"))
     fits: dict[float, dict[str, FittedMaterial]] = {}
     for (nm, kind), several in by_kind.items():

@@ -16,16 +16,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.campaign.captures import chosen, find_captures
 from processing.campaign.tasks import CaptureMeasure, CaptureTask, locate, measure, task_view
 from processing.computing.blas import one_blas_thread
-from processing.doors import read_json
-from processing.errors import NotDetermined, ProcessError
+from processing.errors import NotDetermined
 from processing.geometry.viewing import ViewingGeometry
 from processing.polarization.image_difference import rmsd
-from processing.reduction.flat import FlatCapture, flat_captures, nearest_flat
+from processing.reduction.flat import flat_captures, nearest_flat
 from processing.reduction.mueller import Progress
 from processing.reflectance.tables import ScatteringTable
-from processing.storage.capture import Capture, CaptureError, made_of_captures
+from processing.storage.capture import Capture
 from processing.storage.provenance import Step, file_identity
 
 #: The default demosaicing reaches so far across the outline (`processing.reduction.mosaic.methods.REACH`).
@@ -86,75 +86,6 @@ class CampaignResult:
         return float(np.mean(finite)) if finite else float("nan")
 
 
-def find_captures(
-    folder: Path, out: Path | None = None
-) -> tuple[list[tuple[Path, str, float, float]], bool, list[str]]:
-    """Captures under a folder as (path, "mueller" or "stokes", nm, omega), whether simulated, and files left out.
-
-    Flat fields are in neither list, nor is anything in `out`, the campaign's own results.
-
-    Raises
-    ------
-    ProcessError : no capture, or simulated and measured ones together.
-    """
-    found, kinds, left_out = [], {}, []
-    for path in sorted(folder.rglob("*.h5")):
-        if (out is not None and path.is_relative_to(out)) or made_of_captures(path):
-            continue
-        try:
-            with Capture(path) as capture:
-                header, simulated, flat = capture.header, capture.simulated, FlatCapture.of(capture)
-                kind: str = capture.reduces_to
-                done, planned, status = len(capture.done), capture.planned_states, capture.status
-        except CaptureError as error:
-            left_out.append(f"{path}: {error}")
-            continue
-        if done < planned or status != "complete":
-            left_out.append(f"{path}: {done} of {planned} states, {status}; `acquire` goes on with it")
-            continue
-        if flat is not None:
-            continue
-        if header.omega_deg is None or header.sample.kind in ("air", "mirror"):
-            left_out.append(f"{path}: no arm angle" if header.omega_deg is None else f"{path}: {header.sample.kind}")
-            continue
-        kinds[path] = simulated
-        found.append((path, kind, float(header.wavelength_nm), float(header.omega_deg)))
-    left_out += _unfinished(folder, out)
-    if not found:
-        raise ProcessError(
-            f"{folder} holds no complete capture of an object with an arm angle. {' '.join(left_out[:3])}"
-        )
-    if len(set(kinds.values())) > 1:
-        simulated_one = next(p for p, s in kinds.items() if s)
-        measured_one = next(p for p, s in kinds.items() if not s)
-        raise ProcessError(
-            f"{folder} mixes simulated captures ({simulated_one.name}) and measured ones ({measured_one.name}); "
-            "they are never compared as one campaign. Put them into two folders."
-        )
-    return found, next(iter(kinds.values())), left_out
-
-
-def _unfinished(folder: Path, out: Path | None) -> list[str]:
-    """Captures that are being taken or were interrupted, and those that the index of a campaign has as not complete."""
-    partial = [path for path in sorted(folder.rglob("*.h5.partial")) if out is None or not path.is_relative_to(out)]
-    lines = [f"{path}: a capture that is not finished; `acquire` goes on with it" for path in partial]
-    named = {path.name.removesuffix(".partial") for path in partial}
-    for index in sorted(folder.rglob("index.json")):
-        try:
-            entries = read_json(index)
-        except ProcessError:
-            # Somebody else's, or damaged: the captures tell for themselves.
-            continue
-        if not isinstance(entries, dict):
-            continue
-        lines += [
-            f"{index.parent / name}: {entry.get('status', 'not taken')}"
-            for name, entry in entries.items()
-            if isinstance(entry, dict) and name not in named and not (index.parent / name).exists()
-        ]
-    return lines
-
-
 @dataclass(frozen=True)
 class Campaign:
     """`process campaign`: every capture of a folder reduced, and the two instruments and the model compared.
@@ -171,6 +102,7 @@ class Campaign:
     register : take centre and scale of the sphere from the images instead of from the geometry file.
     border_px : pixels nearer than this to the outline do not count.
     instrument : file of the Mueller polarimeter to use instead of the model in the captures.
+    modes, samples : names of those whose captures take part; empty for all.
     """
 
     folder: Path
@@ -181,6 +113,8 @@ class Campaign:
     register: bool = False
     border_px: int = BORDER_PX
     instrument: Path | None = None
+    modes: tuple[str, ...] = ()
+    samples: tuple[str, ...] = ()
 
     @one_blas_thread()
     def run(self, pool: Executor, progress: Progress | None = None) -> CampaignResult:
@@ -188,13 +122,14 @@ class Campaign:
 
         Raises
         ------
-        ProcessError : see `find_captures`; two captures of the same kind, wavelength and angle.
+        ProcessError : see `find_captures` and `chosen`.
         """
-        captures, simulated, left_out = find_captures(self.folder, self.out)
+        found, simulated, left_out = find_captures(self.folder, self.out)
+        captures, others = chosen(found, self.modes, self.samples)
+        left_out = left_out + others
         self.out.mkdir(parents=True, exist_ok=True)
-        _refuse_twins(captures)
-        flats = _flats(self.folder, [path for path, *_ in captures])
-        tasks = [self._task(path, kind, flats.get(path)) for path, kind, _, _ in captures]
+        flats = _flats(self.folder, [capture.path for capture in captures])
+        tasks = [self._task(capture.path, capture.kind, flats.get(capture.path)) for capture in captures]
         if self.register:
             tasks = _registered(tasks, pool)
         views = {task.kind: task_view(task) for task in tasks}
@@ -221,14 +156,6 @@ class Campaign:
             flat=str(flat or ""),
             instrument=str(self.instrument or "") if kind == "mueller" else "",
         )
-
-
-def _refuse_twins(captures: Sequence[tuple[Path, str, float, float]]) -> None:
-    seen: dict[tuple[str, float, float], Path] = {}
-    for path, kind, nm, omega in captures:
-        twin = seen.setdefault((kind, nm, round(omega, 2)), path)
-        if twin != path:
-            raise ProcessError(f"{twin.name} and {path.name} are both {kind} captures at {nm:g} nm, {omega:g} degrees.")
 
 
 def _flats(folder: Path, paths: Sequence[Path]) -> dict[Path, Path]:

@@ -27,6 +27,10 @@ def campaign_command(
     instrument: Annotated[
         Path | None, typer.Option(help="Instrument file of the Mueller captures instead of the one in them.")
     ] = None,
+    mode: Annotated[
+        list[str] | None, typer.Option(help="Take the captures of this mode only; several times for several modes.")
+    ] = None,
+    sample: Annotated[list[str] | None, typer.Option(help="The same for samples, by their names.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: FOLDER/campaign.")] = None,
     registered: Annotated[bool, typer.Option("--register", help="Find the sphere in the images.")] = False,
     border: Annotated[int, typer.Option(min=0, help="Pixels along the outline that do not count.")] = 4,
@@ -43,7 +47,8 @@ def campaign_command(
     if not folder.is_dir():
         raise ProcessError(f"{folder}: no such folder. Give the folder that holds the captures.")
     target = out or folder / "campaign"
-    step = Campaign(folder, target, geometry, material, stokes_geometry, registered, border, instrument)
+    chosen = tuple(mode or ()), tuple(sample or ())
+    step = Campaign(folder, target, geometry, material, stokes_geometry, registered, border, instrument, *chosen)
     with executor(workers, scheduler) as pool, progress_bar("campaign", "captures") as tick:
         result = step.run(pool, tick)
     write_csv(result, target / "campaign.csv")

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
+from processing.campaign.captures import find_captures
 from processing.campaign.executors import executor
-from processing.campaign.run import BORDER_PX, PAPER, Campaign, CampaignResult, find_captures
+from processing.campaign.run import BORDER_PX, PAPER, Campaign, CampaignResult
 from processing.campaign.tasks import CaptureTask, measure
 from processing.errors import ProcessError
 from processing.geometry.viewing import ViewingGeometry
@@ -248,3 +249,33 @@ def test_what_cannot_be_a_campaign_is_refused(folder, configs, tmp_path):
     files = configs / "geometries/one_inch_sphere.yaml", configs / "materials/red_print.yaml"
     with executor(1) as pool, pytest.raises(ProcessError, match="are both"):
         Campaign(tmp_path, tmp_path / "out", *files).run(pool)
+
+
+def test_of_two_modes_or_samples_at_one_angle_the_user_chooses(folder, configs, process, tmp_path):
+    """A campaign takes samples x modes; without a choice such a folder could not be processed at all."""
+    names = {"drr_35.h5": ("drr", "red_sphere"), "fine_35.h5": ("drr_fine", "red_sphere")}
+    names |= {"stokes_35.h5": ("stokes", "red_sphere"), "other_35.h5": ("stokes", "white_sphere")}
+    for name, (mode, sample) in names.items():
+        (tmp_path / name).write_bytes((folder / f"{'stokes' if mode == 'stokes' else 'drr'}_35.h5").read_bytes())
+        with h5py.File(tmp_path / name, "r+") as h5:
+            header = json.loads(h5["entry"].attrs["header_json"])
+            header |= {"mode": mode, "sample": {"kind": "unknown", "name": sample}}
+            h5["entry"].attrs["header_json"] = json.dumps(header)
+    files = ("--geometry", configs / "geometries/one_inch_sphere.yaml")
+    files += ("--material", configs / "materials/red_print.yaml")
+    refused = "drr_35.h5 and fine_35.h5 are both mueller captures at 662 nm, 35 degrees, of the modes drr and drr_fine"
+    code, _, err = process("campaign", tmp_path, *files)
+    assert (code, refused in err, "--mode drr_fine --out FOLDER" in err) == (2, True, True), err
+    code, _, err = process("campaign", tmp_path, *files, "--mode", "drr", "--mode", "stokes")
+    assert (code, "of the samples white_sphere and red_sphere" in err) == (2, True), err
+    code, _, err = process("campaign", tmp_path, *files, "--mode", "mosaic")
+    assert (code, "no capture is of the mode 'mosaic'; there are: drr, drr_fine, stokes" in err) == (2, True), err
+    code, out, err = process(
+        "campaign", tmp_path, *files, "--mode", "drr", "--mode", "stokes", "--sample", "red_sphere"
+    )
+    assert code == 0, err
+    assert "fine_35.h5: mode drr_fine, sample red_sphere; not asked for" in err
+    assert "other_35.h5: mode stokes, sample white_sphere; not asked for" in err
+    made = {path.name for path in (tmp_path / "campaign").glob("*.h5")}
+    assert {"drr_35.mueller.h5", "stokes_35.stokes.h5"} <= made
+    assert not any(name.startswith(("fine", "other")) for name in made)

@@ -4,7 +4,7 @@ import h5py
 import pytest
 from ruamel.yaml import YAML
 
-from processing.campaign.run import find_captures
+from processing.campaign.captures import find_captures
 from processing.commands.application import main as process
 from processing.commands.diagnose import main as diagnose
 

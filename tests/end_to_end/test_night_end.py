@@ -20,7 +20,7 @@ from acquisition.screen.observer import StateReport
 from acquisition.screen.progress import ConsoleProgress, _duration
 from acquisition.screen.rows import print_rows
 from drivers.motion import Position
-from processing.campaign.run import find_captures
+from processing.campaign.captures import find_captures
 from processing.errors import ProcessError
 from processing.instrument.states import rotating_retarders
 

@@ -1,0 +1,136 @@
+"""The captures of a campaign's folder: which of them are of an object, and which of these are compared."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from processing.doors import read_json
+from processing.errors import ProcessError
+from processing.reduction.flat import FlatCapture
+from processing.storage.capture import Capture, CaptureError, made_of_captures
+
+
+class ObjectCapture(NamedTuple):
+    """A complete capture of an object; `kind` is "mueller" or "stokes", `mode` and `sample` are the user's names."""
+
+    path: Path
+    kind: str
+    wavelength_nm: float
+    omega_deg: float
+    mode: str
+    sample: str
+
+
+def find_captures(folder: Path, out: Path | None = None) -> tuple[list[ObjectCapture], bool, list[str]]:
+    """Captures under a folder, whether they are simulated, and files left out.
+
+    Flat fields are in neither list, nor is anything in `out`, the campaign's own results.
+
+    Raises
+    ------
+    ProcessError : no capture, or simulated and measured ones together.
+    """
+    found, kinds, left_out = [], {}, []
+    for path in sorted(folder.rglob("*.h5")):
+        if (out is not None and path.is_relative_to(out)) or made_of_captures(path):
+            continue
+        try:
+            with Capture(path) as capture:
+                header, simulated, flat = capture.header, capture.simulated, FlatCapture.of(capture)
+                kind: str = capture.reduces_to
+                done, planned, status = len(capture.done), capture.planned_states, capture.status
+        except CaptureError as error:
+            left_out.append(f"{path}: {error}")
+            continue
+        if done < planned or status != "complete":
+            left_out.append(f"{path}: {done} of {planned} states, {status}; `acquire` goes on with it")
+            continue
+        if flat is not None:
+            continue
+        if header.omega_deg is None or header.sample.kind in ("air", "mirror"):
+            left_out.append(f"{path}: no arm angle" if header.omega_deg is None else f"{path}: {header.sample.kind}")
+            continue
+        kinds[path] = simulated
+        nm, omega = float(header.wavelength_nm), float(header.omega_deg)
+        found.append(ObjectCapture(path, kind, nm, omega, header.mode, header.sample.name or header.sample.kind))
+    left_out += _unfinished(folder, out)
+    if not found:
+        raise ProcessError(
+            f"{folder} holds no complete capture of an object with an arm angle. {' '.join(left_out[:3])}"
+        )
+    if len(set(kinds.values())) > 1:
+        simulated_one = next(p for p, s in kinds.items() if s)
+        measured_one = next(p for p, s in kinds.items() if not s)
+        raise ProcessError(
+            f"{folder} mixes simulated captures ({simulated_one.name}) and measured ones ({measured_one.name}); "
+            "they are never compared as one campaign. Put them into two folders."
+        )
+    return found, next(iter(kinds.values())), left_out
+
+
+def _unfinished(folder: Path, out: Path | None) -> list[str]:
+    """Captures that are being taken or were interrupted, and those that the index of a campaign has as not complete."""
+    partial = [path for path in sorted(folder.rglob("*.h5.partial")) if out is None or not path.is_relative_to(out)]
+    lines = [f"{path}: a capture that is not finished; `acquire` goes on with it" for path in partial]
+    named = {path.name.removesuffix(".partial") for path in partial}
+    for index in sorted(folder.rglob("index.json")):
+        try:
+            entries = read_json(index)
+        except ProcessError:
+            # Somebody else's, or damaged: the captures tell for themselves.
+            continue
+        if not isinstance(entries, dict):
+            continue
+        lines += [
+            f"{index.parent / name}: {entry.get('status', 'not taken')}"
+            for name, entry in entries.items()
+            if isinstance(entry, dict) and name not in named and not (index.parent / name).exists()
+        ]
+    return lines
+
+
+def chosen(
+    captures: Sequence[ObjectCapture], modes: Sequence[str] = (), samples: Sequence[str] = ()
+) -> tuple[list[ObjectCapture], list[str]]:
+    """The captures of these modes and samples (empty: of all), at most one of a kind, wavelength and angle; the others.
+
+    Raises
+    ------
+    ProcessError : no capture is of a mode or sample, or two captures would be compared with the same others.
+    """
+    for what, wanted, there in (
+        ("mode", modes, {capture.mode for capture in captures}),
+        ("sample", samples, {capture.sample for capture in captures}),
+    ):
+        if unknown := [name for name in wanted if name not in there]:
+            raise ProcessError(f"no capture is of the {what} {unknown[0]!r}; there are: {', '.join(sorted(there))}.")
+    taken, left_out = [], []
+    for capture in captures:
+        if (modes and capture.mode not in modes) or (samples and capture.sample not in samples):
+            left_out.append(f"{capture.path}: mode {capture.mode}, sample {capture.sample}; not asked for")
+        else:
+            taken.append(capture)
+    if not taken:
+        raise ProcessError("no capture is of that mode and that sample.")
+    _refuse_twins(taken)
+    return taken, left_out
+
+
+def _refuse_twins(captures: Sequence[ObjectCapture]) -> None:
+    seen: dict[tuple[str, float, float], ObjectCapture] = {}
+    for capture in captures:
+        twin = seen.setdefault((capture.kind, capture.wavelength_nm, round(capture.omega_deg, 2)), capture)
+        if twin is capture:
+            continue
+        says = f"{twin.path.name} and {capture.path.name} are both {capture.kind} captures at"
+        says += f" {capture.wavelength_nm:g} nm, {capture.omega_deg:g} degrees"
+        for what in ("mode", "sample"):
+            one, other = getattr(twin, what), getattr(capture, what)
+            if one != other:
+                raise ProcessError(
+                    f"{says}, of the {what}s {one} and {other}. Choose with --{what}, several times for several; each "
+                    f"choice needs a folder of its own for its results: --{what} {other} --out FOLDER."
+                )
+        raise ProcessError(f"{says}. Put one of them into another folder.")
