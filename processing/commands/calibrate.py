@@ -44,10 +44,12 @@ def calibrate_command(
     from processing.calibration.fitted_file import write_fitted
     from processing.calibration.known_sample import part_of
     from processing.calibration.train import POOR_FIT, fit_curves, fit_trains
-    from processing.doors import require_distinct
+    from processing.doors import require_distinct, require_new
     from processing.instrument.model import InstrumentModel
     from processing.storage.capture import Capture
 
+    if write is not None:
+        require_new(write)
     require_distinct(captures)
     further = _wavelengths(at, dispersion)
     model = InstrumentModel.load(instrument)

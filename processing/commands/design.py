@@ -57,8 +57,11 @@ def design_command(
     albedo: Annotated[float, typer.Option(min=0, help="--stokes: M00 at normal incidence that is assumed.")] = 0.5,
 ) -> None:
     """Rank, condition number, equally weighted variance and standard errors of a table, before any motor moves."""
+    from processing.doors import require_new
     from processing.errors import ProcessError
 
+    if out is not None:
+        require_new(out)
     if stokes:
         if geometry is None or material is None or camera is None:
             raise ProcessError("--stokes needs --geometry FILE, --material FILE and --camera FILE")

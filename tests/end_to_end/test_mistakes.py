@@ -76,7 +76,23 @@ def test_a_place_for_no_file_is_refused_before_the_work(acquire, small_rig, capt
     with pytest.raises(SystemExit) as end:
         diagnose([str(capture), "--instrument", str(configs / "instruments/rgb950.yaml"), "--write", "no/where.yaml"])
     assert end.value.code == 2
-    assert capfd.readouterr() == ("", "error: no/where.yaml: there is no folder no. Make it, or give another name.\n")
+    told = "error: no/where.yaml: there is no folder no. Make it, or give another name.\n"
+    assert capfd.readouterr() == ("", told)
+    free = ("--free", "psa_retarder.retardance_deg", "--write", "no/where.yaml")
+    instrument = str(configs / "instruments/rgb950.yaml")
+    with pytest.raises(SystemExit) as end:
+        process(["calibrate", str(capture), "--instrument", instrument, *free])
+    # Not a word of the fit before.
+    assert (end.value.code, *capfd.readouterr()) == (2, "", told)
+
+
+def test_a_table_of_the_user_is_not_replaced_by_a_design(run, configs, tmp_path):
+    table = tmp_path / "mine.csv"
+    table.write_text("psg,psa\n0,0\n")
+    instrument = configs / "instruments/rgb950.yaml"
+    code, err = run("design", instrument, "--wavelength", 662, "--out", table)
+    assert (code, f"{table} exists and is not replaced" in err) == (2, True)
+    assert table.read_text() == "psg,psa\n0,0\n"
 
 
 def test_a_file_that_is_not_meant_is_called_what_it_is(run, acquire, capture, configs, tmp_path, monkeypatch):

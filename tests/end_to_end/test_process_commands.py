@@ -125,7 +125,7 @@ def test_calibrate_finds_a_wrong_train_and_never_overwrites(
     assert model.at(451).generator == before.at(451).generator
     code, _, err = process(*command)
     assert code == 2
-    assert "never replaces" in err
+    assert "is not replaced" in err
 
 
 @pytest.mark.parametrize(
