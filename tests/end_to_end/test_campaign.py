@@ -270,9 +270,8 @@ def test_of_two_modes_or_samples_at_one_angle_the_user_chooses(folder, configs, 
     assert (code, "of the samples white_sphere and red_sphere" in err) == (2, True), err
     code, _, err = process("campaign", tmp_path, *files, "--mode", "mosaic")
     assert (code, "no capture is of the mode 'mosaic'; there are: drr, drr_fine, stokes" in err) == (2, True), err
-    code, out, err = process(
-        "campaign", tmp_path, *files, "--mode", "drr", "--mode", "stokes", "--sample", "red_sphere"
-    )
+    wanted = ("--mode", "drr", "--mode", "stokes", "--sample", "red_sphere")
+    code, _, err = process("campaign", tmp_path, *files, *wanted)
     assert code == 0, err
     assert "fine_35.h5: mode drr_fine, sample red_sphere; not asked for" in err
     assert "other_35.h5: mode stokes, sample white_sphere; not asked for" in err

@@ -7,7 +7,7 @@ from steady_capture import steady_capture
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
 from processing.diagnosis.instrument.moments import moments_of
 from processing.diagnosis.instrument.projection import add_block, noise_information
-from processing.diagnosis.instrument.structure import Images, _tests
+from processing.diagnosis.instrument.structure import Images, Residual, _tests, descriptions
 from processing.diagnosis.search.space import Sums
 
 STATES, SIDE, SIGMA = 8, 240, 0.01
@@ -58,3 +58,20 @@ def test_neighbours_of_pure_noise_scatter_by_one_standard_deviation():
         tests, _ = _tests(images, np.ones(rows), np.zeros((rows, 2)), 16, 1.0, noise_known=True)
         found += [tests["neighbours, rows"], tests["neighbours, columns"]]
     assert np.std(found) == pytest.approx(1, abs=0.15)
+
+
+def test_what_captures_leave_over_is_told_with_their_names():
+    """Of two captures the same sentences stood there twice, and nothing said which was whose."""
+
+    def left(excess: float) -> Residual:
+        none = np.zeros(3)
+        image = np.zeros((3, 2, 2), np.float32)
+        return Residual(image, none, np.array([0.0, 2.0, 1.0]), {"sum of squares": excess}, {}, {}, none, 0.0)
+
+    assert descriptions(["a.h5"], [left(11.0)])[0] == "sum of squares: 11 standard deviations above noise"
+    assert descriptions(["a.h5", "b.h5", "c.h5"], [left(11.0), left(0.0), left(12.0)]) == (
+        "a.h5: sum of squares: 11 standard deviations above noise",
+        "a.h5: states that are furthest off on average: 1, 2, 0",
+        "c.h5: sum of squares: 12 standard deviations above noise",
+        "c.h5: states that are furthest off on average: 1, 2, 0",
+    )

@@ -15,7 +15,7 @@ from processing.diagnosis.instrument.guard import chances, checks, lasts, predic
 from processing.diagnosis.instrument.least_change import without_change
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.recommend import recommended
-from processing.diagnosis.instrument.structure import Residual, description, residual
+from processing.diagnosis.instrument.structure import Residual, descriptions, residual
 from processing.diagnosis.instrument.telling import (
     calibrated,
     capture_report,
@@ -119,7 +119,7 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
     rivals = [(c.candidates[0], *c.alternatives) for c in named if c.alternatives]
     unexplained = None
     if verdict in ("unexplained", "partly_explained"):
-        lines = tuple(line for r in after for line in description(r))
+        lines = descriptions([c.name for c in asked.captures], after)
         tried = tuple(c.candidates[0].label for c in named) or tuple(
             r.candidate for r in ranking(found, solved.before)[:5]
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -274,6 +275,16 @@ def _correlates(r: NDArray[np.float32], signal: NDArray[np.float32], good: NDArr
         if x.std() > 0 and y.std() > 0:
             out[name] = float(np.corrcoef(x, y)[0, 1])
     return out
+
+
+def descriptions(names: Sequence[str], left: Sequence[Residual]) -> tuple[str, ...]:
+    """Sentences about what captures leave over, each with the name of its capture where there are several."""
+    several = len(names) > 1
+    return tuple(
+        f"{name}: {line}" if several else line
+        for name, found in zip(names, left, strict=True)
+        for line in description(found)
+    )
 
 
 def description(found: Residual, threshold: float = LIMIT) -> list[str]:
