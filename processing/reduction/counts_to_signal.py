@@ -200,15 +200,17 @@ class BlockReader:
         """
         from processing.reduction.move_image import REACH, shifted_back
 
-        margin = (math.ceil(float(np.abs(shift_px).max()) / pitch) + REACH) * pitch
+        # Where the layout has taken the kinds of pixels apart, each image is of one kind.
+        apart = pitch * self.capture.frame_shape[0] // self.capture.stored_shape[0]
+        margin = (math.ceil(float(np.abs(shift_px).max()) / pitch) + REACH) * apart
         height = self.capture.frame_shape[0]
         first, last = max(rows.start - margin, 0), min(rows.stop + margin, height)
         for k, state in enumerate(self.states):
             x, y = shift_px[k] / pitch
             frame = self.capture.frames(int(state), slice(first, last)).astype(np.float32)
             for channel, image in enumerate(frame):
-                for i, j in np.ndindex(pitch, pitch):
-                    image[i::pitch, j::pitch] = shifted_back(image[i::pitch, j::pitch], x, y)
+                for i, j in np.ndindex(apart, apart):
+                    image[i::apart, j::apart] = shifted_back(image[i::apart, j::apart], x, y)
                 block[k, channel] = image[rows.start - first : rows.stop - first]
 
     def load(

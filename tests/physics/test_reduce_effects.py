@@ -15,6 +15,7 @@ from processing.reduction.mueller import reduce_mueller
 from processing.storage.capture import Capture
 from processing.storage.images import MuellerImage
 from processing.storage.product import Step
+from processing.yaml_file import dump_yaml
 
 SHAPE = (24, 30)
 FULL_SCALE = 4095.0
@@ -159,6 +160,25 @@ def test_pixels_of_a_mosaic_are_moved_among_their_own_kind(synthetic_capture) ->
 
         assert off(2) < 2e-3
         assert off(1) > 0.1
+
+
+def test_super_pixels_behind_a_plate_that_moves_the_image_are_moved_back(synthetic_capture, configs: Path) -> None:
+    """Each kind of pixel is an image of its own there already; it was taken apart once more, and moved twice as far."""
+    model = InstrumentModel.load(configs / "instruments/polarization_camera_retarder.yaml")
+    y, x = np.indices((64, 80)).astype(float)
+    levels = np.array([[1.0, 0.1], [0.4, 3.0]])[np.arange(64)[:, None] % 2, np.arange(80) % 2]
+    shift = np.array([[0.0, 0.0], [1.4, -0.6], [-0.8, 2.6]])
+    frames = np.stack([levels * (2000 + 500 * np.sin((x - a) / 7) * np.cos((y - b) / 9)) for a, b in shift])
+    path = synthetic_capture(
+        frames[:, None], {"psa": np.zeros(3)}, mosaic=model.mosaic, instrument_yaml=dump_yaml(model)
+    )
+    with Capture(path, by_super_pixel=True) as capture:
+        counts = CountsCorrection(1.0, {}, shift, model.pitch)
+        reader = BlockReader(capture, np.arange(3), Correction.of(capture), counts)
+        moved = np.concatenate([reader.read(rows).copy() for rows in (slice(0, 15), slice(15, 32))], axis=2)
+    images = moved.reshape(3, 4, 32, 40)
+    for image in images[1:]:
+        assert np.max(np.abs(image / images[0] - 1)[:, 6:-6, 6:-6]) < 2e-3
 
 
 def test_retardance_that_varies_over_the_image(rgb950: InstrumentModel, synthetic_capture) -> None:
