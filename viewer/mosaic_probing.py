@@ -12,7 +12,7 @@ from processing.errors import ProcessError
 from processing.reduction.mosaic.layout import MosaicLayout
 from processing.reduction.mueller import relative_exposure
 from processing.reduction.stokes import channel_rows
-from processing.storage.capture import Capture
+from processing.storage.capture import Capture, CaptureError
 from viewer.probing import MOST, Region, finite
 from viewer.sample_states import SampleStates
 
@@ -34,7 +34,13 @@ class SuperPixelReducer:
             model, states = self._sample.model, self._sample.numbers
             mosaic = capture.header.mosaic or model.mosaic or ()
             self._layout = MosaicLayout.of(mosaic, [channel.name for channel in model.channels])
-            _, self._analyzers = channel_rows(capture, model, states, self._sample.changes)
+            try:
+                _, self._analyzers = channel_rows(capture, model, states, self._sample.changes)
+            except CaptureError as error:
+                raise ProcessError(
+                    "the states have different angles, and a super-pixel no single Stokes vector: `Reduce` makes the "
+                    "Mueller image of them, whose page has the values of each."
+                ) from error
             self._relative = relative_exposure(capture, states)
 
     def curve(self, region: Region) -> dict[str, Any]:

@@ -111,7 +111,8 @@ def _of_product(path: Path, query: Any, library: Library) -> dict[str, Any]:
 def _planes(product: Product, region: Region) -> list[dict[str, Any]]:
     told = []
     for name in product.names:
-        if name.endswith("_errors") or name == "mueller" or name.endswith("covariance"):
+        # The flags are told in words.
+        if name.endswith(("_errors", "covariance")) or name in ("mueller", "pixel_flags"):
             continue
         values = product.get(name, region.rows)[..., region.columns]
         if values.size // region.pixels > 4:

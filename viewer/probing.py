@@ -14,6 +14,7 @@ from processing.errors import ProcessError
 from processing.instrument.determined import determined_basis
 from processing.maps.quantities import quantities_block
 from processing.reduction.counts_to_signal import saturation
+from processing.reduction.facts import determined_words
 from processing.reduction.mueller import Choice, field_of, measurement_matrix
 from processing.reduction.solvers.inversion import ELEMENTS, Inversion
 from processing.reduction.solvers.plain import MuellerSolver
@@ -138,7 +139,12 @@ class PixelReducer:
             header=header,
             steps=(),
             simulated=simulated,
-            facts={"weighted": False, "rank": self._inversion.rank, "pixels": count},
+            facts={
+                "weighted": False,
+                "rank": self._inversion.rank,
+                "determined": determined_words(self._inversion),
+                "pixels": count,
+            },
         )
         return image, intensities
 
@@ -179,7 +185,8 @@ def curve(
 
 def matrix(image: MuellerImage) -> dict[str, Any]:
     """Mueller matrix over m00 with its standard errors, and what it decomposes into."""
-    m, errors = image.values.reshape(4, 4).astype(float), image.errors.reshape(4, 4).astype(float)
+    seen = image.seen.reshape(4, 4)
+    m, errors = (np.where(seen, v.reshape(4, 4), np.nan).astype(float) for v in (image.values, image.errors))
     derived = quantities_block(image, (), {}) if int(image.facts.get("rank", 16)) == ELEMENTS else {}
     named = {name: values.reshape(-1).astype(float) for name, values in derived.items()}
     with np.errstate(divide="ignore", invalid="ignore"):

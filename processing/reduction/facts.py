@@ -87,9 +87,14 @@ def mueller_facts(
                 "large: the gain or read noise is not this camera's, or a black level was not subtracted"
             )
     if inversion.rank < len(inversion.basis):
-        seen = determined_elements(inversion.basis)
-        facts["determined"] = ", ".join(f"m{k // 4}{k % 4}" for k in np.flatnonzero(seen)) or "combinations only"
+        facts["determined"] = determined_words(inversion)
     return facts | {"warnings": warnings}
+
+
+def determined_words(inversion: Inversion) -> str:
+    """Which elements a partial polarimeter determines, as `seen_elements` reads it."""
+    seen = determined_elements(inversion.basis)
+    return ", ".join(f"m{k // 4}{k % 4}" for k in np.flatnonzero(seen)) or "combinations only"
 
 
 def _median(values: NDArray[Any]) -> float:

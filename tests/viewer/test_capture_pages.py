@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 
+from processing.instrument.model import InstrumentModel
 from processing.steps.reduction import Reduction
 from processing.storage.importing import ImportRequest, import_capture
 from processing.storage.product import Product
@@ -174,6 +175,25 @@ def test_a_super_pixel_has_a_curve_for_each_analyzer_and_a_stokes_vector(client,
     product = Reduction(lab / "mosaic.h5").make()
     there = client.get("/probe", params={"file": product.name, "x0": 5, "y0": 3}).json()
     assert there["fit"]["stokes"] == one["stokes"]
+
+
+def test_a_pixel_of_a_partial_polarimeter_has_the_elements_that_it_sees(client, configs, synthetic_capture):
+    text = (configs / "instruments" / "linear_mueller.yaml").read_text()
+    model = InstrumentModel.load(configs / "instruments" / "linear_mueller.yaml")
+    angles = {"psg": 13.0 * np.arange(30), "psa": 37.0 * np.arange(30)}
+    signal = 3000 * model.rows(angles)[:, 0] @ np.diag([1, 0.6, 0.5, 0.3]).ravel()
+    frames = np.round(12 + signal[:, None, None, None] * np.ones((4, 5))).astype(np.uint16)
+    detector = {"black_level_counts": 12.0, "gain_e_per_count": 1.0, "read_noise_e": 2.0, "bits": 16}
+    path = synthetic_capture(frames, angles, name="lab/one.h5", instrument_yaml=text, detector=detector)
+    Reduction(path).make()
+    for what, file in (("curve", "one.h5"), ("matrix", "one.h5"), ("probe", "one.mueller.h5")):
+        answer = client.get(what, params={"file": file, "x0": 2, "y0": 1})
+        assert answer.status_code == 200, answer.text
+        if what != "curve":
+            m = np.array(answer.json()["matrix"]["mueller"], float)
+            np.testing.assert_allclose(m[:3, :3], np.diag([1, 0.6, 0.5]), atol=1e-3)
+            assert np.isnan([*m[3], *m[:, 3]]).all()
+            assert answer.json()["matrix"]["quantities"] == {}
 
 
 def test_a_probe_outside_the_image_is_refused(client, drr_capture):

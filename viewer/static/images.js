@@ -29,6 +29,9 @@ export const place = plane => ({
   x0: plane.x0 + (plane.step - 1) / 2, dx: plane.step, y0: plane.y0 + (plane.step - 1) / 2, dy: plane.step,
 });
 
+/** Longest side over the shortest, up to which pixels are drawn square. */
+const MOST_ASPECT = 16;
+
 /** A button that switches between zooming and drawing a region; it looks pressed once the picture does so. */
 export function drawsRegions(button, node) {
   pressed(button, async () => {
@@ -90,9 +93,15 @@ export class ImageView {
       dragmode: this.node.layout?.dragmode || "zoom", margin: { l: 44, r: 8, t: 8, b: 36 },
       ...more,
       xaxis: { range: [-0.5, this.shape[1] - 0.5], constrain: "domain", title: { text: "column / pixels" }, showgrid: false, zeroline: false, ...more.xaxis },
-      yaxis: { range: [this.shape[0] - 0.5, -0.5], scaleanchor: "x", constrain: "domain", title: { text: "row / pixels" }, showgrid: false, zeroline: false, ...more.yaxis },
+      yaxis: { range: [this.shape[0] - 0.5, -0.5], ...this.anchor("x"), constrain: "domain", title: { text: "row / pixels" }, showgrid: false, zeroline: false, ...more.yaxis },
       shapes: [...this.marks(), ...(more.shapes || [])],
     };
+  }
+
+  /** Square pixels, but for an image of a few long rows or columns (a line camera, a spectrum), of which a line were left. */
+  anchor(axis) {
+    const [rows, columns] = this.shape;
+    return Math.max(rows, columns) > MOST_ASPECT * Math.min(rows, columns) ? {} : { scaleanchor: axis };
   }
 
   marks() {

@@ -40,7 +40,9 @@ export function drawCurve(node, found, now = null) {
 }
 
 const number = (v, digits = 4) => v === null || v === undefined ? "-" : Math.abs(v) >= 1e4 ? v.toExponential(2) : v.toFixed(digits);
-const pm = (v, e, digits = 4) => e === null || e === undefined ? number(v, digits) : `${number(v, digits)} ± ${number(e, digits)}`;
+// Noise may make anything of a value without an error bar: it must not look certain.
+const UNKNOWN = "± ?: too near to the noise, or to a place where its error bar would not hold.";
+const pm = (v, e, digits = 4) => v === null || v === undefined ? "-" : `${number(v, digits)} ± ${e === null || e === undefined ? "?" : number(e, digits)}`;
 const cell = (text, tag = "td") => { const node = document.createElement(tag); node.textContent = text; return node; };
 const row = (...cells) => { const node = document.createElement("tr"); node.append(...cells); return node; };
 const heading = text => cell(text, "h3");
@@ -52,7 +54,8 @@ function muellerTable(matrix) {
   matrix.mueller.forEach((line, i) => {
     const cells = line.map((v, j) => {
       const node = cell(i || j ? number(v) : "1");
-      const small = cell(i || j ? `± ${number(matrix.mueller_errors[i][j])}` : `m00 = ${number(matrix.m00, 1)}`, "small");
+      const error = v === null ? "not seen" : `± ${number(matrix.mueller_errors[i][j])}`;
+      const small = cell(i || j ? error : `m00 = ${number(matrix.m00, 1)}`, "small");
       node.append(small);
       return node;
     });
@@ -135,7 +138,9 @@ export function showProbe(node, found) {
   const xi = matrix.quantities.coherency_eigenvalues;
   const plot = node.querySelector(".plot") || simplexPlot();
   if (xi && xi.value.every(v => v !== null)) left.append(heading("Where its eigenvalues lie; the thick edge is the triply degenerate model"), plot);
-  right.append(heading("Decomposition"), scroll(quantityTable(matrix.quantities)));
+  right.append(heading("Decomposition"));
+  if (xi) right.append(scroll(quantityTable(matrix.quantities)), cell(UNKNOWN, "p"));
+  else right.append(cell("A part of a Mueller matrix has none.", "p"));
   if (found.fit) right.append(cell(chiSquare(found.fit), "p"));
   columns.append(left, right);
   const title = cell(`At ${found.where}`, "h2");

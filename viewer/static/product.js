@@ -34,12 +34,14 @@ async function show(fresh) {
   errors.disabled = Boolean(m) && !m.errors;
   if (errors.disabled) errors.checked = false;
   byId("about").textContent = m ? m.about : normalized.checked
-    ? "Elements over m00 on one scale, instrument frames; the first panel is m00 in counts. Grey: too dark." : "Elements in counts on one scale, instrument frames.";
+    ? "Elements over m00 on one scale, instrument frames; the first panel is m00 in counts. Grey: too dark, or not determined." : "Elements in counts on one scale, instrument frames.";
   if (fresh) { view = newView(); view.region = region; }
   await run(() => view.refresh());
 }
 
-const number = v => (v === null ? "-" : Math.abs(v) >= 1e4 || (v && Math.abs(v) < 1e-3) ? v.toExponential(3) : v.toFixed(4));
+const number = v => (v === null ? "-" : Number.isInteger(v) ? String(v) : Math.abs(v) >= 1e4 || Math.abs(v) < 1e-3 ? v.toExponential(3) : v.toFixed(4));
+// Without an error bar, where others of its kind have one, a value may be noise: it must not look certain.
+const withError = (v, errors, k) => number(v) + (!errors || v === null ? "" : ` ± ${errors[k] === null ? "?" : number(errors[k])}`);
 
 async function probe(chosen) {
   region = chosen;
@@ -55,7 +57,7 @@ async function probe(chosen) {
       const line = document.createElement("tr"), head = document.createElement("th"), cell = document.createElement("td");
       head.textContent = plane.name.replaceAll("_", " ");
       head.title = plane.about;
-      cell.textContent = plane.value.map((v, k) => number(v) + (plane.error && plane.error[k] !== null ? ` ± ${number(plane.error[k])}` : "")).join(",  ");
+      cell.textContent = plane.value.map((v, k) => withError(v, plane.error, k)).join(",  ");
       line.append(head, cell);
       return line;
     }));
