@@ -23,7 +23,8 @@ from acquisition.rig.config import RigConfig, load_rig
 from processing.geometry.mesh import Mesh
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
-from processing.reduction.mueller import choose_model, reduce_mueller
+from processing.reduction.instrument_of_capture import choose_model
+from processing.reduction.mueller import reduce_mueller
 from processing.reflectance.base import load_reflectance
 from processing.reflectance.pbsdf import load as load_pbsdf
 from processing.reflectance.tables import ScatteringTable

@@ -46,6 +46,7 @@ def calibrate_command(
     from processing.calibration.train import POOR_FIT, fit_curves, fit_trains
     from processing.doors import require_distinct, require_new
     from processing.instrument.model import InstrumentModel
+    from processing.reduction.instrument_of_capture import require_belongs
     from processing.storage.capture import Capture
 
     if write is not None:
@@ -58,6 +59,7 @@ def calibrate_command(
         with Capture(capture, by_super_pixel=True) as source:
             nm = source.header.wavelength_nm
             rows, columns = _region(region, source.frame_shape)
+            require_belongs(source, model.at(nm))
             parts.append(part_of(source, model.at(nm), rows, columns))
             simulated |= source.simulated
         where = f"rows {rows.start}:{rows.stop}, columns {columns.start}:{columns.stop}"
@@ -95,7 +97,7 @@ def calibrate_mosaic_command(
     """Fit the analysis vector of every pixel of a polarization sensor (Powell and Gruev)."""
     from processing.calibration.mosaic import fit_response
     from processing.commands.summary import summary
-    from processing.reduction.mueller import choose_model
+    from processing.reduction.instrument_of_capture import choose_model
     from processing.storage.capture import Capture
     from processing.storage.product import Step, file_identity
 
@@ -156,5 +158,5 @@ def _region(text: str | None, shape: tuple[int, int]) -> tuple[slice, slice]:
     except ValueError:
         raise CalibrationError(f"--region {text}: write it as r0:r1,c0:c1, whole numbers") from None
     if not (0 <= r0 < r1 <= height and 0 <= c0 < c1 <= width):
-        raise CalibrationError(f"--region {text}: outside the frame of {height} rows and {width} columns")
+        raise CalibrationError(f"--region {text}: no part of a frame of {height} rows and {width} columns")
     return slice(r0, r1), slice(c0, c1)

@@ -7,8 +7,27 @@ from typing import Annotated
 
 import typer
 
+#: Of figures that can be drawn.
+ENDINGS = (".png", ".svg", ".pdf", ".jpg", ".tif", ".eps")
+
+
+def _require_figure(figure: Path | None) -> Path | None:
+    """The place for a figure is looked at before the work that it is to show. Raises ProcessError."""
+    if figure is not None:
+        from processing.doors import require_folder
+        from processing.errors import ProcessError
+
+        require_folder(figure)
+        if figure.suffix.lower() not in ENDINGS:
+            raise ProcessError(
+                f"--figure {figure}: give a name that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}."
+            )
+    return figure
+
+
 FigureFile = Annotated[
-    Path | None, typer.Option("--figure", help="Figure (PNG, SVG, PDF); default: beside the product.")
+    Path | None,
+    typer.Option("--figure", help="Figure (PNG, SVG, PDF); default: beside the product.", callback=_require_figure),
 ]
 NoFigure = Annotated[bool, typer.Option("--no-figure", help="Draw no figure.")]
 

@@ -29,6 +29,7 @@ from processing.reduction.effects_of_capture import (
     with_extra,
 )
 from processing.reduction.facts import mueller_facts
+from processing.reduction.instrument_of_capture import require_belongs
 from processing.reduction.left_out import LeftOut
 from processing.reduction.noise import NoiseModel, noise_of
 from processing.reduction.sample_states import sample_states
@@ -121,16 +122,10 @@ def angles_of(capture: Capture, model: InstrumentModel, states: NDArray[np.int64
 
     Raises
     ------
-    CaptureError : an axis that the model turns has no angles, or not in every state.
+    CaptureError : the capture is not of this instrument, or an axis has no angle in some state.
     """
     angles = {name: value[states] for name, value in capture.angles_deg.items()}
-    missing = [axis for axis in model.axes if axis not in angles]
-    if missing:
-        have = ", ".join(sorted(angles)) or "none"
-        raise CaptureError(
-            f"{capture.path}: instrument {model.name!r} turns {', '.join(missing)}, but the capture has angles of: "
-            f"{have}. Use the instrument file that belongs to the capture."
-        )
+    require_belongs(capture, model)
     read = [np.isfinite(angles[axis]) for axis in model.axes]
     bad = ~np.all([np.ones(len(states), dtype=bool), *read], axis=0)
     if np.any(bad):
@@ -178,15 +173,6 @@ def relative_exposure(capture: Capture, states: NDArray[np.int64]) -> NDArray[np
             f"{capture.path}: exposure_s is given for some states only, or not positive; give it for all or none."
         )
     return np.asarray(exposure / exposure.max())
-
-
-def choose_model(capture: Capture, instrument: Path | None) -> InstrumentModel:
-    """The instrument model at the capture's wavelength: from a file, else the one in the capture."""
-    if instrument is not None:
-        return InstrumentModel.load(instrument).at(capture.header.wavelength_nm)
-    if capture.instrument is None:
-        raise CaptureError(f"{capture.path} holds no instrument model. Give one with --instrument FILE.")
-    return capture.instrument
 
 
 def reduce_mueller(

@@ -11,8 +11,9 @@ from processing.calibration.photon_transfer import read_camera
 from processing.errors import ProcessError
 from processing.reduction.counts_to_signal import Correction
 from processing.reduction.flat import flat_captures, nearest_flat
+from processing.reduction.instrument_of_capture import choose_model
 from processing.reduction.left_out import LeftOut
-from processing.reduction.mueller import Choice, choose_model, reduce_mueller
+from processing.reduction.mueller import Choice, reduce_mueller
 from processing.steps.file_step import FileStep, Found, Progress
 from processing.storage.capture import Capture
 from processing.storage.product import is_product

@@ -86,6 +86,38 @@ def test_a_place_for_no_file_is_refused_before_the_work(acquire, small_rig, capt
     assert (end.value.code, *capfd.readouterr()) == (2, "", told)
 
 
+def test_the_instrument_file_of_another_camera_is_named_as_such(run, capture, configs, tmp_path, capfd):
+    """Frames of one camera were taken for those of a mosaic, or the command ended in a traceback."""
+    files = configs / "instruments"
+    for file, words in (
+        (
+            "linear_stokes.yaml",
+            "its camera has no polarization mosaic, that of the instrument 'linear Stokes camera' a",
+        ),
+        (
+            "drr_wollaston.yaml",
+            "its frames have 1 channel, the instrument 'two quarter-wave plates and a Wollaston pri",
+        ),
+    ):
+        for command in (
+            ("reduce", capture, "--out", tmp_path / "no.h5"),
+            ("calibrate", capture, "--free", "any.thing"),
+        ):
+            code, err = run(*command, "--instrument", files / file)
+            assert (code, words in err, err.count("\n")) == (2, True, 1), err
+        with pytest.raises(SystemExit) as end:
+            diagnose([str(capture), "--instrument", str(files / file)])
+        assert (end.value.code, words in capfd.readouterr().err) == (2, True)
+    assert not (tmp_path / "no.h5").exists()
+
+
+@pytest.mark.parametrize("figure", ["no/where.png", "figure.docx"])
+def test_a_figure_that_cannot_be_drawn_is_refused_before_the_work(run, capture, tmp_path, figure):
+    code, err = run("reduce", capture, "--out", tmp_path / "m.h5", "--figure", tmp_path / figure)
+    assert (code, err.count("\n")) == (2, 1)
+    assert not (tmp_path / "m.h5").exists()
+
+
 def test_a_table_of_the_user_is_not_replaced_by_a_design(run, configs, tmp_path):
     table = tmp_path / "mine.csv"
     table.write_text("psg,psa\n0,0\n")

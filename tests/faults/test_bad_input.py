@@ -10,7 +10,8 @@ import pytest
 
 from processing.doors import ProcessError, parse_json, read_text
 from processing.instrument.states import rotating_retarders
-from processing.reduction.mueller import choose_model, reduce_mueller
+from processing.reduction.instrument_of_capture import choose_model
+from processing.reduction.mueller import reduce_mueller
 from processing.storage.capture import Capture, CaptureError
 from processing.storage.product import Product, ProductError, Step
 from processing.yaml_file import MOST_BYTES, ConfigError, load_yaml

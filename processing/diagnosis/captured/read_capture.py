@@ -43,11 +43,6 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     if cut_off.all():
         raise CaptureError(f"{capture.path}: the counts of every state are cut off at zero. Raise the black level.")
     names = tuple(c.name for c in model.channels)
-    if raw.shape[1] != len(names):
-        raise CaptureError(
-            f"{capture.path}: {raw.shape[1]} channel(s), the instrument {model.name!r} has {len(names)}. "
-            "Use the instrument file that belongs to the capture."
-        )
     detector, integer = capture.header.detector, capture.integer_counts
     top = float(2**detector.bits - 1) - detector.black_level_counts if integer and detector.bits else frames.top
     angles = {name: value[states] for name, value in capture.angles_deg.items()}
