@@ -41,6 +41,7 @@ def seen(folder: Path, library: Library) -> dict[str, Any]:
     found: dict[str, Any] = {"running": run is not None}
     if view is not None:
         found |= {"complete": view.complete, "cells": {cell.name: cell.status for cell in view.cells}}
+        found["logged"] = view.events[:1]
         if run is not None:
             found["night_s"] = seconds_left(view, run)
     if run is None:

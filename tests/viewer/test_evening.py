@@ -139,6 +139,10 @@ def _start_watch_stop_resume(page: Page, other: Page, lab: Path, address: str) -
     expect(other.locator("#captures")).to_have_text(re.compile(r"\d+ of 26"))
     expect(other.locator("#lampwords")).to_have_text(re.compile("dark-corrected mean of each state"))
     expect(other.locator("#frame .nsewdrag")).to_be_attached()
+    # What has ended is told there without loading the page anew: sign with its link, bar and log.
+    expect(other.locator("a.cell.done").first).to_be_attached()
+    expect(other.locator("#log")).to_contain_text("capture ended: 001_")
+    expect(other.locator("#timeline")).to_contain_text("001_")
     keep(other, "campaign")
     partial = next((lab / "evening").glob("*.partial"), None)
     if partial is not None:

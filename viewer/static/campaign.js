@@ -5,7 +5,7 @@ import { ImageView, place, readPlane, saturated } from "./images.js";
 import { accent, at, byId, draw, duration, embedded, getJson, narrow, post, quiet, say, statusColour } from "./plots.js";
 
 const run = byId("run"), folder = run.dataset.folder;
-let view = null, shown = {};
+let view = null, shown = {}, logged = null;
 
 /** A time of a file, which names its zone, as the clock on the wall has it. */
 const local = text => { const d = new Date(text); return isNaN(d) ? text : new Date(d - d.getTimezoneOffset() * 60000).toISOString().slice(0, 23); };
@@ -40,9 +40,27 @@ function drawLamp(lamp) {
     () => ({ xaxis: { title: { text: "state" } }, yaxis: { title: { text: "lamp / %" }, zerolinecolor: quiet() }, margin: { t: 4 } }));
 }
 
-/** Signs of the grid as they change; links come when the page is loaded anew. */
+/** Times of the log as the clock on the wall has them. */
+function localTimes() {
+  for (const time of document.querySelectorAll("time")) time.textContent = local(time.dateTime).slice(0, 19).replace("T", " ");
+}
+
+/** Grid with its links, timeline and log, once the log has another line; what runs stays as it is. */
+async function renew(now) {
+  const newest = JSON.stringify(now.logged);
+  if (logged === newest) return;
+  logged = newest;
+  const page = new DOMParser().parseFromString(await (await fetch(location)).text(), "text/html");
+  const fresh = page.querySelectorAll("[data-renewed]");
+  if (byId("timeline")) Plotly.purge(byId("timeline"));
+  document.querySelectorAll("[data-renewed]").forEach((part, k) => part.replaceWith(fresh[k]));
+  timeline();
+  localTimes();
+}
+
+/** Signs of the grid as they change. */
 function grid(now) {
-  const signs = byId("signs") ? embedded("signs") : {};
+  const signs = embedded("signs");
   document.querySelectorAll(".cell[data-name]").forEach(cell => {
     const status = now.cells?.[cell.dataset.name];
     if (!status || cell.classList.contains(status)) return;
@@ -87,6 +105,7 @@ function show(now) {
   byId("progress").value = now.done;
   byId("activity").textContent = now.activity;
   grid(now);
+  renew(now).catch(() => { logged = ""; });
   facts(byId("axes"), Object.entries(now.axes_deg).map(([name, value]) => [name, `${value.toFixed(3)}°`]));
   if (now.lamp) drawLamp(now.lamp);
   byId("messages").replaceChildren(...(now.messages.length ? now.messages : ["none"]).map(text => {
@@ -110,7 +129,7 @@ byId("stop").addEventListener("click", async event => {
 
 addEventListener("load", () => {
   timeline();
-  for (const time of document.querySelectorAll("time")) time.textContent = local(time.dateTime).slice(0, 19).replace("T", " ");
+  localTimes();
   const events = new EventSource(at("events", { folder }));
   events.onmessage = event => show(JSON.parse(event.data));
   document.body.dataset.ready = "yes";
