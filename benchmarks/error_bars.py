@@ -22,11 +22,10 @@ from processing.maps.quantities import EXTRA, quantities_block
 from processing.maps.xi0 import eigenvalue_block
 from processing.polarization.cloude import coherency_eigenvalues
 from processing.polarization.quantities import PAPER_PAIRS
+from processing.reports.colours import period_deg
 
 #: Brightness of the truth: its noise is below rounding.
 BRIGHT = 1e13
-#: Period of angles in degrees.
-PERIODS = {"orientation_deg": 180.0, "fast_axis_deg": 180.0, "axis_or_90_deg": 90.0}
 #: A quantity that varies by less than this in the truth's own error is fixed by definition.
 FIXED = 1e-9
 
@@ -64,9 +63,8 @@ def _entry(
     name: str, sample: str, electrons: float, values: np.ndarray, errors: np.ndarray, truth: np.ndarray
 ) -> Entry:
     error = values.astype(float) - truth
-    for ending, period in PERIODS.items():
-        if name.endswith(ending):
-            error -= period * np.round(error / period)
+    if (period := period_deg(name, "degree" if name.endswith("_deg") else "")) is not None:
+        error -= period * np.round(error / period)
     known = np.isfinite(error) & np.isfinite(errors) & (errors > FIXED)
     varies = known.mean(axis=-1, keepdims=True) > 0.5
     pull = (error / np.where(known, errors, 1))[known & varies]

@@ -4,7 +4,8 @@
 
 The frames of a capture, each compressed by itself, in memory: MB of counts a second by the clock, best of the repeats.
 Plain counts are copied, the least that any reader does with them; Blosc2 with LZ4 is the fastest codec that is in use
-for such data. Last, what a file that is read from a disc gains: up to which rate of the disc each way is faster.
+for such data (`pip install blosc2`). Last, what a file that is read from a disc gains: up to which rate of the disc
+each way is faster.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from starlette.responses import HTMLResponse, Response
 
 from processing.errors import ProcessError
 from processing.reduction.noise import NoiseModel
-from processing.reports.colours import ALL, CYCLIC, LIGHT, SIGNED, Scale, scale_of, steps
+from processing.reports.colours import ALL, LIGHT, SIGNED, Scale, period_deg, scale_of, steps
 from processing.storage.capture import Capture
 from processing.storage.product import LIT_ERRORS, Product, is_product
 from viewer.frames import chosen
@@ -85,11 +85,10 @@ def difference(request: Request) -> Response:
             _same_shape(early.frame_shape, late.frame_shape)
             window = Window.asked(query, early.frame_shape, most=640)
             one, other = (_of_capture(capture, query, window) for capture in (early, late))
-            units, scale = "counts", Scale(LIGHT, *_ends(one[0]))
+            name, units, scale = None, "counts", Scale(LIGHT, *_ends(one[0]))
     apart = one[0] - other[0]
-    if scale.colours == CYCLIC:
-        # Orientations are the same after half a turn.
-        apart = (apart + 90) % 180 - 90
+    if (period := None if name is None else period_deg(name, units)) is not None:
+        apart = (apart + period / 2) % period - period / 2
     with np.errstate(divide="ignore", invalid="ignore"):
         over = apart / np.hypot(one[1], other[1])
     wide = scale_of("deviation", "", apart)

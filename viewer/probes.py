@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from starlette.requests import Request
 from starlette.responses import JSONResponse
 
 from processing.errors import ProcessError
+from processing.reports.colours import period_deg
 from processing.storage.capture import Capture
 from processing.storage.images import MuellerImage
 from processing.storage.product import Product
@@ -121,12 +123,20 @@ def _planes(product: Product, region: Region) -> list[dict[str, Any]]:
         errors = f"{name}_errors"
         entry = {"name": name, "units": product.units(name), "about": product.long_name(name)}
         with np.errstate(invalid="ignore"):
-            entry["value"] = finite(flat.mean(axis=1))
+            entry["value"] = finite(_mean(flat, period_deg(name, product.units(name))))
             if errors in product.names:
                 each = product.get(errors, region.rows)[..., region.columns].reshape(-1, region.pixels).astype(float)
                 entry["error"] = finite(np.sqrt(np.square(each).sum(axis=1)) / region.pixels)
         told.append(entry)
     return told
+
+
+def _mean(values: NDArray[np.float64], period: float | None) -> NDArray[np.float64]:
+    """Mean over the pixels of (planes, pixels); of orientations, that of 1 and 179 degrees is 0 and not 90."""
+    if period is None:
+        return np.asarray(values.mean(axis=1))
+    turns = np.exp(2j * np.pi * values / period).mean(axis=1)
+    return np.asarray(np.angle(turns) / (2 * np.pi) * period % period)
 
 
 def capture_of(product: Product, library: Library) -> tuple[Path, Path | None] | None:

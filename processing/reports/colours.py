@@ -37,11 +37,20 @@ class Scale:
     high: float
 
 
+def period_deg(name: str, units: str) -> float | None:
+    """After how many degrees an orientation is the same again; None for what is none."""
+    if units != "degree" or name.endswith("_errors"):
+        return None
+    if "axis_or_90" in name:
+        return 90.0
+    return 180.0 if any(part in name for part in _ORIENTATIONS) else None
+
+
 def colours_of(name: str, units: str) -> str:
     """Name of the colour map for a quantity of a product."""
     if name.endswith("_errors"):
         return ERROR
-    if units == "degree" and any(part in name for part in _ORIENTATIONS):
+    if period_deg(name, units) is not None:
         return CYCLIC
     if any(name.endswith(part) or part in name.split("_") for part in (*_LIGHT, *_FLAGS)):
         return LIGHT
@@ -51,12 +60,12 @@ def colours_of(name: str, units: str) -> str:
 
 
 def scale_of(name: str, units: str, values: NDArray[np.floating]) -> Scale:
-    """Colours and limits for a map: a turn for orientations, symmetric about zero for signed quantities."""
+    """Colours and limits for a map: a period for orientations, symmetric about zero for signed quantities."""
     colours = colours_of(name, units)
     finite = values[np.isfinite(values)]
     low, high = np.percentile(finite, [100 - END_PERCENT, END_PERCENT]) if finite.size else (0.0, 1.0)
-    if colours == CYCLIC:
-        return Scale(colours, 0.0, 180.0)
+    if (period := period_deg(name, units)) is not None:
+        return Scale(colours, 0.0, period)
     if colours == SIGNED:
         most = max(abs(float(low)), abs(float(high)), 1e-6)
         return Scale(colours, -most, most)

@@ -136,3 +136,22 @@ def test_a_fact_without_a_value_reads_as_on_the_console(client, lab):
     page = client.get("product?file=p.h5").text
     assert re.search(r"median reduced chi square</t[hd]>\s*<td[^>]*>none</td>", page)
     assert re.search(r"darks</t[hd]>\s*<td[^>]*>none</td>", page)
+
+
+@pytest.mark.parametrize(
+    ("name", "period"), [("diattenuation_orientation_deg", 180.0), ("retardance_axis_or_90_deg", 90.0)]
+)
+def test_orientations_either_side_of_their_wrap_are_neighbours(name, period, client, lab):
+    header = CaptureHeader(title="", simulated=True, mode="drr", wavelength_nm=662, detector=Detector())
+    planes = {name: Plane((), "degree", "an axis"), f"{name}_errors": Plane((), "degree", "its errors")}
+    for file, angles in (("a", [1.0, period - 1.0]), ("b", [period - 1.0, 1.0])):
+        with ProductWriter(lab / f"{file}.h5", "quantities", header, (1, 2), planes, ()) as writer:
+            writer.write(slice(0, 1), **{name: np.array([angles]), f"{name}_errors": np.full((1, 2), 2.0)})
+            writer.seal({"warnings": []})
+    (_, _, apart, over), told = plane(client.get("/difference", params={"a": "a.h5", "b": "b.h5", "name": name}))
+    np.testing.assert_allclose(apart, [[2, -2]], atol=1e-4)
+    np.testing.assert_allclose(over, [[2 / 8**0.5, -2 / 8**0.5]], atol=1e-4)
+    assert told["scales"][0] == {"colours": "twilight", "low": 0.0, "high": period}
+    (found,) = client.get("/probe", params={"file": "a.h5", "x0": 0, "x1": 2, "y0": 0, "y1": 1}).json()["planes"]
+    assert (found["value"][0] + 10) % period == pytest.approx(10, abs=1e-6)
+    assert found["error"][0] == pytest.approx(2 / 2**0.5)
