@@ -52,11 +52,29 @@ def require_file(path: Path, error: type[ProcessError] = ProcessError, most_byte
     return found.st_size
 
 
-def require_place(path: Path, overwrite: bool = False) -> None:
-    """Raise ProcessError unless a file can be made there: the folder is there, the name is free or may be replaced."""
+def require_place(path: Path, overwrite: bool = False, captures_too: bool = False) -> None:
+    """Raise ProcessError unless a file can be made there: the folder is there, the name is free or may be replaced.
+
+    A capture is never replaced, except by another one (`captures_too`): what was measured cannot be made again.
+    """
     if path.exists() and not path.is_dir() and not overwrite:
         raise ProcessError(f"{path} exists. Give another --out, or --overwrite to replace it.")
     require_folder(path)
+    if not captures_too and _is_capture(path):
+        raise ProcessError(f"{path} is a capture, and is not replaced: it cannot be made again. Give another --out.")
+
+
+def _is_capture(path: Path) -> bool:
+    import h5py
+
+    if not path.is_file():
+        return False
+    try:
+        # One that is being written is locked, and a capture as well.
+        with h5py.File(path, "r", locking=False) as h5:
+            return "umov_schema" in h5.attrs
+    except (OSError, RuntimeError):
+        return False
 
 
 def require_new(path: Path) -> None:

@@ -75,7 +75,7 @@ def import_capture(
     ProcessError : the states file, a frame or the stack cannot be used, or the capture exists already.
     ConfigError, WavelengthError : the instrument file cannot be used.
     """
-    require_place(request.out, request.overwrite)
+    require_place(request.out, request.overwrite, captures_too=True)
     model = None
     if request.instrument is not None:
         model = InstrumentModel.load(request.instrument)

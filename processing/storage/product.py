@@ -293,7 +293,7 @@ class Product(OpenH5):
     def require(self, *kinds: str) -> None:
         """Raise ProductError unless the product is of one of the kinds."""
         if self.kind not in kinds:
-            raise ProductError(f"{self.path} holds a {self.kind} image; this needs: {', '.join(kinds)}.")
+            raise ProductError(f"{self.path} holds {_a(self.kind)} image; this needs: {', '.join(kinds)}.")
 
     def _dataset(self, name: str) -> h5py.Dataset:
         if name not in self.names:
@@ -334,6 +334,10 @@ class Product(OpenH5):
         """Row slices of about `pixels` pixels."""
         step = max(1, pixels // max(self.shape[1], 1))
         return [slice(k, min(k + step, self.shape[0])) for k in range(0, self.shape[0], step)]
+
+
+def _a(kind: str) -> str:
+    return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}"
 
 
 def _is_beside(name: str, dataset: h5py.Dataset) -> bool:

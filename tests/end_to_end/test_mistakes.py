@@ -86,7 +86,7 @@ def test_a_place_for_no_file_is_refused_before_the_work(acquire, small_rig, capt
     assert (end.value.code, *capfd.readouterr()) == (2, "", told)
 
 
-def test_the_instrument_file_of_another_camera_is_named_as_such(run, capture, configs, tmp_path, capfd):
+def test_another_camera_s_instrument_file_and_a_place_for_no_figure_are_named(run, capture, configs, tmp_path, capfd):
     """Frames of one camera were taken for those of a mosaic, or the command ended in a traceback."""
     files = configs / "instruments"
     for file, words in (
@@ -108,14 +108,26 @@ def test_the_instrument_file_of_another_camera_is_named_as_such(run, capture, co
         with pytest.raises(SystemExit) as end:
             diagnose([str(capture), "--instrument", str(files / file)])
         assert (end.value.code, words in capfd.readouterr().err) == (2, True)
+    # Neither is there a product where its figure could not be drawn.
+    for figure in ("no/where.png", "figure.docx"):
+        code, err = run("reduce", capture, "--out", tmp_path / "no.h5", "--figure", tmp_path / figure)
+        assert (code, err.count("\n")) == (2, 1)
     assert not (tmp_path / "no.h5").exists()
 
 
-@pytest.mark.parametrize("figure", ["no/where.png", "figure.docx"])
-def test_a_figure_that_cannot_be_drawn_is_refused_before_the_work(run, capture, tmp_path, figure):
-    code, err = run("reduce", capture, "--out", tmp_path / "m.h5", "--figure", tmp_path / figure)
-    assert (code, err.count("\n")) == (2, 1)
-    assert not (tmp_path / "m.h5").exists()
+def test_what_was_measured_is_never_replaced(run, capture, tmp_path):
+    """`--overwrite` is for what can be made again: a reduction with the wrong --out took its capture's place."""
+    raw = capture.read_bytes()
+    other = tmp_path / "other.h5"
+    other.write_bytes(raw)
+    assert run("reduce", capture, "--out", tmp_path / "m.h5", "--no-figure") == (0, "")
+    for command in (("reduce", capture), ("xi0", tmp_path / "m.h5"), ("report", tmp_path / "m.h5")):
+        for out in (capture, other):
+            code, err = run(*command, "--out", out, "--overwrite")
+            assert (code, f"{out} is a capture, and is not replaced" in err) == (2, True), err
+    assert capture.read_bytes() == other.read_bytes() == raw
+    # A product still is.
+    assert run("reduce", capture, "--out", tmp_path / "m.h5", "--no-figure", "--overwrite") == (0, "")
 
 
 def test_a_table_of_the_user_is_not_replaced_by_a_design(run, configs, tmp_path):
