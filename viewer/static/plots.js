@@ -56,7 +56,7 @@ export function layout(more = {}) {
     paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
     font: { color: ink, family: "system-ui, DejaVu Sans, sans-serif", size: 12 },
     margin: { l: 52, r: 12, t: 10, b: 40, ...margin }, showlegend: false, hovermode: "closest", uirevision: "kept",
-    legend: { orientation: "h", y: 1.12, x: 0 },
+    legend: { orientation: "h", y: 1.02, yanchor: "bottom", x: 0 },
     xaxis: { ...axis, ...xaxis }, yaxis: { ...axis, ...yaxis }, ...rest,
   };
 }
