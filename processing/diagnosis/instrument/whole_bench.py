@@ -17,8 +17,8 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.fit import Fit, held_out, minimize, prior, score
 from processing.diagnosis.search.likely_set import everything
-from processing.diagnosis.search.posterior import Posterior, Say, posterior, quadratic, resampled
-from processing.diagnosis.search.rules import DECISIVE, FAR_OFF, LIKELY, REFUTED, SHARES, TAKES_PART
+from processing.diagnosis.search.posterior import Posterior, Say, posterior, resampled
+from processing.diagnosis.search.rules import DECISIVE, FAR_OFF, LIKELY, REFUTED, ROUNDS, SHARES, TAKES_PART
 from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import (
@@ -125,10 +125,10 @@ class WholeBench:
     def weighed(self, found: Posterior, units: Array) -> Posterior:
         """The same with a unit of chi-square of its own for each capture: structure in one does not devalue others."""
         self.whole.weights = 1 / units
-        sums = self.whole.sums(found.space, found.values)
-        form = quadratic(self.whole, found.space, found.values, sums)
+        # Of one capture the weight is another unit; of several the least certain values move far.
+        out = resampled(self.whole, found, rounds=1 if units.size == 1 else ROUNDS)
         self.whole.weights = np.ones(units.size)
-        return resampled(found, form)
+        return out
 
     def _offered(self, candidate: Candidate) -> bool:
         effect = candidate.effect

@@ -16,6 +16,8 @@ from processing.instrument.effects.base import ValuePerState
 #: The prior that keeps unseen parameters still is this many times wider than a typical size.
 PRIOR_WIDTH = 10.0
 STEPS = 15
+#: What is held out is predicted to this fraction of the excess: a fit that ends earlier would still know it.
+MANY_STEPS, HELD_OUT_RELATIVE = 30, 1e-4
 #: Times that corrections of counts are expanded anew in one fit.
 EXPANSIONS = 2
 #: The fit ends when a step promises less than this in chi-square, or this fraction of the excess.
@@ -51,20 +53,22 @@ def minimize(
     steps: int = STEPS,
     expansions: int = EXPANSIONS,
     least_gain: float = LEAST_GAIN,
+    weak: Array | None = None,
 ) -> Fit:
     """Least squares by Levenberg-Marquardt with bounds, on the data of the folds given; `free` (K,) may hold some.
 
-    It ends when a step gains less than `least_gain`.
+    It ends when a step gains less than `least_gain`. `weak` (K,) is the curvature of the prior; default: `prior`.
     Corrections of counts are expanded about the start, and at most `expansions` times anew about where the fit ended.
     """
     if folds is None and expansions:
         problem.relinearize(space, start)
-    fit = _descend(problem, space, start, folds, free, steps, least_gain)
+    weak = prior(space) if weak is None else weak
+    fit = _descend(problem, space, start, folds, free, steps, least_gain, weak)
     if folds is None:
         for _ in range(expansions):
             if not problem.relinearize(space, fit.values):
                 break
-            fit = _descend(problem, space, fit.values, folds, free, steps, least_gain)
+            fit = _descend(problem, space, fit.values, folds, free, steps, least_gain, weak)
     return fit
 
 
@@ -76,9 +80,9 @@ def _descend(
     free: NDArray[np.bool_] | None,
     steps: int,
     least_gain: float,
+    weak: Array,
 ) -> Fit:
     use = list(range(problem.folds) if folds is None else folds)
-    weak = prior(space)
     lower, upper = space.joined("lower"), space.joined("upper")
     free = (np.ones(space.size, dtype=bool) if free is None else free) & ~space.fixed
     x = np.clip(start, lower, upper)
@@ -190,6 +194,11 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
             values = minimize(problem, space, full.values, others, steps=6).values
         else:
             values = _one_step(full, space, others, weak)
+            if _worse(problem, space, full, values, others, weak):
+                # The least certain values moved farther than one step can tell.
+                least = max(LEAST_GAIN, HELD_OUT_RELATIVE * abs(full.excess))
+                fit = minimize(problem, space, full.values, others, steps=MANY_STEPS, least_gain=least, weak=weak)
+                values = fit.values
         if local.any():
             start = np.where(local, full.values, values)
             fit = minimize(problem, space, start, [fold], free=local, steps=3)
@@ -234,6 +243,13 @@ def _in_sample(space: Space, full: Fit, weak: Array) -> HeldOut:
     shares = full.sums.shares.sum(axis=2) * [1.0, share]
     excess = float(full.sums.excess.sum())
     return HeldOut(excess, max(share * freedom, 1e-300), square, max(share * count, 1e-300), shares)
+
+
+def _worse(problem: Problem, space: Space, full: Fit, values: Array, folds: Sequence[int], weak: Array) -> bool:
+    """Whether the data of these folds and the prior are fitted worse than by the fit to all of them."""
+    new = problem.sums(space, values, derivatives=False)
+    gain = full.sums.excess[folds].sum() - new.excess[folds].sum() + weak @ (full.values**2 - values**2)
+    return not gain >= 0
 
 
 def _one_step(full: Fit, space: Space, folds: Sequence[int], weak: Array) -> Array:

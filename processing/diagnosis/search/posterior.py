@@ -18,6 +18,7 @@ from processing.diagnosis.search.problem import Problem
 from processing.diagnosis.search.rules import (
     BENT,
     CHANGES,
+    GROWTH,
     LEAST_NOISE,
     NOMINAL_TAU,
     ROUNDS,
@@ -85,7 +86,6 @@ def posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start:
     """
     members, groups = grouped(space, fixed)
     x = about = start
-    typical, lower, upper = (space.joined(name) for name in ("typical", "lower", "upper"))
     rounds = ROUNDS if problem.noise_known else FEWER_ROUNDS
     for left in reversed(range(rounds)):
         problem.relinearize(space, x)
@@ -102,20 +102,30 @@ def posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start:
             # Several large causes, none of which explains much alone, or far from linear: all of them at once first.
             x = _everything(problem, space, fixed, x, sets.noise)
             continue
-        settled = bool(left == 0)
+        settled = left == 0
         if not settled:
-            samples = sample(sets, state, SAMPLES_BEFORE)
-            mean = np.where(space.fixed, x, np.clip(samples.mean * typical, lower, upper))
-            new = _improved(problem, space, groups, samples, mean)
-            spread = np.sqrt(np.maximum(np.diag(samples.covariance), 1e-12)) * typical
-            settled = bool(np.all(np.abs(new - x) < SETTLED * spread))
+            new, settled = _next(problem, space, sets, state, x)
             x = x if settled else new
         if settled:
             break
     samples = _averaged(sets, state)
     there = [space.candidates[members[g][0]].label for g in np.flatnonzero((samples.probability > 0.5) & sets.free)]
     say(f"likely: {', '.join(there) or 'nothing'}; unit of chi-square {state.unit:.3g}")
-    return _posterior_of(space, members, sets, samples)
+    return _posterior_of(problem, space, members, sets, samples, about)
+
+
+def _next(problem: Problem, space: Space, sets: Sets, state: State, x: Array) -> tuple[Array, bool]:
+    """Values (K,) about which to linearize next, and whether they are so near to x (K,) that there is no need."""
+    samples = sample(sets, state, SAMPLES_BEFORE)
+    new = _improved(problem, space, sets.groups, samples, [_mean(space, samples, x), x])
+    spread = np.sqrt(np.maximum(np.diag(samples.covariance), 1e-12)) * space.joined("typical")
+    return new, bool(np.all(np.abs(new - x) < SETTLED * spread))
+
+
+def _mean(space: Space, samples: Samples, x: Array) -> Array:
+    """Values (K,), mean over the sets; of what is not fitted those of x (K,)."""
+    typical, lower, upper = (space.joined(name) for name in ("typical", "lower", "upper"))
+    return np.where(space.fixed, x, np.clip(samples.mean * typical, lower, upper))
 
 
 def _averaged(sets: Sets, state: State) -> Samples:
@@ -143,17 +153,32 @@ def _everything(problem: Problem, space: Space, fixed: Sequence[Candidate], x: A
     return out
 
 
-def resampled(found: Posterior, form: Quadratic) -> Posterior:
-    """The same with another chi-square, from the likeliest set on."""
-    sets = Sets(form, found.sets.groups, found.sets.noise)
-    samples = _averaged(sets, climb(sets, found.samples.best))
-    return _posterior_of(found.space, found.members, sets, samples)
+def resampled(problem: Problem, found: Posterior, rounds: int) -> Posterior:
+    """The same with other weights of the captures, from the likeliest set on; linearized anew at most so many times."""
+    x, space = found.values, found.space
+    for left in reversed(range(rounds)):
+        sets = Sets(quadratic(problem, space, x, problem.sums(space, x)), found.sets.groups, found.sets.noise)
+        state = climb(sets, found.samples.best)
+        new, settled = _next(problem, space, sets, state, x) if left else (x, True)
+        if settled:
+            break
+        x = new
+        problem.relinearize(space, x)
+    return _posterior_of(problem, space, found.members, sets, _averaged(sets, state), x)
 
 
-def _posterior_of(space: Space, members: tuple[tuple[int, ...], ...], sets: Sets, samples: Samples) -> Posterior:
-    typical = space.joined("typical")
-    values = np.clip(samples.mean * typical, space.joined("lower"), space.joined("upper"))
-    values[space.fixed] = 1.0
+def _posterior_of(
+    problem: Problem, space: Space, members: tuple[tuple[int, ...], ...], sets: Sets, samples: Samples, about: Array
+) -> Posterior:
+    """The posterior of a problem linearized `about` values (K,)."""
+    typical, values = space.joined("typical"), _mean(space, samples, np.ones(space.size))
+    z, form = values / typical, sets.form
+    told = float(form.excess + 2 * form.gradient @ z + z @ form.curvature @ z)
+    there = problem.sums(space, values, derivatives=False)
+    left = float(there.excess.sum()) + (0.0 if problem.noise_known else float(there.freedom.sum()))
+    if not sets.noise.unit(left) <= GROWTH * sets.noise.unit(told):
+        # The least certain values lie along a bent valley, in which the straight line to their mean does not stay.
+        values = _improved(problem, space, sets.groups, samples, [about], 2 * STEPS)
     return Posterior(space, members, sets, samples, values, samples.covariance * np.outer(typical, typical))
 
 
@@ -211,8 +236,18 @@ def _told(problem: Problem, space: Space, x: Array, h: Array, typical: Array) ->
     return np.asarray(np.clip(1 - noise / np.maximum(np.diag(h), 1e-300), 0.0, 1.0))
 
 
-def _improved(problem: Problem, space: Space, groups: Sequence[Group], samples: Samples, x: Array) -> Array:
-    """Values (K,) at the minimum of chi-square and prior, of the groups that are likely to be there."""
+def _improved(
+    problem: Problem,
+    space: Space,
+    groups: Sequence[Group],
+    samples: Samples,
+    starts: Sequence[Array],
+    steps: int = STEPS,
+) -> Array:
+    """Values (K,) at the minimum of chi-square and prior, of the groups that are likely to be there.
+
+    The descent begins at the best of some places (K,).
+    """
     index = np.concatenate(
         [np.zeros(0, dtype=np.int64)]
         + [g.index for g, p in zip(groups, samples.probability, strict=True) if p > TAKES_PART]
@@ -222,11 +257,20 @@ def _improved(problem: Problem, space: Space, groups: Sequence[Group], samples: 
     positions = np.concatenate([np.zeros(0, dtype=np.int64), *(np.r_[space.slices[k]] for k in chosen)]).astype(int)
     typical = space.joined("typical")[positions]
     width = np.sqrt(np.diag(samples.covariance) + samples.mean**2)[positions] * typical
-    out = np.where(space.fixed, x, 0.0)
+    weak = samples.best.unit / np.maximum(width, 1e-3 * typical) ** 2
+    out = np.where(space.fixed, starts[0], 0.0)
     if positions.size:
-        unit = samples.best.unit
-        out[positions] = descend(problem, part, x[positions], unit / np.maximum(width, 1e-3 * typical) ** 2)
+        places = [x[positions] for x in starts]
+        left = [_penalized(problem.sums(part, x, derivatives=False), weak, x) for x in places]
+        best = int(np.argmin(np.nan_to_num(left, nan=np.inf)))
+        out[positions] = descend(problem, part, places[best], weak, steps)
     return out
+
+
+def _penalized(sums: Sums, weak: Array, values: Array, reference: float | None = None) -> float:
+    """Chi-square over its stretch and prior, in units of noise that is `reference` as a whole."""
+    freedom = max(float(sums.freedom.sum()), 1e-300)
+    return float(sums.excess.sum() * (freedom if reference is None else reference) / freedom + weak @ values**2)
 
 
 def descend(problem: Problem, space: Space, x: Array, weak: Array, steps: int = STEPS) -> Array:
@@ -236,11 +280,7 @@ def descend(problem: Problem, space: Space, x: Array, weak: Array, steps: int = 
     start = problem.sums(space, x, derivatives=False)
     reference, damping = float(start.freedom.sum()), 0.0
 
-    def cost(s: Sums, v: Array) -> float:
-        freedom = max(float(s.freedom.sum()), 1e-300)
-        return float(s.excess.sum() * reference / freedom + weak @ v**2)
-
-    least = cost(start, x)
+    least = _penalized(start, weak, x, reference)
     for _ in range(steps):
         sums = problem.sums(space, x)
         freedom = max(float(sums.freedom.sum()), 1e-300)
@@ -250,7 +290,7 @@ def descend(problem: Problem, space: Space, x: Array, weak: Array, steps: int = 
             move = np.linalg.solve(h + damping * np.diag(np.diag(h)), g)
             tried = np.where(space.fixed, x, np.clip(x - move, lower, upper))
             # Derivatives are most of the work; a step that is refused needs none.
-            now = cost(problem.sums(space, tried, derivatives=False), tried)
+            now = _penalized(problem.sums(space, tried, derivatives=False), weak, tried, reference)
             if now <= least:
                 break
             damping = max(10 * damping, 1e-3)

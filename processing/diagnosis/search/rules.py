@@ -118,7 +118,7 @@ DECISIVE = 25.0
 #: its own: 0.4 GB, or 300 values for 40 states of an unknown sample. The likeliest values are taken.
 BESIDE_FIELD = 5e7
 #: [1] Growth of the unit of chi-square, by what the tests of the residual find, from which on the sets are visited
-#: again.
+#: again; and at the mean of the sets beyond what a straight line to it promised, from which on a descent replaces it.
 GROWTH = 1.05
 
 # ---- wiring --------------------------------------------------------------------------------------------------------
