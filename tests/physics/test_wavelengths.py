@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.instrument.mueller_slopes import mueller_slopes
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.starts import along_wavelengths
 from processing.diagnosis.instrument.whole_bench import WholeBench
@@ -118,7 +119,17 @@ def test_a_free_source_leaves_no_residual():
         assert sums.count.sum() == pytest.approx(gain.size if free else 2 * gain.size - 1)
     assert left[True] < 1e-5
     assert left[False] > 0.1
-    assert not any(c.kind.startswith("source") for c in problem.pool())
+    # What changes both channels of a state alike is taken up too.
+    assert not any(c.kind.startswith("source") or c.kind.endswith("transmission") for c in problem.pool())
+
+
+def test_what_the_intensities_do_not_tell_of_m_is_no_error_of_the_instrument(problem):
+    space = Space(tuple(c for c in problem.pool() if c.kind == "rotation_eccentricity"))
+    values = np.zeros(space.size)
+    told, half, nothing = (mueller_slopes(problem, space, values, np.full(3, x))[0] for x in (1.0, 1e3, 1e9))
+    assert told == pytest.approx(mueller_slopes(problem, space, values)[0])
+    assert np.trace(nothing) < 1e-6 * np.trace(told)
+    assert 0.01 < np.trace(half) / np.trace(told) < 0.99
 
 
 def one_run(wavelengths) -> InstrumentProblem:

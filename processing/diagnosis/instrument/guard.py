@@ -39,7 +39,13 @@ def checks(problem: InstrumentProblem, solved: Solution) -> tuple[Check, ...]:
             holds=bool(after <= WORSE * before),
         )
     ]
+    several = len(problem.captures) > 1
     for k, data in enumerate(problem.captures):
+        if several:
+            # The sum decides; what became of each is told also where nothing is written.
+            old, new = (100 * found.rms_of(k) for found in (solved.before, solved.after))
+            name = f"rms on held-out data of {data.name} at {data.wavelength_nm:g} nm, percent"
+            out.append(Check(name=name, before=old, after=new, holds=True))
         (rank, condition), (new_rank, new_condition) = (
             _of_rows(problem, k, space, fit)
             for space, fit in ((solved.base, solved.before_fit), (solved.space, solved.fit))
@@ -128,13 +134,20 @@ def slopes_of(problem: InstrumentProblem, found: Posterior, solved: Solution) ->
         if c in correction or (not isinstance(c.effect, FieldEffect | Switch) and spread[p].any())
     }
     space, index = Space(tuple(part)), np.concatenate([*part.values()])
-    products, light = mueller_slopes(problem, space, found.values[index])
+    products, light = mueller_slopes(problem, space, found.values[index], _left(problem, solved))
     return Slopes(
         index,
         np.concatenate([np.full(c.size, c in correction) for c in part]),
         np.concatenate([np.full(c.size, scope_of(c) == "instrument") for c in part]),
         products / (max(light, 1e-300) * ELEMENTS),
     )
+
+
+def _left(problem: InstrumentProblem, solved: Solution) -> Array:
+    """What is left over of each capture (captures,) after the correction, in units of its noise; noise at least."""
+    noise = np.array([m.noise_floor for m in problem.moments])
+    left = np.array([solved.after.rms_of(k) for k in range(noise.size)])
+    return np.asarray(np.maximum(left / np.maximum(noise, 1e-300), 1.0))
 
 
 def predicted_change_of_part(

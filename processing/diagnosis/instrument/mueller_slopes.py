@@ -13,11 +13,16 @@ from processing.diagnosis.search.space import Space
 from processing.instrument.changes import Changes
 
 
-def mueller_slopes(problem: InstrumentProblem, space: Space, values: Array) -> tuple[Array, float]:
+def mueller_slopes(
+    problem: InstrumentProblem, space: Space, values: Array, left: Array | None = None
+) -> tuple[Array, float]:
     """Products (K, K) of the derivatives of M, and the sum of m00 squared, over all pixels.
 
-    The products are summed over elements and pixels, a common factor of M left out.
+    The products are summed over elements and pixels, a common factor of M left out. `left` (captures,) is what the
+    intensities of each are known to, in units of noise (default: 1). What they do not tell of M, within the size of its
+    elements, is not made wrong by an instrument either.
     """
+    left = np.ones(len(problem.captures)) if left is None else left
     problem, values = problem.near(space, values)
     products, light = np.zeros((space.size, space.size)), 0.0
     for k, moments in enumerate(problem.moments):
@@ -26,11 +31,17 @@ def mueller_slopes(problem: InstrumentProblem, space: Space, values: Array) -> t
         changes = problem.changes(k, mine, own)
         columns = partial(_all_columns, problem, k)
         w, c = columns(changes), problem.coefficients(k, changes)
-        back = np.linalg.pinv(w * moments.counts[:, None], rcond=RANK)
+        u, size, vt = np.linalg.svd(w * moments.counts[:, None], full_matrices=False)
+        u, size, vt = u[:, size > RANK * size[0]], size[size > RANK * size[0]], vt[size > RANK * size[0]]
         dw, dc = problem.slopes(k, mine, own, w, columns), problem.slopes_of_counts(k, mine, own, c)
         scale = 1 / moments.sigma[:, None]
         for block in moments.blocks[:: problem.folds if moments.tiles is None else 1]:
-            m = back @ (np.einsum("fl,flr->lr", c, block.z) * scale)
+            y = np.einsum("fl,flr->lr", c, block.z) * scale
+            m00 = (vt[:, 0] / size) @ (u.T @ y)
+            # The best linear estimate of elements that are as large as m00 at most.
+            unknown = left[k] ** 2 * block.pixels / max(float(m00 @ m00), 1e-300)
+            back = (vt.T * (size / (size**2 + unknown))) @ u.T
+            m = back @ y
             slopes = -np.einsum("el,klm,mr->ker", back, dw, m, optimize=True)
             for j in np.flatnonzero(np.any(dc, axis=(1, 2))):
                 slopes[j] += back @ (np.einsum("fl,flr->lr", dc[j], block.z) * scale)

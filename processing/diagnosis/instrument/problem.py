@@ -36,8 +36,8 @@ from processing.instrument.changes import Changes
 from processing.instrument.effects.base import (
     FieldEffect,
     ImageShift,
+    LevelEffect,
     PointwiseEffect,
-    SourceEffect,
 )
 from processing.instrument.model import InstrumentModel
 
@@ -96,9 +96,11 @@ class InstrumentProblem:
     def pool(self) -> tuple[Candidate, ...]:
         """Every effect at every place of the captures."""
         found = pool(self.model, [c.conditions for c in self.captures], self.wavelengths_nm)
-        # The level of a free source is projected out already.
-        free = [self._free_source(k) for k in range(len(self.captures))]
-        return tuple(c for c in found if not isinstance(c.effect, SourceEffect) or not free[c.capture or 0])
+        return tuple(c for c in found if not (isinstance(c.effect, LevelEffect) and self._is_projected_out(c)))
+
+    def _is_projected_out(self, level: Candidate) -> bool:
+        """Whether every source that it acts on has a free level, which takes it up."""
+        return all(self._free_source(k) for k, nm in enumerate(self.wavelengths_nm) if level.acts(k, nm))
 
     def powers(self) -> list[tuple[int, Array]]:
         """Rows that the unknowns leave over, and the power of each component of the signal, for each capture."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 from processing.arrays import Array
 from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import OpticsEffect, turns
+from processing.instrument.effects.base import LevelEffect, OpticsEffect, turns
 from processing.instrument.model import InstrumentModel
 
 
-class Transmission(OpticsEffect):
+class Transmission(OpticsEffect, LevelEffect):
     """Relative change of transmission, once and twice per turn of the element."""
 
     belongs_to = "dispersion"

@@ -50,7 +50,11 @@ class OpticsEffect(InstrumentEffect):
     """Changes the polarization elements or the detector channels; a known surface shows it too."""
 
 
-class SourceEffect(InstrumentEffect):
+class LevelEffect(InstrumentEffect):
+    """Changes all channels of a state by one factor: a source whose level is free (`free_source`) takes it up."""
+
+
+class SourceEffect(LevelEffect):
     """Changes the light of the source, by the same share in the whole image."""
 
 
