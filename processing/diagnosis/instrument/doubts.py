@@ -9,13 +9,14 @@ import numpy as np
 from processing.diagnosis.instrument.edges import at_edges
 from processing.diagnosis.instrument.nameless import NamelessWaves
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.source_patterns import beat_explains_more, patterned
+from processing.diagnosis.instrument.source_patterns import beat_explains_more, chance_of_pattern, patterned
 from processing.diagnosis.instrument.unevenness import unevenness
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause, shown
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import (
     BOUND,
+    CHANCE_OF_PATTERN,
     EDGES,
     LIMIT,
     ONE_PATTERN,
@@ -39,6 +40,8 @@ from processing.instrument.effects.base import (
 #: The reason for which values for each state are not used either, where an unknown sample takes up a part of them: what
 #: it takes up is then not like the rest, as it is with random values.
 PATTERN = "its values follow one wave or jump over the states, as a beat or a fringe does: they are not random"
+#: The reason of a source beside one with that pattern.
+BESIDE_PATTERN = "it may be a part of a source that changes as no effect of the list does"
 #: The same of an effect in whose place a source with one wave fits better.
 BEAT = "a source that beats explains more than it does"
 #: The same where a plate that turns has a wave of its own that is not in the list.
@@ -77,7 +80,7 @@ def doubts(
     for cause in causes:
         first = cause.candidates[0]
         if cause not in out and isinstance(first.effect, SourceEffect) and first.capture in patterned:
-            out[cause] = "it may be a part of a source that changes as no effect of the list does"
+            out[cause] = BESIDE_PATTERN
     # What follows a pattern is no effect of the list: what it took away is left over as well.
     left += sum(2 * cause.log_odds * found.samples.best.unit for cause, why in out.items() if why in ELSE)
     for rank, cause in enumerate(causes, 1):
@@ -105,14 +108,14 @@ def _of_itself(
     if isinstance(effect, ValuePerState):
         if not testable(problem, solved, cause, causes):
             return "as many values as the data have"
-        return PATTERN if _one_pattern(found, cause) else None
+        return PATTERN if _one_pattern(problem, found, cause) else None
     if isinstance(effect, SourceEffect):
         return OF_THE_SAMPLE if any(_uneven(problem, solved, c, cause) for c in cause.candidates) else None
     # Channels that look at places apart leave something where the image is curved: that is not alike either.
     alike = isinstance(effect, CountsEffect) or any(c.place_px is not None for c in problem.captures)
     if not alike and any(_uneven(problem, solved, c, cause) for c in cause.candidates):
         return NOT_ALIKE
-    return BEAT if problem.noise_known and _is_one_name(cause) and beat_explains_more(found, cause) else None
+    return BEAT if problem.noise_known and _is_one_name(cause) and beat_explains_more(problem, found, cause) else None
 
 
 def _is_one_name(cause: Cause) -> bool:
@@ -166,16 +169,25 @@ def _at_bound(cause: Cause) -> bool:
     return False
 
 
-def _one_pattern(found: Posterior, cause: Cause) -> bool:
+def _one_pattern(problem: InstrumentProblem, found: Posterior, cause: Cause) -> bool:
     typical = found.space.joined("typical")
     part = dict(zip(found.space.candidates, found.space.slices, strict=True))
-    held, beyond, noise = 0.0, 0.0, 0.0
+    seen = []
     for candidate, values, covariance in zip(cause.candidates, cause.values, cause.covariance, strict=True):
         p = part[candidate]
         curvature = found.sets.form.curvature[p, p] / np.outer(typical[p], typical[p]) / found.samples.best.unit
-        seen = patterned(values, curvature, covariance)
-        held, beyond, noise = held + seen.held, beyond + seen.beyond_noise, noise + seen.noise
-    return beyond > noise and held > ONE_PATTERN * beyond
+        seen.append(patterned(values, curvature, covariance))
+    beyond = sum(one.beyond_noise for one in seen)
+    if beyond <= sum(one.noise for one in seen):
+        return False
+    if any(acts_on_unknown(problem, c) for c in cause.candidates):
+        return chance_of_pattern(seen) < CHANCE_OF_PATTERN
+    return sum(one.held for one in seen) > ONE_PATTERN * beyond
+
+
+def acts_on_unknown(problem: InstrumentProblem, candidate: Candidate) -> bool:
+    """Whether the candidate acts on a capture of an unknown sample."""
+    return any(c.sample is None and candidate.acts(k, c.wavelength_nm) for k, c in enumerate(problem.captures))
 
 
 def _uneven(problem: InstrumentProblem, solved: Solution, candidate: Candidate, cause: Cause) -> bool:

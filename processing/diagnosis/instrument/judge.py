@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.instrument.doubts import ELSE, doubts, testable
+from processing.diagnosis.instrument.doubts import BESIDE_PATTERN, ELSE, PART_OF_LEFT, acts_on_unknown, doubts, testable
 from processing.diagnosis.instrument.empirical import empirical
 from processing.diagnosis.instrument.evidence import wanted_for_evidence, would_be_seen
 from processing.diagnosis.instrument.guard import chances, checks, lasts, predicted_changes, refusal
@@ -38,7 +38,7 @@ from processing.diagnosis.search.posterior import Posterior, Say
 from processing.diagnosis.search.result import Diagnosis, Unexplained, Verdict
 from processing.diagnosis.search.rules import CHANCE_WORSE, GROWTH, LIKELY, LIMIT, WHITE
 from processing.diagnosis.search.solution import Solution
-from processing.instrument.effects.base import ValuePerState
+from processing.instrument.effects.base import FieldEffect, ValuePerState
 from processing.instrument.model import InstrumentModel
 
 
@@ -94,9 +94,7 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
     # What as many values as the data have took away may be any structure.
     left += sum(2 * c.log_odds * found.samples.best.unit for c in untold)
     doubt = doubts(asked, found, solved, named, left)
-    # Values that are not random, or may be any structure, are wrong where an unknown sample takes up a part of them.
-    patterned = (*untold, *(cause for cause, reason in doubt.items() if reason in ELSE))
-    unfit = [c for cause in patterned for c in cause.candidates if _unknown(problem, c)]
+    unfit = _unfit(problem, solved, named, untold, doubt)
     if unfit:
         solved = solution(bench, found, unfit)
         after = tuple(residual(asked, k, solved.space, solved.fit) for k in captures)
@@ -161,9 +159,25 @@ def _grown(units: Array, unit: float) -> bool:
     return bool(units.max() > GROWTH * unit)
 
 
-def _unknown(problem: InstrumentProblem, candidate: Candidate) -> bool:
-    """Whether the candidate acts on a capture of an unknown sample."""
-    return any(c.sample is None and candidate.acts(k, c.wavelength_nm) for k, c in enumerate(problem.captures))
+def _unfit(
+    problem: InstrumentProblem,
+    solved: Solution,
+    named: Sequence[Cause],
+    untold: Sequence[Cause],
+    doubt: Mapping[Cause, str],
+) -> list[Candidate]:
+    """What is not used where an unknown sample takes up a part of it, for it may be any structure or a part of such."""
+    # Values that are not random, or as many as the data have; and those of a source that were found beside them.
+    unfit = [*untold, *(cause for cause, reason in doubt.items() if reason in (*ELSE, BESIDE_PATTERN))]
+    found = [c for cause in unfit for c in cause.candidates]
+    if any(reason in ELSE for reason in doubt.values()):
+        # Something is there that is not in the list: only what has a name of its own is no part of it.
+        stands = [cause for cause in named if doubt.get(cause, PART_OF_LEFT) == PART_OF_LEFT]
+        own = {c for cause in stands for c in (*cause.candidates, *cause.alternatives)}
+        found += [
+            c for c in solved.effects if c not in own and not (isinstance(c.effect, FieldEffect) or c.state_chosen)
+        ]
+    return [c for c in dict.fromkeys(found) if acts_on_unknown(problem, c)]
 
 
 def directions(problem: InstrumentProblem, k: int) -> float:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import betaincc
 
 from processing.arrays import Array
+from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import ONE_WAVE
+from processing.diagnosis.search.rules import ONE_WAVE, SURE
 from processing.instrument.effects.base import SourceEffect, ValuePerState
 
 #: Frequencies of a wave over n states, for each state; and between two of them, where a wave is looked at closely.
 FREQUENCIES, CLOSELY = 8, 9
+#: Values of the largest pattern, a jump beside a drift and its bend.
+VALUES = 3
 
 
 def waves(cycles: Array, n: int) -> Array:
@@ -32,11 +37,12 @@ def jumps(n: int) -> Iterator[Array]:
         yield np.column_stack([(k >= first) - 1 + first / n, drift])
 
 
-def beat_explains_more(found: Posterior, cause: Cause) -> bool:
+def beat_explains_more(problem: InstrumentProblem, found: Posterior, cause: Cause) -> bool:
     """Whether in a cause's place a source that follows one wave, in each of its captures, fits better.
 
     What a turning plate passes is a wave over the states too, of once or twice a turn; a beat has a frequency of its
-    own. Values for each state that take part are asked themselves (`patterned`).
+    own. Where no such turn explains what the wave does, a wave that fits as well is enough: no name is sure beside it.
+    Values for each state that take part are asked themselves (`patterned`).
     """
     sets, best = found.sets, found.samples.best
     labels = [found.label(g) for g in range(len(found.members))]
@@ -47,26 +53,43 @@ def beat_explains_more(found: Posterior, cause: Cause) -> bool:
         return False
     own = labels.index(cause.candidates[0])
     given = sets.given_others(sets.without(best, own))
-    most = 0.0
+    beats, turns, cost = 0.0, 0.0, 0.0
     for g in source:
         curvature, gradient = given[g]
         last = 0
         for m in found.members[g]:
-            part = slice(last, last := last + found.space.candidates[m].size)
-            most += _best(curvature[part, part], gradient[part]) - 2 * ONE_WAVE
-    return bool(most > _explained(*given[own]))
+            candidate = found.space.candidates[m]
+            part = slice(last, last := last + candidate.size)
+            asked = curvature[part, part], gradient[part]
+            beats += _best(*asked)
+            turns += max((_held(wave, *asked) for wave in _turns(problem, candidate)), default=0.0)
+            cost += 2 * ONE_WAVE
+    odds = 2 * np.log(SURE / (1 - SURE)) if beats - turns > cost else 0.0
+    return bool(beats - cost > _explained(*given[own]) - odds)
+
+
+def _turns(problem: InstrumentProblem, candidate: Candidate) -> Iterator[Array]:
+    """Cosine and sine (n, 2) of once and twice the turn of every element, over the states of a candidate's capture."""
+    capture = problem.captures[candidate.capture or 0]
+    for element in problem.model.elements():
+        if element.axis is not None:
+            angles = np.deg2rad(element.ratio * capture.conditions.angles_deg[element.axis])
+            for periods in (1, 2):
+                yield np.stack([np.cos(periods * angles), np.sin(periods * angles)], axis=1)
+
+
+def _held(wave: Array, curvature: Array, gradient: Array) -> float:
+    """Chi-square that values along a wave (N, 2) explain."""
+    return _explained(wave.T @ curvature @ wave, wave.T @ gradient)
 
 
 def _best(curvature: Array, gradient: Array) -> float:
     """Most chi-square that one wave of values with a curvature (N, N) and a gradient (N,) explains."""
 
-    def explained(wave: Array) -> float:
-        return _explained(wave.T @ curvature @ wave, wave.T @ gradient)
-
     cycles, step = _cycles(gradient.size)
-    near = cycles[int(np.argmax([explained(wave) for wave in waves(cycles, gradient.size)]))]
+    near = cycles[int(np.argmax([_held(wave, curvature, gradient) for wave in waves(cycles, gradient.size)]))]
     closely = near + step * np.linspace(-1, 1, 2 * CLOSELY + 1)
-    return max(explained(wave) for wave in waves(closely, gradient.size))
+    return max(_held(wave, curvature, gradient) for wave in waves(closely, gradient.size))
 
 
 def _cycles(n: int) -> tuple[Array, float]:
@@ -81,11 +104,30 @@ def _explained(curvature: Array, gradient: Array) -> float:
 
 @dataclass(frozen=True)
 class Patterned:
-    """Chi-square that values explain, as far as one pattern holds it, beyond noise, and what noise alone explains."""
+    """Chi-square that values explain, as far as one pattern holds it, beyond noise, and what noise alone explains.
+
+    `directions` is in how many random values would have it alike; `tried` how many patterns there are.
+    """
 
     held: float
     beyond_noise: float
     noise: float
+    directions: float
+    tried: int
+
+
+def chance_of_pattern(seen: Sequence[Patterned]) -> float:
+    """Greatest chance that one pattern in each capture holds as much of random values (patterns resemble each other).
+
+    The share that `VALUES` of D directions hold is distributed as a beta variable. A capture counts by what it tells.
+    """
+    beyond = np.array([max(one.beyond_noise, 0.0) for one in seen])
+    weight = beyond / beyond.sum()
+    captures = 1 / float(weight @ weight)
+    rest = captures * float(weight @ [max(one.directions - VALUES, 1.0) for one in seen])
+    share = min(sum(one.held for one in seen) / float(beyond.sum()), 1.0)
+    tried: float = float(weight @ [one.tried for one in seen]) ** captures
+    return min(1.0, tried * float(betaincc(VALUES * captures / 2, rest / 2, share)))
 
 
 def patterned(values: Array, information: Array, covariance: Array) -> Patterned:
@@ -107,4 +149,6 @@ def patterned(values: Array, information: Array, covariance: Array) -> Patterned
         u, size, _ = np.linalg.svd(root @ pattern, full_matrices=False)
         along = u[:, size > 1e-6 * size[0]].T @ seen
         held = max(held, float(along @ along))
-    return Patterned(held, float(seen @ seen) - noise, noise)
+    # One direction is that of the mean.
+    directions = float(power.clip(0).sum() ** 2 / np.sum(power.clip(0) ** 2)) - 1
+    return Patterned(held, float(seen @ seen) - noise, noise, directions, n)

@@ -82,20 +82,25 @@ def test_bound(m: Patch) -> bool:
     return [doubts._at_bound(cause(values=[v])) for v in (0.0009, 0.0011)] == [True, False]
 
 
-def follows(m: Patch, *seen: tuple[float, float]) -> bool:
-    """Whether values follow a pattern that has, in each capture, so much of so much."""
+def follows(m: Patch, *seen: tuple[float, float], sample: str | None = "air") -> bool:
+    """Whether values follow a pattern that has, in each capture of such a sample, so much of so much."""
     told = replace(
         cause(), candidates=tuple(made() for _ in seen), values=(0,) * len(seen), covariance=(0,) * len(seen)
     )
     found = Some(space=Space(told.candidates), sets=one(1.0, 0.0, len(seen)), samples=Some(best=Some(unit=1.0)))
     each = iter(seen)
-    m.setattr(doubts, "patterned", lambda *a: source_patterns.Patterned(*next(each), 10.0))
-    return doubts._one_pattern(found, told)
+    m.setattr(doubts, "patterned", lambda *a: source_patterns.Patterned(*next(each), 10.0, 24.0, 40))
+    return doubts._one_pattern(Some(captures=[Some(sample=sample, wavelength_nm=662.0)]), found, told)
 
 
 @decides
 def test_one_pattern(m: Patch) -> bool:
     return [follows(m, (held, 100.0)) for held in (83.0, 87.0)] == [False, True]
+
+
+@decides
+def test_chance_of_pattern(m: Patch) -> bool:
+    return [follows(m, (held, 100.0), sample=None) for held in (58.7, 59.5)] == [False, True]
 
 
 def test_a_capture_that_tells_little_does_not_make_all_others_follow_a_pattern(monkeypatch):
@@ -200,7 +205,12 @@ def test_times(m: Patch) -> bool:
 
 @decides
 def test_one_wave(m: Patch) -> bool:
-    # A wave of the source explains as much as is said, the cause 50.
+    # A wave of the source explains as much as is said, the cause and what turns 50.
+    turning = Some(axis="psg", ratio=1.0)
+    problem = Some(
+        captures=[Some(conditions=Some(angles_deg={"psg": np.zeros(1)}))], model=Some(elements=lambda: [turning])
+    )
+
     def beats(explained: float) -> bool:
         m.setattr(source_patterns, "_best", lambda *of: explained)
         m.setattr(source_patterns, "_explained", lambda *of: 50.0)
@@ -214,7 +224,7 @@ def test_one_wave(m: Patch) -> bool:
             label=lambda g: [told.candidates[0], source][g],
             space=Some(candidates=(told.candidates[0], source)),
         )
-        return source_patterns.beat_explains_more(found, told)
+        return source_patterns.beat_explains_more(problem, found, told)
 
     return not beats(58.5) and beats(59.5)
 

@@ -5,11 +5,12 @@ from types import SimpleNamespace as Some
 import numpy as np
 from rule_decisions import Patch, cause, decides, made
 
-from processing.diagnosis.instrument import empirical, guard, least_change, whole_bench, wiring
+from processing.diagnosis.instrument import empirical, guard, judge, least_change, whole_bench, wiring
+from processing.diagnosis.instrument.doubts import PART_OF_LEFT, WAVE
 from processing.diagnosis.search import causes
 from processing.diagnosis.search.result import Empirical
 from processing.diagnosis.search.space import Space
-from processing.instrument.effects.base import GeneralEffect
+from processing.instrument.effects.base import FieldEffect, GeneralEffect
 
 
 def miswired(m: Patch, start: float, without: float) -> bool:
@@ -108,3 +109,17 @@ def test_empirical_share(m: Patch) -> bool:
 def test_also(m: Patch) -> bool:
     told = without_name(m, 0.0, 2.7, 3.3)
     return told is not None and told.would_also_fit == ("k0", "k1")
+
+
+def test_beside_what_is_in_no_list_only_what_has_a_name_of_its_own_is_used() -> None:
+    waved, named, likely, nameless = (made(kind=kind) for kind in ("waved", "named", "likely", "nameless"))
+    field = made(FieldEffect)
+    told = [cause(candidate=c) for c in (waved, named, likely)]
+    problem = Some(captures=[Some(sample=None, wavelength_nm=662.0)])
+    solved = Some(effects=(waved, named, likely, nameless, field))
+    doubt = {told[0]: WAVE, told[2]: PART_OF_LEFT}
+    assert judge._unfit(problem, solved, told, [], doubt) == [waved, nameless]
+    assert judge._unfit(problem, solved, told, [], {told[2]: PART_OF_LEFT}) == []
+    # A sample that is known takes up nothing.
+    problem.captures[0].sample = "air"
+    assert judge._unfit(problem, solved, told, [], doubt) == []
