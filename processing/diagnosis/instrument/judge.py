@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.instrument.doubts import BESIDE_PATTERN, ELSE, PART_OF_LEFT, acts_on_unknown, doubts, testable
+from processing.diagnosis.instrument.doubts import BESIDE_PATTERN, ELSE, acts_on_unknown, doubts, testable
 from processing.diagnosis.instrument.empirical import empirical
 from processing.diagnosis.instrument.evidence import wanted_for_evidence, would_be_seen
 from processing.diagnosis.instrument.guard import chances, checks, lasts, predicted_changes, refusal
@@ -172,8 +172,7 @@ def _unfit(
     found = [c for cause in unfit for c in cause.candidates]
     if any(reason in ELSE for reason in doubt.values()):
         # Something is there that is not in the list: only what has a name of its own is no part of it.
-        stands = [cause for cause in named if doubt.get(cause, PART_OF_LEFT) == PART_OF_LEFT]
-        own = {c for cause in stands for c in (*cause.candidates, *cause.alternatives)}
+        own = {c for cause in named if cause not in doubt for c in (*cause.candidates, *cause.alternatives)}
         found += [
             c for c in solved.effects if c not in own and not (isinstance(c.effect, FieldEffect) or c.state_chosen)
         ]

@@ -118,7 +118,7 @@ def test_beside_what_is_in_no_list_only_what_has_a_name_of_its_own_is_used() -> 
     problem = Some(captures=[Some(sample=None, wavelength_nm=662.0)])
     solved = Some(effects=(waved, named, likely, nameless, field))
     doubt = {told[0]: WAVE, told[2]: PART_OF_LEFT}
-    assert judge._unfit(problem, solved, told, [], doubt) == [waved, nameless]
+    assert judge._unfit(problem, solved, told, [], doubt) == [waved, likely, nameless]
     assert judge._unfit(problem, solved, told, [], {told[2]: PART_OF_LEFT}) == []
     # A sample that is known takes up nothing.
     problem.captures[0].sample = "air"
