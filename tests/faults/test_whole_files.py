@@ -1,6 +1,7 @@
 """On a full disc nothing is left of a report or an export, and what was there is as it was."""
 
 import resource
+import sys
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -36,12 +37,15 @@ def product(tmp_path_factory):
 @contextmanager
 def full_disc(most_bytes=1000):
     """Files of this process cannot grow further: what a full disc looks like to it."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before, bytecode = resource.getrlimit(resource.RLIMIT_FSIZE), sys.dont_write_bytecode
+    # Python would keep the first bytes of a module that it imports here as the whole of it.
+    sys.dont_write_bytecode = True
     resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, before[1]))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        sys.dont_write_bytecode = bytecode
 
 
 @pytest.mark.parametrize(("kind", "there"), [*((kind, False) for kind in WRITERS), ("csv", True), ("html", True)])
