@@ -18,7 +18,7 @@ from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.fit import Fit, held_out, minimize, prior, score
 from processing.diagnosis.search.likely_set import everything
 from processing.diagnosis.search.posterior import Posterior, Say, posterior, resampled
-from processing.diagnosis.search.rules import DECISIVE, FAR_OFF, LIKELY, REFUTED, ROUNDS, SHARES, TAKES_PART
+from processing.diagnosis.search.rules import DECISIVE, FAR_OFF, GROWTH, LIKELY, REFUTED, ROUNDS, SHARES, TAKES_PART
 from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import (
@@ -90,7 +90,9 @@ class WholeBench:
             self.say("the same with the noise that this light has")
             if self.whole is not self.problem:
                 self.problem.adopt_noise(*solved)
-            found = self._posterior(list(found.space.candidates), fixed, found)
+            again = self._posterior(list(found.space.candidates), fixed, found)
+            # Nobody knows the noise to a thousandth, and of many pixels that would be structure: what was found stays.
+            found = again if again.samples.best.unit <= GROWTH * found.samples.best.unit else found
         return found
 
     def _with_what_scatters_so(self, found: Posterior, fixed: Sequence[Candidate]) -> Posterior:

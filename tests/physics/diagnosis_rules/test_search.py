@@ -4,9 +4,10 @@ from dataclasses import replace
 from types import SimpleNamespace as Some
 
 import numpy as np
-from rule_decisions import QUIET, Asked, Patch, decides, made
+import pytest
+from rule_decisions import QUIET, Asked, Patch, bench, decides, made
 
-from processing.diagnosis.instrument import beside_fields, judge, starts
+from processing.diagnosis.instrument import beside_fields, judge, starts, whole_bench
 from processing.diagnosis.search import likely_set, posterior
 from processing.diagnosis.search.sets import Quadratic, Sets, State
 from processing.diagnosis.search.space import Space, Sums
@@ -132,3 +133,18 @@ def test_beside_field(m: Patch) -> bool:
 @decides
 def test_growth(m: Patch) -> bool:
     return judge._grown(np.array([1.06]), 1.0) and not judge._grown(np.array([1.04]), 1.0)
+
+
+@pytest.mark.parametrize(("unit", "kept"), [(330.0, 0), (1.02, 1)])
+def test_noise_that_looks_like_structure_takes_nothing_away(monkeypatch: Patch, unit: float, kept: int) -> None:
+    """Of many pixels a thousandth of the noise is structure, in the light of which seven causes became nothing."""
+    found = [Some(samples=Some(best=Some(unit=u)), space=Space(())) for u in (1.0, unit)]
+    each = iter(found)
+    whole = Some(noise_known=True, adopt_noise=lambda *of: True, holds_out_states=False)
+    tried = bench(pool=(), whole=whole, problem=whole)
+    monkeypatch.setattr(whole_bench, "applied", lambda *of: ())
+    for name, answer in (("_clipped", []), ("as_many_as_intensities", set())):
+        monkeypatch.setattr(whole_bench.WholeBench, name, lambda self, *of, answer=answer: answer)
+    monkeypatch.setattr(whole_bench.WholeBench, "_posterior", lambda self, *of: next(each))
+    monkeypatch.setattr(whole_bench.WholeBench, "_with_what_scatters_so", lambda self, found, fixed: found)
+    assert tried.run() is found[kept]
