@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -199,10 +200,10 @@ def refused(tmp_path):
 
 
 @pytest.fixture
-def acquire_refuses(refused, capfd):
-    from acquisition.commands.application import main
+def told(refused, capfd):
+    """Runs a command that refuses its input; returns what it says, in lines that can be read."""
 
-    def run(*arguments):
+    def run(main, *arguments):
         refused(main, *arguments)
         said = capfd.readouterr().err
         assert "Traceback" not in said
@@ -213,13 +214,18 @@ def acquire_refuses(refused, capfd):
 
 
 @pytest.fixture
-def process_refuses(refused, capfd):
+def acquire_refuses(told):
+    from acquisition.commands.application import main
+
+    return partial(told, main)
+
+
+@pytest.fixture
+def process_refuses(told):
     from processing.commands.application import main
 
     def run(*arguments):
-        refused(main, *arguments)
-        said = capfd.readouterr().err
-        assert "Traceback" not in said
+        said = told(main, *arguments)
         assert len(said.splitlines()) == 1, said
         return said
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from processing.diagnosis.instrument.source_patterns import beat_explains_more
+from processing.diagnosis.instrument.source_patterns import beat_explains_as_well
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.posterior import Posterior
@@ -42,7 +42,7 @@ def seen_in(cycles, captures=1, beside=None):
 
 
 def turning(captures=1):
-    """What beat_explains_more asks of the problem: a plate that turns once."""
+    """What beat_explains_as_well asks of the problem: a plate that turns once."""
     angles = {"plate": 360.0 * np.arange(STATES) / STATES}
     plates = [SimpleNamespace(axis="plate", ratio=1.0), SimpleNamespace(axis=None)]
     return SimpleNamespace(
@@ -54,9 +54,9 @@ def turning(captures=1):
 @pytest.mark.parametrize(("cycles", "beats"), [(2.0, False), (1.0, False), (2.06, True), (2.2, True), (1.7, True)])
 def test_a_beat_beside_a_harmonic_of_the_turn_is_told_from_it(cycles, beats):
     found = seen_in(cycles)
-    assert beat_explains_more(turning(), found, causes(found, 0.0)[0]) == beats
+    assert beat_explains_as_well(turning(), found, causes(found, 0.0)[0]) == beats
 
 
 def test_what_turns_alike_in_all_captures_is_the_plate():
     found = seen_in(1.0, captures=3, beside=np.array([0.3, 0.4, -0.2, 0.5]))
-    assert not beat_explains_more(turning(3), found, causes(found, 0.0)[0])
+    assert not beat_explains_as_well(turning(3), found, causes(found, 0.0)[0])

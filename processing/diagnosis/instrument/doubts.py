@@ -9,7 +9,7 @@ import numpy as np
 from processing.diagnosis.instrument.edges import at_edges
 from processing.diagnosis.instrument.nameless import NamelessWaves
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.source_patterns import beat_explains_more, chance_of_pattern, patterned
+from processing.diagnosis.instrument.source_patterns import beat_explains_as_well, chance_of_pattern, patterned
 from processing.diagnosis.instrument.unevenness import unevenness
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause, shown
@@ -40,10 +40,8 @@ from processing.instrument.effects.base import (
 #: The reason for which values for each state are not used either, where an unknown sample takes up a part of them: what
 #: it takes up is then not like the rest, as it is with random values.
 PATTERN = "its values follow one wave or jump over the states, as a beat or a fringe does: they are not random"
-#: The reason of a source beside one with that pattern.
-BESIDE_PATTERN = "it may be a part of a source that changes as no effect of the list does"
-#: The same of an effect in whose place a source with one wave fits better.
-BEAT = "a source that beats explains more than it does"
+#: The same of an effect in whose place a source with one wave fits better, or as well with a frequency of its own.
+BEAT = "a source that beats explains as much as it does"
 #: The same where a plate that turns has a wave of its own that is not in the list.
 WAVE = "a plate that changes two to four times a turn explains as much as it does"
 #: The image does not move where that would be seen best.
@@ -52,6 +50,8 @@ STANDS = "the edges, which were left out of the fit, do not move as it says"
 NOT_ALIKE = "it differs from part to part of the image, which nothing in the train does"
 #: Reasons that say that something else is there, of which what the cause explains is left over.
 ELSE = (PATTERN, BEAT, WAVE, STANDS, NOT_ALIKE)
+#: The reason of a source beside one that follows a pattern: where that is not used, neither is this.
+BESIDE_PATTERN = "it may be a part of a source that changes as no effect of the list does"
 #: The reason for which nothing is written for later captures: the sample or its light changed, and what is found beside
 #: that may be a part of it.
 OF_THE_SAMPLE = "it differs from part to part of the image, which a source does not"
@@ -115,7 +115,9 @@ def _of_itself(
     alike = isinstance(effect, CountsEffect) or any(c.place_px is not None for c in problem.captures)
     if not alike and any(_uneven(problem, solved, c, cause) for c in cause.candidates):
         return NOT_ALIKE
-    return BEAT if problem.noise_known and _is_one_name(cause) and beat_explains_more(problem, found, cause) else None
+    return (
+        BEAT if problem.noise_known and _is_one_name(cause) and beat_explains_as_well(problem, found, cause) else None
+    )
 
 
 def _is_one_name(cause: Cause) -> bool:

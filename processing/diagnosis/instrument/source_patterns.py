@@ -37,8 +37,8 @@ def jumps(n: int) -> Iterator[Array]:
         yield np.column_stack([(k >= first) - 1 + first / n, drift])
 
 
-def beat_explains_more(problem: InstrumentProblem, found: Posterior, cause: Cause) -> bool:
-    """Whether in a cause's place a source that follows one wave, in each of its captures, fits better.
+def beat_explains_as_well(problem: InstrumentProblem, found: Posterior, cause: Cause) -> bool:
+    """Whether in a cause's place a source that follows one wave, in each of its captures, fits better or as well.
 
     What a turning plate passes is a wave over the states too, of once or twice a turn; a beat has a frequency of its
     own. Where no such turn explains what the wave does, a wave that fits as well is enough: no name is sure beside it.

@@ -224,14 +224,14 @@ def test_one_wave(m: Patch) -> bool:
             label=lambda g: [told.candidates[0], source][g],
             space=Some(candidates=(told.candidates[0], source)),
         )
-        return source_patterns.beat_explains_more(problem, found, told)
+        return source_patterns.beat_explains_as_well(problem, found, told)
 
     return not beats(58.5) and beats(59.5)
 
 
 def test_what_is_one_of_several_is_not_asked_whether_a_source_beats(monkeypatch):
     """A weak one would take all stronger names with it, for what it explains would count as left."""
-    monkeypatch.setattr(doubts, "beat_explains_more", lambda *of: True)
+    monkeypatch.setattr(doubts, "beat_explains_as_well", lambda *of: True)
     told, problem = cause(), Some(noise_known=True, captures=())
     solved = Some(space=Space(()))
     either = replace(told, alternatives=(made(),))
