@@ -73,10 +73,11 @@ def _repeats(capture: Capture, light: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 def _fitted(capture: Capture, light: NDArray[np.int64], signal: NDArray[np.float64]) -> NDArray[np.float64] | None:
     model = capture.instrument
-    if model is None or capture.header.mosaic is not None or capture.channels > 1:
+    if model is None or not model.axes:
         return None
     changes = capture_changes(capture, model, light)
-    w = model.rows(angles_of(capture, model, light), changes).reshape(len(light), 16)
+    # Beams and the analyzers of a mosaic have as many pixels each: the mean of a frame is that of all.
+    w = model.rows(angles_of(capture, model, light), changes).mean(axis=1)
     known = np.isfinite(signal)
     if known.sum() < np.linalg.matrix_rank(w[known], rtol=1e-6) + SPARE:
         return None

@@ -12,8 +12,8 @@ from processing.errors import ProcessError
 from processing.reduction.mosaic.layout import MosaicLayout
 from processing.reduction.mueller import relative_exposure
 from processing.reduction.stokes import channel_rows
-from processing.storage.capture import Capture, CaptureError
-from viewer.probing import MOST, Region, finite
+from processing.storage.capture import Capture
+from viewer.probing import MOST, Region, analyzer_names, finite
 from viewer.sample_states import SampleStates
 
 
@@ -28,19 +28,11 @@ class SuperPixelReducer:
     def __init__(self, path: Path, instrument: Path | None = None) -> None:
         self._path = path
         with Capture(path) as capture:
-            if capture.header.colours is not None:
-                raise ProcessError("each colour of this sensor is a mosaic of its own: split it with `process colours`")
             self._sample = SampleStates(capture, instrument)
             model, states = self._sample.model, self._sample.numbers
             mosaic = capture.header.mosaic or model.mosaic or ()
             self._layout = MosaicLayout.of(mosaic, [channel.name for channel in model.channels])
-            try:
-                _, self._analyzers = channel_rows(capture, model, states, self._sample.changes)
-            except CaptureError as error:
-                raise ProcessError(
-                    "the states have different angles, and a super-pixel no single Stokes vector: `Reduce` makes the "
-                    "Mueller image of them, whose page has the values of each."
-                ) from error
+            _, self._analyzers = channel_rows(capture, model, states, self._sample.changes)
             self._relative = relative_exposure(capture, states)
 
     def curve(self, region: Region) -> dict[str, Any]:
@@ -66,7 +58,7 @@ class SuperPixelReducer:
         covariance = (solve * variance) @ solve.T
         return {
             "states": np.repeat(self._sample.numbers, len(self._layout.channels)).tolist(),
-            "series": [f"{name}°" if name.isdecimal() else name for name in self._layout.channels],
+            "series": analyzer_names(self._layout.channels),
             "signal": signal.tolist(),
             "fitted": fitted.tolist(),
             "noise": finite(np.sqrt(variance)),

@@ -32,10 +32,10 @@ def _curve_of(path: Path, query: Any) -> dict[str, Any]:
     with Capture(path) as capture:
         region = Region.asked(query, capture.frame_shape)
         found = raw_curve(capture, region, chosen(capture, {"channel": query.get("channel", 0)})[1])
-        channels, running = capture.channels, capture.status == "running"
+        running = capture.status == "running"
     if running:
         return found | {"told": "The capture is being taken; the fit comes when it is complete."}
-    return found | _fit(path, region, channels, None)
+    return found | _fit(path, region, None)
 
 
 def matrix_of(request: Request) -> JSONResponse:
@@ -49,25 +49,25 @@ def matrix_of(request: Request) -> JSONResponse:
 
 
 def _matrix(path: Path, region: Region, instrument: Path | None) -> dict[str, Any]:
-    """Nothing for a polarization camera, whose super-pixels have a Stokes vector."""
+    """Nothing where the super-pixels of a polarization camera have a Stokes vector."""
     reducer = reducer_of(path, instrument)
     return {} if isinstance(reducer, SuperPixelReducer) else {"matrix": matrix(reducer.image(region)[0])}
 
 
-def _fit(path: Path, region: Region, channels: int, instrument: Path | None) -> dict[str, Any]:
+def _fit(path: Path, region: Region, instrument: Path | None) -> dict[str, Any]:
     try:
         reducer = reducer_of(path, instrument)
         if isinstance(reducer, SuperPixelReducer):
             fit = reducer.curve(region)
         else:
-            fit = curve(reducer, *reducer.image(region), channels)
+            fit = curve(reducer, region)
     except ProcessError as error:
         return {"told": f"No fit: {error}"}
     return {"fit": fit, "told": fit["told"]}
 
 
 def reducer_of(path: Path, instrument: Path | None) -> PixelReducer | SuperPixelReducer:
-    """What reduces single pixels of a capture, super-pixels of a mosaic; kept while its files stay as they are."""
+    """What reduces single pixels of a capture, or super-pixels; kept while its files stay as they are."""
     changed = [p.stat().st_mtime_ns for p in (path, instrument) if p is not None]
     return _kept(path, instrument, tuple(changed))
 
@@ -75,8 +75,8 @@ def reducer_of(path: Path, instrument: Path | None) -> PixelReducer | SuperPixel
 @lru_cache(maxsize=4)
 def _kept(path: Path, instrument: Path | None, changed: tuple[int, ...]) -> PixelReducer | SuperPixelReducer:
     with Capture(path) as capture:
-        mosaic = capture.header.mosaic is not None
-    return SuperPixelReducer(path, instrument) if mosaic else PixelReducer(path, instrument)
+        stokes = capture.reduces_to == "stokes"
+    return SuperPixelReducer(path, instrument) if stokes else PixelReducer(path, instrument)
 
 
 def of_product(request: Request) -> JSONResponse:
@@ -100,11 +100,10 @@ def _of_product(path: Path, query: Any, library: Library) -> dict[str, Any]:
         return found | {"told": "The capture behind this product is not in the folder."}
     path, instrument = source
     with Capture(path) as capture:
-        channels = capture.channels
         # A Stokes image may have one pixel for each super-pixel.
         region = region.enlarged(capture.frame_shape[0] // shape[0])
         found |= raw_curve(capture, region, 0) | {"where": found["where"]}
-    found |= _fit(path, region, channels, instrument)
+    found |= _fit(path, region, instrument)
     if "matrix" not in found and "fit" in found:
         found |= _matrix(path, region, instrument)
     return found

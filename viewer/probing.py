@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,10 @@ class Region:
         """The same place in an image of so many times as many rows and columns."""
         return Region(*(slice(times * part.start, times * part.stop) for part in (self.rows, self.columns)))
 
+    def reduced(self, times: int) -> Region:
+        """The cells of so many rows and columns that it touches, as a region of an image of one pixel a cell."""
+        return Region(*(slice(part.start // times, -(-part.stop // times)) for part in (self.rows, self.columns)))
+
     @property
     def pixels(self) -> int:
         """How many."""
@@ -83,6 +88,8 @@ def raw_curve(capture: Capture, region: Region, channel: int) -> dict[str, Any]:
 class PixelReducer:
     """Reduces single pixels and regions of a Mueller capture as `process reduce` does; opened once, asked often.
 
+    Behind elements that turn, each super-pixel of a polarization camera is a pixel with a channel for each analyzer.
+
     Parameters
     ----------
     instrument : file to use instead of the model in the capture.
@@ -90,23 +97,32 @@ class PixelReducer:
 
     def __init__(self, path: Path, instrument: Path | None = None) -> None:
         self._path = path
-        with Capture(path) as capture:
+        with self._opened() as capture:
+            #: Rows and columns of the frame to one of the image.
+            self._cell = capture.stored_shape[0] // capture.frame_shape[0]
+            self.channels = capture.channel_names
             self.sample = SampleStates(capture, instrument)
             sample = self.sample
             self._w = measurement_matrix(capture, sample.model, sample.numbers, sample.changes)
             self._inversion = Inversion.of(self._w.reshape(-1, 16), f"{path}: ", determined_basis(sample.model))
             self._field = field_of(capture, sample.model, sample.numbers, sample.changes)
 
+    def _opened(self) -> Capture:
+        return Capture(self._path, by_super_pixel=True)
+
     def image(self, region: Region) -> tuple[MuellerImage, NDArray[np.float64]]:
-        """The region as an image of one pixel, the mean of those that can be used, and its intensities (N,), counts.
+        """A region of the frame as an image of one pixel, and its intensities (N,) in counts.
+
+        It is the mean of those pixels that can be used; super-pixels count that the region touches.
 
         Raises
         ------
         ProcessError : none of its pixels can be used, or it is too large.
         """
+        region = region.reduced(self._cell)
         if region.pixels * self._w.size // 16 > MOST:
             raise ProcessError(f"{region} is more than is reduced at once; draw a smaller one")
-        with Capture(self._path) as capture:
+        with self._opened() as capture:
             reader, frames, signal = self.sample.read(capture, region.rows)
             noise = self.sample.noise
             solver = Choice(noise=noise).solver(MuellerSolver(self._inversion, reader, noise), self._field)
@@ -156,30 +172,42 @@ class PixelReducer:
         x, y = (np.array([2 * at / max(size - 1, 1) - 1]) for at, size in zip(middle, shape[::-1], strict=True))
         return self._field.matrix(self._field.extra(x, y)[:, 0])
 
-    def told(self) -> str:
-        """How it is reduced, in a few words."""
+    def told(self, region: Region) -> str:
+        """How a region is reduced, in a few words."""
         model = self.sample.model
         effects = f", {len(model.effects)} effect(s)" if model.effects else ""
-        return f"{model.name}{effects}; black: {self.sample.correction.source}"
+        whole = f"; {region.reduced(self._cell).enlarged(self._cell)}" if self._cell > 1 else ""
+        return f"{model.name}{effects}{whole}; black: {self.sample.correction.source}"
 
 
-def curve(
-    reducer: PixelReducer, image: MuellerImage, intensities: NDArray[np.float64], channels: int
-) -> dict[str, Any]:
-    """Signal of each sample state with the fitted one, and the residual in units of the noise."""
+def analyzer_names(channels: Sequence[str]) -> list[str]:
+    """Names of channels as a plot shows them: azimuths with their unit."""
+    return [f"{name}°" if name.isdecimal() else name for name in channels]
+
+
+def curve(reducer: PixelReducer, region: Region) -> dict[str, Any]:
+    """Signal of each sample state and channel with the fitted one, and the residual in units of the noise.
+
+    Raises
+    ------
+    ProcessError : see `PixelReducer.image`.
+    """
+    image, intensities = reducer.image(region)
+    channels = len(reducer.channels)
     fitted = image.w @ image.values.reshape(16).astype(float)
     noise = np.sqrt(image.intensity_variance.reshape(-1).astype(float))
     residual = (intensities - fitted) / noise
     free = max(len(fitted) - int(image.facts["rank"]), 1)
     return {
         "states": np.repeat(reducer.sample.numbers, channels).tolist(),
+        "series": analyzer_names(reducer.channels) if channels > 1 else [""],
         "signal": intensities.tolist(),
         "fitted": fitted.tolist(),
         "noise": finite(noise),
         "residual": finite(residual),
         "chi_square": finite(np.sum(residual**2) / free),
         "noise_known": bool(np.isfinite(image.noise_slope).all()),
-        "told": reducer.told(),
+        "told": reducer.told(region),
     }
 
 

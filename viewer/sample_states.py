@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from processing.reduction.counts_to_signal import BlockReader, Correction
 from processing.reduction.cut_off import without_cut_off
 from processing.reduction.effects_of_capture import capture_changes, counts_correction
-from processing.reduction.instrument_of_capture import choose_model
+from processing.reduction.instrument_of_capture import choose_model, require_one_colour
 from processing.reduction.noise import NoiseModel, noise_of
 from processing.reduction.sample_states import sample_states
 from processing.storage.capture import Capture
@@ -34,6 +34,7 @@ class SampleStates:
     """
 
     def __init__(self, capture: Capture, instrument: Path | None = None) -> None:
+        require_one_colour(capture)
         self.model = choose_model(capture, instrument)
         self.numbers, _ = without_cut_off(capture, sample_states(capture))
         self.changes = capture_changes(capture, self.model, self.numbers)

@@ -42,5 +42,14 @@ def require_belongs(capture: Capture, model: InstrumentModel) -> None:
     raise CaptureError(f"{capture.path}: {difference}. Use the instrument file that belongs to the capture.")
 
 
+def require_one_colour(capture: Capture) -> None:
+    """Raise CaptureError for a mosaic below a colour filter: the mosaics of its colours lie side by side."""
+    if capture.header.mosaic is not None and capture.header.colours is not None:
+        raise CaptureError(
+            f"{capture.path} is of a colour sensor: each colour is a mosaic of its own. "
+            "Split it with `process colours`."
+        )
+
+
 def _counted(channels: int) -> str:
     return "1 channel" if channels == 1 else f"{channels} channels"

@@ -29,7 +29,7 @@ from processing.reduction.effects_of_capture import (
     with_extra,
 )
 from processing.reduction.facts import mueller_facts
-from processing.reduction.instrument_of_capture import require_belongs
+from processing.reduction.instrument_of_capture import require_belongs, require_one_colour
 from processing.reduction.left_out import LeftOut
 from processing.reduction.noise import NoiseModel, noise_of
 from processing.reduction.sample_states import sample_states
@@ -122,8 +122,9 @@ def angles_of(capture: Capture, model: InstrumentModel, states: NDArray[np.int64
 
     Raises
     ------
-    CaptureError : the capture is not of this instrument, or an axis has no angle in some state.
+    CaptureError : the capture is not of this instrument, or of several colours, or an axis has no angle in some state.
     """
+    require_one_colour(capture)
     angles = {name: value[states] for name, value in capture.angles_deg.items()}
     require_belongs(capture, model)
     read = [np.isfinite(angles[axis]) for axis in model.axes]
@@ -243,6 +244,7 @@ def reduce_mueller(
         try:
             facts = mueller_facts(inversion, noise, correction, product, len(states), choice.weighted)
         except CaptureError as error:
+            product.discard()
             raise CaptureError(f"{capture.path}: {error}{_without_numbers(capture, states)}") from error
         facts["warnings"] += cut_off
         facts |= _further_facts(choice, sent)

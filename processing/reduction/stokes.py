@@ -16,6 +16,7 @@ from processing.reduction.counts_to_signal import Correction
 from processing.reduction.cut_off import without_cut_off
 from processing.reduction.effects_of_capture import capture_changes, counts_correction
 from processing.reduction.facts import in_words
+from processing.reduction.instrument_of_capture import require_one_colour
 from processing.reduction.left_out import LeftOut
 from processing.reduction.mosaic.layout import MosaicLayout
 from processing.reduction.mosaic.merge import MergedFrame, merge
@@ -112,11 +113,7 @@ def reduce_stokes(
     mosaic = capture.header.mosaic or model.mosaic
     if mosaic is None:
         raise CaptureError(f"{capture.path} is not a mosaic capture; it reduces to a Mueller image.")
-    if capture.header.colours is not None:
-        raise CaptureError(
-            f"{capture.path} is of a colour sensor: each colour is a mosaic of its own. "
-            "Split it with `process colours`."
-        )
+    require_one_colour(capture)
     layout = MosaicLayout.of(mosaic, [c.name for c in model.channels])
     left_out = left_out or LeftOut()
     states, cut_off = without_cut_off(capture, left_out.rest_of(sample_states(capture), capture.path))

@@ -207,6 +207,11 @@ class ProductWriter(OpenH5):
             self._partial.unlink()
         return self.path
 
+    def discard(self) -> None:
+        """Leave nothing of a product that cannot be sealed, and so not be gone on with."""
+        self._h5.close()
+        self._partial.unlink()
+
     def _packed(self) -> Path | None:
         """A copy of the file, whose values are all there, with those planes compressed that it makes much smaller.
 

@@ -7,9 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from processing.diagnosis.captured.read_capture import read_capture
 from processing.errors import ProcessError
+from processing.instrument.model import InstrumentModel
 from processing.reduction.mosaic.layout import MosaicLayout
-from processing.storage.capture import Capture
+from processing.steps.reduction import Reduction
+from processing.storage.capture import Capture, CaptureError
 from processing.storage.colour_split import split_colours
 
 MOSAIC = np.array([["90", "45"], ["135", "0"]])
@@ -65,3 +68,20 @@ def test_what_cannot_be_split_says_so(synthetic_capture, tmp_path: Path) -> None
     plain = synthetic_capture(np.zeros((1, 1, 8, 8), np.uint16), {"psg": np.zeros(1)})
     with pytest.raises(ProcessError, match="no colour filter"):
         split_colours(plain, tmp_path)
+
+
+def test_several_colours_are_refused_where_something_turns_too(synthetic_capture, configs: Path) -> None:
+    file = configs / "instruments" / "mosaic_polarimeter.yaml"
+    model = InstrumentModel.load(file)
+    path = synthetic_capture(
+        np.full((24, 1, 8, 8), 500, np.uint16),
+        {"psg": 15.0 * np.arange(24)},
+        mosaic=model.mosaic,
+        colours=rolled(COLOURS.repeat(2, 0).repeat(2, 1), 0, 0),
+        channels=("mosaic",),
+        instrument_yaml=file.read_text(),
+    )
+    with pytest.raises(CaptureError, match="process colours"):
+        Reduction(path).make()
+    with Capture(path) as capture, pytest.raises(CaptureError, match="process colours"):
+        read_capture(capture, model)

@@ -175,6 +175,13 @@ def test_saturated_states_are_left_out_pixel_by_pixel(rgb950: InstrumentModel, s
     assert any("saturated" in w for w in image.facts["warnings"])
 
 
+def test_a_capture_that_is_saturated_everywhere_leaves_no_file(rgb950: InstrumentModel, synthetic_capture) -> None:
+    path = synthetic_capture(np.full((40, 1, 4, 6), 4095, np.uint16), table(), detector=detector(bits=12))
+    with pytest.raises(CaptureError, match="Nothing was written"):
+        reduced(path, rgb950)
+    assert list(path.parent.iterdir()) == [path]
+
+
 @pytest.mark.parametrize("left", [5, 0])
 @pytest.mark.filterwarnings("error")
 def test_pixels_without_enough_states_are_not_determined(rgb950: InstrumentModel, synthetic_capture, left) -> None:

@@ -177,6 +177,64 @@ def test_a_super_pixel_has_a_curve_for_each_analyzer_and_a_stokes_vector(client,
     assert there["fit"]["stokes"] == one["stokes"]
 
 
+def test_a_super_pixel_behind_a_turned_generator_has_a_curve_for_each_analyzer_and_a_matrix(
+    client, configs, synthetic_capture
+):
+    file = configs / "instruments" / "mosaic_polarimeter.yaml"
+    model = InstrumentModel.load(file)
+    angles = {"psg": 15.0 * np.arange(24)}
+    m = np.diag([1, 0.6, 0.5, 0.3])
+    m[0, 1] = 0.1
+    signal = dict(zip([c.name for c in model.channels], 3000 * (model.rows(angles) @ m.ravel()).T, strict=True))
+    cell = np.array([[signal[name] for name in row] for row in model.mosaic]).transpose(2, 0, 1)
+    # A row of super-pixels with twice the light each.
+    light = np.repeat(2.0 ** np.arange(3), 2)
+    frames = np.round(64 + np.tile(cell, (1, 2, 3)) * light).astype(np.uint16)
+    detector = {"black_level_counts": 64.0, "gain_e_per_count": 1.0, "read_noise_e": 2.0, "bits": 16}
+    path = synthetic_capture(
+        frames[:, None],
+        angles,
+        name="lab/turned.h5",
+        mosaic=model.mosaic,
+        channels=("mosaic",),
+        instrument_yaml=file.read_text(),
+        detector=detector,
+    )
+    asked = {"file": "turned.h5", "x0": 3, "y0": 1}
+    fit = client.get("/curve", params=asked).json()["fit"]
+    assert fit["series"] == ["0°", "45°", "90°", "135°"]
+    assert "columns 2 to 3, rows 0 to 1" in fit["told"]
+    np.testing.assert_allclose(
+        fit["fitted"][:4], 2 * np.array([signal[n][0] for n in ("0", "45", "90", "135")]), rtol=1e-3
+    )
+    matrix = client.get("/matrix", params=asked).json()["matrix"]
+    np.testing.assert_allclose(np.array(matrix["mueller"], float)[:3], m[:3], atol=2e-3)
+    assert np.isnan(np.array(matrix["mueller"], float)[3]).all()
+    # Its product has one pixel for each super-pixel.
+    product = Reduction(path).make()
+    there = client.get("/probe", params={"file": product.name, "x0": 1, "y0": 0}).json()
+    assert there["fit"] == fit
+    # A region is the mean of its super-pixels, whole.
+    region = client.get("/curve", params={"file": "turned.h5", "x0": 1, "y0": 1, "x1": 5, "y1": 2}).json()["fit"]
+    np.testing.assert_allclose(region["fitted"], np.array(fit["fitted"]) / 2 * 7 / 3, rtol=1e-3)
+
+
+def test_beams_have_a_curve_each(client, configs, synthetic_capture):
+    file = configs / "instruments" / "drr_wollaston.yaml"
+    model, angles = InstrumentModel.load(file), {"psg": 7.3 * np.arange(30)}
+    signal = 3000 * model.rows(angles) @ np.diag([1, 0.6, 0.5, 0.3]).ravel()
+    synthetic_capture(
+        np.round(signal[..., None, None] * np.ones((2, 3))).astype(np.uint16),
+        angles,
+        name="lab/beams.h5",
+        channels=("left", "right"),
+        instrument_yaml=file.read_text(),
+    )
+    fit = client.get("/curve", params={"file": "beams.h5", "x0": 1, "y0": 1}).json()["fit"]
+    assert fit["series"] == ["left", "right"]
+    np.testing.assert_allclose(fit["fitted"], signal.ravel(), atol=1)
+
+
 def test_a_pixel_of_a_partial_polarimeter_has_the_elements_that_it_sees(client, configs, synthetic_capture):
     text = (configs / "instruments" / "linear_mueller.yaml").read_text()
     model = InstrumentModel.load(configs / "instruments" / "linear_mueller.yaml")

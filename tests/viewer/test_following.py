@@ -166,6 +166,27 @@ def test_the_lamp_is_told_from_polarization(flickering):
     assert np.std(np.delete(ratio, 17)) < 0.002
 
 
+@pytest.mark.parametrize("name", ["mosaic_polarimeter", "drr_wollaston"])
+def test_the_lamp_is_told_where_a_frame_holds_several_channels(name, configs, synthetic_capture):
+    file = configs / "instruments" / f"{name}.yaml"
+    model, angles = InstrumentModel.load(file), {"psg": 7.3 * np.arange(30)}
+    m = np.diag([1, 0.6, 0.5, 0.3])
+    m[0, 1:] = 0.3, 0.2, 0.1
+    of_frame = 1000 * (model.rows(angles) @ m.ravel()).mean(axis=1)
+    of_frame[21] *= 1.01
+    frames = np.zeros((30, 1 if model.mosaic else 2, 4, 4), np.uint16)
+    more = {"mosaic": model.mosaic, "channels": ("mosaic",)} if model.mosaic else {"channels": ("left", "right")}
+    path = synthetic_capture(frames, angles, instrument_yaml=file.read_text(), **more)
+    with h5py.File(path, "r+") as h5:
+        h5["entry/states/monitor"][...] = of_frame
+    with Capture(path) as capture:
+        told = lamp(capture)
+    assert np.ptp(of_frame) / of_frame.mean() > 0.1
+    ratio = np.array(told["ratio"])
+    assert told["states"][int(np.argmax(ratio))] == 21
+    assert ratio.max() == pytest.approx(1.01, abs=1e-6)
+
+
 def test_a_few_states_tell_no_lamp_yet(flickering):
     with h5py.File(flickering, "r+") as h5:
         h5["entry/states/done"][15:] = 0

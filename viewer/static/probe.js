@@ -29,12 +29,12 @@ export function drawCurve(node, found, now = null) {
   }, () => {
     const worst = fit ? Math.max(4, ...fit.residual.map(v => Math.abs(v ?? 0) * 1.1)) : 4;
     const shapes = now === null || !found.state ? [] : [{ type: "line", x0: found.state[now], x1: found.state[now], yref: "paper", y0: 0, y1: 1, line: { color: warn(), width: 1, dash: "dot" } }];
-    const both = { xaxis: { title: { text: "state" } }, yaxis: { title: { text: fit ? "signal / counts" : "counts" }, rangemode: "tozero", domain: fit ? [0.4, 1] : [0, 1] } };
+    const both = { xaxis: { title: { text: "state" } }, yaxis: { title: { text: fit ? "signal / counts" : "counts" }, rangemode: "tozero", domain: fit ? [0.47, 1] : [0, 1] } };
     if (!fit) return { ...both, shapes, showlegend: true };
     const zone = { type: "rect", xref: "paper", x0: 0, x1: 1, yref: "y2", y0: -2, y1: 2, fillcolor: accent(), opacity: 0.12, line: { width: 0 }, layer: "below" };
     return {
       ...both, showlegend: true, shapes: [...shapes, zone], xaxis: { title: { text: "state" }, anchor: "y2" },
-      yaxis2: { domain: [0, 0.3], range: [-worst, worst], title: { text: "residual / noise" }, gridcolor: "rgba(128,128,128,.25)", zerolinecolor: quiet(), automargin: true },
+      yaxis2: { domain: [0, 0.38], range: [-worst, worst], title: { text: "residual / noise" }, gridcolor: "rgba(128,128,128,.25)", zerolinecolor: quiet(), automargin: true },
     };
   });
 }
