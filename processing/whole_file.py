@@ -7,39 +7,73 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from processing.errors import ProcessError
+
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
+def whole_file(path: Path, *, new: bool = False) -> Iterator[Path]:
     """A name to write to; the file gets its own, and replaces one of that name, when the block has ended well.
 
     Where the block fails, on a full disc say, nothing of it is left and a file that was there is as it was.
 
+    Parameters
+    ----------
+    new : replace nothing, not even a file that came while the block ran.
+
     Raises
     ------
+    FileExistsError
+        There is one, and `new` was asked for.
     OSError
     """
     path = path.resolve()
-    if path.exists() and not path.is_file():
+    if not new and path.exists() and not path.is_file():
         # A terminal or a pipe: there is nothing to replace.
         yield path
         return
-    # Its ending stays last: libraries tell the format by it.
-    new = path.with_name(f".{path.stem}.new{path.suffix}")
+    # Its ending stays last, libraries tell the format by it; another process may be writing a file of this name.
+    beside = path.with_name(f".{path.stem}.{os.getpid()}.new{path.suffix}")
     try:
-        yield new
-        file = os.open(new, os.O_RDONLY)
+        yield beside
+        file = os.open(beside, os.O_RDONLY)
         try:
             # A disc may tell only now that it is full.
             os.fsync(file)
         finally:
             os.close(file)
-        os.replace(new, path)
+        if new:
+            _take_free_name(beside, path)
+        else:
+            os.replace(beside, path)
     except BaseException:
-        new.unlink(missing_ok=True)
+        beside.unlink(missing_ok=True)
         raise
+
+
+def _take_free_name(beside: Path, path: Path) -> None:
+    """Rename where the name is free; to look first and rename then would replace what came between."""
+    try:
+        os.link(beside, path)
+    except FileExistsError:
+        raise
+    except OSError:
+        # Sticks (exFAT) and some network discs have no second names for a file: an empty one takes it.
+        path.open("x").close()
+        os.replace(beside, path)
+    else:
+        beside.unlink()
 
 
 def write_whole_text(path: Path, text: str) -> None:
     """Write text as UTF-8, wholly or not at all. Raises OSError."""
     with whole_file(path) as new:
         new.write_text(text, encoding="utf-8")
+
+
+def write_new_text(path: Path, text: str) -> None:
+    """Write text as UTF-8 into a new file, whole or not at all; ProcessError where there is one, and OSError."""
+    try:
+        with whole_file(path, new=True) as new:
+            new.write_text(text, encoding="utf-8")
+    except FileExistsError as error:
+        raise ProcessError(f"{path} exists and is not replaced. Give another name.") from error

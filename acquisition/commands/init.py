@@ -12,6 +12,7 @@ from acquisition.rig.config import RigConfig
 from drivers.errors import CameraError
 from drivers.registry import Family, device_kinds
 from processing.doors import require_new
+from processing.whole_file import write_new_text
 from processing.yaml_file import parse_yaml
 
 #: What is known to carry these USB numbers (vendor, product); a plain FTDI chip (0403:6001) may be anything.
@@ -152,5 +153,5 @@ def write_rig(path: Path) -> str:
     require_new(path)
     (cameras, why), ports = found_cameras(), found_ports()
     text = rig_text(path.stem, cameras, ports, why)
-    path.write_text(text, encoding="utf-8")
+    write_new_text(path, text)
     return f"{path}: {len(cameras)} camera(s), {len(ports)} serial port(s). Fill in the axes, then acquire doctor --rig"

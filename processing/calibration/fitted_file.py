@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from ruamel.yaml import YAML
 
-from processing.calibration.known_sample import CalibrationError
 from processing.calibration.train import FittedValues
 from processing.calibration.train_values import belongs_to
+from processing.whole_file import write_new_text
 
 
 def write_fitted(source: Path, target: Path, fitted: Mapping[float, FittedValues], note: str) -> None:
@@ -20,10 +20,8 @@ def write_fitted(source: Path, target: Path, fitted: Mapping[float, FittedValues
 
     Raises
     ------
-    CalibrationError : `target` exists.
+    ProcessError : `target` exists.
     """
-    if target.exists():
-        raise CalibrationError(f"{target} exists; a calibration never replaces a file. Give another --write.")
     yaml = YAML()
     yaml.indent(mapping=2, sequence=4, offset=2)
     yaml.width = 120
@@ -47,8 +45,7 @@ def write_fitted(source: Path, target: Path, fitted: Mapping[float, FittedValues
     tree["source"] = note
     text = StringIO()
     yaml.dump(tree, text)
-    with target.open("x", encoding="utf-8") as file:
-        file.write(text.getvalue())
+    write_new_text(target, text.getvalue())
 
 
 def _key(known: Any, wavelength_nm: float) -> float:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from processing.whole_file import write_whole_text
+from processing.whole_file import write_new_text
 
 if TYPE_CHECKING:
     from processing.calibration.state_design import Noise, Score
@@ -193,8 +193,8 @@ def _write(table: StateTable, path: Path, wavelength_nm: float) -> None:
         lines = ["kind: plan", *light, "states:", "  kind: table", "  angles:"]
         for name in names:
             lines.append(f"    {name}: [{', '.join(f'{angle:.4f}' for angle in table.angles_deg[name])}]")
-        write_whole_text(path, "\n".join(lines) + "\n")
+        write_new_text(path, "\n".join(lines) + "\n")
         return
     lines = [",".join(names)]
     lines += [",".join(f"{table.angles_deg[name][k]:.6f}" for name in names) for k in range(len(table))]
-    write_whole_text(path, "\n".join(lines) + "\n")
+    write_new_text(path, "\n".join(lines) + "\n")

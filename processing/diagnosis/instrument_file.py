@@ -7,6 +7,7 @@ from pathlib import Path
 from processing.diagnosis.search.result import Diagnosis
 from processing.errors import ProcessError
 from processing.instrument.model import Dispersive, EffectParameter, InstrumentModel
+from processing.whole_file import write_new_text
 from processing.yaml_file import ConfigError, dump_yaml, parse_yaml
 
 
@@ -44,6 +45,11 @@ def _merged(old: Dispersive, entry: EffectParameter, wavelengths_nm: tuple[float
     return {k: v for k, v in kept.items() if all(abs(k - w) >= 0.5 for w in new)} | new
 
 
+def file_head(first: str, note: str) -> str:
+    """The comment at the head of a file: what wrote it, and why it is believed."""
+    return "".join(f"# {line}\n" for line in (first, *note.splitlines()))
+
+
 def write_instrument(path: Path, model: InstrumentModel, diagnosis: Diagnosis, note: str = "") -> None:
     """Write `extended` to a new file.
 
@@ -55,7 +61,9 @@ def write_instrument(path: Path, model: InstrumentModel, diagnosis: Diagnosis, n
     Raises
     ------
     WriteError
-        The file exists, there is nothing to write, or more than an instrument file may hold.
+        There is nothing to write, or more than an instrument file may hold.
+    ProcessError
+        The file exists.
     """
     if diagnosis.correction is not None and diagnosis.correction.refused is not None:
         raise WriteError(f"{path} was not written: {diagnosis.correction.refused}.")
@@ -68,10 +76,4 @@ def write_instrument(path: Path, model: InstrumentModel, diagnosis: Diagnosis, n
         raise WriteError(
             f"{error}: what was found is too much for one file. Diagnose fewer captures at once."
         ) from error
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(f"# Written by `diagnose`: {diagnosis.verdict}, see `effects`.\n")
-            file.writelines(f"# {line}\n" for line in note.splitlines())
-            file.write(text)
-    except FileExistsError as error:
-        raise WriteError(f"{path} exists; diagnose never replaces a file. Give another --write.") from error
+    write_new_text(path, file_head(f"Written by `diagnose`: {diagnosis.verdict}, see `effects`.", note) + text)

@@ -1,5 +1,6 @@
 """On a full disc nothing is left of a report or an export, and what was there is as it was."""
 
+import errno
 import resource
 import sys
 from contextlib import contextmanager
@@ -9,9 +10,10 @@ import numpy as np
 import pytest
 
 from processing.commands.application import main
+from processing.errors import ProcessError
 from processing.storage.capture_schema import CaptureHeader, Detector
 from processing.storage.product import Plane, ProductWriter
-from processing.whole_file import write_whole_text
+from processing.whole_file import whole_file, write_new_text, write_whole_text
 
 SHAPE = (20, 30)
 WRITERS = {
@@ -77,3 +79,29 @@ def test_a_link_stays_a_link_and_a_pipe_is_written_to(tmp_path):
     assert (tmp_path / "target.txt").read_text() == "new"
     write_whole_text(Path("/dev/null"), "gone")
     assert Path("/dev/null").is_char_device()
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_a_file_that_comes_while_another_is_written_stays(tmp_path, monkeypatch, links):
+    def refused(*_):
+        raise OSError(errno.EPERM, "no links on this disc")
+
+    if not links:
+        monkeypatch.setattr("os.link", refused)
+    path = tmp_path / "report.html"
+
+    def late():
+        with whole_file(path, new=True) as new:
+            new.write_text("mine")
+            path.write_text("of somebody else")
+
+    with pytest.raises(FileExistsError):
+        late()
+    assert path.read_text() == "of somebody else"
+    path.unlink()
+    write_new_text(path, "mine")
+    assert path.read_text() == "mine"
+    with pytest.raises(ProcessError, match="exists and is not replaced"):
+        write_new_text(path, "yours")
+    assert path.read_text() == "mine"
+    assert list(tmp_path.iterdir()) == [path]

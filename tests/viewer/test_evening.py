@@ -224,7 +224,7 @@ def _diagnose_and_accept(page: Page, lab: Path) -> None:
     page.get_by_label("New instrument file").fill("evening.yaml")
     page.get_by_role("button", name="Accept", exact=True).click()
     # A name that is taken is never written over.
-    expect(page.locator("#answer")).to_contain_text("exists; diagnose never replaces a file")
+    expect(page.locator("#answer")).to_contain_text("exists and is not replaced")
     page.get_by_label("New instrument file").fill("with_wedge.yaml")
     page.get_by_role("button", name="Accept", exact=True).click()
     expect(page.get_by_text("Accepted on")).to_be_visible()

@@ -14,12 +14,12 @@ from processing.diagnosis.search.result import (
     FoundEffect,
     Unexplained,
 )
-from processing.whole_file import write_whole_text
+from processing.whole_file import write_new_text
 
 
 def write_result(path: Path, d: Diagnosis) -> None:
     """Write the result as JSON, and print where."""
-    write_whole_text(path, d.model_dump_json(indent=2) + "\n")
+    write_new_text(path, d.model_dump_json(indent=2) + "\n")
     typer.echo(str(path))
 
 

@@ -14,13 +14,12 @@ from processing.diagnosis.instrument.projection import add_response
 from processing.diagnosis.instrument.structure import HARMONICS, Residual
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.space import Space
-from processing.doors import require_new
 from processing.polarization.cloude import xi0_and_dominant
 from processing.reports.colours import SIGNED
 from processing.reports.design import style, templates
 from processing.reports.figure_style import png
 from processing.reports.template import Figure as Picture
-from processing.whole_file import write_whole_text
+from processing.whole_file import write_new_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,8 +42,7 @@ def write_report(path: Path, judged: Judged, problem: InstrumentProblem) -> None
             captures=[_capture(judged, problem, k) for k in range(len(problem.captures))],
         )
     )
-    require_new(path)
-    write_whole_text(path, text)
+    write_new_text(path, text)
 
 
 def _errors(judged: Judged) -> list[list[str]]:

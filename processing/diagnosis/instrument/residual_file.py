@@ -14,6 +14,7 @@ from processing.diagnosis.instrument.judge import Judged
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.errors import ProcessError
 from processing.storage.h5_door import DAMAGE
+from processing.whole_file import whole_file
 
 MOMENTS = ("before", "after")
 
@@ -49,7 +50,7 @@ def write_residuals(path: Path, judged: Judged, problem: InstrumentProblem) -> N
             harmonics[moment] = {axis: values.tolist() for axis, values in residual.harmonics.items()}
         told.append({"name": data.name, "harmonics": harmonics})
     try:
-        with path.open("xb") as file:
+        with whole_file(path, new=True) as new, new.open("wb") as file:
             np.savez_compressed(file, told=np.array(json.dumps(told)), **arrays)
     except FileExistsError as error:
         raise ProcessError(f"{path} exists and is not replaced. Give another --residuals.") from error

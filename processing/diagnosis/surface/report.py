@@ -14,10 +14,9 @@ from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.judge import SurfaceJudged
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.diagnosis.surface.quantities import dominant_errors, quantities
-from processing.doors import require_new
 from processing.reports.colours import SIGNED
 from processing.reports.template import Figure, Section, render
-from processing.whole_file import write_whole_text
+from processing.whole_file import write_new_text
 
 
 def write_surface_report(path: Path, judged: SurfaceJudged, problem: SurfaceProblem) -> None:
@@ -69,8 +68,7 @@ def write_surface_report(path: Path, judged: SurfaceJudged, problem: SurfaceProb
             figures.append(Figure(_png(dominant_figure(judged, problem, k)), caption))
         sections.append(Section(capture.name, facts, figures))
     title = f"diagnose: {d.material} with {d.instrument}"
-    require_new(path)
-    write_whole_text(path, render(title, d.simulated, f"{d.wavelengths_nm[0]:g} nm", sections))
+    write_new_text(path, render(title, d.simulated, f"{d.wavelengths_nm[0]:g} nm", sections))
 
 
 def residual_figure(judged: SurfaceJudged, problem: SurfaceProblem, k: int) -> Any:

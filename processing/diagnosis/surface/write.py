@@ -7,14 +7,16 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from processing.diagnosis.instrument_file import WriteError
+from processing.diagnosis.instrument_file import WriteError, file_head
 from processing.diagnosis.search.result import FoundEffect
 from processing.diagnosis.surface.judge import SurfaceDiagnosis
+from processing.doors import require_new
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.applied_effects import instrument_effects
 from processing.instrument.model import AppliedEffect, InstrumentModel
 from processing.reflectance import first_surface, polarized_diffuse
 from processing.reflectance.effects.base import GeometryEffect, MaterialEffect, reflectance_effects
+from processing.whole_file import write_new_text
 from processing.yaml_file import dump_yaml
 
 
@@ -79,7 +81,8 @@ def write_surface(
 
     Raises
     ------
-    WriteError : one of the files exists, or nothing was found that a file could hold.
+    WriteError : nothing was found that a file could hold.
+    ProcessError : one of the files exists.
     """
     kinds = {e.kind for e in diagnosis.effects}
     of_surface = [effect for kind, effect in reflectance_effects().items() if kind in kinds]
@@ -97,11 +100,8 @@ def write_surface(
         found = f" {', '.join(sorted(kinds))} has no place in a file: mend it at the bench." if kinds else ""
         raise WriteError(f"nothing was found that could go into {path}; it was not written.{found}")
     for target, _ in models:
-        if target.exists():
-            raise WriteError(f"{target} exists; diagnose never replaces a file. Give another --write.")
+        require_new(target)
+    head = file_head(f"Written by `diagnose --reflectance`: {diagnosis.verdict}.", note)
     for target, model in models:
-        with target.open("x", encoding="utf-8") as file:
-            file.write(f"# Written by `diagnose --reflectance`: {diagnosis.verdict}.\n")
-            file.writelines(f"# {line}\n" for line in note.splitlines())
-            file.write(dump_yaml(model))
+        write_new_text(target, head + dump_yaml(model))
     return [target for target, _ in models]
