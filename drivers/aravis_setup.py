@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
 
 from drivers import genicam
 from drivers.acquisition_status import AcquisitionStatus
@@ -31,6 +31,14 @@ _SWITCHED_OFF = (
     "ChunkModeActive",
     "AcquisitionFrameRateEnable",
 )
+# What a capture sets after the features, whatever they say.
+_SET_BY_CAPTURES = {
+    **dict.fromkeys(genicam.EXPOSURE_US, "give exposure_s in the plan"),
+    "ExposureMode": "it is Timed",
+    "AcquisitionMode": "it is Continuous",
+    "TriggerMode": "it is On",
+    "TriggerSource": "give `trigger` in the settings, and trigger_line",
+}
 
 
 class Config(BaseModel):
@@ -52,8 +60,8 @@ class Config(BaseModel):
     trigger_line: str = Field(default="Line0", description="input of the hardware trigger")
     trigger_edge: Literal["RisingEdge", "FallingEdge"] = "RisingEdge"
     trigger_timeout_s: float = Field(default=10.0, gt=0, description="longest wait for a hardware trigger")
-    features: dict[str, bool | int | float | str] = Field(
-        default={}, description="any GenICam features by name, set in this order and read back; they win over settings"
+    features: dict[str, bool | int | FiniteFloat | str] = Field(
+        default={}, description="any GenICam features by name, set in this order after the region and read back"
     )
     chunk_timestamp: bool = Field(
         default=True, description="take the time of an exposure from behind the image, where the camera can send it"
@@ -67,6 +75,14 @@ class Config(BaseModel):
         "told by number and by the time of the trigger alone",
     )
     trigger_latency_s: float = Field(default=0.002, ge=0, description="added to the exposure before the bench moves")
+
+    @field_validator("features")
+    @classmethod
+    def _leaves_captures_their_own(cls, features: dict[str, bool | int | float | str]) -> Any:
+        for name in features:
+            if name in _SET_BY_CAPTURES:
+                raise ValueError(f"{name} is set by every capture: {_SET_BY_CAPTURES[name]}")
+        return features
 
 
 def structure_of(settings: CameraSettings) -> tuple[object, ...]:
@@ -179,6 +195,18 @@ class Setup:
         for name in names:
             self._features.set_number((name,), factor)
 
+    def _factor(self, what: str) -> int | None:
+        """Binning or decimation as it is, whoever set it; None where the camera has none."""
+        factors = [self._features.number((f"{what}{axis}",)) for axis in ("Horizontal", "Vertical")]
+        known = {round(factor) for factor in factors if factor is not None}
+        if len(known) > 1:
+            raise self._refused(
+                f"read {what}",
+                f"columns and rows have {factors[0]:g} and {factors[1]:g}, a capture holds one factor for both. "
+                f"Give `{what.lower()}` in the settings",
+            )
+        return next(iter(known), None)
+
     def _set_reversed(self, name: str, wanted: bool | None) -> None:
         if not wanted:
             self._features.switch_off(name)
@@ -242,8 +270,9 @@ class Setup:
         if features.find(("TriggerSelector",)) is not None:
             features.set_choice("TriggerSelector", "FrameStart")
         features.set_choice("TriggerSource", self._config.trigger_line if self.hardware else "Software")
-        if self.hardware and features.find(("TriggerActivation",)) is not None:
-            features.set_choice("TriggerActivation", self._config.trigger_edge)
+        edge = "TriggerActivation"
+        if self.hardware and edge not in self._config.features and features.find((edge,)) is not None:
+            features.set_choice(edge, self._config.trigger_edge)
         features.set_choice("TriggerMode", "On")
         self.status = AcquisitionStatus(features)
 
@@ -253,6 +282,7 @@ class Setup:
         if settings.exposure_s is not None:
             features.set_number(genicam.EXPOSURE_US, settings.exposure_s * 1e6, floor=_EXPOSURE_FLOOR_US)
         if settings.gain_db is not None:
+            self._require_free("gain_db", *genicam.GAIN_DB, *genicam.GAIN_RAW)
             per_db = self._config.gain_raw_per_db
             if features.find(genicam.GAIN_DB) is not None:
                 features.set_number(genicam.GAIN_DB, settings.gain_db, floor=_GAIN_FLOOR_DB)
@@ -264,7 +294,14 @@ class Setup:
                     "this camera has no Gain in decibels; with GainRaw, `gain_raw_per_db` is needed in the rig file",
                 )
         if settings.black_level is not None:
+            self._require_free("black_level", *genicam.BLACK_LEVEL)
             features.set_number(genicam.BLACK_LEVEL, settings.black_level, floor=_BLACK_LEVEL_FLOOR)
+
+    def _require_free(self, setting: str, *names: str) -> None:
+        """One of two values for the same thing would be dropped in silence."""
+        for name in names:
+            if name in self._config.features:
+                raise self._refused(f"{name} in `features`", f"{setting} is given as well. Leave one of them out")
 
     def read_back(self, frame_average: int | None) -> CameraSettings:
         """Every setting as the camera has it now."""
@@ -275,8 +312,7 @@ class Setup:
         if gain_db is None and raw is not None and self._config.gain_raw_per_db is not None:
             gain_db = raw / self._config.gain_raw_per_db
         self.exposure_s = (exposure_us or 0.0) * 1e-6
-        binning = features.number(("BinningHorizontal",))
-        decimation = features.number(("DecimationHorizontal",))
+        binning, decimation = self._factor("Binning"), self._factor("Decimation")
         with features.asking("read the region"):
             left, top, width, height = self._camera.get_region()
         self.size, fmt = (int(width), int(height)), self.pixel_format()
@@ -289,8 +325,8 @@ class Setup:
             height=fmt.scale * int(height),
             offset_x=fmt.scale * int(left),
             offset_y=fmt.scale * int(top),
-            binning=None if binning is None else int(binning),
-            decimation=None if decimation is None else int(decimation),
+            binning=binning,
+            decimation=decimation,
             reverse_x=features.optional_flag("ReverseX"),
             reverse_y=features.optional_flag("ReverseY"),
             packet_size=self.packet_size(),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
 from drivers.errors import CameraError, CameraLost, SettingRefused
 
@@ -23,6 +23,8 @@ SENSOR_HEIGHT = ("SensorHeight", "HeightMax")
 PACKET_DELAY = ("GevSCPD",)
 SERIAL_NUMBER = ("DeviceSerialNumber", "DeviceID")
 FIRMWARE = ("DeviceFirmwareVersion", "DeviceVersion")
+
+T = TypeVar("T")
 
 
 class Features:
@@ -188,16 +190,43 @@ class Features:
         Raises
         ------
         SettingRefused
-            No such feature, not of that kind, out of its limits, or read back different.
+            No such feature, a command, one that can only be read, a value of another kind, out of its limits, or read
+            back different.
         """
+        asked = f"set {name} to {value}"
         if self.find((name,)) is None:
-            raise self._refused(f"set {name} to {value}", "this camera has no such feature now")
-        if isinstance(value, bool):
-            self.set_flag(name, value)
-        elif isinstance(value, str):
-            self.set_choice(name, value)
-        else:
+            raise self._refused(asked, "this camera has no such feature now")
+        node, kinds = self._device.get_feature(name), self._aravis
+        if isinstance(node, kinds.GcCommand):
+            raise self._refused(asked, "it is a command and holds no value")
+        with self.asking(f"look up {name}"):
+            if node.get_actual_access_mode() == kinds.GcAccessMode.RO:
+                raise self._refused(asked, "it can only be read")
+        # An enumeration is a number and a text to Aravis as well.
+        if isinstance(node, kinds.GcBoolean):
+            self.set_flag(name, self._of_kind(name, value, bool, "true or false"))
+        elif isinstance(node, kinds.GcEnumeration):
+            self.set_choice(name, self._of_kind(name, value, str, f"one of {', '.join(self.choices(name))}"))
+        elif isinstance(node, kinds.GcInteger | kinds.GcFloat):
+            if isinstance(value, bool | str) or (isinstance(node, kinds.GcInteger) and value != int(value)):
+                raise self._refused(asked, f"it takes a {'whole ' if isinstance(node, kinds.GcInteger) else ''}number")
             self.set_number((name,), value)
+        elif isinstance(node, kinds.GcString):
+            self._set_text(name, self._of_kind(name, value, str, "a text"))
+        else:
+            raise self._refused(asked, "it is no feature with a value")
+
+    def _of_kind(self, name: str, value: object, kind: type[T], wanted: str) -> T:
+        if not isinstance(value, kind):
+            raise self._refused(f"set {name} to {value}", f"it takes {wanted}")
+        return value
+
+    def _set_text(self, name: str, text: str) -> None:
+        with self.asking(f"set {name} to {text}"):
+            self._camera.set_string(name, text)
+            back = str(self._camera.get_string(name))
+        if back != text:
+            raise self._refused(f"set {name} to {text}", f"it reads back {back!r}")
 
     def dump(self) -> dict[str, str]:
         """Every feature under the root category that can be read now, as text, in the order of the node map."""

@@ -3,6 +3,8 @@ then sends the prompt ">", which the SC10 and the FW102C follow with a blank."""
 
 from __future__ import annotations
 
+import re
+
 from drivers.errors import CommandRejected, ReplyError, ReplyTimeout
 from drivers.serial_link import SerialLink
 
@@ -73,7 +75,8 @@ class PromptLine:
         if frame is None:
             raise ReplyTimeout(asked, f"no reply in {reply_s:g} s", "Check power, cable and baud rate")
         # The blank behind the prompt of the answer before stands at the front.
-        lines = frame.decode("ascii", "replace").replace("\n", "").lstrip(" ").split("\r")
+        # Terminal servers turn the CR of the box into LF, or into both.
+        lines = re.split(r"[\r\n]+", frame.decode("ascii", "replace").lstrip(" \r\n"))
         if lines[0] != text:
             raise ReplyError(asked, f"the echo is {lines[0]!r}", "The line is disturbed: check cable and baud rate")
         answer = " ".join(line for line in lines[1:] if line)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,14 +63,17 @@ PixelSource = Callable[[ExposureInfo], NDArray[np.uint16]]
 def counts_of(source: PixelSource, info: ExposureInfo, fmt: PixelFormat, bits: int) -> NDArray[np.uint16]:
     """Counts that a pixel source of so many bits gives for an exposure, cut to the bits of a format.
 
+    A format that sends each super-pixel as one pixel has its region in super-pixels; the source is asked for pixels.
+
     Raises
     ------
     ValueError
         The source gave another shape or type, or counts of more bits.
     """
-    pixels = source(info)
-    if pixels.shape != (fmt.scale * info.height, fmt.scale * info.width) or pixels.dtype != np.uint16:
-        raise ValueError(f"the pixel source gave {pixels.dtype} {pixels.shape}, not uint16 {(info.height, info.width)}")
+    left, top, width, height = (fmt.scale * edge for edge in info.region)
+    pixels = source(replace(info, width=width, height=height, offset_x=left, offset_y=top))
+    if pixels.shape != (height, width) or pixels.dtype != np.uint16:
+        raise ValueError(f"the pixel source gave {pixels.dtype} {pixels.shape}, not uint16 {(height, width)}")
     if bits < fmt.bits and int(pixels.max()) >> bits:
         raise ValueError(f"the pixel source gave {int(pixels.max())}, more than {bits} bits hold")
     return pixels >> np.uint16(bits - fmt.bits) if fmt.bits < bits else pixels

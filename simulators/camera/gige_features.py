@@ -10,6 +10,7 @@ import re
 from collections.abc import Sequence
 from xml.sax.saxutils import quoteattr
 
+from drivers.pixel_formats import pixel_format
 from simulators.camera.node_map import NodeMap
 
 SENSOR_HEIGHT, SENSOR_WIDTH = 0x118, 0x11C
@@ -99,10 +100,10 @@ def _flag(name: str, address: int, access: str = "RW", index: str = "") -> str:
     )
 
 
-def _text(name: str, address: int, length: int) -> str:
+def _text(name: str, address: int, length: int, access: str = "RO") -> str:
     return (
         f'<StringReg Name="{name}" NameSpace="Standard"><Address>{address:#x}</Address><Length>{length}</Length>'
-        "<AccessMode>RO</AccessMode><pPort>Device</pPort></StringReg>"
+        f"<AccessMode>{access}</AccessMode><pPort>Device</pPort></StringReg>"
     )
 
 
@@ -146,16 +147,18 @@ def _identity(table: NodeMap) -> list[str]:
         _text("DeviceModelName", MODEL_NAME, 32),
         _text("DeviceVersion", 0x88, 32),
         _text("DeviceSerialNumber", 0xD8, 16),
+        _text("DeviceUserID", 0xE8, 16, "RW"),
     ]
     return texts + ([_float(table.temperature, TEMPERATURE_C, -40.0, 100.0, "RO")] if table.temperature else [])
 
 
 def _region(table: NodeMap, width: int, height: int) -> list[str]:
+    angles = any(pixel_format(name).angles for name in table.pixel_formats)
     features = [
         _integer("SensorWidth", SENSOR_WIDTH, 1, width, "RO"),
         _integer("SensorHeight", SENSOR_HEIGHT, 1, height, "RO"),
-        _formula("WidthMax", f"{width} / (B * D)", B="BinningXRegister", D="DecimationXRegister"),
-        _formula("HeightMax", f"{height} / (B * D)", B="BinningYRegister", D="DecimationYRegister"),
+        _most("WidthMax", width, "X", angles=angles),
+        _most("HeightMax", height, "Y", angles=angles),
         _formula("OffsetXMax", "M - W", M="WidthMax", W="Width"),
         _formula("OffsetYMax", "M - H", M="HeightMax", H="Height"),
         _register("BinningX", BINNING_X),
@@ -174,6 +177,15 @@ def _region(table: NodeMap, width: int, height: int) -> list[str]:
     if table.reverse:
         features += [_flag("ReverseX", REVERSE_X), _flag("ReverseY", REVERSE_Y)]
     return features
+
+
+def _most(name: str, pixels: int, axis: str, *, angles: bool) -> str:
+    factors = {"B": f"Binning{axis}Register", "D": f"Decimation{axis}Register"}
+    if not angles:
+        return _formula(name, f"{pixels} / (B * D)", **factors)
+    # Four counts a pixel, which is a super-pixel of the sensor.
+    together = "((((F &gt;&gt; 16) &amp; 0xFF) &gt; 16) ? 2 : 1)"
+    return _formula(name, f"{pixels} / (B * D * {together})", **factors, F="PixelFormatRegister")
 
 
 def _acquisition(table: NodeMap) -> list[str]:

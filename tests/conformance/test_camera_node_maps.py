@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from drivers.camera import CameraSettings
 from drivers.cameras import aravis
@@ -34,7 +35,6 @@ class MakersCamera:
 
     def __init__(self, name: str, stack: ExitStack, played_from: Path | None = None) -> None:
         self.table: NodeMap = node_map(name)
-        self.scale = 1
         camera: GigeCamera | PlayedCamera
         if played_from is None:
             camera = GigeCamera("MAKER1", *SIZE, self.show, bits=16, description=name)
@@ -46,8 +46,8 @@ class MakersCamera:
 
     def show(self, info: ExposureInfo) -> NDArray[np.uint16]:
         """Neighbours differ, each frame differs, the lowest eight bits hold it all."""
-        shape = (self.scale * info.height, self.scale * info.width)
-        return ((np.arange(shape[0] * shape[1]) * 7 + info.frame_id) % 251).astype(np.uint16).reshape(shape)
+        pixels = (np.arange(info.height * info.width) * 7 + info.frame_id) % 251
+        return pixels.astype(np.uint16).reshape(info.height, info.width)
 
     def show_again(self, frame_id: int) -> NDArray[np.uint16]:
         """What the whole sensor showed in a frame."""
@@ -95,10 +95,9 @@ def test_every_format_of_the_maker_gives_its_counts(maker: MakersCamera) -> None
     camera = maker.open()
     for name in maker.table.pixel_formats:
         fmt = pixel_format(name)
-        maker.scale = fmt.scale
         maker.simulated.bits = fmt.bits
         back = camera.configure(CameraSettings(exposure_s=1e-4, pixel_format=name))
-        assert (back.width, back.height) == (fmt.scale * SIZE[0], fmt.scale * SIZE[1])
+        assert (back.width, back.height) == SIZE
         frame = camera.capture()[0]
         expected = (np.arange(frame.pixels.size) * 7 + frame.frame_id) % 251
         assert np.array_equal(frame.pixels.ravel(), expected), name
@@ -179,11 +178,40 @@ def test_a_frame_without_its_time_behind_the_image_is_lost_and_not_given_the_tim
     [
         ({"NoSuchFeature": 1}, "no such feature"),
         ({"Gamma": 77.0}, "limits"),
+        ({"GevSCPD": 12.6}, "takes a whole number"),
+        ({"Gain": "6"}, "takes a number"),
         ({"TriggerActivation": "Sideways"}, "this camera offers"),
+        ({"TriggerActivation": 1}, "takes one of RisingEdge, FallingEdge"),
+        ({"PtpEnable": 1}, "takes true or false"),
+        ({"DeviceUserID": 4}, "takes a text"),
+        ({"SensorWidth": 5}, "can only be read"),
+        ({"TriggerSoftware": True}, "is a command"),
+        ({"Gain": 3}, "gain_db is given as well"),
+        ({"BlackLevel": 3}, "black_level is given as well"),
     ],
 )
 def test_a_feature_that_is_not_taken_is_refused(wrong: dict[str, object], says: str) -> None:
     with ExitStack() as stack:
         camera = MakersCamera("loopback", stack).open(features=wrong)
         with pytest.raises(SettingRefused, match=says):
-            camera.configure(CameraSettings(exposure_s=1e-3))
+            camera.configure(CameraSettings(exposure_s=1e-3, gain_db=6.0, black_level=2.0))
+
+
+def test_features_of_every_kind_are_set() -> None:
+    wanted = {"DeviceUserID": "bench 4", "GevSCPD": 12, "Gamma": 0.5, "PtpEnable": True, "GainAuto": "Once", "Gain": 3}
+    with ExitStack() as stack:
+        camera = MakersCamera("loopback", stack).open(features=wanted, bits=8)
+        assert camera.configure(CameraSettings(exposure_s=1e-3)).gain_db == 3.0
+        found = camera.node_map()
+        assert {name: found[name] for name in wanted} == {
+            **{"DeviceUserID": "bench 4", "GevSCPD": "12", "Gamma": "0.5"},
+            **{"PtpEnable": "true", "GainAuto": "Once", "Gain": "3"},
+        }
+
+
+@pytest.mark.parametrize("name", ["ExposureTime", "TriggerMode", "TriggerSource", "AcquisitionMode"])
+def test_a_feature_that_every_capture_sets_is_refused_in_the_rig_file(name: str) -> None:
+    with pytest.raises(ValidationError, match=f"{name} is set by every capture"):
+        aravis.Config(features={name: "Off"})
+    with pytest.raises(ValidationError, match="finite"):
+        aravis.Config(features={"Gain": float("inf")})

@@ -88,18 +88,21 @@ def test_horizontal_light_reads_zero_degrees_wherever_the_region_begins(
 
 
 @pytest.mark.parametrize(
-    ("settings", "says"),
+    ("camera", "says"),
     [
-        ({"binning": 2}, "mosaic_binning: like_with_like"),
-        ({"decimation": 2}, "leaves out pixels"),
-        ({"reverse_x": True}, "mirrors its frames"),
-        ({"width": 41, "height": 24}, "no whole number of super-pixels"),
+        ({"settings": {"binning": 2}}, "mosaic_binning: like_with_like"),
+        ({"settings": {"decimation": 2}}, "leaves out pixels"),
+        ({"settings": {"reverse_x": True}}, "mirrors its frames"),
+        ({"settings": {"width": 41, "height": 24}}, "no whole number of super-pixels"),
+        ({"features": {"BinningVertical": 2}}, "columns and rows have 1 and 2"),
+        ({"features": {"DecimationHorizontal": 2}}, "columns and rows have 2 and 1"),
+        ({"features": {"ReverseY": True}}, "mirrors its frames"),
     ],
 )
 def test_a_mosaic_whose_analyzers_cannot_be_known_is_refused(
-    acquire: Acquire, small_rig: Rig, short_plan: Callable[[str], Path], tmp_path: Path, settings: dict, says: str
+    acquire: Acquire, small_rig: Rig, short_plan: Callable[[str], Path], tmp_path: Path, camera: dict, says: str
 ) -> None:
-    rig = small_rig(top={"camera": CAMERA | {"settings": settings}})
+    rig = small_rig(top={"camera": CAMERA | camera})
     code, _, err = acquire("--rig", rig, "--plan", short_plan("stokes"), *THROUGH, "--out", tmp_path / "captures")
     assert code != 0
     assert says in " ".join(err.split())
@@ -183,10 +186,18 @@ def test_a_rotator_of_limited_travel_takes_the_same_states_half_a_turn_away(
         assert np.all(np.abs(capture.angles_deg["psa"]) <= 95)
 
 
+@pytest.mark.parametrize(
+    ("pixel_format", "offset_x"), [("PolarizeMono12p", 4), ("PolarizedAngles_0d_45d_90d_135d_Mono12p", 8)]
+)
 def test_a_maker_s_polarization_camera_takes_a_capture_with_its_node_map(
-    acquire: Acquire, small_rig: Rig, short_plan: Callable[[str], Path], tmp_path: Path
+    acquire: Acquire,
+    small_rig: Rig,
+    short_plan: Callable[[str], Path],
+    tmp_path: Path,
+    pixel_format: str,
+    offset_x: int,
 ) -> None:
-    settings = {"pixel_format": "PolarizeMono12p", "width": 40, "height": 32, "offset_x": 4}
+    settings = {"pixel_format": pixel_format, "width": 40, "height": 32, "offset_x": offset_x}
     camera = CAMERA | {"settings": settings, "features": {"PtpEnable": True}}
     rig = small_rig(top={"camera": camera}, camera="lucid_tri050s_p")
     out = tmp_path / "captures"
@@ -198,6 +209,7 @@ def test_a_maker_s_polarization_camera_takes_a_capture_with_its_node_map(
         assert capture.camera_nodes["PtpStatus"] == "Disabled"
         assert capture.camera_nodes["DeviceModelName"] == "TRI050S-P"
         assert capture.column("camera_temperature_c").tolist() == [38.5, 38.5]
+        assert capture.frame_shape == (32, 40)
     assert_horizontal(path)
 
 

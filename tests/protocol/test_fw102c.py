@@ -13,6 +13,7 @@ from drivers.sources import fw102c, sc10
 from simulators.clock import Clock, patient_clock
 from simulators.controllers.fw102c import FW102CEmulator
 from simulators.controllers.sc10 import SC10Emulator
+from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort
 
 POSITIONS = {451.0: 1, 662.0: 3}
@@ -37,6 +38,31 @@ def test_bytes_of_the_wheel() -> None:
     ):
         emulator.receive(sent)
         assert emulator.take_output() == came
+
+
+class OtherLineEnds:
+    """An emulator behind a terminal server that changes CR."""
+
+    def __init__(self, emulator: Emulator, line_end: bytes) -> None:
+        self._emulator, self._line_end = emulator, line_end
+        self.receive, self.next_output_s = emulator.receive, emulator.next_output_s
+
+    def take_output(self) -> bytes:
+        return self._emulator.take_output().replace(b"\r", self._line_end)
+
+
+@pytest.mark.parametrize("line_end", [b"\n", b"\r\n", b"\n\r"])
+def test_lines_that_end_otherwise(line_end: bytes) -> None:
+    emulator = FW102CEmulator(Clock(100.0, base=patient_clock()))
+    with (
+        PtyPort(OtherLineEnds(emulator, line_end)) as port,
+        LineRegistry(clock=patient_clock()) as lines,
+    ):
+        source = fw102c.open(fw102c.Config(port=port.path, positions=POSITIONS, dark_position=6), lines)
+        source.select(662.0)
+        source.set_light(True)
+        assert source.is_on()
+        assert emulator.light_at(662.0) == 1.0
 
 
 def test_the_filter_of_the_wavelength_stands_in_the_beam(wheel: tuple[FW102CEmulator, str, LineRegistry]) -> None:
