@@ -23,6 +23,14 @@ from drivers.errors import CameraError
 from drivers.pixel_formats import PixelFormat, pixel_format, pixel_format_of
 from simulators.camera import gige_features as features
 from simulators.camera.camera_memory import CameraMemory
+from simulators.camera.event_messages import (
+    CAPABILITY,
+    EVENTS,
+    EVENTS_SUPPORTED,
+    NUMBER_OF_CHANNELS,
+    EventMessages,
+    Moment,
+)
 from simulators.camera.exposure import ExposureInfo, PixelSource, counts_of
 from simulators.camera.frame_packets import FramePackets, send, with_chunks
 from simulators.camera.node_map import node_map
@@ -96,6 +104,7 @@ class GigeCamera(SimulatedCamera):
         self._gone = threading.Event()
         self._camera: Any = None
         self._memory: CameraMemory | None = None
+        self._events: EventMessages | None = None
         # First, because its message says what is missing.
         load_aravis()
         self._library = ctypes.CDLL("libaravis-0.8.so.0")
@@ -130,6 +139,10 @@ class GigeCamera(SimulatedCamera):
         self._gone.clear()
         self._camera, self._memory = camera, CameraMemory(camera.get_fake_camera())
         self._memory.power_up(*self._size, self._table)
+        self._events = EventMessages(self._memory.read)
+        if self._table is not None and self._table.events:
+            self._memory.write(NUMBER_OF_CHANNELS, 1)
+            self._memory.write(CAPABILITY, self._memory.read(CAPABILITY) | EVENTS_SUPPORTED)
         # hash() of a GObject wrapper is the object's address.
         self._library.arv_fake_camera_set_fill_pattern(self._memory.address, self._callback, None)
         self.lost_ratio = self._lost_ratio
@@ -142,6 +155,8 @@ class GigeCamera(SimulatedCamera):
         self._camera.set_property("gvsp-lost-ratio", 1.0)
         self._library.arv_fake_camera_set_fill_pattern(self._memory.address, _FillPattern(), None)
         self._camera = self._memory = None
+        if self._events is not None:
+            self._events.close()
 
     @property
     def lost_ratio(self) -> float:
@@ -180,11 +195,13 @@ class GigeCamera(SimulatedCamera):
         camera = self._camera
         if start_s < self._armed_at_s and camera is not None:
             self.ignored_triggers += 1
+            self._tell("missed", 0)
             camera.set_property("gvsp-lost-ratio", 1.0)
             return
         chunked: FramePackets | None = None
         try:
             info = self._info(buffer, exposure_us, gain_raw)
+            self._tell("started", info.frame_id)
             fmt = self._format(code)
             data = fmt.encode(counts_of(self._source, info, fmt, self.bits))
             if self._sends_chunks():
@@ -205,10 +222,22 @@ class GigeCamera(SimulatedCamera):
         self._arm_after(start_s + exposure_us * 1e-6)
         # The frame is sent when this returns, and no frame leaves a camera before its exposure has ended.
         # Real time: the same thread answers commands, and Aravis gives up a camera that is silent for three seconds.
-        self._gone.wait(max(0.0, start_s + exposure_us * 1e-6 + delay_s - time.monotonic()))
+        self._gone.wait(max(0.0, start_s + exposure_us * 1e-6 - time.monotonic()))
+        if not self._gone.is_set():
+            self._tell("ended", int(self._library.arv_buffer_get_frame_id(buffer)))
+        self._gone.wait(delay_s)
         if chunked is not None and self._memory is not None and not self._gone.is_set():
             self.chunk_times_ns.append(chunked.time_ns)
             send(chunked, self._memory.read, self.address, self._lost_ratio)
+
+    def _tell(self, moment: Moment, frame_id: int) -> None:
+        """Tell the events of a moment that a host has asked for."""
+        memory, events = self._memory, self._events
+        if self._table is None or memory is None or events is None:
+            return
+        for k, (name, number) in enumerate(self._table.events.items()):
+            if name in EVENTS[moment] and memory.read(features.EVENT_NOTIFICATION + 4 * k):
+                events.tell(self.address, number, frame_id, time.time_ns())
 
     def _sends_chunks(self) -> bool:
         offers = self._table is not None and self._table.chunk_timestamp

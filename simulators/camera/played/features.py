@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Iterator, Sequence
 
 from drivers.genicam import BLACK_LEVEL, GAIN_DB, GAIN_RAW
+from simulators.camera.event_messages import EVENTS, Moment
 from simulators.camera.exposure import ExposureInfo
 from simulators.camera.played.formula import Number
 from simulators.camera.played.node_tree import REGISTERS, NodeError, NodeTree
@@ -118,6 +119,18 @@ class Features:
             if self._nodes.chosen("TriggerMode") == "Off":
                 return None
             return self._nodes.chosen("TriggerSource")
+
+    def events(self, moment: Moment) -> list[int]:
+        """Numbers of the events of a moment that a host has asked for."""
+        nodes, selector, switch = self._nodes, "EventSelector", "EventNotification"
+        asked = []
+        for name in EVENTS[moment] if self._has(selector) and self._has(switch) else ():
+            if name in nodes.entries(selector) and f"Event{name}" in nodes:
+                with nodes.assuming(selector, name):
+                    # Makers have several words for on.
+                    if nodes.chosen(switch) != "Off":
+                        asked.append(int(nodes.value(f"Event{name}")))
+        return asked
 
     def time_chunk(self, time_ns: int) -> dict[int, bytes] | None:
         """The chunk with the time of an exposure, by its number; empty if it is not enabled, None without chunks."""

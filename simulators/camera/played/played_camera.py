@@ -17,6 +17,7 @@ from pathlib import Path
 
 from drivers.errors import CameraError
 from drivers.pixel_formats import pixel_format_of
+from simulators.camera.event_messages import EventMessages, Moment
 from simulators.camera.exposure import PixelSource, counts_of
 from simulators.camera.frame_packets import (
     HOST_ADDRESS,
@@ -89,6 +90,7 @@ class PlayedCamera(SimulatedCamera):
         self._wake = threading.Condition(self._lock)
         self._channel = ControlChannel(self)
         self._worker: threading.Thread | None = None
+        self._events: EventMessages | None = None
         self._was_on = self._plugged_in = self._acquiring = self._triggered = self._busy = False
         # Which start of the acquisition this is: an exposure of an earlier one is thrown away.
         self._run_number = 0
@@ -136,6 +138,7 @@ class PlayedCamera(SimulatedCamera):
         self._plugged_in = self._was_on = True
         xml = (self._description.name, self._xml_at, len(self._description.served))
         boot(self._memory, self.address, self._texts, xml)
+        self._events = EventMessages(self._bootstrap)
         try:
             self._channel.open(self.address)
         except OSError as error:
@@ -151,6 +154,8 @@ class PlayedCamera(SimulatedCamera):
             self._plugged_in = False
             self._begin(acquiring=False)
         self._channel.close()
+        if self._events is not None:
+            self._events.close()
         worker, self._worker = self._worker, None
         if worker is not None:
             worker.join()
@@ -227,11 +232,17 @@ class PlayedCamera(SimulatedCamera):
                 return
             if self._busy or self._triggered:
                 self.ignored_triggers += 1
+                self._tell("missed", 0)
                 return
             self._triggered = True
             # Before the command is answered: whoever asks then is told that it exposes.
             self._features.show(exposing=True, armed=False)
             self._wake.notify_all()
+
+    def _tell(self, moment: Moment, frame_id: int) -> None:
+        if self._events is not None:
+            for number in self._features.events(moment):
+                self._events.tell(self.address, number, frame_id, time.time_ns())
 
     def _run(self) -> None:
         while self._plugged_in:
@@ -264,6 +275,7 @@ class PlayedCamera(SimulatedCamera):
             info = self._features.info(self._frame_id)
             fmt = pixel_format_of(*self._features.pixel_format())
             self._features.show(exposing=True, armed=False)
+            self._tell("started", info.frame_id)
         try:
             data = fmt.encode(counts_of(self._source, info, fmt, self.bits)).tobytes()
             with self._wake:
@@ -278,6 +290,7 @@ class PlayedCamera(SimulatedCamera):
                 self._busy = False
                 if self._run_number == run_number:
                     self._features.show(exposing=False, armed=True)
+                    self._tell("ended", info.frame_id)
         payload = data if chunks is None else with_chunks(data, chunks)
         frame = FramePackets(info.frame_id, time_ns, code & 0xFFFF_FFFF, info.region, payload, chunks is not None)
         self._sent.append(frame)
