@@ -128,7 +128,7 @@ def _measure_mueller(task: CaptureTask, product: Path, view: ViewingGeometry) ->
     m0 = xi0_and_dominant(m)[1]
     noise, eigenvalues = coherency_noise(image), coherency_eigenvalues(m)
     found = corrected(np.asarray(eigenvalues[:, None], dtype=float), noise)
-    xi0, stderr = found.xi0[:, 0], (found.interval_68[1] - found.interval_68[0])[:, 0] / 2
+    xi0, stderr = found.xi0[:, 0], found.stderr[:, 0]
     # A limit on the noise: one on the outcome would keep upward fluctuations only.
     good = np.isfinite(xi0) & ~(noise.coupling[:, 0] > MAX_STDERR) & _inner(geometry, task.border_px)
     measured, modelled = linear_diattenuation(m0), linear_diattenuation(model)

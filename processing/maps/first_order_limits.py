@@ -22,8 +22,8 @@ Planes = dict[str, NDArray[Any]]
 SEEN = 3.0
 #: Eigenvalues have one where their neighbours are this many times the noise between them away.
 APART = 5.0
-#: The fast axis is determined where it is the slow one with less than this probability.
-FLIPPED = 0.02
+#: The fast axis is determined where it is the slow one with less than this probability: three errors from 180 degrees.
+FLIPPED = 0.00135
 #: Components of the vectors whose magnitudes these are.
 MAGNITUDES = {
     "diattenuation": 3,

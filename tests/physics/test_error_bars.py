@@ -33,7 +33,8 @@ def test_near_180_degrees_the_axis_is_not_determined_but_the_pair_of_axes_is(axi
     found = block(triply_degenerate.mueller_matrix(mueller.retarder(axis, np.pi), 0.9), electrons)
     fast, errors = found["retardance_fast_axis_deg"], found["retardance_fast_axis_deg_errors"]
     assert np.std(fast) > 20  # it flips
-    assert np.isfinite(errors).mean() < 0.05
+    # Three errors from 180 degrees by chance: 0.3 %.
+    assert np.isfinite(errors).mean() < 0.01
     assert found["retardance_axis_flip"].mean() > 0.1
     # Of the two axes: 0 and 90 degrees are the same.
     apart = (found["retardance_axis_or_90_deg"] - np.rad2deg(axis) + 45) % 90 - 45
