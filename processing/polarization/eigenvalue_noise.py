@@ -131,13 +131,13 @@ class CorrectedXi0:
 
     @property
     def stderr(self) -> Array:
-        """Of xi0: within one and 1.96 of it lie the whole 68 and 95 % interval, and of an estimate below 1/4, 1/4 itself.
+        """Of xi0: within one and 1.96 of it lie the whole 68 and 95 % interval, and below 1/4 that limit itself.
 
         Half the 68 % interval where that is even. Near 1/4 it is not, and half of it would cover half of the truths.
         """
         farthest = [np.abs(bounds - self.xi0).max(axis=0) for bounds in (self.interval_68, self.interval_95)]
         # No sample lies below 1/4: an estimate there is off by that much at least.
-        return np.maximum(farthest[0], np.maximum(farthest[1], 0.25 - self.xi0) / _DEVIATES[-1])
+        return np.asarray(np.maximum(farthest[0], np.maximum(farthest[1], 0.25 - self.xi0) / _DEVIATES[-1]))
 
 
 def corrected(eigenvalues: Array, noise: EigenvalueNoise) -> CorrectedXi0:
