@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from processing.arrays import Array
@@ -15,8 +16,9 @@ from processing.diagnosis.captured.read_frames import read_frames
 from processing.diagnosis.search.rules import DARK_RIM, FAINTEST
 from processing.instrument.changes import Conditions, elapsed
 from processing.instrument.model import InstrumentModel
+from processing.reduction.black import Black
 from processing.reduction.counts_to_signal import Correction
-from processing.reduction.mueller import angles_of, relative_exposure
+from processing.reduction.mueller import angles_of, measurement_matrix, relative_exposure
 from processing.reduction.noise import NoiseModel
 from processing.reduction.sample_states import sample_states
 from processing.storage.capture import Capture, CaptureError
@@ -73,7 +75,8 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     noise = NoiseModel.of(detector, integer)
     if noise is not None:
         excess = correction.black.excess(noise, capture.column("exposure_s")[states])
-        slope, floor = noise.slope / repeats / top, noise.averaged_floor(repeats, excess) / top**2
+        floor = noise.averaged_floor(repeats, excess) + _of_black(capture, model, states, correction.black, noise)
+        slope, floor = noise.slope / repeats / top, floor / top**2
         data = replace(data, slope=slope / side**2, floor=floor / side**2, noise_known=True, noise_source=noise.source)
     stated = capture.sigma
     if stated is not None:
@@ -84,6 +87,24 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     if not data.noise_known and data.usable.sum() >= FEWEST_PIXELS:
         data = estimated_noise(data)
     return without_dark_pixels(data) if data.noise_known else data
+
+
+def _of_black(
+    capture: Capture, model: InstrumentModel, states: NDArray[np.int64], black: Black, noise: NoiseModel
+) -> Array:
+    """Noise of each state (N,), counts^2, that leaves in a residual what the noise of the dark frames leaves there.
+
+    It is the same in all states of an exposure: what of that looks like a sample, the fit of one takes up. Mean over
+    the channels.
+    """
+    rows = measurement_matrix(capture, model.model_copy(update={"effects": ()}), states)
+    if capture.header.sample.kind != "unknown":
+        rows = rows @ known_mueller(capture.header.sample).reshape(16, 1)
+    channels, a = rows.shape[1], rows.reshape(-1, rows.shape[2])
+    outside = np.eye(len(a)) - a @ np.linalg.pinv(a)
+    left = outside @ np.repeat(black.weights(capture.column("exposure_s")[states]), channels, axis=0)
+    variance = left**2 @ black.mean_variance(noise) / np.maximum(np.diag(outside), 1e-9)
+    return np.asarray(variance.reshape(-1, channels).mean(axis=1))
 
 
 def _places_px(model: InstrumentModel, side: int) -> Array | None:
