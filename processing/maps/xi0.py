@@ -32,7 +32,7 @@ MAX_STDERR = 0.1
 NORMAL_95 = 1.959964
 
 _XI0 = Plane((), "", "largest coherency eigenvalue over their sum; 1 = no depolarization, 1/4 = ideal depolarizer")
-_XI0_ERRORS = Plane((), "", "standard errors of xi0: within one and 1.96 of them lie the 68 and 95 % intervals; noise of the intensities only")
+_XI0_ERRORS = Plane((), "", "standard errors of xi0, both ends of its 68 and 95 % intervals within 1 and 1.96 of them")
 _INTERVALS = {
     f"xi0_{level}": Plane((2,), "", f"lower and upper bound of the {level} % interval of xi0, not clipped at 1/4 or 1")
     for level in (68, 95)
