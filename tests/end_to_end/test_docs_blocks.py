@@ -9,6 +9,7 @@ title that says what it is: `NAME.yaml` is written for the commands that follow,
 
 import contextlib
 import glob
+import logging
 import os
 import re
 import shlex
@@ -98,6 +99,8 @@ def blocks_of(page: Path) -> list[Block]:
     return found
 
 
+# The parser logs every rule that it tries, which takes as long as the parsing.
+logging.getLogger("markdown_it").setLevel(logging.INFO)
 BLOCKS = [block for page in PAGES for block in blocks_of(page)]
 
 

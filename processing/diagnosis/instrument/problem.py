@@ -212,9 +212,11 @@ class InstrumentProblem:
             if applied.scope == "instrument" or data.name in applied.captures:
                 apply_to(changes, model, applied)
         changes.shift_px = changes.shift_px - self.own_px[capture] * data.pitch
+        # At zero an effect does nothing: there is no need to ask it.
+        other_than_zero = [0, *np.cumsum(values != 0).tolist()]
         for candidate, part in zip(space.candidates, space.slices, strict=True):
-            # At zero an effect does nothing: there is no need to ask it.
-            if candidate.acts(capture, data.wavelength_nm) and values[part].any():
+            there = other_than_zero[part.stop] > other_than_zero[part.start]
+            if there and candidate.acts(capture, data.wavelength_nm):
                 candidate.apply(changes, model, values[part])
         return changes
 
