@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from processing.reduction.black import Black
 from processing.reduction.effects_of_capture import CountsCorrection
 from processing.reduction.flat import Flat
-from processing.reduction.lit_darks import lit_darks
+from processing.reduction.lit_darks import leaked_light, lit_darks
 from processing.storage.capture import Capture, CaptureError
 from processing.storage.pixel_mask import Mask
 
@@ -79,6 +79,8 @@ class Correction:
         lit = None if dark_from else lit_darks(capture)
         if lit is not None:
             warnings.append(f"{lit}. Subtracting them leaves no signal: take the capture again with the light shut off")
+        elif dark_from is None and (leak := leaked_light(capture)) is not None:
+            warnings.append(leak)
         runs = np.unique(capture.run_of_states[_light(capture)]).size
         if runs > 1:
             warnings.append(

@@ -56,10 +56,53 @@ def test_dark_darks_pass(lights: list[float], wrong_black: float) -> None:
     assert verdict(0.0, lights, black=BLACK + wrong_black) is None
 
 
+@pytest.mark.parametrize("mosaic", [True, False])
+def test_lit_darks_of_a_light_that_is_weaker_than_the_noise_are_found(mosaic: bool) -> None:
+    # A pixel's noise is 2 counts.
+    assert verdict(1.5, [1.5, 1.4, 1.6], mosaic=mosaic) is not None
+
+
+@pytest.mark.parametrize("light", [0.0, 0.2, 0.5, 1.0])
+def test_dark_darks_of_a_light_in_the_noise_pass(light: float) -> None:
+    for seed in range(20):
+        look = LitDarks(BLACK, mosaic=True, lights=1)
+        look.dark(0.01, POSES[0], frame(0.0, 2 * seed))
+        assert look.light(0.01, POSES[0], frame(light, 2 * seed + 1)) is None
+
+
 def test_darks_of_another_exposure_say_nothing() -> None:
     look = LitDarks(BLACK, mosaic=True, lights=1)
     look.dark(0.01, POSES[0], frame(900.0, 1))
     assert look.light(0.02, POSES[0], frame(900.0, 2)) is None
+
+
+def warned(synthetic_capture, dark: np.ndarray, light: np.ndarray, **header: object) -> list[str]:
+    counts = np.stack([dark, dark, light, light]).astype(np.uint16)[:, None]
+    roles = ("dark", "dark", "sample", "sample")
+    header = {"detector": Detector(black_level_counts=BLACK), "mosaic": (("90", "45"), ("135", "0"))} | header
+    path = synthetic_capture(counts, {"psg": np.zeros(4)}, role=roles, channels=("mosaic",), **header)
+    with Capture(path) as capture:
+        return [text for text in Correction.of(capture).warnings if "dark" in text]
+
+
+def test_the_reduction_warns_of_darks_that_are_brighter_in_a_part_or_in_one_analyzer(synthetic_capture) -> None:
+    light = frame(800.0, 1)
+    corner, analyzer = frame(0.0, 2), frame(0.0, 2)
+    corner[:20, :40] += 500.0
+    analyzer[::2, 1::2] += 900.0
+    (text,) = warned(synthetic_capture, corner, light)
+    assert "in 25 % of the image of single analyzers the dark states are brighter" in text
+    (text,) = warned(synthetic_capture, analyzer, light)
+    assert "of single analyzers the dark states are brighter" in text
+    assert not warned(synthetic_capture, frame(0.0, 2), light)
+
+
+def test_the_reduction_warns_of_darks_that_hold_a_part_of_the_light(synthetic_capture) -> None:
+    leak = frame(0.0, 2) + 300.0
+    (text,) = warned(synthetic_capture, leak, frame(800.0, 1) + 300.0)
+    assert "299 counts above the declared black level 64" in text
+    undeclared = Detector(black_level_counts=0.0)
+    assert not warned(synthetic_capture, frame(0.0, 2), frame(100.0, 1), detector=undeclared)
 
 
 def test_the_reduction_warns(synthetic_capture) -> None:
