@@ -14,6 +14,7 @@ from processing.commands.application import main as process
 from processing.storage.capture import Capture
 from processing.storage.images import StokesImage
 from simulators.camera.gige_camera import GigeCamera
+from simulators.camera.node_map import node_map
 from simulators.rig.rig import SimulatedRig
 
 Rig = Callable[..., Path]
@@ -54,13 +55,13 @@ def assert_horizontal(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("offset_x", "offset_y", "pixel_format"),
+    ("offset_x", "offset_y", "pixel_format", "table"),
     [
-        *[(x, y, "PolarizeMono12p") for x, y in ((0, 0), (1, 0), (0, 1), (1, 1))],
-        (1, 0, "PolarizeMono12"),
-        (1, 0, "PolarizeMono8"),
-        (0, 1, "PolarizeMono12Packed"),
-        (1, 1, "PolarizeMono16"),
+        *[(x, y, "PolarizeMono12p", "lucid_tri050s_p") for x, y in ((0, 0), (1, 0), (0, 1), (3, 5))],
+        (1, 0, "PolarizeMono12", "loopback"),
+        (1, 0, "PolarizeMono8", "loopback"),
+        (0, 1, "PolarizeMono12Packed", "loopback"),
+        (1, 1, "PolarizeMono16", "loopback"),
     ],
 )
 def test_horizontal_light_reads_zero_degrees_wherever_the_region_begins(
@@ -71,10 +72,13 @@ def test_horizontal_light_reads_zero_degrees_wherever_the_region_begins(
     offset_x: int,
     offset_y: int,
     pixel_format: str,
+    table: str,
 ) -> None:
+    # The steps of the maker's camera are 4: as if it took any offset.
+    (tmp_path / "fine.yaml").write_text(node_map(table).model_copy(update={"step": {}}).model_dump_json())
     region = {"width": 40, "height": 24, "offset_x": offset_x, "offset_y": offset_y, "pixel_format": pixel_format}
     bits = 8 if pixel_format == "PolarizeMono8" else 12
-    rig = small_rig(top={"camera": CAMERA | {"bits": bits, "settings": region}})
+    rig = small_rig(top={"camera": CAMERA | {"bits": bits, "settings": region}}, camera="fine.yaml")
     out = tmp_path / "captures"
     code, _, err = acquire("--rig", rig, "--plan", short_plan("stokes"), *THROUGH, "--out", out)
     assert code == 0, err
