@@ -38,6 +38,27 @@ def pytest_configure(config: pytest.Config) -> None:
             fcntl.ioctl(control, SIOCSIFFLAGS, struct.pack("16sH14x", b"lo", IFF_UP))
 
 
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Let every test process begin with its share of the tests marked `long`.
+
+    Each gets an equal number of tests, in the order of `items`; one that has ended takes half of what another has left,
+    from the end. A long test there would be the last to run, with nothing beside it.
+    """
+    processes = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    if processes == 1:
+        return
+    long = [item for item in items if item.get_closest_marker("long")]
+    others = [item for item in items if not item.get_closest_marker("long")]
+    dealt: list[pytest.Item] = []
+    for n in range(processes):
+        first = long[n::processes]
+        count = (len(items) - len(dealt)) // (processes - n) - len(first)
+        dealt += first + others[: max(count, 0)]
+        del others[: max(count, 0)]
+    items[:] = dealt + others
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Folder of the real measurements; without it a test skips, in CI it fails."""

@@ -22,6 +22,7 @@ def diagnosed(path):
     return path.stem, json.loads(judged.diagnosis.model_dump_json())
 
 
+@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_blind_captures(configs, tmp_path):
     cases = make(tmp_path, COUNT, SEED, configs)

@@ -63,6 +63,8 @@ SMALLER = {
     "configs/campaigns/red_sphere.yaml": {"stop: 90": "stop: 20", "[451, 662]": "[662]"},
 }
 UNTIL_CTRL_C = "until Ctrl-C"
+#: The page with a campaign, its products and a report.
+LONGEST = "processing"
 SLOW = "UMOV_SLOW"
 
 
@@ -173,7 +175,10 @@ def run(words: list[str]) -> None:
     assert not end.value.code, f"{shlex.join(words)} ended with {end.value.code}"
 
 
-@pytest.mark.parametrize("page", WITH_CODE, ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(p, id=p.stem, marks=[pytest.mark.long] if p.stem == LONGEST else []) for p in WITH_CODE],
+)
 def test_commands_and_python_run_as_they_stand(
     page: Path, desk: Path, own_files: dict[str, Callable[[], object]], request: pytest.FixtureRequest
 ) -> None:

@@ -16,6 +16,7 @@ def cells(text: str, row: str) -> list[str]:
     return [re.sub("<.*?>", "", cell).strip() for cell in re.findall(r"<td>(.*?)</td>", line, re.S)][1:]
 
 
+@pytest.mark.long
 def test_the_page(tmp_path: Path) -> None:
     """One test, so that no second process takes the study anew."""
     with executor(1) as pool:

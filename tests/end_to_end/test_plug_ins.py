@@ -42,6 +42,7 @@ def run(installed, tmp_path):
     return done
 
 
+@pytest.mark.long
 def test_it_passes_the_conformance_kit(run):
     # With its own settings and none of our fixtures, as on its author's machine.
     done = run(

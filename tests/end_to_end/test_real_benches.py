@@ -167,6 +167,7 @@ def test_answer_to_a_small_bench_harms_nothing(group, seed, given, configs, tmp_
         assert result["verdict"] == "consistent"
 
 
+@pytest.mark.long
 def test_bench_of_another_polarimeter_is_mended_too(configs, tmp_path):
     """Two quarter-wave plates at 5 to 1, steps of its own: nothing in the search knows the lab's own instrument."""
     made = Polarimeter("drr_5to1.yaml", states=30, step_deg=6.0, ratio=5.0)

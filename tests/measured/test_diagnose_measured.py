@@ -145,6 +145,7 @@ def single_detector(shared_data: Path, folder: Path, instrument: Path, wavelengt
     return imported(folder, lines, instrument, wavelength_nm, "air")
 
 
+@pytest.mark.long
 def test_ten_wavelengths_share_their_mechanics(shared_data, configs, tmp_path):
     instrument = configs / "instruments/drr_single_detector.yaml"
     paths = []

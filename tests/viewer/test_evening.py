@@ -111,6 +111,7 @@ def test_a_button_waits_for_its_script(address, window):
     expect(page.get_by_role("button", name="Start")).to_be_enabled()
 
 
+@pytest.mark.long
 def test_a_whole_evening(lab, address, window):
     page = window()
     page.goto(f"{address}/")
