@@ -1,8 +1,8 @@
 """Speed of the commands and of the tasks of `./lab bench` beside an earlier commit of this project, in turns.
 
 Run: python benchmarks/against_commit.py COMMIT [--rounds 5] [--only WORD] [--folder FOLDER]
-The commit is checked out into a folder of its own and takes two captures on its simulated rig, which both versions
-then work on. A round runs each of them once, as a program of its own, in alternating order; the ratio is the median of
+The commit is checked out into a folder of its own and takes captures on its simulated rig, which both versions then
+work on. A round runs each of them once, as a program of its own, in alternating order; the ratio is the median of
 the rounds' ratios, by the processor's user time and by the clock. Other work on the machine disturbs the clock; it
 disturbs both versions alike. The first round, which compiles, does not count.
 """
@@ -31,6 +31,7 @@ AT_MOST = 1.3
 #: `{drr}` and `{stokes}` are captures, `{m}` and `{s}` products of them, `{out}` a new file.
 COMMANDS = {
     "process reduce": "reduce {drr} --out {out}.h5 --no-figure",
+    "process reduce, 2048 x 2448": "reduce {large} --out {out}.h5 --no-figure",
     "process reduce --weighted --covariance": "reduce {drr} --weighted --covariance --out {out}.h5 --no-figure",
     "process reduce, mosaic": "reduce {stokes} --out {out}.h5 --no-figure",
     "process xi0": "xi0 {m} --out {out}.h5 --no-figure",
@@ -45,7 +46,7 @@ COMMANDS = {
 #: Of `./lab bench`, what both versions have: the words of --only, and how the line begins where others fit too.
 SAME_NAME = (
     *("drr", "field", "weighted small", "weighted large", "cloude", "eigenvalues", "lu-chipman", "mosaic", "normals"),
-    *("capture to disc", "reduce", "diagnose unknown", "diagnose moves", "diagnose air"),
+    *("capture to disc", "diagnose unknown", "diagnose moves", "diagnose air"),
 )
 TASKS = dict.fromkeys(SAME_NAME, "") | {"xi0": "xi0 and M00", "table": "table"}
 FREE = "psg_retarder.retardance_deg,psg_retarder.azimuth_deg,psa_retarder.retardance_deg,psa_retarder.azimuth_deg"
@@ -96,7 +97,12 @@ def both_in_turns(
 def files_for(old: Version, folder: Path) -> dict[str, str]:
     """Captures taken and reduced by the older version, whose files the newer one reads too."""
     found = {}
-    captures = {"drr": "--omega 35", "stokes": "--omega 35 --mode stokes", "air": "--omega 180 --sample air"}
+    captures = {
+        "drr": "--omega 35",
+        "stokes": "--omega 35 --mode stokes",
+        "air": "--omega 180 --sample air",
+        "large": f"--omega 35 --rig {_large_rig(old, folder)}",
+    }
     for key, words in captures.items():
         out = folder / key
         if not out.exists():
@@ -107,6 +113,15 @@ def files_for(old: Version, folder: Path) -> dict[str, str]:
         if not Path(found[key]).exists():
             old.run(old.script("process", "reduce", found[capture], "--out", found[key], "--no-figure"))
     return found
+
+
+def _large_rig(old: Version, folder: Path) -> Path:
+    """The simulated rig of the older version with a camera of 2048 x 2448 pixels."""
+    configs = old.root / "configs"
+    text = (configs / "rigs/simulated.yaml").read_text(encoding="utf-8").replace("../", f"{configs}/")
+    path = folder / "large_rig.yaml"
+    path.write_text(re.sub("rows: .*", "rows: 2048", re.sub("columns: .*", "columns: 2448", text)), encoding="utf-8")
+    return path
 
 
 def main() -> None:
