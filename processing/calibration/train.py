@@ -272,6 +272,11 @@ class _Fit:
         _, singular, vt = np.linalg.svd(jacobian, full_matrices=False)
         if singular[-1] <= UNSEEN * singular[0]:
             open_ones = dict.fromkeys(self.shared.unknown[k].name for k in np.flatnonzero(np.abs(vt[-1]) > 0.1))
+            if len(open_ones) == 1:
+                raise NotDetermined(
+                    f"the data look the same whatever {next(iter(open_ones))} is. Hold it fixed, or capture another "
+                    "known sample (kind mueller), for instance a polarizer."
+                )
             raise NotDetermined(f"the data do not tell apart: {', '.join(open_ones)}. Hold one of them fixed.")
         variance = 2 * float(found.cost) / self.freedom
         return np.asarray(np.linalg.inv(jacobian.T @ jacobian) * variance * np.outer(step, step))

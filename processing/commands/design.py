@@ -88,7 +88,8 @@ def design_command(
     if optimize is not None and "angles" in optimize:
         from processing.commands.loaded_late.design_angles import optimize_angles
 
-        chosen = optimize_angles(model, noise, counts, optimize, speed or (), weighted, jitter)
+        now = {n: _present(model, n, ratio, step, table) for n in counts}
+        chosen = optimize_angles(model, noise, now, optimize, speed or (), weighted, jitter)
     elif optimize is not None:
         chosen = _optimized(model, noise, counts, optimize, ratio)
     else:
@@ -117,6 +118,20 @@ def _counts(text: str) -> list[int]:
     if min(found) < 1:
         raise ProcessError(f"--states {text!r}: a table has at least one state")
     return found
+
+
+def _present(
+    model: InstrumentModel, count: int, ratio: float, step: float | None, table: Path | None
+) -> StateTable | None:
+    """What is measured now: the table that is given, or equal steps where there can be such."""
+    from processing.errors import ProcessError
+
+    try:
+        return _given(model, [count], ratio, step, table)
+    except ProcessError:
+        if table is not None:
+            raise
+        return None
 
 
 def _given(

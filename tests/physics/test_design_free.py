@@ -127,6 +127,8 @@ def test_command_writes_a_plan_that_acquire_takes(configs, tmp_path):
     done = CliRunner().invoke(app, [*options, "--optimize", "angles,retardances", "--out", str(plan)])
     assert done.exit_code == 0, done.output
     assert "the bound for 24 intensities is 66.6667" in done.output
+    assert "the table as it is, 24 states" in done.output
+    assert "to change at the bench: the table, and plates of these retardances" in done.output
     from acquisition.capture.plan import MeasurementPlan
 
     states = MeasurementPlan.load(plan).states
@@ -134,6 +136,14 @@ def test_command_writes_a_plan_that_acquire_takes(configs, tmp_path):
     assert set(states.angles_deg()) == {"psg", "psa"}
     wrong = CliRunner().invoke(app, [*options, "--optimize", "angles", "--speed", "arm=3"])
     assert "the instrument turns" in str(wrong.exception)
+
+
+def test_the_labs_own_table_is_told_beside_the_best_for_its_plates(configs):
+    options = ["design", str(configs / "instruments/rgb950.yaml"), "--wavelength", "662", "--optimize", "angles"]
+    done = CliRunner().invoke(app, options)
+    assert "equally weighted variance 71.4" in done.output
+    assert "the table as it is, 40 states: 86.33" in done.output
+    assert "to change at the bench: the table alone" in done.output
 
 
 def test_robustness_is_told_of_what_was_optimized(configs):

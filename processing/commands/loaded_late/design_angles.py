@@ -7,12 +7,13 @@ from collections.abc import Mapping, Sequence
 import typer
 
 from processing.arrays import Array
-from processing.calibration.free_angles import FreeDesign, Goal, free_design, with_retardances
+from processing.calibration.free_angles import FreeDesign, Goal, bound_of, free_design, with_retardances
 from processing.calibration.motor_time import Point, Speed, front, move_seconds
 from processing.calibration.robustness import ERRORS, errors_of_table
-from processing.calibration.state_design import Noise
+from processing.calibration.state_design import Noise, score
 from processing.commands.progress_bar import progress_bar
 from processing.errors import ProcessError
+from processing.instrument.determined import determined_basis
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import StateTable, rotating_retarders
 
@@ -24,13 +25,18 @@ SINGULAR = 1e9
 def optimize_angles(
     model: InstrumentModel,
     noise: Noise,
-    counts: Sequence[int],
+    now: Mapping[int, StateTable | None],
     free: str,
     speeds: Sequence[str],
     weighted: bool,
     jitter_deg: float,
 ) -> StateTable:
-    """Optimize, print, and return the (last) best table. Raises ProcessError."""
+    """Optimize, print, and return the (last) best table; `now` has what is measured now for each number of states.
+
+    Raises
+    ------
+    ProcessError : what may change is no such thing, an axis is unknown, or no table determines all.
+    """
     names = {name.strip() for name in free.split(",")}
     if not names <= MAY_CHANGE:
         raise ProcessError(f"--optimize {free!r}: free angles go with retardances, not with a ratio")
@@ -40,7 +46,7 @@ def optimize_angles(
     unknown = sorted(set(given) - set(model.axes))
     if unknown:
         raise ProcessError(f"--speed {unknown[0]}: the instrument turns {', '.join(model.axes)}")
-    for n in counts:
+    for n, present in now.items():
         with progress_bar(f"{n} states", "starts") as tick:
             if given:
                 points = front(model, n, given, goal, "retardances" in names, tick)
@@ -50,6 +56,8 @@ def optimize_angles(
         if best.variance >= SINGULAR:
             raise ProcessError(f"no {n} states of {model.name!r} were found that determine all that it can; take more")
         _show(model, n, best)
+        if present is not None:
+            _show_present(model, noise, present, "retardances" in names)
         if given:
             _show_front(model, n, points, given)
         tell_robustness(with_retardances(model, best.retardances_deg), best.angles_deg)
@@ -71,6 +79,15 @@ def _show(model: InstrumentModel, states: int, best: FreeDesign) -> None:
         f"  equally weighted variance {best.variance:.4f}; the bound for {states * len(model.channels)} intensities "
         f"is {best.bound:.4f} ({best.variance / best.bound - 1:+.2%})"
     )
+
+
+def _show_present(model: InstrumentModel, noise: Noise, now: StateTable, with_plates: bool) -> None:
+    basis, intensities = determined_basis(model), len(now) * len(model.channels)
+    found = score(model.rows(now.angles_deg), noise, basis, bound_of(model, intensities))
+    is_whole = found.rank == found.wanted
+    variance = f"{found.equally_weighted_variance:.4f}" if is_whole else f"rank {found.rank} of {found.wanted}"
+    change = "the table, and plates of these retardances" if with_plates else "the table alone"
+    typer.echo(f"  the table as it is, {len(now)} states: {variance}; to change at the bench: {change}")
 
 
 def _show_front(model: InstrumentModel, states: int, points: Sequence[Point], speeds: dict[str, Speed]) -> None:
