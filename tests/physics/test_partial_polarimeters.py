@@ -266,7 +266,7 @@ def test_a_sample_that_does_not_see_the_train_does_not_calibrate_it(synthetic_ca
     path = synthetic_capture(frames, {"psa": 22.5 * np.arange(8)}, sample={"kind": "air"})
     with Capture(path) as capture:
         part = part_of(capture, nominal, slice(None), slice(None))
-    with pytest.raises(NotDetermined, match="the same whatever psa_retarder.azimuth_deg is"):
+    with pytest.raises(NotDetermined, match="look the same whatever"):
         fit_trains([part], ["psa_retarder.azimuth_deg"])
 
 
