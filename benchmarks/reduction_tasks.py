@@ -47,7 +47,7 @@ def some_frames(shape: tuple[int, int], states: int) -> list[np.ndarray]:
 
 
 def frames_of_a_ball(shape: tuple[int, int], states: int) -> list[np.ndarray]:
-    """As a camera takes them, each with its own shot noise: of equal frames a product packs as none of a camera does."""
+    """As a camera takes them, each with its own shot noise: products of equal frames pack as none of a camera do."""
     random = np.random.default_rng(5)
     y, x = np.meshgrid(*(np.linspace(-1, 1, n, dtype=np.float32) for n in shape), indexing="ij")
     lit = np.sqrt(np.clip(0.8 - x**2 - y**2, 0, None))
