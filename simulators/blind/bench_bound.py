@@ -22,7 +22,7 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.systematic import ELEMENTS
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.likely_set import likely_set
-from processing.diagnosis.search.posterior import grouped, noise_of, quadratic
+from processing.diagnosis.search.linearized import grouped, noise_of, quadratic
 from processing.diagnosis.search.rules import CHANGES
 from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets
 from processing.diagnosis.search.space import Space

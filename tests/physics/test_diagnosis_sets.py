@@ -9,8 +9,8 @@ from scipy.special import betaln
 
 from processing.diagnosis.instrument.source_patterns import chance_of_pattern, patterned
 from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.descent import descend
 from processing.diagnosis.search.likely_set import likely_set
-from processing.diagnosis.search.posterior import descend
 from processing.diagnosis.search.rules import FEW_CAUSES, TAU, TAU_WEIGHT
 from processing.diagnosis.search.sampling import sample
 from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets, State

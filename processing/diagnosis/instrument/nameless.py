@@ -15,7 +15,8 @@ from processing.arrays import Array
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause
-from processing.diagnosis.search.posterior import Posterior, quadratic
+from processing.diagnosis.search.linearized import quadratic
+from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import SURE
 from processing.diagnosis.search.sets import Group, Sets, State
 from processing.diagnosis.search.space import Space

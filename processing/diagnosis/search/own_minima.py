@@ -17,7 +17,8 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause, least_odds
 from processing.diagnosis.search.fit import Fit, minimize
 from processing.diagnosis.search.likely_set import retune
-from processing.diagnosis.search.posterior import Say, grouped, noise_of, quadratic
+from processing.diagnosis.search.linearized import grouped, noise_of, quadratic
+from processing.diagnosis.search.posterior import Say
 from processing.diagnosis.search.problem import Problem
 from processing.diagnosis.search.rules import BOUND, EXPLAINS, HOPE, IMITATES, LEADERS
 from processing.diagnosis.search.sets import Group, Sets, State

@@ -107,6 +107,11 @@ FAR_OFF = 0.05
 NEAR_ENOUGH = 0.01
 #: [unit of chi-square] After the first choice of groups, from which on the first linearization is not believed.
 BENT = 2.0
+#: [typical sizes] Standard deviation of every group where all begin at once and each intensity counts in full: among
+#: causes that can do the same the least values are the likeliest, and a straight line is believed only near them.
+SHRUNK = 0.3
+#: [of the unit of chi-square] That a round of such a search may leave of the one before, or it ends.
+GAINING = 0.5
 #: [log odds] Loss of a change of the set that is still tried: the unit of chi-square may fall with it.
 HOPE = -6.0
 #: [log odds] From which on a group is not taken away any more on the way down from all groups.

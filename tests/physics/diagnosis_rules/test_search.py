@@ -1,5 +1,6 @@
 """Constants of the search, and what it may cost."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace as Some
 
@@ -8,8 +9,8 @@ import pytest
 from rule_decisions import QUIET, Asked, Patch, bench, decides, made
 
 from processing.diagnosis.instrument import beside_fields, judge, starts, whole_bench
-from processing.diagnosis.search import likely_set, posterior
-from processing.diagnosis.search.sets import Quadratic, Sets, State
+from processing.diagnosis.search import descent, down_to_noise, likely_set, posterior
+from processing.diagnosis.search.sets import Group, Quadratic, Sets, State
 from processing.diagnosis.search.space import Space, Sums
 
 
@@ -32,7 +33,9 @@ def rounds(m: Patch, unit: float = 1.0, moves: float = 9.0, known: bool = True) 
         visits.append(count)
         return Some(mean=np.zeros(1), covariance=np.eye(1), probability=np.zeros(1))
 
-    def everything(problem: object, space: object, fixed: object, x: np.ndarray, noise: object) -> np.ndarray:
+    def everything(
+        problem: object, space: object, fixed: object, x: np.ndarray, noise: object, tau: float
+    ) -> np.ndarray:
         nonlocal all_first
         all_first = True
         return x
@@ -40,11 +43,13 @@ def rounds(m: Patch, unit: float = 1.0, moves: float = 9.0, known: bool = True) 
     m.setattr(posterior, "quadratic", lambda *a: Quadratic(0.0, np.zeros(1), np.eye(1)))
     m.setattr(posterior, "noise_of", lambda *a: replace(QUIET, known=known))
     m.setattr(posterior, "likely_set", lambda s: State(np.zeros(1), unit))
+    m.setattr(descent, "sample", visit)
     m.setattr(posterior, "sample", visit)
     m.setattr(posterior, "stay", visit)
-    m.setattr(posterior, "_everything", everything)
-    m.setattr(posterior, "_improved", lambda *of: np.full(1, moves * len(visits)))
+    m.setattr(posterior, "all_at_once", everything)
+    m.setattr(descent, "improved", lambda *of: np.full(1, moves * len(visits)))
     m.setattr(posterior, "_posterior_of", lambda *a: None)
+    m.setattr(posterior, "down_to_noise", lambda *a: None)
     problem = Some(noise_known=True, relinearize=lambda *a: False, sums=lambda *a: Sums.empty(1, 1))
     posterior.posterior(problem, Space((made(),)), (), np.zeros(1), lambda line: None)
     return visits, all_first
@@ -64,6 +69,36 @@ def test_near_enough(m: Patch) -> bool:
 @decides
 def test_bent(m: Patch) -> bool:
     return not rounds(m, unit=1.9)[1] and rounds(m, unit=2.1)[1]
+
+
+def full(m: Patch, units: Sequence[float]) -> tuple[list[float], int]:
+    """Widths from which a search in full begins, and how often it goes on while the unit is one of these."""
+    widths: list[float] = []
+    left, gone_on = iter(units), 0
+
+    def go_on(*of: object) -> tuple[np.ndarray, bool]:
+        nonlocal gone_on
+        gone_on += 1
+        return np.zeros(1), False
+
+    m.setattr(down_to_noise, "all_at_once", lambda *of: widths.append(of[-1]))
+    m.setattr(down_to_noise, "quadratic", lambda *of: Quadratic(0.0, np.zeros(1), np.eye(1)))
+    m.setattr(down_to_noise, "noise_of", lambda *of: Some(unit=lambda excess: next(left, 99.0)))
+    m.setattr(down_to_noise, "likely_set", lambda sets: None)
+    m.setattr(down_to_noise, "next_values", go_on)
+    problem = Some(relinearize=lambda *of: False, sums=lambda *of: Sums.empty(1, 1))
+    down_to_noise.down_to_noise(problem, Space((made(),)), (), [Group(np.array([0]))], np.zeros(1), QUIET, 10.0)
+    return widths, gone_on
+
+
+@decides
+def test_shrunk(m: Patch) -> bool:
+    return full(m, [10.0])[0] == [0.3]
+
+
+@decides
+def test_gaining(m: Patch) -> bool:
+    return full(m, [4.5, 9.0])[1] == 1 and full(m, [5.5])[1] == 0
 
 
 @decides

@@ -1,0 +1,124 @@
+"""Descent to the minimum of chi-square and prior, anew linearized on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from processing.arrays import Array
+from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.problem import Problem
+from processing.diagnosis.search.rules import NOMINAL_TAU, SAMPLES_BEFORE, SETTLED, TAKES_PART
+from processing.diagnosis.search.sampling import Samples, sample
+from processing.diagnosis.search.sets import Group, Noise, Sets, State
+from processing.diagnosis.search.space import Space, Sums
+
+STEPS = 6
+#: Times that everything is linearized anew before groups are chosen.
+EXPANSIONS = 8
+#: The descent ends when a step gains less than this in chi-square, or this fraction of it.
+LEAST_GAIN, LEAST_RELATIVE = 0.05, 1e-7
+
+
+def all_at_once(
+    problem: Problem, space: Space, fixed: Sequence[Candidate], x: Array, noise: Noise, tau: float
+) -> Array:
+    """Values (K,) with every group there and `tau` typical sizes wide, but those that are one of many alternatives."""
+    chosen = [k for k, c in enumerate(space.candidates) if not c.state_chosen]
+    part = Space(tuple(space.candidates[k] for k in chosen))
+    positions = np.concatenate([np.r_[space.slices[k]] for k in chosen]).astype(int)
+    always = np.concatenate([np.full(c.size, c in fixed) for c in part.candidates])
+    width = part.joined("typical") * np.where(always, NOMINAL_TAU, tau)
+    values = x[positions]
+    for _ in range(EXPANSIONS):
+        sums = problem.sums(part, values, derivatives=False)
+        left = float(sums.excess.sum()) + (0.0 if problem.noise_known else float(sums.freedom.sum()))
+        new = descend(problem, part, values, noise.unit(left) / width**2, steps=3)
+        moved, values = np.max(np.abs(new - values) / width), new
+        if not problem.relinearize(part, values) and moved < SETTLED:
+            break
+    out = x.copy()
+    out[positions] = values
+    return out
+
+
+def next_values(problem: Problem, space: Space, sets: Sets, state: State, x: Array) -> tuple[Array, bool]:
+    """Values (K,) about which to linearize next, and whether they are so near to x (K,) that there is no need."""
+    samples = sample(sets, state, SAMPLES_BEFORE)
+    new = improved(problem, space, sets.groups, samples, [mean_over_sets(space, samples, x), x])
+    spread = np.sqrt(np.maximum(np.diag(samples.covariance), 1e-12)) * space.joined("typical")
+    return new, bool(np.all(np.abs(new - x) < SETTLED * spread))
+
+
+def mean_over_sets(space: Space, samples: Samples, x: Array) -> Array:
+    """Values (K,), mean over the sets; of what is not fitted those of x (K,)."""
+    typical, lower, upper = (space.joined(name) for name in ("typical", "lower", "upper"))
+    return np.where(space.fixed, x, np.clip(samples.mean * typical, lower, upper))
+
+
+def improved(
+    problem: Problem,
+    space: Space,
+    groups: Sequence[Group],
+    samples: Samples,
+    starts: Sequence[Array],
+    steps: int = STEPS,
+) -> Array:
+    """Values (K,) at the minimum of chi-square and prior, of the groups that are likely to be there.
+
+    The descent begins at the best of some places (K,).
+    """
+    index = np.concatenate(
+        [np.zeros(0, dtype=np.int64)]
+        + [g.index for g, p in zip(groups, samples.probability, strict=True) if p > TAKES_PART]
+    )
+    chosen = [k for k, part in enumerate(space.slices) if part.start in set(index.tolist())]
+    part = Space(tuple(space.candidates[k] for k in chosen))
+    positions = np.concatenate([np.zeros(0, dtype=np.int64), *(np.r_[space.slices[k]] for k in chosen)]).astype(int)
+    typical = space.joined("typical")[positions]
+    width = np.sqrt(np.diag(samples.covariance) + samples.mean**2)[positions] * typical
+    weak = samples.best.unit / np.maximum(width, 1e-3 * typical) ** 2
+    out = np.where(space.fixed, starts[0], 0.0)
+    if positions.size:
+        places = [x[positions] for x in starts]
+        left = [_penalized(problem.sums(part, x, derivatives=False), weak, x) for x in places]
+        best = int(np.argmin(np.nan_to_num(left, nan=np.inf)))
+        out[positions] = descend(problem, part, places[best], weak, steps)
+    return out
+
+
+def _penalized(sums: Sums, weak: Array, values: Array, reference: float | None = None) -> float:
+    """Chi-square over its stretch and prior, in units of noise that is `reference` as a whole."""
+    freedom = max(float(sums.freedom.sum()), 1e-300)
+    return float(sums.excess.sum() * (freedom if reference is None else reference) / freedom + weak @ values**2)
+
+
+def descend(problem: Problem, space: Space, x: Array, weak: Array, steps: int = STEPS) -> Array:
+    """Values at the minimum of chi-square over its stretch, plus weak . x^2, near x (Levenberg-Marquardt, bounds)."""
+    lower, upper = space.joined("lower"), space.joined("upper")
+    problem.relinearize(space, x)
+    start = problem.sums(space, x, derivatives=False)
+    reference, damping = float(start.freedom.sum()), 0.0
+
+    least = _penalized(start, weak, x, reference)
+    for _ in range(steps):
+        sums = problem.sums(space, x)
+        freedom = max(float(sums.freedom.sum()), 1e-300)
+        g = sums.gradient.sum(axis=0) - sums.excess.sum() / freedom * sums.stretch.sum(axis=0) + weak * x
+        h = sums.curvature.sum(axis=0) + np.diag(weak)
+        for _ in range(8):
+            move = np.linalg.solve(h + damping * np.diag(np.diag(h)), g)
+            tried = np.where(space.fixed, x, np.clip(x - move, lower, upper))
+            # Derivatives are most of the work; a step that is refused needs none.
+            now = _penalized(problem.sums(space, tried, derivatives=False), weak, tried, reference)
+            if now <= least:
+                break
+            damping = max(10 * damping, 1e-3)
+        # Also where the sum is no number: so far away that the model has no intensities.
+        if not now <= least:
+            break
+        gain, x, least, damping = least - now, tried, now, damping / 10
+        if gain < LEAST_GAIN + LEAST_RELATIVE * abs(least):
+            break
+    return x

@@ -1,0 +1,68 @@
+"""The chi-square of a problem as a quadratic form in all candidates, their groups, and the unit that it is told in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from processing.arrays import Array
+from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.problem import Problem
+from processing.diagnosis.search.rules import LEAST_NOISE, NOMINAL_TAU, SLACK
+from processing.diagnosis.search.sets import Group, Noise, Quadratic
+from processing.diagnosis.search.space import Space, Sums
+
+
+def grouped(space: Space, fixed: Sequence[Candidate]) -> tuple[tuple[tuple[int, ...], ...], list[Group]]:
+    """Candidates of each group, and the groups: one kind at one place in all captures."""
+    by_key: dict[tuple[str, str, int | None], list[int]] = {}
+    for k, c in enumerate(space.candidates):
+        by_key.setdefault((c.kind, c.place, c.capture if c.state_chosen else None), []).append(k)
+    families = [space.candidates[m[0]].family for m in by_key.values()]
+    groups = []
+    for mine, family in zip(by_key.values(), families, strict=True):
+        index = np.concatenate([np.r_[space.slices[k]] for k in mine]).astype(np.int64)
+        always = space.candidates[mine[0]] in fixed
+        groups.append(Group(index, float(families.count(family)), NOMINAL_TAU if always else None))
+    return tuple(tuple(m) for m in by_key.values()), groups
+
+
+def noise_of(problem: Problem, sums: Sums) -> Noise:
+    """What the unit of chi-square is made of in a problem."""
+    freedom = max(float(sums.freedom.sum()), 1.0)
+    if not problem.noise_known:
+        # The unit is then the square of what `freedom` was reckoned with, relative to the signal.
+        relative = float(sums.square.sum() / max(sums.count.sum(), 1.0)) * freedom
+        left = max(float(sums.excess.sum()) + freedom, 1e-300)
+        return Noise(False, freedom, floor=LEAST_NOISE**2 * left / max(relative, 1e-300))
+    weighty = sum(free * power.sum() ** 2 / float(np.sum(power**2)) for free, power in problem.powers())
+    return Noise(True, max(weighty, 1.0), SLACK * float(np.sqrt(2 * freedom * problem.spread)))
+
+
+def quadratic(problem: Problem, space: Space, x: Array, sums: Sums) -> Quadratic:
+    """The chi-square about x as a form about zero, in typical sizes.
+
+    A bend of the response stretches residual and noise alike, which is no gain: the derivative of the residual is that
+    of the residual over the stretch, r / (1 + a . dx), so r a goes off it.
+    """
+    typical = space.joined("typical")
+    freedom, excess = max(float(sums.freedom.sum()), 1e-300), float(sums.excess.sum())
+    a = sums.stretch.sum(axis=0) * typical / freedom
+    g = sums.gradient.sum(axis=0) * typical
+    h = sums.curvature.sum(axis=0) * np.outer(typical, typical)
+    h = h - np.outer(g, a) - np.outer(a, g) + (excess - freedom) * np.outer(a, a)
+    g = g - excess * a
+    told = _told(problem, space, x, h, typical)
+    h, g = h * np.outer(told, told), g * told
+    value, vector = np.linalg.eigh(h)
+    h = (vector * np.maximum(value, 0.0)) @ vector.T
+    z = x / typical
+    total = excess if problem.noise_known else excess + freedom
+    return Quadratic(float(total - 2 * g @ z + z @ h @ z), g - h @ z, h)
+
+
+def _told(problem: Problem, space: Space, x: Array, h: Array, typical: Array) -> Array:
+    """Share (K,) of the curvature that is not noise of image derivatives."""
+    noise = np.diag(problem.noise_information(space, x)) * typical**2
+    return np.asarray(np.clip(1 - noise / np.maximum(np.diag(h), 1e-300), 0.0, 1.0))
