@@ -16,6 +16,7 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import RANK, add_response
 from processing.diagnosis.instrument.undone import undoing
 from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.rules import NOISE_LEVEL
 from processing.diagnosis.search.space import Space
 
 #: Corrections of counts, each undone at its values.
@@ -25,11 +26,12 @@ Undone = Mapping[Candidate, Array]
 def scatter_prefers(problem: InstrumentProblem, space: Space, values: Array, new: Undone, old: Undone) -> float:
     """Log likelihood of the residual with the noise of the counts that `new` undoes, over that with `old`.
 
-    The residual is that of the captures at `values` (K,), the same in both.
+    The residual is that of the captures at `values` (K,), the same in both. Of many pixels the noise's own error
+    (`NOISE_LEVEL`) is larger than what chance does to their scatter: they say no more than it lets them.
     """
     problem.relinearize(space, values)
     near, local = problem.near(space, values)
-    gain = 0.0
+    gain = pairs = 0.0
     for k, (data, still) in enumerate(zip(near.captures, problem.still, strict=True)):
         rest, free = _rest(near, k, space, local)
         share, good = free * near.moments[k].left, data.usable & ~data.clipped
@@ -38,7 +40,8 @@ def scatter_prefers(problem: InstrumentProblem, space: Space, values: Array, new
             for undone in (old, new)
         )
         gain += 0.5 * (before - after)
-    return gain
+        pairs += float(share.sum()) * good.sum() / 2
+    return gain / (1 + pairs * NOISE_LEVEL**2 / 2)
 
 
 def _log_scatter(

@@ -16,6 +16,7 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import add_response
 from processing.diagnosis.instrument.tile_sums import tile_columns
 from processing.diagnosis.search.fit import Fit
+from processing.diagnosis.search.linearized import deviation_of
 from processing.diagnosis.search.rules import LIMIT
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import FIELD_TERMS, Changes, field_terms
@@ -199,7 +200,7 @@ def _tests(
     # Of smooth patterns moved frames keep all the noise, of single pixels only a part.
     freedom = shown @ wanted.sum(axis=1, dtype=float)
     # Name to chi-square beyond noise, and its standard deviation with nothing but noise.
-    found = {"sum of squares": (_square(flat) - freedom, np.sqrt(2 * max(freedom, 1e-300) * spread))}
+    found = {"sum of squares": (_square(flat) - freedom, deviation_of(max(freedom, 1e-300), spread))}
     if count < FEWEST_PIXELS:
         # What goes with the signal, or with the place, needs an image.
         return _in_deviations(found)

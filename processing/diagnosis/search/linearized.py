@@ -9,7 +9,7 @@ import numpy as np
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.problem import Problem
-from processing.diagnosis.search.rules import LEAST_NOISE, NOMINAL_TAU, SLACK
+from processing.diagnosis.search.rules import LEAST_NOISE, NOISE_LEVEL, NOMINAL_TAU, SLACK
 from processing.diagnosis.search.sets import Group, Noise, Quadratic
 from processing.diagnosis.search.space import Space, Sums
 
@@ -37,7 +37,12 @@ def noise_of(problem: Problem, sums: Sums) -> Noise:
         left = max(float(sums.excess.sum()) + freedom, 1e-300)
         return Noise(False, freedom, floor=LEAST_NOISE**2 * left / max(relative, 1e-300))
     weighty = sum(free * power.sum() ** 2 / float(np.sum(power**2)) for free, power in problem.powers())
-    return Noise(True, max(weighty, 1.0), SLACK * float(np.sqrt(2 * freedom * problem.spread)))
+    return Noise(True, max(weighty, 1.0), SLACK * deviation_of(freedom, problem.spread))
+
+
+def deviation_of(freedom: float, spread: float) -> float:
+    """Standard deviation of a sum of squares of so many degrees of freedom: of chance, and of the noise's own error."""
+    return float(np.hypot(np.sqrt(2 * freedom * spread), NOISE_LEVEL * freedom))
 
 
 def quadratic(problem: Problem, space: Space, x: Array, sums: Sums) -> Quadratic:

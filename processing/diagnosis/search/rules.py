@@ -36,6 +36,9 @@ UNSEEN = 0.3
 # ---- noise ---------------------------------------------------------------------------------------------------------
 #: [standard deviations] Total excess over the noise's own chi-square up to which it is no structure.
 SLACK = 2.0
+#: [of its variance] Standard error of the noise itself: no gain is known better than to half a percent. Of two million
+#: intensities that is five times what chance does to their sum of squares.
+NOISE_LEVEL = 0.005
 #: [of the signal] Least residual that is taken as noise where the noise is not known, and least change of M/m00 that is
 #: asked for its error: no bench repeats better.
 LEAST_NOISE = 1e-4

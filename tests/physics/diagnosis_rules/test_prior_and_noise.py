@@ -83,6 +83,13 @@ def test_slack(m: Patch) -> bool:
 
 
 @decides
+def test_noise_level(m: Patch) -> bool:
+    # Of two million intensities chance alone would forgive an excess of 4000.
+    n = noise(True, 0.0, 2e6)
+    return n.unit(18_000.0) == 1.0 < n.unit(23_000.0)
+
+
+@decides
 def test_least_noise(m: Patch) -> bool:
     return abs(noise(False, 0.0, 100.0).unit(0.0) - 1e-8) < 1e-9
 
