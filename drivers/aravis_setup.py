@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
@@ -14,12 +15,16 @@ from drivers.errors import CameraError, SettingRefused
 from drivers.genicam import Features
 from drivers.pixel_formats import PixelFormat, pixel_format, pixel_format_of
 
+log = logging.getLogger(__name__)
+
 # Fits every Ethernet; jumbo frames have to be asked for, because a switch in between may drop them.
 _DEFAULT_PACKET_BYTES = 1500
 # Differences on read-back that are rounding on cameras that state no step: a sensor row, a tenth of a decibel, a count.
 _EXPOSURE_FLOOR_US = 20.0
 _GAIN_FLOOR_DB = 0.1
 _BLACK_LEVEL_FLOOR = 1.0
+# How near to a whole number the sensor's size over that of a frame is where pixels are binned or left out.
+_WHOLE = 0.02
 # What makes counts non-linear in light or changes between frames.
 # A frame rate limits the exposure, and triggered frames have none.
 _SWITCHED_OFF = (
@@ -207,6 +212,20 @@ class Setup:
             )
         return next(iter(known), None)
 
+    def _untold_factor(self, told: int) -> int:
+        """How many times fewer columns or rows than the sensor has can be had, beyond the binning and decimation told.
+
+        Makers have more ways than those two features: skipping, binning by another engine that a selector hides.
+        """
+        found = 1
+        for sensor, most in (("SensorWidth", "WidthMax"), ("SensorHeight", "HeightMax")):
+            whole, sent = self._features.number((sensor,)), self._features.number((most,))
+            if whole and sent:
+                ratio = whole / (sent * self.pixel_format().scale * told)
+                if abs(ratio - round(ratio)) < _WHOLE * ratio:
+                    found = max(found, round(ratio))
+        return found
+
     def _set_reversed(self, name: str, wanted: bool | None) -> None:
         if not wanted:
             self._features.switch_off(name)
@@ -313,6 +332,15 @@ class Setup:
             gain_db = raw / self._config.gain_raw_per_db
         self.exposure_s = (exposure_us or 0.0) * 1e-6
         binning, decimation = self._factor("Binning"), self._factor("Decimation")
+        untold = self._untold_factor((binning or 1) * (decimation or 1))
+        if untold > 1:
+            log.warning(
+                "camera %s: frames have %d times fewer pixels along an axis than the sensor, and neither Binning nor "
+                "Decimation tells why; recorded as decimation",
+                self._name,
+                untold,
+            )
+            decimation = (decimation or 1) * untold
         with features.asking("read the region"):
             left, top, width, height = self._camera.get_region()
         self.size, fmt = (int(width), int(height)), self.pixel_format()

@@ -22,7 +22,7 @@ from drivers.errors import FrameLost, SettingRefused
 from drivers.pixel_formats import pixel_format
 from simulators.camera.exposure import ExposureInfo
 from simulators.camera.gige_camera import GigeCamera
-from simulators.camera.gige_features import description
+from simulators.camera.gige_features import DECIMATION_X, DECIMATION_Y, description
 from simulators.camera.node_map import NodeMap, node_map, node_maps
 from simulators.camera.played.played_camera import PlayedCamera
 from simulators.clock import patient_clock
@@ -121,6 +121,18 @@ def test_the_region_keeps_to_the_steps_of_the_maker(maker: MakersCamera) -> None
     else:
         with pytest.raises(SettingRefused, match="no such feature"):
             camera.configure(CameraSettings(binning=2))
+
+
+@pytest.mark.parametrize("registers", [(DECIMATION_X, DECIMATION_Y), (DECIMATION_Y,)])
+def test_pixels_that_are_left_out_by_a_feature_of_the_maker_s_own_are_noticed(registers: tuple[int, ...]) -> None:
+    with ExitStack() as stack:
+        # Its table has no decimation.
+        maker = MakersCamera("lucid_tri050s_p", stack)
+        camera = maker.open(bits=8)
+        assert camera.configure(CameraSettings(binning=2)).decimation is None
+        for register in registers:
+            maker.simulated.write_register(register, 2)
+        assert camera.configure(CameraSettings(binning=1)).decimation == 2
 
 
 def test_features_of_the_rig_file_are_set_and_the_node_map_tells_them(maker: MakersCamera) -> None:
