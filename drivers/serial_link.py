@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import os
+import select
 import termios
 import threading
 import time
@@ -24,6 +26,8 @@ Framer = Callable[[bytearray], bytes | None]
 LONGEST_FRAME = 1024
 # Reads wait in slices, so that a deadline is met to within one slice.
 READ_SLICE_S = 0.02
+# Counted by the real clock: a machine that stands still for a moment is no lost port.
+WRITE_S = 10.0
 
 
 def line_framer(buffer: bytearray) -> bytes | None:
@@ -118,7 +122,15 @@ class SerialLink:
         with self._write_lock, self._lost_port_named():
             if self._transcript is not None:
                 self._transcript.note(">>", data)
+            self._wait_for_room()
             self._serial.write(data)
+
+    def _wait_for_room(self) -> None:
+        """Wait as long as a device holds the line (XOFF, CTS); pyserial would try again and again, on a whole core."""
+        with contextlib.suppress(io.UnsupportedOperation):
+            _, ready, _ = select.select([], [self._serial.fileno()], [], WRITE_S)
+            if not ready:
+                raise serial.SerialTimeoutException(f"it takes nothing for {WRITE_S:g} s")
 
     def read_frame(self, deadline_s: float) -> bytes | None:
         """Return the next whole frame, or None if none is complete when `clock` shows `deadline_s`."""
@@ -192,8 +204,7 @@ def _open_port(port: str, baudrate: int, held_by: str | None, xonxoff: bool, rts
             baudrate=baudrate,
             stopbits=serial.STOPBITS_TWO if two_stop_bits else serial.STOPBITS_ONE,
             timeout=READ_SLICE_S,
-            # Counted by the real clock: a machine that stands still for a moment is no lost port.
-            write_timeout=10.0,
+            write_timeout=WRITE_S,
             xonxoff=xonxoff,
             rtscts=rtscts,
             **options,

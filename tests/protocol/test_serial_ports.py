@@ -1,9 +1,14 @@
 """Ports: permission, TCP, transcripts, one owner for each line, emulators that outlive their clients."""
 
 import errno
+import os
+import pty
+import select
 import socket
 import subprocess
 import threading
+import time
+import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -45,6 +50,34 @@ def test_a_file_that_is_no_port(tmp_path: Path) -> None:
         SerialLink(str(plain), 9600, line_framer)
     with pytest.raises(PortNotFound):
         SerialLink("socket://127.0.0.1:1", 9600, line_framer)
+
+
+def test_a_write_waits_quietly_while_the_device_holds_the_line() -> None:
+    """A controller, or noise that looks like its XOFF, holds the line until XON."""
+    device, port = pty.openpty()
+    tty.setraw(port)
+    link = SerialLink(os.ttyname(port), 57_600, line_framer, xonxoff=True)
+    spent_s: list[float] = []
+
+    def write() -> None:
+        link.write(b"1TS\r\n")
+        spent_s.append(time.thread_time())
+
+    os.write(device, b"\x13")
+    while select.select([], [port], [], 0)[1]:
+        time.sleep(0.001)
+    writer = threading.Thread(target=write)
+    writer.start()
+    time.sleep(1.0)
+    assert not spent_s
+    os.write(device, b"\x11")
+    writer.join()
+    assert os.read(device, 100) == b"1TS\r\n"
+    # Trying again and again takes as much of a second as the machine has to give.
+    assert spent_s[0] < 0.05
+    link.close()
+    os.close(device)
+    os.close(port)
 
 
 @contextmanager
