@@ -25,9 +25,9 @@ def test_import_name_comes_from_this_project(name: str) -> None:
     assert Path(module.__file__).is_relative_to(ROOT)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_no_other_distribution_installs_the_name(name: str) -> None:
-    assert set(packages_distributions().get(name, ["umov"])) == {"umov"}
+def test_no_other_distribution_installs_our_names() -> None:
+    owners = packages_distributions()
+    assert {name: set(owners.get(name, ["umov"])) for name in NAMES} == {name: {"umov"} for name in NAMES}
 
 
 def test_every_subpackage_is_in_the_wheel() -> None:
