@@ -17,7 +17,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from processing.storage.packed import Packing, create_packed, pack
+from processing.storage.packed import BYTE_WORTH, SMALL_BYTE_WORTH, Packing, create_packed, pack
 from processing.storage.product import is_product
 from processing.storage.unpacked import read_rows
 
@@ -38,7 +38,8 @@ def ways() -> dict[str, Callable[[h5py.File, h5py.Dataset], None]]:
         out.create_dataset("plane", data=plane[...])
 
     def ours(out: h5py.File, plane: h5py.Dataset) -> None:
-        packing = Packing.of(plane)
+        worth = BYTE_WORTH if is_product(Path(plane.file.filename)) else SMALL_BYTE_WORTH
+        packing = Packing.of(plane, worth)
         if packing.is_worth_it:
             pack(plane, create_packed(out, "plane", plane.shape, plane.dtype), packing)
         else:

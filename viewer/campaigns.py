@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
-from datetime import datetime
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -116,18 +116,20 @@ def read_campaign(folder: Path, library: Library, running: str | None = None) ->
     identity = read_identity(folder)
     if identity is None:
         return None
-    index = read_index(folder)
-    cells = tuple(
-        _cell(number, name, plan, index.get(name, {}), _entry(folder / name, library), name == running)
-        for number, (name, plan) in enumerate(identity.get("plan", {}).items(), 1)
-    )
+    index, plans = read_index(folder), identity.get("plan", {})
+    entries = {name: _entry(folder / name, library) for name in plans}
+    cells = {
+        name: _cell(number, name, plan, index.get(name, {}), entries[name], name == running)
+        for number, (name, plan) in enumerate(plans.items(), 1)
+    }
     events = list(_events(folder / LOG))
+    bars = (_as_in_grid(bar, cells.get(bar.name), entries.get(bar.name)) for bar in _bars(events))
     return CampaignView(
         name=library.name(folder),
         simulated=bool(identity.get("simulated")),
         rig_file=str(identity.get("rig_file", "")),
-        cells=cells,
-        bars=tuple(_bars(events)),
+        cells=tuple(cells.values()),
+        bars=tuple(bars),
         events=tuple((str(e.get("time", "")), _in_words(e)) for e in reversed(events[-100:])),
     )
 
@@ -199,6 +201,17 @@ def _bars(events: list[dict[str, Any]]) -> Iterator[Bar]:
             started = None
     if started is not None:
         yield Bar(*started, None, "running")
+
+
+def _as_in_grid(bar: Bar, cell: Cell | None, entry: Entry | None) -> Bar:
+    """The bar with what the log does not say: that a capture has a flag, or that its run was killed, and when."""
+    if cell is not None and (bar.status, cell.status) == ("done", "flagged"):
+        return replace(bar, status="flagged")
+    if bar.end is None and (cell is None or cell.status != "running"):
+        # The last state that came into its file is the last that is known of it.
+        end = bar.start if entry is None else datetime.fromtimestamp(entry.changed_s, UTC).isoformat()
+        return replace(bar, end=max(end, bar.start), status="partial")
+    return bar
 
 
 def _in_words(event: dict[str, Any]) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from processing.storage.capture import Capture, CaptureError
 from processing.storage.capture_schema import STATE_COLUMNS, STATUS_TYPE, create_layout
 from processing.storage.checksums import summed_values
-from processing.storage.packed import create_packed, pack
+from processing.storage.packed import SMALL_BYTE_WORTH, Packing, create_packed, pack
 
 
 def pack_capture(path: Path) -> tuple[int, int] | None:
@@ -62,7 +62,8 @@ def _write(capture: Capture, old: h5py.File, new: Path) -> None:
             h5, header, targets, roles, capture.frame_shape, capture.dtype, capture.start_time, frames=create_packed
         )
         entry = h5["entry"]
-        pack(there["instrument/detector/data"], entry["instrument/detector/data"])
+        frames = there["instrument/detector/data"]
+        pack(frames, entry["instrument/detector/data"], Packing.of(frames, SMALL_BYTE_WORTH))
         entry["instrument/detector/row_crc32"][...] = there["instrument/detector/row_crc32"][...]
         for axis in targets:
             for name in ("value", "raw_value"):

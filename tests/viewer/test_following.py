@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 
 import h5py
@@ -122,7 +123,12 @@ def test_each_capture_of_a_campaign_has_its_sign(lab, client, drr_capture):
     view = read_campaign(folder, Library(lab), running=None)
     assert [cell.status for cell in view.cells] == ["done", "flagged", "partial", "failed", "missing"]
     assert "20 % of the pixels" in view.cells[1].told.replace("20.00", "20")
-    assert [(bar.name, bar.status) for bar in view.bars] == [("1.h5", "done"), ("2.h5", "running")]
+    assert [(bar.name, bar.status) for bar in view.bars] == [("1.h5", "done"), ("2.h5", "partial")]
+    # Killed: the log does not say when, the file says when its last state came.
+    written = datetime.fromtimestamp((folder / "2.h5").stat().st_mtime, UTC)
+    assert datetime.fromisoformat(view.bars[1].end) == written
+    (*_, taken) = read_campaign(folder, Library(lab), running="2.h5").bars
+    assert (taken.status, taken.end) == ("running", None)
     (block,) = view.blocks()
     assert block.angles_deg == (31, 32, 33, 34, 35)
     # What is running now is running, whatever its file looks like.
