@@ -1,11 +1,12 @@
 """What reading compressed files costs where it is felt: each use of a capture and of its products, against plain ones.
 
-    python benchmarks/packed_uses.py CAPTURE.h5 [--folder FOLDER --cold]
+    python benchmarks/packed_uses.py CAPTURE.h5 [--folder FOLDER --cold --only WORD]
 
 The capture is copied plain and compressed (`acquire compress`), its product of quantities is made plain
 (`UMOV_COMPRESS=0`) and as `process` writes it. Whole commands first, as they are typed, then single steps; by the clock
 and of the processor, medians of the repeats, turn by turn. Files lie in memory, where compression gains nothing, or in
-a folder of a disc; `--cold` has the system forget their contents before each use. `view` is asked as a page asks, over
+a folder of a disc; `--cold` has the system forget their contents before each use. `--only` measures the uses whose
+names have the word. `view` is asked as a page asks, over
 HTTP, and another place at each turn.
 """
 
@@ -27,7 +28,7 @@ import h5py
 import xarray as xr
 from view_times import Server
 
-from processing import reduce_to_dataset
+from processing import open_dataset, reduce_to_dataset
 from processing.storage.packed_capture import pack_capture
 
 REPEATS = 7
@@ -78,13 +79,15 @@ def forget(path: Path) -> None:
 class Comparison:
     """Times uses of plain and packed files, turn by turn, and prints a line for each."""
 
-    def __init__(self, cold: bool) -> None:
-        self.cold = cold
+    def __init__(self, cold: bool, only: str) -> None:
+        self.cold, self.only = cold, only
         print(f"{'':<46} {'by the clock':^26}  {'of the processor':^26}")
         print(f"{'ms':<46}" + 2 * f" {'plain':>8} {'packed':>8} {'ratio':>8} ")
 
     def of(self, use: str, files: dict[str, Path], work: Callable[[Path, int], Times], repeats: int = REPEATS) -> None:
         """One use of either kind of file; once before, for what is kept or compiled."""
+        if self.only not in use:
+            return
         times: dict[str, list[Times]] = {kind: [] for kind in KINDS}
         for turn in range(repeats + 1):
             for kind in KINDS:
@@ -108,9 +111,9 @@ def serve(folder: Path) -> tuple[subprocess.Popen[str], Server]:
     return running, Server(found[0].rstrip("/"), running.pid)
 
 
-def measure(folder: Path, captures: dict[str, Path], products: dict[str, Path], cold: bool) -> None:
+def measure(folder: Path, captures: dict[str, Path], products: dict[str, Path], cold: bool, only: str) -> None:
     """Every use in turn."""
-    compare = Comparison(cold).of
+    compare = Comparison(cold, only).of
     out = folder / "out"
     compare(
         "process reduce", captures, lambda path, _: process("reduce", path, "--overwrite", "--out", out / "image.h5"), 3
@@ -126,6 +129,8 @@ def measure(folder: Path, captures: dict[str, Path], products: dict[str, Path], 
     )
     compare("all frames, by xarray", captures, lambda path, _: timed(lambda: load(path)))
     compare("all planes of the quantities, by xarray", products, lambda path, _: timed(lambda: load(path)))
+    compare("all frames, by processing.open_dataset", captures, lambda path, _: timed(lambda: open_dataset(path)))
+    compare("all planes, by processing.open_dataset", products, lambda path, _: timed(lambda: open_dataset(path)))
     with h5py.File(captures["plain"]) as h5:
         rows, columns = h5["entry/instrument/detector/data"].shape[-2:]
     running, server = serve(folder)
@@ -163,6 +168,7 @@ def main() -> None:
     parser.add_argument("capture", type=Path)
     parser.add_argument("--folder", type=Path, default=Path("/dev/shm"))
     parser.add_argument("--cold", action="store_true")
+    parser.add_argument("--only", default="", metavar="WORD")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=options.folder) as name:
         folder = Path(name)
@@ -178,7 +184,7 @@ def main() -> None:
         for what, files in (("capture", captures), ("quantities", products)):
             sizes = [path.stat().st_size / 1e6 for path in files.values()]
             print(f"{what}: {sizes[0]:.1f} MB plain, {sizes[1]:.1f} MB compressed")
-        measure(folder, captures, products, options.cold)
+        measure(folder, captures, products, options.cold, options.only)
 
 
 if __name__ == "__main__":

@@ -98,8 +98,8 @@ def mueller_figure(elements: NDArray[Any], lit: NDArray[np.bool_], title: str, s
     m00 = elements[0, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         normalized = np.where(lit, elements / m00, np.nan)
-    rest = np.abs(normalized.reshape(16, *m00.shape)[1:])
-    limit = float(np.clip(percentile(rest, 99.5), 1e-6, 1.0))
+    rest = normalized.reshape(16, *m00.shape)[1:]
+    limit = float(np.clip(percentile(np.abs(rest), 99.5), 1e-6, 1.0))
     figure = Figure(figsize=(9.5, 8.6 * max(0.45, m00.shape[0] / max(m00.shape[1], 1)) + 0.8), layout="constrained")
     panels = figure.subplots(4, 4)
     shown: Any = None

@@ -269,6 +269,18 @@ def test_exported_maps_have_the_colours_of_the_reports(exported, monkeypatch):
     assert drawn[6][0] == "mueller 12 (count)"
 
 
+@pytest.mark.parametrize(("outlier", "arrow"), [(-1.0, "min"), (1.0, "max"), (0.0, "neither")])
+def test_the_colour_bar_of_a_mueller_image_has_an_arrow_where_values_lie_beyond_it(outlier, arrow):
+    from processing.reports.figures import mueller_figure
+
+    elements = np.zeros((4, 4, 20, 30))
+    elements[0, 0], elements[1, 1, 3, 4] = 1.0, outlier
+    elements[2, 2] = 0.1
+    figure = mueller_figure(elements, np.ones((20, 30), dtype=bool), "one pixel", simulated=True)
+    bars = [axis._colorbar for axis in figure.axes if hasattr(axis, "_colorbar")]
+    assert [bar.extend for bar in bars] == [arrow]
+
+
 def test_a_mueller_image_alone_is_exported_as_its_own_figure(exported, tmp_path):
     (alone,) = exported("product", "--to", "png", "--plane", "mueller", "--out", f"{tmp_path}/alone.png")
     assert alone.name == "alone.png"
