@@ -56,7 +56,9 @@ _QUANTILES = np.array([
 
 #: Grid of the inverted table: observed height, and width over that of noise alike in all directions.
 _X = np.arange(-20.0, 25.0, 0.1)
-_WIDTH = np.arange(0.2, 2.01, 0.1)
+_WIDTH = np.arange(0.2, 8.01, 0.1)
+#: Noise this many times as large over all directions as about the dominant process may itself have made that process.
+_UNLIKE = 1.2
 
 
 def _inverted() -> NDArray[np.float64]:
@@ -87,11 +89,13 @@ class EigenvalueNoise:
     along : standard error of xi0 to first order.
     coupling : root mean square of the elements of H between the dominant process and another.
     others : sum of squares that noise alone puts into the deviations of xi1, xi2, xi3 from their mean.
+    overall : root mean square of an element of H over all directions; `coupling`, where they are alike.
     """
 
     along: Array
     coupling: Array
     others: Array
+    overall: Array
 
     @classmethod
     def of(cls, total: Array, row: Array, diagonal: Array, along: Array) -> EigenvalueNoise:
@@ -108,7 +112,8 @@ class EigenvalueNoise:
             coupling = np.sqrt(np.maximum(row - diagonal, 0) / 3)
             # In the 3 x 3 block of the others 9 numbers are noise; 1 is their mean.
             others = np.maximum(total - 2 * row + diagonal, 0) * (8 / 9)
-        return cls(along, coupling, others)
+            overall = np.sqrt(total / 15)
+        return cls(along, coupling, others, overall)
 
 
 @dataclass(frozen=True)
@@ -145,14 +150,23 @@ def corrected(eigenvalues: Array, noise: EigenvalueNoise) -> CorrectedXi0:
     xi = np.asarray(eigenvalues, dtype=float)
     height = (4 * xi[..., 0] - 1) / 3
     with np.errstate(divide="ignore", invalid="ignore"):
-        # The table's own noise has a first-order width of sqrt(3)/2 in xi0.
-        width = noise.along / (np.sqrt(0.75) * noise.coupling)
-        bounds = _heights(height / noise.coupling, width) * noise.coupling
+        bounds = _scaled_heights(height, noise.along, noise.coupling)
+        # States of poor condition: where one direction is noisier, the process found is likely to be that of its noise.
+        unlike = noise.overall > _UNLIKE * noise.coupling
+        others = _scaled_heights(height[unlike], noise.along[unlike], noise.overall[unlike])
+        bounds[:2, unlike] = np.maximum(bounds[:2, unlike], others[:2])
+        bounds[3:, unlike] = np.minimum(bounds[3:, unlike], others[3:])
         spread, extra = _small_eigenvalues(xi, bounds[2], noise)
     values = 0.25 + 0.75 * bounds - extra
     shift = xi[..., 0] - values[2]
     # The lower bound is the height of which the observation is a high quantile.
     return CorrectedXi0(values[2], values[[3, 1]], values[[4, 0]], shift, spread)
+
+
+def _scaled_heights(height: Array, along: Array, noise: Array) -> Array:
+    """`_heights` of heights with this noise of an element of H, in their own unit."""
+    # The table's own noise has a first-order width of sqrt(3)/2 in xi0.
+    return _heights(height / noise, along / (np.sqrt(0.75) * noise)) * noise
 
 
 def _heights(observed: Array, width: Array) -> Array:

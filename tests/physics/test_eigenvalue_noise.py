@@ -6,7 +6,7 @@ from noisy_images import five_samples, noisy_image, rgb950
 
 from processing.maps.coherency_noise import largest_deviation_by_noise
 from processing.maps.xi0 import eigenvalue_block
-from processing.polarization import triply_degenerate
+from processing.polarization import mueller, triply_degenerate
 from processing.polarization.cloude import coherency_eigenvalues
 from processing.polarization.eigenvalue_noise import THETA, EigenvalueNoise, corrected
 from processing.polarization.quantities import deviation_from_td
@@ -39,6 +39,23 @@ def test_intervals_of_a_triply_degenerate_matrix_cover(truth, electrons):
     assert 0.78 < np.sqrt(np.mean(pull**2)) < 1.08
     assert np.mean(pull < 1) > 0.683 - 0.03
     assert np.mean(pull < 1.96) > 0.95 - 0.03
+
+
+@pytest.mark.parametrize("truth", [0.25, 0.3])
+def test_intervals_near_a_quarter_are_wide_where_one_direction_is_noisier(truth):
+    # Two plates of 127 degrees at 9 to 1: condition number 26, one direction has 12 times the usual variance.
+    states = np.deg2rad(4.7) * np.arange(41)
+    generator = mueller.retarder(states, np.deg2rad(127)) @ np.array([1.0, 1, 0, 0]) / 2
+    analyzer = np.array([1.0, -1, 0, 0]) / 2 @ mueller.retarder(9 * states, np.deg2rad(127))
+    w = np.einsum("ni,nj->nij", analyzer, generator).reshape(-1, 16)
+    random = np.random.default_rng(3)
+    samples = [PURE, mueller.retarder(0.3, 1.0), mueller.retarder(1.2, 2.5) @ mueller.retarder(0.4, 2.0)]
+    matrices = np.stack([triply_degenerate.mueller_matrix(samples[k], truth) for k in random.integers(3, size=PIXELS)])
+    found = eigenvalue_block(noisy_image(matrices, 500, 5, w))
+    # Half of the 68 % and 60 of the 95 % before; what is missing still is told in docs/quantities.md.
+    for name, least in (("xi0_68", 0.6), ("xi0_95", 0.8)):
+        low, high = found[name].reshape(2, -1)
+        assert np.mean((low <= truth) & (truth <= high)) > least, name
 
 
 @pytest.mark.parametrize("electrons", [200, 20_000])
@@ -89,7 +106,8 @@ def test_the_weighted_estimate_has_the_same_noise_within_its_weights():
 
 
 def test_far_above_the_noise_the_table_goes_on_smoothly():
-    noise = EigenvalueNoise(np.full(400, 0.01 * np.sqrt(0.75)), np.full(400, 0.01), np.zeros(400))
+    even = np.full(400, 0.01)
+    noise = EigenvalueNoise(even * np.sqrt(0.75), even, np.zeros(400), even)
     xi0 = np.linspace(0.25, 0.25 + 0.75 * 0.01 * (THETA[-1] + 4), 400)
     rest = (1 - xi0) / 3
     found = corrected(np.stack([xi0, rest, rest, rest], axis=-1), noise)
