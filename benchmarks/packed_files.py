@@ -37,13 +37,16 @@ def ways() -> dict[str, Callable[[h5py.File, h5py.Dataset], None]]:
     def plain(out: h5py.File, plane: h5py.Dataset) -> None:
         out.create_dataset("plane", data=plane[...])
 
-    def ours(out: h5py.File, plane: h5py.Dataset) -> None:
-        worth = BYTE_WORTH if is_product(Path(plane.file.filename)) else SMALL_BYTE_WORTH
-        packing = Packing.of(plane, worth)
-        if packing.is_worth_it:
-            pack(plane, create_packed(out, "plane", plane.shape, plane.dtype), packing)
-        else:
-            plain(out, plane)
+    def where_worth(byte_worth: float | None = None) -> Callable[[h5py.File, h5py.Dataset], None]:
+        def write(out: h5py.File, plane: h5py.Dataset) -> None:
+            usual = BYTE_WORTH if is_product(Path(plane.file.filename)) else SMALL_BYTE_WORTH
+            packing = Packing.of(plane, byte_worth or usual)
+            if packing.is_worth_it:
+                pack(plane, create_packed(out, "plane", plane.shape, plane.dtype), packing)
+            else:
+                plain(out, plane)
+
+        return write
 
     def all_packed(out: h5py.File, plane: h5py.Dataset) -> None:
         every_byte = Packing(ratio=1.0, deflated=(True,) * plane.dtype.itemsize)
@@ -60,7 +63,9 @@ def ways() -> dict[str, Callable[[h5py.File, h5py.Dataset], None]]:
 
         return write
 
-    found = {"plain": plain, "ours": ours, "every byte of every plane": all_packed, "HDF5's deflate": hdf5("gzip")}
+    found = {"plain": plain, "ours": where_worth()}
+    found |= {f"bytes that become 1/{worth:g}": where_worth(worth) for worth in (1.2, 1.5, 2.0, 2.5)}
+    found |= {"every byte of every plane": all_packed, "HDF5's deflate": hdf5("gzip")}
     return found | {"LZF (h5py alone)": hdf5("lzf")}
 
 
