@@ -70,6 +70,13 @@ def test_dark_darks_of_a_light_in_the_noise_pass(light: float) -> None:
         assert look.light(0.01, POSES[0], frame(light, 2 * seed + 1)) is None
 
 
+def test_single_bright_pixels_are_no_noise_that_hides_lit_darks() -> None:
+    sparkles = np.where(np.random.default_rng(0).random(SHAPE) < 1 / 256, 3000.0, 0.0)
+    look = LitDarks(BLACK, mosaic=True, lights=1)
+    look.dark(0.01, POSES[0], frame(0.0, 1) + sparkles)
+    assert look.light(0.01, POSES[0], frame(0.0, 2) + sparkles) is not None
+
+
 def test_darks_of_another_exposure_say_nothing() -> None:
     look = LitDarks(BLACK, mosaic=True, lights=1)
     look.dark(0.01, POSES[0], frame(900.0, 1))
