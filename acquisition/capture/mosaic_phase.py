@@ -13,15 +13,19 @@ def seen_by_camera(instrument: InstrumentModel, camera: Camera) -> InstrumentMod
     Raises
     ------
     AcquisitionError
-        The camera mirrors, bins or leaves out pixels, so which analyzer a pixel has cannot be known, or the frames
-        hold parts of super-pixels.
+        The camera mirrors, bins or leaves out pixels, so which analyzer or colour filter a pixel has cannot be known,
+        or the frames hold parts of super-pixels.
     """
-    if instrument.mosaic is None:
-        return instrument
     settings = camera.settings
-    wrong = _unknown(settings, camera.bins_like_with_like) or _torn(instrument.mosaic, settings)
+    if instrument.mosaic is None and not camera.describe().colour:
+        return instrument
+    wrong = _unknown(settings, camera.bins_like_with_like)
+    if instrument.mosaic is not None:
+        wrong = wrong or _torn(instrument.mosaic, settings)
     if wrong is not None:
         raise AcquisitionError(wrong)
+    if instrument.mosaic is None:
+        return instrument
     rows, columns = len(instrument.mosaic), len(instrument.mosaic[0])
     top, left = settings.offset_y or 0, settings.offset_x or 0
     mosaic = tuple(
@@ -50,17 +54,17 @@ def colours_of(instrument: InstrumentModel, camera: Camera) -> tuple[tuple[str, 
 
 def _unknown(settings: CameraSettings, bins_like_with_like: bool) -> str | None:
     if settings.offset_x is None or settings.offset_y is None:
-        return "the camera does not tell where its region begins, so which analyzer a pixel has is not known"
+        return "the camera does not tell where its region begins, so which filter a pixel has is not known"
     if settings.reverse_x or settings.reverse_y:
         return (
             "the camera mirrors its frames (ReverseX or ReverseY), and makers differ in where the mosaic then begins. "
             "Leave reverse_x and reverse_y off"
         )
     if (settings.decimation or 1) != 1:
-        return f"decimation {settings.decimation} leaves out pixels of every super-pixel. Set it to 1"
+        return f"decimation {settings.decimation} leaves out pixels of every kind of filter. Set it to 1"
     if (settings.binning or 1) != 1 and not bins_like_with_like:
         return (
-            f"binning {settings.binning} adds up pixels behind different polarizers. Set it to 1; if the manual says "
+            f"binning {settings.binning} adds up pixels behind different filters. Set it to 1; if the manual says "
             "that this camera bins only pixels of one kind, write `mosaic_binning: like_with_like` at the camera"
         )
     return None

@@ -85,6 +85,7 @@ class CaptureRunner:
     observers : told of everything; the simulated bench is one of them.
     saturation_limit : fraction of saturated pixels from which a state raises TooBright; None never.
     mosaic : True for a polarization sensor.
+    lit_darks : comparison of darks and lights that has seen the states of earlier runs; None for a new one.
     """
 
     def __init__(
@@ -98,6 +99,7 @@ class CaptureRunner:
         continue_after_interlock: bool = False,
         saturation_limit: float | None = None,
         mosaic: bool = False,
+        lit_darks: LitDarks | None = None,
     ) -> None:
         self.rig = rig
         self.table = table
@@ -115,7 +117,7 @@ class CaptureRunner:
         self._full_scale = rig.require_camera().full_scale
         self._saturation_limit = saturation_limit
         lights = sum(role != "dark" for role in table.role)
-        self._lit_darks = LitDarks(detector.black_level_counts, mosaic=mosaic, lights=lights)
+        self._lit_darks = lit_darks or LitDarks(detector.black_level_counts, mosaic=mosaic, lights=lights)
         self._repeated = RepeatedState(detector.black_level_counts)
         self._wall_clock = WallClock()
 

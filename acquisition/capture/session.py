@@ -28,6 +28,7 @@ from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
 from drivers.errors import DeviceError
 from processing.instrument.model import InstrumentModel
+from processing.reduction.lit_darks import LitDarks, seen_so_far
 from processing.storage.capture import Capture
 from processing.storage.capture_schema import Status
 
@@ -91,7 +92,11 @@ def resume(
                 f"the camera's region now gives {job.instrument.mosaic}. Go on with the region that began it."
             )
         require_same_devices(capture, rig)
-        earlier = Earlier(len(capture.segments), light_so_far(capture))
+        lights = sum(role != "dark" for role in job.table.role)
+        look, wrong = seen_so_far(capture, lights)
+        if wrong is not None:
+            raise AcquisitionError(f"{partial}: {wrong}. There is nothing to go on with: begin the capture again.")
+        earlier = Earlier(len(capture.segments), light_so_far(capture), look)
     writer = CaptureWriter(as_partial(partial), rig.clock)
     pending = [k for k in range(len(job.table)) if k not in done]
     return _run(job, rig, writer, pending, stop, observers, earlier)
@@ -99,10 +104,11 @@ def resume(
 
 @dataclass(frozen=True)
 class Earlier:
-    """What a capture that is gone on with brings along: its number of segments, and the light in them."""
+    """What a capture that is gone on with brings along: its number of segments, the light in them, and its darks."""
 
     segments: int
     light: LightSoFar
+    darks: LitDarks
 
 
 def place_sample(job: Job, rig: Rig) -> None:
@@ -150,6 +156,7 @@ def _run(
         continue_after_interlock=job.plan.continue_after_interlock,
         saturation_limit=1 - auto.percentile / 100 if isinstance(auto, AutoExposure) else None,
         mosaic=job.instrument.mosaic is not None,
+        lit_darks=None if earlier is None else earlier.darks,
     )
     status: Status = "failed"
     failure: BaseException | None = None

@@ -77,12 +77,14 @@ class LitDarks:
 
 def lit_darks(capture: Capture) -> str | None:
     """What is wrong with the darks of a capture; None if nothing is, or if it has none."""
-    darks = capture.states_with("dark")
-    lights = [k for k, role in enumerate(capture.role) if role != "dark"]
-    if darks.size == 0 or not lights:
-        return None
+    lights = sum(role != "dark" for role in capture.role)
+    return seen_so_far(capture, lights)[1]
+
+
+def seen_so_far(capture: Capture, lights: int) -> tuple[LitDarks, str | None]:
+    """A comparison that has seen the states of a capture, of which `lights` will be light, and what it found."""
     header = capture.header
-    look = LitDarks(header.detector.black_level_counts, mosaic=header.mosaic is not None, lights=len(lights))
+    look = LitDarks(header.detector.black_level_counts, mosaic=header.mosaic is not None, lights=lights)
     exposure_s, targets = capture.column("exposure_s"), capture.planned_targets_deg()
 
     def state(k: int) -> tuple[float, tuple[float, ...], NDArray[np.generic]]:
@@ -90,13 +92,14 @@ def lit_darks(capture: Capture) -> str | None:
         pose = tuple(float(angles[capture.done[k]]) for angles in targets.values())
         return float(exposure_s[k]), pose, capture.frames(k)[0]
 
-    for k in darks.tolist():
+    darks = capture.states_with("dark").tolist()
+    for k in darks:
         look.dark(*state(k))
-    for k in lights:
-        wrong = look.light(*state(k))
+    for k, role in enumerate(capture.role if darks else ()):
+        wrong = look.light(*state(k)) if role != "dark" else None
         if wrong is not None:
-            return wrong
-    return None
+            return look, wrong
+    return look, None
 
 
 def leaked_light(capture: Capture) -> str | None:

@@ -183,6 +183,23 @@ def test_a_shutter_that_sticks_and_says_it_does_not_is_found_by_the_darks(run_wi
     assert path.name.endswith(".partial")
 
 
+def test_lit_darks_of_a_run_that_was_cut_are_found_when_it_goes_on(run_with):
+    def stick(rig, state, retake):
+        if state == 0 and retake == 0:
+            rig.source.set_light(True)
+            rig.simulation.emulators["shutter"].faults.add(parse_fault("jammed"))
+        if state == 4:
+            raise RunFailed("cut before there is a bright state")
+
+    plan = SHORT | {"darks": 2}
+    _, path = run_with(stick, plan=plan)
+    with Capture(path) as capture:
+        assert "dark" in capture.role
+    error, _ = run_with(resume=path, plan=plan)
+    assert isinstance(error, RunFailed)
+    assert "dark states" in str(error)
+
+
 # --- cables -----------------------------------------------------------------------------------------------
 
 

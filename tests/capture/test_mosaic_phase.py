@@ -1,0 +1,36 @@
+"""Which filter stands before a pixel of a colour camera, without a polarization mosaic."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from acquisition.capture.mosaic_phase import colours_of, seen_by_camera
+from acquisition.errors import AcquisitionError
+from drivers.camera import CameraSettings
+from processing.instrument.model import InstrumentModel
+from tests.conftest import ROOT
+
+
+def colour_camera(**settings: object) -> SimpleNamespace:
+    known = CameraSettings(offset_x=0, offset_y=0, width=20, height=16).model_copy(update=settings)
+    return SimpleNamespace(settings=known, bins_like_with_like=False, describe=lambda: SimpleNamespace(colour=True))
+
+
+@pytest.fixture(scope="module")
+def instrument() -> InstrumentModel:
+    return InstrumentModel.load(ROOT / "configs/instruments/rgb950.yaml")
+
+
+@pytest.mark.parametrize("offset", [(0, 0), (1, 0), (0, 1), (3, 5)])
+def test_colours_follow_the_place_of_the_region(instrument, offset):
+    x, y = offset
+    camera = colour_camera(offset_x=x, offset_y=y)
+    assert seen_by_camera(instrument, camera) is instrument
+    first = {(0, 0): "red", (1, 0): "green", (0, 1): "green", (1, 1): "blue"}[x % 2, y % 2]
+    assert colours_of(instrument, camera)[0][0] == first
+
+
+@pytest.mark.parametrize("setting", [{"reverse_x": True}, {"decimation": 2}, {"binning": 2}, {"offset_x": None}])
+def test_what_hides_the_colour_of_a_pixel_is_refused(instrument, setting):
+    with pytest.raises(AcquisitionError, match=r"filter|mirrors"):
+        seen_by_camera(instrument, colour_camera(**setting))
