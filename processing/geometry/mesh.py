@@ -66,6 +66,8 @@ class Mesh(BaseModel):
                 index, face, flat, origin, world.triangles, world.face_normals, corners, points, normal, start, stop
             ),
         )
+        if np.isfinite(points.sum()) and np.isfinite(normal.sum()):
+            return hit.reshape(rays.shape[:-1]), points, normal
         sound = np.isfinite(points).all(axis=1) & np.isfinite(normal).all(axis=1)
         # What has no normal sends no light back that could be told.
         hit[index[~sound]] = False
