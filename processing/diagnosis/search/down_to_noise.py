@@ -37,7 +37,7 @@ def down_to_noise(
     Parameters
     ----------
     start : (K,) values to begin with.
-    noise, unit : of chi-square, as it was; a larger part of it has to go in every round.
+    noise, unit : of chi-square where structure was left; every round has to leave less than `GAINING` of it, or `BENT`.
     """
     x, settled = all_at_once(problem, space, fixed, start, noise, SHRUNK), False
     for left in reversed(range(ROUNDS)):

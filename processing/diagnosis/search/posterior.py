@@ -70,6 +70,7 @@ def posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start:
     members, groups = grouped(space, fixed)
     about, sets, state = _found(problem, space, fixed, groups, start)
     if problem.noise_known and state.unit > BENT:
+        say("structure is left: once more, with every intensity counted in full")
         explained = down_to_noise(problem, space, fixed, groups, start, sets.noise, state.unit)
         if explained is None:
             problem.relinearize(space, about)
