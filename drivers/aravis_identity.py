@@ -8,7 +8,7 @@ from drivers import genicam
 from drivers.aravis_setup import Config, Setup
 from drivers.camera import CameraIdentity
 from drivers.genicam import Features
-from drivers.pixel_formats import PixelFormat
+from drivers.pixel_formats import ANGLES_LAYOUT, PixelFormat
 
 
 def identify(
@@ -39,6 +39,7 @@ def identify(
             polarized=fmt.polarized,
             colour=fmt.colour,
             library=f"Aravis {aravis._version}",
+            analyzers=ANGLES_LAYOUT if fmt.angles else None,
         )
 
 

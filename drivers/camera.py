@@ -105,7 +105,8 @@ class CameraIdentity:
 
     `packet_delay` is the pause between two packets in ticks of the camera's clock, `resend` whether lost packets are
     asked for again; both None off Ethernet. `pixel_format_code` is the code as the camera sends it; `shift` is how many
-    empty low bits were removed; `colour` is True for the raw mosaic of a colour filter.
+    empty low bits were removed; `colour` is True for the raw mosaic of a colour filter. `analyzers` are the names that
+    the camera itself gives to the analyzers over the super-pixel of its frames; None where the pixel format tells none.
     """
 
     kind: str
@@ -128,6 +129,7 @@ class CameraIdentity:
     polarized: bool
     colour: bool
     library: str
+    analyzers: tuple[tuple[str, ...], ...] | None = None
 
 
 class Exposure:

@@ -132,7 +132,9 @@ class PixelFormat:
         return _encode(self, flat)
 
 
-# Where 0, 45, 90 and 135 degrees stand in the super-pixel of the polarization sensors, (row, column).
+#: Angles by the camera's own names over the super-pixel that `decode` makes of a format with `angles`.
+ANGLES_LAYOUT = (("90", "45"), ("135", "0"))
+# Where 0, 45, 90 and 135 degrees stand in it, (row, column).
 _SUPER_PIXEL = ((1, 1), (0, 1), (0, 0), (1, 0))
 
 
@@ -238,6 +240,11 @@ PIXEL_FORMATS: tuple[PixelFormat, ...] = (
     PixelFormat("PolarizedAngles_0d_45d_90d_135d_Mono8", 0x8220000F, 8, polarized=True, angles=True),
     PixelFormat("PolarizedAngles_0d_45d_90d_135d_Mono12p", 0x8230001F, 12, "p", polarized=True, angles=True),
     PixelFormat("PolarizedAngles_0d_45d_90d_135d_Mono16", 0x8240002F, 16, polarized=True, angles=True),
+    # The same of the colour sensor: each count has the colour of its super-pixel, which make a Bayer pattern.
+    PixelFormat("PolarizedAngles_0d_45d_90d_135d_BayerRG8", 0x8220020F, 8, polarized=True, colour=True, angles=True),
+    PixelFormat(
+        "PolarizedAngles_0d_45d_90d_135d_BayerRG12p", 0x8230021F, 12, "p", polarized=True, colour=True, angles=True
+    ),
     # FLIR, named in Spinnaker's public interface without codes; layout by the rule of the names (unverified).
     PixelFormat("Polarized8", None, 8, polarized=True),
     PixelFormat("Polarized10p", None, 10, "p", polarized=True),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from acquisition.errors import AcquisitionError
-from drivers.camera import Camera, CameraSettings
+from drivers.camera import Camera, CameraIdentity, CameraSettings
 from processing.instrument.model import InstrumentModel
 
 
@@ -14,14 +14,14 @@ def seen_by_camera(instrument: InstrumentModel, camera: Camera) -> InstrumentMod
     ------
     AcquisitionError
         The camera mirrors, bins or leaves out pixels, so which analyzer or colour filter a pixel has cannot be known,
-        or the frames hold parts of super-pixels.
+        the frames hold parts of super-pixels, or the camera names the analyzers otherwise than the instrument.
     """
-    settings = camera.settings
-    if instrument.mosaic is None and not camera.describe().colour:
+    settings, who = camera.settings, camera.describe()
+    if instrument.mosaic is None and not who.colour:
         return instrument
     wrong = _unknown(settings, camera.bins_like_with_like)
     if instrument.mosaic is not None:
-        wrong = wrong or _torn(instrument.mosaic, settings)
+        wrong = wrong or _torn(instrument.mosaic, settings) or _named_otherwise(instrument.mosaic, who)
     if wrong is not None:
         raise AcquisitionError(wrong)
     if instrument.mosaic is None:
@@ -78,3 +78,15 @@ def _torn(mosaic: tuple[tuple[str, ...], ...], settings: CameraSettings) -> str 
             f"{columns} x {rows}. Change width and height"
         )
     return None
+
+
+def _named_otherwise(mosaic: tuple[tuple[str, ...], ...], who: CameraIdentity) -> str | None:
+    # Such a format begins with a whole super-pixel wherever its region is.
+    if who.analyzers is None or mosaic == who.analyzers:
+        return None
+    told, declared = (" / ".join(" ".join(line) for line in layout) for layout in (who.analyzers, mosaic))
+    return (
+        f"pixel format {who.pixel_format} tells the analyzer of each count, which makes super-pixels of {told}; the "
+        f"instrument file has {declared}. Write `mosaic: {[list(line) for line in who.analyzers]}` there and name the "
+        "channels as the camera does, each with the azimuth that it has on your bench; or choose a raw format"
+    )

@@ -34,3 +34,25 @@ def test_colours_follow_the_place_of_the_region(instrument, offset):
 def test_what_hides_the_colour_of_a_pixel_is_refused(instrument, setting):
     with pytest.raises(AcquisitionError, match=r"filter|mirrors"):
         seen_by_camera(instrument, colour_camera(**setting))
+
+
+@pytest.mark.parametrize(
+    ("told", "declared", "wrong"),
+    [
+        ((("90", "45"), ("135", "0")), (("90", "45"), ("135", "0")), False),
+        (None, (("0", "45"), ("135", "90")), False),
+        ((("90", "45"), ("135", "0")), (("0", "45"), ("135", "90")), True),
+        ((("90", "45"), ("135", "0")), (("90", "135"), ("45", "0")), True),
+    ],
+)
+def test_analyzers_that_the_camera_names_are_those_of_the_instrument(told, declared, wrong):
+    camera = colour_camera()
+    camera.describe = lambda: SimpleNamespace(colour=False, analyzers=told, pixel_format="by angle")
+    stokes = InstrumentModel.load(ROOT / "configs/instruments/linear_stokes.yaml").model_copy(
+        update={"mosaic": declared}
+    )
+    if wrong:
+        with pytest.raises(AcquisitionError, match="tells the analyzer of each count"):
+            seen_by_camera(stokes, camera)
+    else:
+        assert seen_by_camera(stokes, camera).mosaic == declared

@@ -106,3 +106,16 @@ def own_files(
         "with data of another lab": frames_of_another_lab,
         "with a capture that a power cut ended, and your rig": power_cut,
     }
+
+
+@pytest.fixture
+def short_plan(tmp_path: Path) -> Callable[[str], Path]:
+    """A plan of one dark and one light state of a mode."""
+
+    def make(mode: str, more: str = "") -> Path:
+        path = tmp_path / f"{mode}.yaml"
+        states = "states: {kind: fixed, states: 1}" if mode == "stokes" else ""
+        path.write_text(f"kind: plan\nmode: {mode}\ndarks: 1\nexposure_s: 0.005\n{states}\n{more}\n")
+        return path
+
+    return make

@@ -14,29 +14,14 @@ from processing.commands.application import main as process
 from processing.storage.capture import Capture
 from processing.storage.images import StokesImage
 from simulators.camera.gige_camera import GigeCamera
-from simulators.camera.node_map import node_map
 from simulators.rig.rig import SimulatedRig
 
 Rig = Callable[..., Path]
 Acquire = Callable[..., tuple[int, str, str]]
 
-SENSOR = (("90", "45"), ("135", "0"))
 CAMERA = {"kind": "aravis", "bits": 12, "packet_size": 9000}
 STYLE = Path(__file__).parents[1] / "conformance" / "descriptions" / "in_the_style_of_makers.xml"
 THROUGH = ("--sample", "air", "--omega", 180)
-
-
-@pytest.fixture
-def short_plan(tmp_path: Path) -> Callable[[str], Path]:
-    """A plan of one dark and one light state of a mode."""
-
-    def make(mode: str, more: str = "") -> Path:
-        path = tmp_path / f"{mode}.yaml"
-        states = "states: {kind: fixed, states: 1}" if mode == "stokes" else ""
-        path.write_text(f"kind: plan\nmode: {mode}\ndarks: 1\nexposure_s: 0.005\n{states}\n{more}\n")
-        return path
-
-    return make
 
 
 def run_process(*arguments: object) -> None:
@@ -52,43 +37,6 @@ def assert_horizontal(path: Path) -> None:
     s0, s1, s2 = StokesImage.load(out).values[:, 4:-4, 4:-4]
     assert np.median(np.hypot(s1, s2) / s0) == pytest.approx(1.0, abs=0.02)
     assert np.max(np.abs(np.rad2deg(np.arctan2(s2, s1)) / 2)) < 3.0
-
-
-@pytest.mark.parametrize(
-    ("offset_x", "offset_y", "pixel_format", "table"),
-    [
-        *[(x, y, "PolarizeMono12p", "lucid_tri050s_p") for x, y in ((0, 0), (1, 0), (0, 1), (3, 5))],
-        (1, 0, "PolarizeMono12", "loopback"),
-        (1, 0, "PolarizeMono8", "loopback"),
-        (0, 1, "PolarizeMono12Packed", "loopback"),
-        (1, 1, "PolarizeMono16", "loopback"),
-    ],
-)
-def test_horizontal_light_reads_zero_degrees_wherever_the_region_begins(
-    acquire: Acquire,
-    small_rig: Rig,
-    short_plan: Callable[[str], Path],
-    tmp_path: Path,
-    offset_x: int,
-    offset_y: int,
-    pixel_format: str,
-    table: str,
-) -> None:
-    # The steps of the maker's camera are 4: as if it took any offset.
-    (tmp_path / "fine.yaml").write_text(node_map(table).model_copy(update={"step": {}}).model_dump_json())
-    region = {"width": 40, "height": 24, "offset_x": offset_x, "offset_y": offset_y, "pixel_format": pixel_format}
-    bits = 8 if pixel_format == "PolarizeMono8" else 12
-    rig = small_rig(top={"camera": CAMERA | {"bits": bits, "settings": region}}, camera="fine.yaml")
-    out = tmp_path / "captures"
-    code, _, err = acquire("--rig", rig, "--plan", short_plan("stokes"), *THROUGH, "--out", out)
-    assert code == 0, err
-    (path,) = out.glob("*.h5")
-    with Capture(path) as capture:
-        rolled = np.roll(SENSOR, (-offset_y, -offset_x), axis=(0, 1))
-        assert capture.header.mosaic == tuple(map(tuple, rolled))
-        assert capture.instrument is not None
-        assert capture.instrument.mosaic == capture.header.mosaic
-    assert_horizontal(path)
 
 
 @pytest.mark.parametrize(
@@ -190,18 +138,10 @@ def test_a_rotator_of_limited_travel_takes_the_same_states_half_a_turn_away(
         assert np.all(np.abs(capture.angles_deg["psa"]) <= 95)
 
 
-@pytest.mark.parametrize(
-    ("pixel_format", "offset_x"), [("PolarizeMono12p", 4), ("PolarizedAngles_0d_45d_90d_135d_Mono12p", 8)]
-)
 def test_a_maker_s_polarization_camera_takes_a_capture_with_its_node_map(
-    acquire: Acquire,
-    small_rig: Rig,
-    short_plan: Callable[[str], Path],
-    tmp_path: Path,
-    pixel_format: str,
-    offset_x: int,
+    acquire: Acquire, small_rig: Rig, short_plan: Callable[[str], Path], tmp_path: Path
 ) -> None:
-    settings = {"pixel_format": pixel_format, "width": 40, "height": 32, "offset_x": offset_x}
+    settings = {"pixel_format": "PolarizeMono12p", "width": 40, "height": 32, "offset_x": 4}
     camera = CAMERA | {"settings": settings, "features": {"PtpEnable": True}}
     rig = small_rig(top={"camera": camera}, camera="lucid_tri050s_p")
     out = tmp_path / "captures"
