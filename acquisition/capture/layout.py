@@ -13,7 +13,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from processing.storage.capture_schema import STATUS_TYPE
+from acquisition.capture.text_box import TextBox
+from processing.storage.capture_schema import STATUS_TYPE, reserve_texts
 
 #: Attribute of the entry: at which byte of the file its status stands.
 STATUS_AT = "status_at"
@@ -25,13 +26,14 @@ RUNNING = b"running".ljust(len(STATUS_MARK), b"\0")
 PIECE = 1 << 20
 
 
-def put_layout(path: Path, needed: int, make: Callable[[h5py.File], None]) -> None:
+def put_layout(path: Path, needed: int, make: Callable[[h5py.File], None], begin: bytes = b"") -> None:
     """Make a new file on the disc, with all its space taken and all of it synced.
 
     Parameters
     ----------
     needed : bytes to take at first, about what the file will have.
     make : fills the empty file, with `create_layout` and what goes with it.
+    begin : first line of the journal of segments.
 
     Raises
     ------
@@ -46,8 +48,13 @@ def put_layout(path: Path, needed: int, make: Callable[[h5py.File], None]) -> No
         with open(memory, "w+b", buffering=0, closefd=False) as image, h5py.File(image, "w") as h5:
             make(h5)
             entry = h5["entry"]
+            texts = reserve_texts(entry, begin)
             entry.attrs.modify("status", np.array(STATUS_MARK, dtype=STATUS_TYPE))
             entry.attrs[STATUS_AT] = np.frombuffer(PLACE_MARK, np.int64)[0]
+            h5.flush()
+            lengths = [(TextBox(memory, dataset), length) for dataset, length in texts.items()]
+        for box, length in lengths:
+            box.set_length(memory, length)
         _mark_places(memory)
         size = os.fstat(memory).st_size
         os.posix_fallocate(file, 0, size)

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acquisition.capture.layout import STATUS_AT, write_whole
+from acquisition.capture.text_box import TextBox
 from acquisition.errors import AcquisitionError
 from processing.storage.capture_schema import STATUS_TYPE, Status, fitted_json, json_bytes
 from processing.storage.checksums import row_crc32, state_crc32
@@ -34,20 +35,15 @@ UNREADABLE = (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeE
 
 
 class _Place:
-    """Where a dataset without chunks lies in the file: its first byte, bytes of a row, type of a value.
+    """Where a dataset without chunks lies in the file: its first byte, bytes of a row, type of a value."""
 
-    Parameters
-    ----------
-    whole : the dataset is one row, a box of bytes.
-    """
-
-    def __init__(self, dataset: h5py.Dataset, whole: bool = False) -> None:
+    def __init__(self, dataset: h5py.Dataset) -> None:
         offset = dataset.id.get_offset()
         if offset is None:
             raise ValueError(f"{dataset.name} has no place of its own in the file")
         self.offset: int = offset
         self.dtype = dataset.dtype
-        self.step = self.dtype.itemsize * int(np.prod(dataset.shape if whole else dataset.shape[1:]))
+        self.step = self.dtype.itemsize * int(np.prod(dataset.shape[1:]))
 
 
 class StateFile:
@@ -105,9 +101,9 @@ class StateFile:
                 if group.attrs.get("NX_class") == "NXpositioner"
             }
             self._row_sums = _Place(detector["row_crc32"])
-            self._segments = _Place(entry["segments/json"], whole=True)
+            self._segments = TextBox(self._file, entry["segments/json"])
             self._status_at = int(entry.attrs[STATUS_AT])
-            self._closing = _Place(entry["closing/json"], whole=True)
+            self._closing = TextBox(self._file, entry["closing/json"])
             data = detector["data"]
             if data.compression is not None:
                 raise ValueError("its frames are compressed and stay as they are")
@@ -165,33 +161,25 @@ class StateFile:
     def add_segment_record(self, record: Mapping[str, Any], part: float = 1.0) -> None:
         """Add a line to the journal of segments, cut to this part of the room left. Raises AcquisitionError if full."""
         end = self._journal()[1]
-        room = int(part * (self._segments.step - end)) - LINE_BYTES
+        room = int(part * (self._segments.room - end)) - LINE_BYTES
         raw = json_bytes(record) if part == 1 else fitted_json(record, max(room, 0))
         if len(raw) > room:
             raise AcquisitionError(
                 f"{self.path} was gone on with so often that its journal is full. Begin it anew with --as-new."
             )
-        line = encode_line(raw)
         # What a line that was cut off has left goes with it.
-        rest = np.zeros(self._segments.step - end, np.uint8)
-        rest[: len(line)] = np.frombuffer(line, np.uint8)
-        self._write(self._segments.offset + end, rest)
-        self.sync()
+        self._write_text(self._segments, end, encode_line(raw))
 
     def segment_records(self) -> list[dict[str, Any]]:
         """The lines of the journal of segments."""
         return self._journal()[0]
 
     def _journal(self) -> tuple[list[dict[str, Any]], int]:
-        return decode_lines(os.pread(self._file, self._segments.step, self._segments.offset))
+        return decode_lines(self._segments.read(self._file))
 
     def write_closing(self, record: Mapping[str, Any]) -> None:
         """Replace the closing record; one that is too long loses what `fitted_json` leaves out."""
-        raw = fitted_json(record, self._closing.step)
-        box = np.zeros(self._closing.step, np.uint8)
-        box[: len(raw)] = np.frombuffer(raw, np.uint8)
-        self._write(self._closing.offset, box)
-        self.sync()
+        self._write_text(self._closing, 0, fitted_json(record, self._closing.room))
 
     def is_at(self, path: Path) -> bool:
         """Whether the open file is the one of that name: False once it was deleted or moved."""
@@ -226,6 +214,24 @@ class StateFile:
 
     def _write(self, offset: int, values: NDArray[Any]) -> None:
         write_whole(self._file, offset, _bytes_of(values))
+
+    def _write_text(self, box: TextBox, start: int, raw: bytes) -> None:
+        """Replace a text from a byte on, and end it there; on the disc when this returns.
+
+        Whenever this is cut off, what readers are shown is the text before or the text now, with zero bytes behind it:
+        it grows before and shrinks after it is written, and behind its end there are zero bytes alone.
+        """
+        before, now = box.length(self._file), start + len(raw)
+        if now > before:
+            self._set_length(box, now)
+        self._write(box.offset + start, np.frombuffer(raw.ljust(before - start, b"\0"), np.uint8))
+        self.sync()
+        if now < before:
+            self._set_length(box, now)
+
+    def _set_length(self, box: TextBox, length: int) -> None:
+        box.set_length(self._file, length)
+        self.sync()
 
     def _write_image(self, offset: int, image: NDArray[Any]) -> None:
         """Write an image and have the disc begin with it; that it is there says the sync alone."""

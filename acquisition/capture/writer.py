@@ -143,13 +143,11 @@ class CaptureWriter:
             create_layout(h5, header, dict(table.angles_deg), table.role, frame_shape, np.uint16, start_time)
             h5["entry/states/exposure_s"][...] = table.exposure_s
             h5["entry/states/repeats"][...] = table.repeats
-            if begin is not None:
-                h5["entry/segments/json"][()] = encode_line(json_bytes(begin))
 
         try:
             make_folder(path.parent)
             check_space(path.parent, needed)
-            put_layout(new, needed, make)
+            put_layout(new, needed, make, b"" if begin is None else encode_line(json_bytes(begin)))
             _require_layout(new, table)
             os.rename(new, partial)
             sync(partial.parent)

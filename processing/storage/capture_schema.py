@@ -34,7 +34,7 @@ SampleKind = Literal["air", "mirror", "mueller", "unknown"]
 
 #: The longest status; shorter ones are padded, so that a status is replaced in its place.
 STATUS_TYPE = h5py.string_dtype("ascii", 8)
-#: Bytes set aside for the closing record, and for the records of all segments.
+#: Bytes that the closing record and the records of all segments may have.
 CLOSING_BYTES = 256 * 1024
 SEGMENTS_BYTES = 512 * 1024
 
@@ -205,14 +205,36 @@ def create_layout(
         note = add_group(entry, name, "NXnote")
         note["type"] = f"application/{kind}"
         # As bytes, which is what a note holds for NeXus.
-        raw = text.encode()
-        note.create_dataset("data", data=raw, dtype=h5py.string_dtype("utf-8", max(len(raw), 1)))
+        _put_text(note, "data", text.encode())
     _plot(entry, header.title, tuple(target_deg))
-    # Written later, in space that exists already: a line for the begin and the end of each segment of the run, and at
-    # sealing end time, ledger, statistics and messages. A text of fixed length: readers show what stands in it.
-    for name, size in (("segments", SEGMENTS_BYTES), ("closing", CLOSING_BYTES)):
+
+
+def reserve_texts(entry: h5py.Group, begin: bytes) -> dict[h5py.Dataset, int]:
+    """Take the space of what is written later: the journal of segments and the closing record.
+
+    The journal has a line for the begin and the end of each segment of the run, the record end time, ledger, statistics
+    and messages.
+
+    Returns
+    -------
+    Each dataset with the bytes of its text, one at least; the dataset is as long as its room until the file is told.
+    """
+    reserved = {}
+    for name, size, text in (("segments", SEGMENTS_BYTES, begin), ("closing", CLOSING_BYTES, b"")):
         group = add_group(entry, name, "NXcollection")
-        _allocated(group, "json", (), h5py.string_dtype("utf-8", size), chunks=None)[()] = b""
+        dataset = _allocated(group, "json", (), h5py.string_dtype("utf-8", size), chunks=None)
+        dataset[()] = text
+        reserved[dataset] = max(len(text), 1)
+    return reserved
+
+
+def put_record(entry: h5py.Group, name: str, raw: bytes) -> None:
+    """Write the journal of segments or the closing record, in JSON, into a file that takes no more states."""
+    _put_text(add_group(entry, name, "NXcollection"), "json", raw)
+
+
+def _put_text(group: h5py.Group, name: str, raw: bytes) -> None:
+    group.create_dataset(name, data=raw, dtype=h5py.string_dtype("utf-8", max(len(raw), 1)))
 
 
 def _positioner(entry: h5py.Group, axis: str, target_deg: NDArray[np.float64]) -> None:
@@ -267,11 +289,9 @@ def _plot(entry: h5py.Group, title: str, axes: tuple[str, ...]) -> None:
 def write_closing(h5: h5py.File, status: Status, closing: Mapping[str, Any]) -> None:
     """Write the closing record (end time, time ledger, stream statistics, messages) and the status.
 
-    The room for it was taken when the file was made. A record that is longer loses the newest entries of its longest
-    lists, and says so under `left_out`: a capture is sealed whatever happened in it.
+    A record that is too long loses the newest entries of its longest lists, and says so under `left_out`.
     """
-    box = h5["entry/closing/json"]
-    box[()] = fitted_json(closing, room=box.dtype.itemsize)
+    put_record(h5["entry"], "closing", fitted_json(closing, room=CLOSING_BYTES))
     write_status(h5, status)
 
 

@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 
 from processing.storage.capture import Capture, CaptureError
-from processing.storage.capture_schema import STATE_COLUMNS, STATUS_TYPE, create_layout
+from processing.storage.capture_schema import STATE_COLUMNS, STATUS_TYPE, create_layout, put_record
 from processing.storage.checksums import summed_values
 from processing.storage.packed import SMALL_BYTE_WORTH, Packing, create_packed, pack
 
@@ -74,8 +74,8 @@ def _write(capture: Capture, old: h5py.File, new: Path) -> None:
             there["states"].copy("sigma", entry["states"], without_attrs=True)
             entry["states/sigma"].attrs["units"] = "count"
         for name in ("segments", "closing"):
-            text = there[f"{name}/json"][...].tobytes().rstrip(b"\0")
-            entry[f"{name}/json"][()] = text
+            if name in there:
+                put_record(entry, name, there[f"{name}/json"][...].tobytes().rstrip(b"\0"))
         entry.attrs.modify("status", np.array(b"complete", dtype=STATUS_TYPE))
 
 

@@ -1,7 +1,9 @@
 """The file of a capture that is being taken: states, columns, journal, closing record, each at its place."""
 
+import contextlib
 import errno
 import os
+import shutil
 from pathlib import Path
 
 import h5py
@@ -14,7 +16,8 @@ from acquisition.capture.writer import CaptureWriter
 from acquisition.errors import AcquisitionError
 from processing.instrument.states import StateTable
 from processing.storage.capture import Capture
-from processing.storage.capture_schema import CaptureHeader
+from processing.storage.capture_schema import CLOSING_BYTES, SEGMENTS_BYTES, CaptureHeader
+from processing.storage.segments import encode_line
 
 SHAPE, STATES = (4, 5), 3
 HEADER = CaptureHeader(title="three states", simulated=True, mode="drr", wavelength_nm=662)
@@ -107,24 +110,25 @@ def test_columns_are_read_and_replaced_whole(path, file):
 
 
 def test_journal_keeps_its_lines_and_takes_over_what_was_cut_off(path, file):
-    beyond = os.pread(file._file, 256, file._segments.offset + file._segments.step)
+    beyond = os.pread(file._file, 256, file._segments.offset + file._segments.room)
     assert file.segment_records() == []
     file.add_segment_record({"event": "begin", "n": 1})
     file.add_segment_record({"event": "end"}, part=0.5)
     assert file.segment_records() == [{"event": "begin", "n": 1}, {"event": "end"}]
     # A line whose end never reached the disc is not there, and the next one covers all of it.
     end = file._journal()[1]
+    file._set_length(file._segments, end + 400)
     file._write(file._segments.offset + end, np.frombuffer(b"12345678 {" + 300 * b"x", np.uint8))
     file.add_segment_record({"event": "begin", "n": 2})
     assert [r.get("n") for r in file.segment_records()] == [1, None, 2]
-    rest = os.pread(file._file, file._segments.step, file._segments.offset)[file._journal()[1] :]
+    rest = os.pread(file._file, file._segments.room, file._segments.offset)[file._journal()[1] :]
     assert not rest.strip(b"\0")
     # What comes after the journal in the file is not touched.
-    assert os.pread(file._file, 256, file._segments.offset + file._segments.step) == beyond
+    assert os.pread(file._file, 256, file._segments.offset + file._segments.room) == beyond
 
 
 def test_a_record_is_cut_to_its_part_of_the_room_and_a_full_journal_is_told(path, file):
-    room = file._segments.step
+    room = file._segments.room
     file.add_segment_record({"event": "end", "messages": ["m" * 100] * (room // 50)}, part=0.5)
     (record,) = file.segment_records()
     assert record["left_out"]["messages"] > 0
@@ -150,6 +154,67 @@ def test_closing_record_and_status_are_replaced(path, file):
     with Capture(path) as there:
         assert there.closing == {"end_time": "now"}
         assert there.status == "failed"
+
+
+def _texts(path):
+    with h5py.File(path, locking=False) as h5:
+        return h5["entry/closing/json"][()], h5["entry/segments/json"][()]
+
+
+def test_every_reader_is_shown_texts_of_their_own_length(path, file):
+    """No zero bytes behind them, in a file that is under way either; the room stays."""
+    assert _texts(path) == (b"", b"")
+    file.add_segment_record({"event": "begin"})
+    file.write_closing({"end_time": "a long time after it began"})
+    file.write_closing({"end_time": "now"})
+    file.add_segment_record({"event": "end"})
+    closing, segments = _texts(path)
+    assert closing == b'{"end_time": "now"}'
+    assert segments == encode_line(b'{"event": "begin"}') + encode_line(b'{"event": "end"}')
+    with h5py.File(path, locking=False) as h5:
+        for name, text, room in (("closing", closing, CLOSING_BYTES), ("segments", segments, SEGMENTS_BYTES)):
+            dataset = h5[f"entry/{name}/json"]
+            assert dataset.dtype == h5py.string_dtype("utf-8", len(text))
+            assert dataset.id.get_storage_size() == room
+
+
+@pytest.mark.parametrize("records", [("short", "much longer than that"), ("much longer than that", "short")])
+def test_a_text_that_is_cut_off_anywhere_reads_as_before_or_as_it_is_now(path, file, monkeypatch, records):
+    before, now = ({"end_time": text} for text in records)
+    file.write_closing(before)
+    file.add_segment_record(before)
+    sync, seen = file.sync, []
+
+    def look():
+        copy = Path(shutil.copy(path, path.with_name("copy.h5")))
+        with Capture(copy) as there:
+            assert there.closing in (before, now)
+            assert file.segment_records() in ([before], [before, now])
+            seen.append(there.closing)
+
+    monkeypatch.setattr(file, "sync", lambda: (sync(), look()))
+    file.write_closing(now)
+    file.add_segment_record(now)
+    # Two steps each: the length of a text, and what stands in it.
+    assert len(seen) == 4
+    assert seen[-1] == now
+
+
+def test_padded_texts_of_an_older_file_are_gone_on_with(path, file):
+    """Where the length was that of the room; the next text ends where it ends."""
+    file.add_segment_record({"event": "begin"})
+    for box in (file._segments, file._closing):
+        file._set_length(box, box.room)
+    file.close()
+    with Capture(path) as there:
+        assert there.closing == {}
+    with contextlib.closing(StateFile(path)) as older:
+        assert older.segment_records() == [{"event": "begin"}]
+        older.add_segment_record({"event": "end"})
+        older.write_closing({"end_time": "now"})
+    closing, segments = _texts(path)
+    assert closing == b'{"end_time": "now"}'
+    assert segments == encode_line(b'{"event": "begin"}') + encode_line(b'{"event": "end"}')
 
 
 def test_a_closing_record_that_is_too_long_says_what_it_lost(path, file):
