@@ -138,6 +138,16 @@ def test_a_file_with_the_older_layout_is_read_and_written_in_its_place(capture):
         assert len(there.frames(3)[0]) == SHAPE[0]
 
 
+def test_xarray_is_shown_the_records_as_they_are(capture):
+    """In a file that was imported and cannot be gone on with there is no room behind them either."""
+    with h5py.File(capture) as h5:
+        text = h5["entry/closing/json"]
+        assert text.id.get_storage_size() == text.dtype.itemsize == len(text[()])
+        written = text[()]
+    with xr.open_dataset(capture, engine="h5netcdf", group="entry/closing") as closing:
+        assert closing["json"].item() == written
+
+
 def test_compressed_planes_are_plain_deflate_and_read_the_same(tmp_path):
     """What h5py and MATLAB know without plug-ins; a plane of noise stays as it is, and so does a whole file of it."""
     rng = np.random.default_rng(5)

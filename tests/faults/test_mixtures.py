@@ -2,8 +2,10 @@
 
 import json
 import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
+import h5py
 import pytest
 from ruamel.yaml import YAML
 
@@ -149,6 +151,18 @@ def test_as_new_keeps_apart(partial, quick_rig, acquire, intact):
     assert intact(partial.parent / "run-2.h5") == 19
 
 
+def assert_ends_with_its_text(path: Path) -> None:
+    """Nothing stands behind the text of either record, in a file that is gone on with as in one that is sealed."""
+    with h5py.File(path) as h5:
+        texts = {name: h5[f"entry/{name}/json"] for name in ("closing", "segments")}
+        # What h5py gives has no zero bytes at its end, whatever is stored.
+        assert [text.dtype.itemsize for text in texts.values()] == [len(text[()]) for text in texts.values()]
+        closing = json.loads(texts["closing"].asstr()[()])
+        assert all(json.loads(line[9:]) for line in texts["segments"].asstr()[()].splitlines())
+    with Capture(path) as capture:
+        assert capture.closing == closing
+
+
 def test_a_resume_is_a_recorded_segment_and_nothing_is_forgotten(run_with, tmp_path):
     def door(rig, state, retake):
         if state == 4:
@@ -156,8 +170,10 @@ def test_a_resume_is_a_recorded_segment_and_nothing_is_forgotten(run_with, tmp_p
 
     error, path = run_with(door, plan=SHORT)
     assert "the door is open" in str(error)
+    assert_ends_with_its_text(path)
     error, final = run_with(resume=path, plan=SHORT)
     assert error is None
+    assert_ends_with_its_text(final)
     with Capture(final) as capture:
         first, second = capture.segments
         closing = capture.closing
