@@ -39,10 +39,24 @@ _SWITCHED_OFF = (
 # What a capture sets after the features, whatever they say.
 _SET_BY_CAPTURES = {
     **dict.fromkeys(genicam.EXPOSURE_US, "give exposure_s in the plan"),
+    "ExposureAuto": "it is Off",
     "ExposureMode": "it is Timed",
     "AcquisitionMode": "it is Continuous",
     "TriggerMode": "it is On",
     "TriggerSource": "give `trigger` in the settings, and trigger_line",
+    "GevSCPSPacketSize": "give packet_size",
+}
+# Features behind the settings of `structure_of`.
+_BEHIND = {
+    "pixel_format": ("PixelFormat",),
+    "width": ("Width",),
+    "height": ("Height",),
+    "offset_x": ("OffsetX",),
+    "offset_y": ("OffsetY",),
+    "binning": ("BinningHorizontal", "BinningVertical"),
+    "decimation": ("DecimationHorizontal", "DecimationVertical"),
+    "reverse_x": ("ReverseX",),
+    "reverse_y": ("ReverseY",),
 }
 
 
@@ -160,6 +174,9 @@ class Setup:
     def set_structure(self, settings: CameraSettings) -> None:
         """Pixel format, region, binning, packets and trigger: the acquisition must be stopped."""
         features = self._features
+        for setting, names in _BEHIND.items():
+            if getattr(settings, setting) is not None:
+                self._require_free(setting, *names)
         for name in _SWITCHED_OFF:
             if name not in self._config.features:
                 features.switch_off(name)
@@ -170,8 +187,7 @@ class Setup:
         ):
             features.set_number(("Gamma",), 1.0, floor=1e-3)
         if settings.pixel_format is not None:
-            pixel_format(settings.pixel_format)
-            features.set_choice("PixelFormat", settings.pixel_format)
+            self._set_pixel_format(settings.pixel_format)
         self._clear_offsets()
         self._set_both("Binning", settings.binning)
         self._set_both("Decimation", settings.decimation)
@@ -191,6 +207,12 @@ class Setup:
                 f"bits {self._config.bits} and shift {self._config.shift} in the rig file",
                 f"{fmt.name} holds {fmt.bits} bits",
             )
+
+    def _set_pixel_format(self, name: str) -> None:
+        if name in self._features.choices("PixelFormat"):
+            # Before the camera is changed: one that it sends and that is not known here cannot be taken.
+            pixel_format(name)
+        self._features.set_choice("PixelFormat", name)
 
     def _set_both(self, what: str, factor: int | None) -> None:
         """Set the binning or decimation along both axes; 1 where the camera has none is no request."""

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from drivers.clock import REAL, Clock
 from drivers.errors import PermissionRefused, PortBusy, PortLost, PortNotFound
-from drivers.serial_link import port_holders
+from drivers.serial_link import end_the_holder, line_framer, port_holders
 
 # _IOW(91, 10, __u32), milliseconds; the kernel takes no less than 100.
 _SET_TIMEOUT = 0x40045B0A
@@ -46,7 +46,7 @@ class MessageDevice:
         asked = f"open {port}"
         others = [who for pid, who in port_holders(port) if pid != os.getpid() and who != f"{held_by} (pid {pid})"]
         if others:
-            raise PortBusy(asked, f"it is in use by {', '.join(others)}", "End that program; nothing was sent")
+            raise PortBusy(asked, f"it is in use by {', '.join(others)}", f"{end_the_holder(port)}; nothing was sent")
         try:
             self._file = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_CLOEXEC)
         except PermissionError as error:
@@ -55,7 +55,7 @@ class MessageDevice:
             found = ", ".join(str(path) for path in sorted(Path("/dev").glob("usbtmc*"))) or "none"
             raise PortNotFound(asked, str(error.strerror), f"USBTMC devices found: {found}. Correct `port`") from error
         self._is_usbtmc = Path(os.path.realpath(port)).name.startswith("usbtmc")
-        self._buffer = b""
+        self._buffer = bytearray()
 
     def write(self, message: str) -> None:
         """Send one message."""
@@ -65,9 +65,9 @@ class MessageDevice:
             raise self._lost(error) from error
 
     def read(self, timeout_s: float) -> str | None:
-        """The next message, without its line end; None if none comes in time."""
+        """The next message, without its line end (CR, LF or both); None if none comes in time."""
         end_s = self.clock.now_s() + timeout_s
-        while b"\n" not in self._buffer:
+        while (line := line_framer(self._buffer)) is None:
             if not self._is_usbtmc and not select.select([self._file], [], [], _SLICE_S)[0]:
                 if self.clock.now_s() > end_s:
                     return None
@@ -76,7 +76,6 @@ class MessageDevice:
             if data is None:
                 return None
             self._buffer += data
-        line, _, self._buffer = self._buffer.partition(b"\n")
         return line.decode("ascii", "replace").strip()
 
     def _receive(self, timeout_s: float) -> bytes | None:
@@ -92,7 +91,7 @@ class MessageDevice:
 
     def drop_input(self) -> None:
         """Throw away what waits; an instrument on USBTMC keeps an answer until it is asked for."""
-        self._buffer = b""
+        self._buffer.clear()
         while not self._is_usbtmc and select.select([self._file], [], [], 0)[0]:
             if not self._receive(0):
                 return

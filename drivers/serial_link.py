@@ -196,7 +196,7 @@ def _open_port(port: str, baudrate: int, held_by: str | None, xonxoff: bool, rts
         holders = [(pid, who) for pid, who in port_holders(port) if pid != os.getpid()]
         others = [who for pid, who in holders if who != f"{held_by} (pid {pid})"]
         if others:
-            raise PortBusy(asked, f"it is in use by {', '.join(others)}", f"{_end_the_holder(port)}; nothing was sent")
+            raise PortBusy(asked, f"it is in use by {', '.join(others)}", f"{end_the_holder(port)}; nothing was sent")
     try:
         options: dict[str, Any] = {} if "://" in port else {"exclusive": True}
         return serial.serial_for_url(
@@ -239,7 +239,8 @@ def port_holders(port: str) -> list[tuple[int, str]]:
     return holders
 
 
-def _end_the_holder(port: str) -> str:
+def end_the_holder(port: str) -> str:
+    """What to do about a program that has a port open."""
     if not os.path.realpath(port).startswith("/dev/pts/"):
         return "End that program"
     return "End that program or, if it is the simulator behind this port, write its name as `held_by` in the rig file"

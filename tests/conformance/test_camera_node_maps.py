@@ -221,7 +221,39 @@ def test_features_of_every_kind_are_set() -> None:
         }
 
 
-@pytest.mark.parametrize("name", ["ExposureTime", "TriggerMode", "TriggerSource", "AcquisitionMode"])
+@pytest.mark.parametrize(
+    ("setting", "feature"),
+    [
+        ({"pixel_format": "Mono12"}, {"PixelFormat": "Mono8"}),
+        ({"width": 32, "height": 32}, {"Width": 16}),
+        ({"width": 32, "offset_x": 2}, {"OffsetX": 4}),
+        ({"binning": 2}, {"BinningVertical": 1}),
+        ({"reverse_x": False}, {"ReverseX": True}),
+    ],
+)
+def test_a_feature_that_says_something_else_than_the_settings_is_refused(
+    setting: dict[str, object], feature: dict[str, object]
+) -> None:
+    with ExitStack() as stack:
+        camera = MakersCamera("loopback", stack).open(features=feature, bits=8)
+        with pytest.raises(SettingRefused, match=f"{next(iter(feature))} in `features`: .* is given as well"):
+            camera.configure(CameraSettings(exposure_s=1e-3, **setting))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("wrong", ["PolarizeMono12P", "BayerRG8"])
+def test_a_pixel_format_that_the_camera_has_not_is_told_with_those_that_it_has(wrong: str) -> None:
+    with ExitStack() as stack:
+        camera = MakersCamera("lucid_tri050s_p", stack).open()
+        with pytest.raises(
+            SettingRefused, match=f"set PixelFormat to {wrong}: this camera offers Mono8, .*Mono16"
+        ) as no:
+            camera.configure(CameraSettings(exposure_s=1e-3, pixel_format=wrong))
+        assert "Polarized12p" not in str(no.value)
+
+
+@pytest.mark.parametrize(
+    "name", ["ExposureTime", "TriggerMode", "TriggerSource", "AcquisitionMode", "GevSCPSPacketSize", "ExposureAuto"]
+)
 def test_a_feature_that_every_capture_sets_is_refused_in_the_rig_file(name: str) -> None:
     with pytest.raises(ValidationError, match=f"{name} is set by every capture"):
         aravis.Config(features={name: "Off"})
