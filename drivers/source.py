@@ -3,8 +3,33 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
 
 from drivers.errors import DeviceError
+
+
+def check_wavelengths(places: Mapping[float, int], what: str, others: Iterable[float] = ()) -> None:
+    """Refuse a rig file that gives one place to two wavelengths, or a value to a wavelength that has no place.
+
+    Parameters
+    ----------
+    places : wavelength in nm to filter position, terminal or channel.
+    what : a place in words.
+    others : wavelengths of the values.
+
+    Raises
+    ------
+    ValueError
+    """
+    first: dict[int, float] = {}
+    for nm, place in places.items():
+        if place in first:
+            raise ValueError(f"{what} {place} is that of {first[place]:g} nm and of {nm:g} nm")
+        first[place] = nm
+    for nm in others:
+        if nm not in places:
+            known = ", ".join(f"{nm:g}" for nm in places)
+            raise ValueError(f"percent is given for {nm:g} nm, and the wavelengths are {known} nm")
 
 
 class LightSource(ABC):

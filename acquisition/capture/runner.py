@@ -343,6 +343,11 @@ class CaptureRunner:
                 "Make sure that the source darkens the sample, or correct detector.black_level_counts in the rig file, "
                 "and begin the capture again."
             )
+        unlit = self._lit_darks.without_light(exposure_s)
+        if unlit is not None:
+            self.warn(
+                f"{unlit}: is the source on at this wavelength, its shutter open, the lens free? The capture goes on"
+            )
 
     def _again(self, state: int, error: FrameLost) -> None:
         tries = self._retakes.get(state, 0) + 1
@@ -350,8 +355,8 @@ class CaptureRunner:
         allowed = self.rig.config.retakes
         if tries > allowed:
             raise RunFailed(
-                f"state {state}: {tries} frames in a row were lost, the last: {error.came_back}. "
-                "Check cable, packet size and network load, then go on with --resume."
+                f"state {state}: {tries} frames in a row were lost, the last: {error.came_back}. {error.what_to_do}. "
+                "Then go on with --resume."
             ) from error
         self.warn(f"state {state}: frame lost ({error.came_back}), taken again, try {tries} of {allowed}")
         self._pending.appendleft(state)

@@ -12,14 +12,14 @@ word that `MODe?` answers, and USBTMC as a whole, which no emulator here speaks.
 from __future__ import annotations
 
 import re
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from drivers.errors import CommandRejected, DeviceError, ReplyError, ReplyTimeout, WrongDevice
 from drivers.message_device import MessageDevice
 from drivers.serial_link import LineRegistry
-from drivers.source import LightSource
+from drivers.source import LightSource, check_wavelengths
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _STATE = re.compile(r"0|1|ON|OFF", re.IGNORECASE)
@@ -41,6 +41,11 @@ class Config(BaseModel):
         default={}, description="brightness by wavelength in nm, set when that is selected"
     )
     reply_s: float = Field(default=1.0, gt=0, description="longest wait for a reply")
+
+    @model_validator(mode="after")
+    def _one_led_for_each_wavelength(self) -> Self:
+        check_wavelengths(self.terminals, "terminal", self.percent)
+        return self
 
 
 class LedDriver(LightSource):

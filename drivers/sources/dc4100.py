@@ -13,14 +13,14 @@ box: the exact text of `E?`, and the number format of `BP?`, which the adapter r
 from __future__ import annotations
 
 import re
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from drivers.clock import Clock
 from drivers.errors import CommandRejected, DeviceError, ReplyError, ReplyTimeout, WrongDevice
 from drivers.serial_link import LineRegistry, SerialLink, Transcript, line_framer
-from drivers.source import LightSource
+from drivers.source import LightSource, check_wavelengths
 
 BAUDRATE = 115200
 MODELS = ("DC4100", "DC4104")
@@ -48,13 +48,19 @@ class Config(BaseModel):
     kind: Literal["dc4100"] = "dc4100"
     port: str = Field(description="device path, /dev/serial/by-id path or socket://host:port")
     held_by: str | None = Field(default=None, description="program that may hold the port too: its simulator")
-    channels: dict[float, int] = Field(
+    channels: dict[float, Annotated[int, Field(ge=1, le=4)]] = Field(
         default={}, description="wavelength in nm to channel 1 to 4; empty: as the LEDs say themselves"
     )
     percent: dict[float, Annotated[float, Field(ge=0, le=100)]] = Field(
         default={}, description="brightness by wavelength in nm, set when that is selected"
     )
     reply_s: float = Field(default=1.0, gt=0, description="longest wait for a reply")
+
+    @model_validator(mode="after")
+    def _one_led_for_each_wavelength(self) -> Self:
+        # Without `channels` the box tells its wavelengths later.
+        check_wavelengths(self.channels, "channel", self.percent if self.channels else ())
+        return self
 
 
 class LedDriver(LightSource):

@@ -20,7 +20,7 @@ from drivers.clock import Clock
 from drivers.errors import DeviceError, WrongDevice
 from drivers.prompt_line import PromptLine, prompt_framer
 from drivers.serial_link import LineRegistry, SerialLink, Transcript
-from drivers.source import LightSource
+from drivers.source import LightSource, check_wavelengths
 from drivers.sources import sc10
 
 BAUDRATE = 115200
@@ -48,6 +48,7 @@ class Config(BaseModel):
             raise ValueError("give dark_position or shutter, one of them: light must be shut off for dark states")
         if self.dark_position in self.positions.values():
             raise ValueError(f"dark_position {self.dark_position} is that of a wavelength as well")
+        check_wavelengths(self.positions, "position")
         return self
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from processing.reduction.black import Black
 from processing.reduction.effects_of_capture import CountsCorrection
 from processing.reduction.flat import Flat
-from processing.reduction.lit_darks import leaked_light, lit_darks
+from processing.reduction.lit_darks import leaked_light, seen_so_far
 from processing.storage.capture import Capture, CaptureError
 from processing.storage.pixel_mask import Mask
 
@@ -76,11 +76,8 @@ class Correction:
                 "no dark states and no black level in the capture: nothing was subtracted, and a pedestal would "
                 "show as depolarization. Take dark states, or import with --black-level."
             )
-        lit = None if dark_from else lit_darks(capture)
-        if lit is not None:
-            warnings.append(f"{lit}. Subtracting them leaves no signal: take the capture again with the light shut off")
-        elif dark_from is None and (leak := leaked_light(capture)) is not None:
-            warnings.append(leak)
+        if dark_from is None:
+            warnings += _of_light(capture)
         runs = np.unique(capture.run_of_states[_light(capture)]).size
         if runs > 1:
             warnings.append(
@@ -92,6 +89,17 @@ class Correction:
         if flat is not None and flat.lost.any():
             bad = flat.lost if bad is None else bad | flat.lost
         return cls(black, source, flat, bad, top, tuple(warnings))
+
+
+def _of_light(capture: Capture) -> list[str]:
+    """Warnings where the light was on for the darks, or not on at all."""
+    lights = _light(capture)
+    look, lit = seen_so_far(capture, lights.size)
+    if lit is not None:
+        return [f"{lit}. Subtracting them leaves no signal: take the capture again with the light shut off"]
+    unlit = [look.without_light(float(exposure_s)) for exposure_s in np.unique(capture.column("exposure_s")[lights])]
+    leak = leaked_light(capture)
+    return [f"{text}: what is left is noise" for text in unlit if text is not None] + ([] if leak is None else [leak])
 
 
 def _light(capture: Capture) -> NDArray[np.int64]:

@@ -1,4 +1,4 @@
-"""Dark states that are not dark: the light was not shut off while they were taken.
+"""Dark states that are not dark, and light states that are: the light was not shut off, or never let through.
 
 Subtracted, such frames leave nothing, and nothing else shows it: every file is well formed and every state whole.
 """
@@ -43,6 +43,9 @@ class LitDarks:
         self._suspects: dict[float, float] = {}
         self._seen: dict[float, int] = {}
         self._brightest: dict[float, float] = {}
+        # Sum of the light frames' blocks, and their noise.
+        self._total: dict[float, tuple[NDArray[np.float64], float]] = {}
+        self._judged: set[float] = set()
 
     def dark(self, exposure_s: float, pose: tuple[float, ...], frame: NDArray[np.generic]) -> None:
         """Take a dark frame (rows, columns); `pose` are the target angles of its state."""
@@ -56,6 +59,8 @@ class LitDarks:
             return None
         blocks = _blocks(frame, self._step) - self._black
         self._seen[exposure_s] = self._seen.get(exposure_s, 0) + 1
+        total, noise = self._total.get(exposure_s, (np.zeros_like(blocks), 0.0))
+        self._total[exposure_s] = total + blocks, max(noise, _block_noise(frame))
         bright = _top(blocks)
         self._brightest[exposure_s] = max(bright, self._brightest.get(exposure_s, bright))
         dark = self._darks.get((exposure_s, *pose))
@@ -74,11 +79,17 @@ class LitDarks:
             f"counts above the declared black level {self._black:g}, the brightest light state {brightest:.0f}"
         )
 
-
-def lit_darks(capture: Capture) -> str | None:
-    """What is wrong with the darks of a capture; None if nothing is, or if it has none."""
-    lights = sum(role != "dark" for role in capture.role)
-    return seen_so_far(capture, lights)[1]
+    def without_light(self, exposure_s: float) -> str | None:
+        """Tell once that enough light states of an exposure were taken and their mean is no brighter than a dark."""
+        seen = self._seen.get(exposure_s, 0)
+        if seen < self._needed or exposure_s in self._judged:
+            return None
+        self._judged.add(exposure_s)
+        total, noise = self._total[exposure_s]
+        dark = next(dark for key, dark in self._darks.items() if key[0] == exposure_s)
+        if _top(total / seen - dark[0]) > NOISE_ALLOWANCE * float(np.hypot(dark[1], noise)):
+            return None
+        return f"the light states of {exposure_s:g} s are no brighter than the dark ones"
 
 
 def seen_so_far(capture: Capture, lights: int) -> tuple[LitDarks, str | None]:

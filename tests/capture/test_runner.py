@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -115,7 +116,8 @@ def test_a_lost_frame_is_taken_again_next_and_counted(rig, runner_of):
 def test_a_state_that_is_lost_in_every_try_ends_the_run(rig, runner_of):
     rig.lost = set(range(3, 30))
     runner = runner_of(psg=(0.0, 10.0, 20.0))
-    with pytest.raises(RunFailed, match=r"state 2: 3 frames in a row were lost, the last: no frame within 1 s"):
+    lost = "state 2: 3 frames in a row were lost, the last: no frame within 1 s. Capture the state again. Then go on"
+    with pytest.raises(RunFailed, match=re.escape(lost)):
         runner.run(range(3))
     assert runner.writer.states() == [0, 1]
     assert rig.events[-1][1] == "stop"
@@ -337,3 +339,13 @@ def test_the_oldest_messages_are_kept_and_the_others_counted():
     assert messages.dropped == 3
     assert messages.texts[0].split()[1] == "0"
     assert len(messages.texts[0]) == len("00:00:00 ") + 500
+
+
+@pytest.mark.parametrize(("light", "times"), [(0, 1), (40, 0)])
+def test_a_capture_without_light_says_so_once(rig, runner_of, light, times):
+    heard = Heard()
+    rig.picture = lambda number: np.full((4, 5), 100 + (light if number > 2 else 0), np.uint16)
+    psg = (0.0, 10.0, *(9.0 * k for k in range(12)))
+    assert runner_of(psg=psg, role=("dark", "dark") + ("sample",) * 12, observers=(heard,)).run(range(14))
+    told = [text for text in heard.warnings if "no brighter than the dark ones: is the source on" in text]
+    assert len(told) == times

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from processing.reduction.counts_to_signal import Correction
-from processing.reduction.lit_darks import LitDarks, lit_darks
+from processing.reduction.lit_darks import LitDarks
 from processing.storage.capture import Capture
 from processing.storage.capture_schema import Detector
 
@@ -70,6 +70,23 @@ def test_dark_darks_of_a_light_in_the_noise_pass(light: float) -> None:
         assert look.light(0.01, POSES[0], frame(light, 2 * seed + 1)) is None
 
 
+@pytest.mark.parametrize("mosaic", [True, False])
+@pytest.mark.parametrize(("light", "seen"), [(0.0, False), (3.0, True), (900.0, True)])
+def test_light_states_that_are_as_dark_as_the_darks_are_told_once(mosaic: bool, light: float, seen: bool) -> None:
+    for seed in range(10):
+        look = LitDarks(BLACK, mosaic=mosaic, lights=12)
+        look.dark(0.01, POSES[0], frame(0.0, 100 + seed))
+        told = []
+        for k, pose in enumerate(POSES):
+            # Crossed polarizers in every second pose.
+            assert look.light(0.01, pose, frame(light * (k % 2 or mosaic), 1000 * seed + k)) is None
+            told.append(look.without_light(0.01))
+        texts = [text for text in told if text is not None]
+        assert len(texts) == (0 if seen else 1)
+        assert all("the light states of 0.01 s are no brighter than the dark ones" in text for text in texts)
+        assert look.without_light(0.02) is None
+
+
 def test_single_bright_pixels_are_no_noise_that_hides_lit_darks() -> None:
     sparkles = np.where(np.random.default_rng(0).random(SHAPE) < 1 / 256, 3000.0, 0.0)
     look = LitDarks(BLACK, mosaic=True, lights=1)
@@ -118,6 +135,10 @@ def test_the_reduction_warns(synthetic_capture) -> None:
     roles = ("dark", "dark", "sample", "sample", "sample")
     path = synthetic_capture(counts, {"psg": np.zeros(5)}, role=roles, channels=("mosaic",), **header)
     with Capture(path) as capture:
-        assert lit_darks(capture) is not None
         (warning,) = [text for text in Correction.of(capture).warnings if "as bright as" in text]
         assert "light shut off" in warning
+
+
+def test_the_reduction_warns_of_a_capture_without_light(synthetic_capture) -> None:
+    (text,) = warned(synthetic_capture, frame(0.0, 2), frame(0.0, 3))
+    assert "the light states of 0.01 s are no brighter than the dark ones" in text

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from drivers.errors import DeviceError, WrongDevice
 from drivers.serial_link import LineRegistry
-from drivers.sources import fw102c, sc10
+from drivers.sources import dc2200, dc4100, fw102c, sc10
 from simulators.clock import Clock, patient_clock
 from simulators.controllers.fw102c import FW102CEmulator
 from simulators.controllers.sc10 import SC10Emulator
@@ -122,3 +122,19 @@ def test_a_blocked_wheel_and_a_wrong_one_are_told(wheel: tuple[FW102CEmulator, s
 def test_a_wheel_that_cannot_be_meant_is_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         fw102c.Config(port="x", **wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("config", "wrong", "says"),
+    [
+        (fw102c.Config, {"positions": {451: 1, 662: 1}, "dark_position": 6}, "position 1 is that of 451 nm and of 662"),
+        (dc2200.Config, {"terminals": {451: 2, 662: 2}}, "terminal 2 is that of 451 nm and of 662 nm"),
+        (dc2200.Config, {"terminals": {662: 2}, "percent": {626: 50}}, "given for 626 nm, and the wavelengths are 662"),
+        (dc4100.Config, {"channels": {451: 1, 662: 1}}, "channel 1 is that of 451 nm and of 662 nm"),
+        (dc4100.Config, {"channels": {451: 5}}, "less than or equal to 4"),
+        (dc4100.Config, {"channels": {451: 1}, "percent": {450: 50}}, "given for 450 nm, and the wavelengths are 451"),
+    ],
+)
+def test_one_place_for_each_wavelength(config: type[BaseModel], wrong: dict[str, object], says: str) -> None:
+    with pytest.raises(ValidationError, match=says):
+        config(port="/dev/ttyUSB0", **wrong)
