@@ -26,6 +26,42 @@ def rgb950(wavelength_nm: float = 662) -> np.ndarray:
     return np.asarray(model.rows(rotating_retarders(1.0).angles_deg).reshape(-1, 16))
 
 
+def two_plates(retardances_deg: tuple[float, float], angles_rad: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """W (N, 16) of two turning plates between crossed polarizers."""
+    generator = mueller.retarder(angles_rad[0], np.deg2rad(retardances_deg[0])) @ np.array([1.0, 1, 0, 0]) / 2
+    analyzer = np.array([1.0, -1, 0, 0]) / 2 @ mueller.retarder(angles_rad[1], np.deg2rad(retardances_deg[1]))
+    return np.asarray(np.einsum("ni,nj->nij", analyzer, generator).reshape(-1, 16))
+
+
+def state_tables() -> dict[str, np.ndarray]:
+    """W (N, 16) of good and of deliberately poor states, condition number 7 to 80."""
+
+    def steps(count: int, step_deg: float, ratio: float) -> tuple[np.ndarray, np.ndarray]:
+        angles = np.deg2rad(step_deg) * np.arange(count)
+        return angles, ratio * angles
+
+    def drawn(seed: int) -> tuple[np.ndarray, np.ndarray]:
+        random = np.random.default_rng(seed)
+        return random.uniform(0, np.pi, 24), random.uniform(0, np.pi, 24)
+
+    return {
+        "RGB950's 40": rgb950(),
+        "two plates of 90 degrees, 5 to 1, 30": two_plates((90, 90), steps(30, 6.0, 5.0)),
+        "127 degrees, 9 to 1, 41": two_plates((127, 127), steps(41, 4.7, 9.0)),
+        "60 and 150 degrees, 4.3 to 1, 36": two_plates((60, 150), steps(36, 10.0, 4.3)),
+        "24 random states": two_plates((127, 95), drawn(19)),
+        "24 others": two_plates((127, 95), drawn(262)),
+    }
+
+
+def random_processes(count: int, seed: int) -> np.ndarray:
+    """Mueller-Jones matrices (count, 4, 4) with m00 = 1, even over all Jones matrices."""
+    parts = np.random.default_rng(seed).normal(size=(2, count, 4))
+    jones = parts[0] + 1j * parts[1]
+    matrices = mueller.coherency_to_mueller(jones[:, :, None] * jones[:, None, :].conj())
+    return np.asarray(matrices / matrices[:, :1, :1])
+
+
 def five_samples() -> dict[str, np.ndarray]:
     """Matrices (4, 4) with m00 = 1 of five kinds."""
     element = mueller.retarder(0.4, 1.2) @ mueller.diattenuator(0.9, 1.0, 0.25) @ mueller.rotation(0.25)

@@ -127,10 +127,10 @@ def _measure_mueller(task: CaptureTask, product: Path, view: ViewingGeometry) ->
     model = load_reflectance(task.material).mueller_jones(geometry.points, image.header.wavelength_nm)
     m0 = xi0_and_dominant(m)[1]
     noise, eigenvalues = coherency_noise(image), coherency_eigenvalues(m)
-    found = corrected(np.asarray(eigenvalues[:, None], dtype=float), noise)
+    found = corrected(np.asarray(eigenvalues[:, None], dtype=float), noise, image.covariance_of_depolarizer())
     xi0, stderr = found.xi0[:, 0], found.stderr[:, 0]
     # A limit on the noise: one on the outcome would keep upward fluctuations only.
-    good = np.isfinite(xi0) & ~(noise.coupling[:, 0] > MAX_STDERR) & _inner(geometry, task.border_px)
+    good = np.isfinite(xi0) & ~(noise.overall[:, 0] > MAX_STDERR) & _inner(geometry, task.border_px)
     measured, modelled = linear_diattenuation(m0), linear_diattenuation(model)
     psi = orientation_difference(modelled, measured)[good]
     chosen = np.flatnonzero(good)

@@ -17,17 +17,21 @@ def coherency_noise(image: MuellerImage) -> EigenvalueNoise:
 
     To first order d xi0 = <dM, m0 - 4 xi0 e00> / (4 m00), m0 being the dominant process.
     """
-    xi0, m0 = xi0_and_dominant(image.matrices)
+    m0 = xi0_and_dominant(image.matrices)[1]
     process = np.asarray(m0, dtype=np.float32).reshape(*m0.shape[:2], 16)
     m00 = image.values[0, 0].astype(float)
+    alone = process.copy()
+    alone[..., 0] -= 1
     with np.errstate(divide="ignore", invalid="ignore"):
-        diagonal = image.variance_of(process) / (4 * m00) ** 2
+        whole, known_m00 = image.variance_of(process), image.variance_of(alone)
+        brightness = np.square(image.errors[0, 0].astype(float))
         row = image.product_of(TRIPLE, process) / m00**2
         total = np.square(image.errors).sum(axis=(0, 1)) / (4 * m00**2)
-        gradient = process.copy()
-        gradient[..., 0] -= 4 * xi0
-        along = np.sqrt(image.variance_of(gradient)) / (4 * m00)
-    return EigenvalueNoise.of(total, row, diagonal, along)
+        with_m00 = (whole - known_m00 - brightness) / (8 * m00**2)
+        along = np.sqrt(known_m00) / (4 * m00)
+        return EigenvalueNoise.of(
+            total, row, whole / (4 * m00) ** 2, along, np.sqrt(brightness) / np.abs(m00), with_m00
+        )
 
 
 def largest_deviation_by_noise(image: MuellerImage) -> NDArray[np.float64]:

@@ -28,6 +28,8 @@ from processing.storage.product import Plane, Product, ProductWriter, Step
 #: Limits of the validity mask (docs/quantities.md, "xi0 and its interval"): on the noise, not on the outcome.
 MAX_CONDITION = 100.0
 MAX_STDERR = 0.1
+#: Relative error of m00, by which all is divided: beyond, xi0 follows it more than the sample. As `lit` of quantities.
+MAX_M00_ERROR = 0.1
 #: Half the 95 % interval of a normal distribution, in standard deviations.
 NORMAL_95 = 1.959964
 
@@ -94,11 +96,11 @@ def eigenvalue_block(image: MuellerImage) -> dict[str, NDArray[Any]]:
     """Planes `MUELLER_PLANES` of an image, or of some rows of it."""
     eigenvalues = coherency_eigenvalues(image.matrices)
     noise = coherency_noise(image)
-    found = corrected(eigenvalues.astype(float), noise)
+    found = corrected(eigenvalues.astype(float), noise, image.covariance_of_depolarizer())
     known = np.isfinite(found.xi0)
     # Without standard errors nothing can be taken off.
     xi0 = np.where(known, found.xi0, eigenvalues[..., 0])
-    valid = known & (image.values[0, 0] > 0) & (noise.coupling <= MAX_STDERR)
+    valid = known & (image.values[0, 0] > 0) & (noise.overall <= MAX_STDERR) & (noise.m00 <= MAX_M00_ERROR)
     return {
         "xi0": xi0,
         "xi0_errors": found.stderr,

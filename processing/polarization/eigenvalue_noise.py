@@ -1,13 +1,12 @@
 """What noise does to coherency eigenvalues, and how to take it off: xi0 without bias, with intervals that cover.
 
 Eigenvalues of a noisy matrix repel each other, so the largest is pushed up, most where it hardly stands out: there the
-delta method fails. For a triply degenerate matrix with noise alike in all directions the height of xi0 over the mean of
-the other three, in units of the noise s of one element of the coherency matrix, depends on one number only, the true
-height theta. Its quantiles, by Monte Carlo (`benchmarks/eigenvalue_quantiles.py`), are inverted: the estimate is
-median-unbiased and the intervals are Neyman's. Far above the noise this is the delta method with its second-order term.
+delta method fails. The height of xi0 over the mean of the other three, of a triply degenerate matrix with the noise of
+the instrument, has quantiles that depend on the true height (`processing.polarization.height_quantiles`, by Monte
+Carlo). They are inverted: the estimate is median-unbiased and the intervals are Neyman's. Far above the noise this is
+the delta method with its second-order term.
 
-Noise that is not alike in all directions enters through two variances: along the dominant process (width), and between
-it and the others (shift). Where the small eigenvalues differ by more than noise, the shift is that of their own gaps.
+Where the small eigenvalues differ by more than noise, the shift is that of their own gaps.
 """
 
 from __future__ import annotations
@@ -16,64 +15,21 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from processing.arrays import Array
+from processing.polarization.height_quantiles import true_heights
 from processing.polarization.mueller import coherency
 
-#: Probabilities of the quantiles: two-sided 95 and 68 % about the median.
-LEVELS = np.array([0.025, 0.15865525, 0.5, 0.84134475, 0.975])
+#: Of the levels of `true_heights`, in standard deviations.
 _DEVIATES = np.array([-1.959964, -1.0, 0.0, 1.0, 1.959964])
-#: True heights of the table, in units of the noise.
-THETA = np.concatenate([np.arange(0, 8, 0.5), np.arange(8, 20.1, 2)])
-#: Spread and shift of the observed height beyond the table: sqrt(1 + 1/3), and 4 / theta.
-_SPREAD, _SHIFT = np.sqrt(4 / 3), 4.0
-_QUANTILES = np.array([
-    [2.067, 2.643, 3.328, 4.100, 4.911],  # 0
-    [2.086, 2.662, 3.351, 4.130, 4.945],  # 0.5
-    [2.125, 2.713, 3.420, 4.225, 5.071],  # 1
-    [2.194, 2.803, 3.546, 4.377, 5.245],  # 1.5
-    [2.301, 2.948, 3.731, 4.611, 5.529],  # 2
-    [2.446, 3.131, 3.971, 4.901, 5.843],  # 2.5
-    [2.621, 3.373, 4.262, 5.240, 6.226],  # 3
-    [2.836, 3.644, 4.598, 5.621, 6.638],  # 3.5
-    [3.103, 3.975, 4.968, 6.009, 7.037],  # 4
-    [3.421, 4.346, 5.367, 6.431, 7.464],  # 4.5
-    [3.781, 4.735, 5.786, 6.865, 7.918],  # 5
-    [4.162, 5.141, 6.213, 7.309, 8.363],  # 5.5
-    [4.554, 5.572, 6.656, 7.757, 8.829],  # 6
-    [4.985, 6.011, 7.108, 8.224, 9.290],  # 6.5
-    [5.411, 6.455, 7.563, 8.677, 9.754],  # 7
-    [5.863, 6.917, 8.027, 9.147, 10.220],  # 7.5
-    [6.320, 7.381, 8.494, 9.623, 10.707],  # 8
-    [8.179, 9.270, 10.397, 11.535, 12.616],  # 10
-    [10.103, 11.191, 12.335, 13.479, 14.555],  # 12
-    [12.045, 13.140, 14.286, 15.426, 16.532],  # 14
-    [14.013, 15.101, 16.247, 17.398, 18.497],  # 16
-    [15.970, 17.073, 18.224, 19.375, 20.483],  # 18
-    [17.944, 19.055, 20.201, 21.342, 22.461],  # 20
-])  # fmt: skip
+#: Beyond the table the observed height is theta + 4 c^2 / theta with the noise c between dominant process and others.
+_SHIFT = 4.0
+#: True heights between which the table gives way to that, in units of the noise. There the process is known, and its
+#: own noise says more than the average over processes of the same width.
+_NEAR, _FAR = 6.0, 10.0
 
-#: Grid of the inverted table: observed height, and width over that of noise alike in all directions.
-_X = np.arange(-20.0, 25.0, 0.1)
-_WIDTH = np.arange(0.2, 8.01, 0.1)
-#: Noise this many times as large over all directions as about the dominant process may itself have made that process.
-_UNLIKE = 1.2
-
-
-def _inverted() -> NDArray[np.float64]:
-    """True height (levels, widths, observed) of which the observed one is the quantile of each level."""
-    # Below 0 the table is continued as an odd function: an estimate may fall below the ideal depolarizer, and must
-    # where its mean is to be right.
-    heights = np.concatenate([-THETA[:0:-1], THETA])
-    observed = np.concatenate([2 * _QUANTILES[0] - _QUANTILES[:0:-1], _QUANTILES])
-    median = observed[:, 2]
-    return np.array(
-        [[np.interp(_X, median + width * (column - median), heights) for width in _WIDTH] for column in observed.T]
-    )
-
-
-_INVERTED = _inverted()
+#: Variance of xi0 over that with m00 known, at least: errors of both that cancel are known no better.
+_LEAST = 0.01
 
 _UNITS = coherency(np.eye(16).reshape(16, 4, 4)) / 2
 #: Re tr(T_a T_b T_k) of the Hermitian matrices T of single Mueller elements.
@@ -86,19 +42,25 @@ class EigenvalueNoise:
 
     Attributes
     ----------
-    along : standard error of xi0 to first order.
+    along : standard error of xi0 to first order, with m00 known.
+    m00 : relative standard error of m00.
+    with_m00 : covariance of the relative error of m00 and that of xi0 with m00 known.
     coupling : root mean square of the elements of H between the dominant process and another.
     others : sum of squares that noise alone puts into the deviations of xi1, xi2, xi3 from their mean.
     overall : root mean square of an element of H over all directions; `coupling`, where they are alike.
     """
 
     along: Array
+    m00: Array
+    with_m00: Array
     coupling: Array
     others: Array
     overall: Array
 
     @classmethod
-    def of(cls, total: Array, row: Array, diagonal: Array, along: Array) -> EigenvalueNoise:
+    def of(
+        cls, total: Array, row: Array, diagonal: Array, along: Array, m00: Array, with_m00: Array
+    ) -> EigenvalueNoise:
         """From second moments of the noise E of H / (2 m00) about the dominant process v.
 
         Parameters
@@ -106,14 +68,21 @@ class EigenvalueNoise:
         total : E tr(E^2).
         row : v^H E[E^2] v.
         diagonal : variance of v^H E v.
-        along : standard error of xi0; differs from sqrt(diagonal) by the noise of m00.
+        along, m00, with_m00 : as the attributes.
         """
         with np.errstate(invalid="ignore"):
             coupling = np.sqrt(np.maximum(row - diagonal, 0) / 3)
             # In the 3 x 3 block of the others 9 numbers are noise; 1 is their mean.
             others = np.maximum(total - 2 * row + diagonal, 0) * (8 / 9)
-            overall = np.sqrt(total / 15)
-        return cls(along, coupling, others, overall)
+            overall = np.sqrt(total / 16)
+        return cls(along, m00, with_m00, coupling, others, overall)
+
+    def error_at(self, height: Array) -> Array:
+        """Standard error of xi0 to first order, of a matrix of this height: M is divided by its noisy m00."""
+        share = 0.75 * height
+        with np.errstate(invalid="ignore"):
+            variance = self.along**2 - 2 * share * self.with_m00 + (share * self.m00) ** 2
+            return np.asarray(np.sqrt(np.maximum(variance, _LEAST * self.along**2)))
 
 
 @dataclass(frozen=True)
@@ -145,17 +114,17 @@ class CorrectedXi0:
         return np.asarray(np.maximum(farthest[0], np.maximum(farthest[1], 0.25 - self.xi0) / _DEVIATES[-1]))
 
 
-def corrected(eigenvalues: Array, noise: EigenvalueNoise) -> CorrectedXi0:
-    """Take the noise off observed eigenvalues (..., 4), descending, of sum 1."""
+def corrected(eigenvalues: Array, noise: EigenvalueNoise, covariance: NDArray[np.float64]) -> CorrectedXi0:
+    """Take the noise off observed eigenvalues (..., 4), descending, of sum 1.
+
+    Parameters
+    ----------
+    covariance : (16, 16), of the elements of an ideal depolarizer, in any unit.
+    """
     xi = np.asarray(eigenvalues, dtype=float)
     height = (4 * xi[..., 0] - 1) / 3
     with np.errstate(divide="ignore", invalid="ignore"):
-        bounds = _scaled_heights(height, noise.along, noise.coupling)
-        # States of poor condition: where one direction is noisier, the process found is likely to be that of its noise.
-        unlike = noise.overall > _UNLIKE * noise.coupling
-        others = _scaled_heights(height[unlike], noise.along[unlike], noise.overall[unlike])
-        bounds[:2, unlike] = np.maximum(bounds[:2, unlike], others[:2])
-        bounds[3:, unlike] = np.minimum(bounds[3:, unlike], others[3:])
+        bounds = _heights(height, noise, covariance)
         spread, extra = _small_eigenvalues(xi, bounds[2], noise)
     values = 0.25 + 0.75 * bounds - extra
     shift = xi[..., 0] - values[2]
@@ -163,23 +132,23 @@ def corrected(eigenvalues: Array, noise: EigenvalueNoise) -> CorrectedXi0:
     return CorrectedXi0(values[2], values[[3, 1]], values[[4, 0]], shift, spread)
 
 
-def _scaled_heights(height: Array, along: Array, noise: Array) -> Array:
-    """`_heights` of heights with this noise of an element of H, in their own unit."""
-    # The table's own noise has a first-order width of sqrt(3)/2 in xi0.
-    return _heights(height / noise, along / (np.sqrt(0.75) * noise)) * noise
-
-
-def _heights(observed: Array, width: Array) -> Array:
-    """True heights (5, ...) whose quantile of each of `LEVELS` is the observed one."""
-    known = np.isfinite(observed) & np.isfinite(width)
-    at = np.stack([np.where(known, width - _WIDTH[0], 0) / 0.1, np.where(known, observed - _X[0], 0) / 0.1])
-    found = np.empty((len(LEVELS), *observed.shape))
-    for k, deviate in enumerate(_DEVIATES):
-        far = observed - _SPREAD * width * deviate
-        beyond = (far + np.sqrt(np.maximum(far**2 - 4 * _SHIFT, 0))) / 2
-        near = map_coordinates(_INVERTED[k], at, order=1, mode="nearest")
-        found[k] = np.where(beyond > THETA[-1] - 4, beyond, near)
-    return np.where(known, found, np.nan)
+def _heights(height: Array, noise: EigenvalueNoise, covariance: NDArray[np.float64]) -> Array:
+    """True heights (5, ...) whose quantile of each of the levels is the observed one."""
+    unit = noise.overall
+    known = np.isfinite(height) & np.isfinite(noise.along) & (noise.along > 0)
+    observed, width = np.where(known, height / unit, 0.0), np.where(known, noise.along / unit, 1.0)
+    near = true_heights(covariance, observed, width)
+    middle = near[2].copy()
+    # What m00 adds is in proportion to the true height.
+    near = middle + (near - middle) * (noise.error_at(np.maximum(middle, 0) * unit) / noise.along)
+    error = 4 / 3 * noise.error_at(height) / unit
+    repelled = 4 * _SHIFT * (noise.coupling / unit) ** 2
+    for bound, deviate in zip(near, _DEVIATES, strict=True):
+        far = observed - error * deviate
+        beyond = (far + np.sqrt(np.maximum(far**2 - repelled, 0))) / 2
+        share = np.clip((beyond - _NEAR) / (_FAR - _NEAR), 0, 1)
+        bound += share * (beyond - bound)
+    return np.where(known, near * unit, np.nan)
 
 
 def _small_eigenvalues(xi: Array, height: Array, noise: EigenvalueNoise) -> tuple[Array, Array]:

@@ -170,6 +170,22 @@ class MuellerImage:
         full *= scale[:, :, None] * scale[:, None, :]
         return np.asarray(full.reshape(*self.mask.shape, 16, 16))
 
+    def covariance_of_depolarizer(self) -> NDArray[np.float64]:
+        """Covariance (16, 16) of the elements of an ideal depolarizer, in any unit: the same for every pixel.
+
+        Where it sends as much light as makes shot and read noise alike. That matters for states of unequal exposure
+        only: an ideal depolarizer sends the same light in all others.
+        """
+        variance = np.zeros(len(self.w))
+        if not np.isnan(self.noise_slope).any():
+            for part in (self.noise_slope * self.w[:, 0], self.noise_floor):
+                variance += part / part.mean() if part.any() else 0.0
+        if not variance.all():
+            variance = np.ones(len(self.w))
+        if self.facts["weighted"]:
+            return np.asarray(np.linalg.inv((self.w.T / variance) @ self.w))
+        return np.asarray((self._inverse * variance) @ self._inverse.T)
+
     def variance_of(self, gradient: NDArray[np.floating]) -> NDArray[np.float64]:
         """First-order variance (rows, columns) of a quantity with gradient (rows, columns, 16) by the elements.
 

@@ -2,17 +2,26 @@
 
 import numpy as np
 import pytest
-from noisy_images import five_samples, noisy_image, rgb950
+from noisy_images import five_samples, noisy_image, random_processes, rgb950, state_tables
 
 from processing.maps.coherency_noise import largest_deviation_by_noise
 from processing.maps.xi0 import eigenvalue_block
-from processing.polarization import mueller, triply_degenerate
+from processing.polarization import triply_degenerate
 from processing.polarization.cloude import coherency_eigenvalues
-from processing.polarization.eigenvalue_noise import THETA, EigenvalueNoise, corrected
+from processing.polarization.eigenvalue_noise import EigenvalueNoise, corrected
+from processing.polarization.height_quantiles import LEVELS, THETA, true_heights
 from processing.polarization.quantities import deviation_from_td
 
 PIXELS = 2500
 PURE = five_samples()["non-depolarizing"]
+
+
+def assert_covered(found: dict[str, np.ndarray], truth: float) -> None:
+    # Sampling makes 0.028 and 0.013 at three deviations. Quantiles at widths that are near, not equal, make the
+    # intervals of 68 % a little long.
+    for name, least, most in (("xi0_68", 0.655, 0.725), ("xi0_95", 0.93, 0.97)):
+        low, high = found[name].reshape(2, -1)
+        assert least < np.mean((low <= truth) & (truth <= high)) < most, name
 
 
 def blocks(matrix: np.ndarray, electrons: float, seed: int = 5) -> dict[str, np.ndarray]:
@@ -23,10 +32,7 @@ def blocks(matrix: np.ndarray, electrons: float, seed: int = 5) -> dict[str, np.
 @pytest.mark.parametrize("truth", [0.25, 0.255, 0.3, 0.4, 0.5, 0.7, 1.0])
 def test_intervals_of_a_triply_degenerate_matrix_cover(truth, electrons):
     found = blocks(triply_degenerate.mueller_matrix(PURE, truth), electrons)
-    # Sampling makes 0.013 and 0.006; noise that is not alike in all directions leaves the rest (docs/quantities.md).
-    for name, level, below in (("xi0_68", 0.683, 0.065), ("xi0_95", 0.95, 0.035)):
-        low, high = found[name].reshape(2, -1)
-        assert level - below < np.mean((low <= truth) & (truth <= high)) < level + 0.04, name
+    assert_covered(found, truth)
     # Nothing is left out because of what came out.
     assert found["valid"].all()
     quoted = np.median(found["xi0_errors"])
@@ -35,27 +41,52 @@ def test_intervals_of_a_triply_degenerate_matrix_cover(truth, electrons):
         assert np.median(found["xi0"]) == pytest.approx(truth, abs=0.15 * quoted)
     # One number for either side, where the interval is lopsided too: half of it had pulls of rms 2 near 1/4.
     pull = np.abs(found["xi0"] - truth) / found["xi0_errors"]
-    # Where xi0 leaves the noise of 1/4 the interval is longest against the scatter: 0.8.
-    assert 0.78 < np.sqrt(np.mean(pull**2)) < 1.08
+    # Where xi0 leaves the noise of 1/4 the interval is longest against the scatter: 0.7.
+    assert 0.68 < np.sqrt(np.mean(pull**2)) < 1.08
     assert np.mean(pull < 1) > 0.683 - 0.03
     assert np.mean(pull < 1.96) > 0.95 - 0.03
 
 
-@pytest.mark.parametrize("truth", [0.25, 0.3])
-def test_intervals_near_a_quarter_are_wide_where_one_direction_is_noisier(truth):
-    # Two plates of 127 degrees at 9 to 1: condition number 26, one direction has 12 times the usual variance.
-    states = np.deg2rad(4.7) * np.arange(41)
-    generator = mueller.retarder(states, np.deg2rad(127)) @ np.array([1.0, 1, 0, 0]) / 2
-    analyzer = np.array([1.0, -1, 0, 0]) / 2 @ mueller.retarder(9 * states, np.deg2rad(127))
-    w = np.einsum("ni,nj->nij", analyzer, generator).reshape(-1, 16)
-    random = np.random.default_rng(3)
-    samples = [PURE, mueller.retarder(0.3, 1.0), mueller.retarder(1.2, 2.5) @ mueller.retarder(0.4, 2.0)]
-    matrices = np.stack([triply_degenerate.mueller_matrix(samples[k], truth) for k in random.integers(3, size=PIXELS)])
-    found = eigenvalue_block(noisy_image(matrices, 500, 5, w))
-    # Half of the 68 % and 60 of the 95 % before; what is missing still is told in docs/quantities.md.
-    for name, least in (("xi0_68", 0.6), ("xi0_95", 0.8)):
-        low, high = found[name].reshape(2, -1)
-        assert np.mean((low <= truth) & (truth <= high)) > least, name
+@pytest.mark.parametrize("truth", [0.25, 0.3, 0.4, 0.7])
+@pytest.mark.parametrize("states", ["127 degrees, 9 to 1, 41", "24 random states", "24 others"])
+def test_intervals_cover_where_one_direction_is_much_noisier(states, truth):
+    # Condition numbers 26, 51 and 80; the first has a direction of 12 times the usual variance.
+    w = state_tables()[states]
+    matrices = triply_degenerate.mueller_matrix(random_processes(PIXELS, 3), truth)
+    for electrons in (2000, 20_000)[states == "24 others" :]:
+        found = eigenvalue_block(noisy_image(matrices, electrons, 5, w))
+        assert found["valid"].all()
+        assert_covered(found, truth)
+
+
+def test_states_that_do_not_determine_the_brightness_give_no_xi0():
+    # xi0 is divided by m00, whose error is half of it here.
+    image = noisy_image(random_processes(500, 1), 60, 5, state_tables()["24 others"])
+    assert not eigenvalue_block(image)["valid"].any()
+
+
+def test_exposures_may_differ():
+    w = state_tables()["RGB950's 40"] * np.geomspace(0.1, 1, 40)[:, None]
+    for truth, electrons in ((0.25, 20), (0.3, 2000)):
+        found = eigenvalue_block(
+            noisy_image(triply_degenerate.mueller_matrix(random_processes(PIXELS, 1), truth), electrons, 5, w)
+        )
+        assert_covered(found, truth)
+
+
+def test_heights_in_even_noise_are_those_of_other_draws():
+    random = np.random.default_rng(1)
+    parts = random.normal(size=(2, 40_000, 4, 4))
+    noise = parts[0] + 1j * parts[1]
+    noise = (noise + noise.conj().swapaxes(1, 2)) / 2
+    for theta in (3.0, 10.0):
+        noise[:, 0, 0] += theta
+        values = np.linalg.eigvalsh(noise)
+        noise[:, 0, 0] -= theta
+        seen = np.quantile(values[:, 3] - values[:, :3].mean(axis=1), LEVELS)
+        found = true_heights(np.eye(16), seen, np.full(len(LEVELS), np.sqrt(0.75)))
+        # The draws of the two scatter by 0.06 in the outermost quantiles at 3.
+        np.testing.assert_allclose(np.diagonal(found), theta, atol=0.2)
 
 
 @pytest.mark.parametrize("electrons", [200, 20_000])
@@ -107,10 +138,11 @@ def test_the_weighted_estimate_has_the_same_noise_within_its_weights():
 
 def test_far_above_the_noise_the_table_goes_on_smoothly():
     even = np.full(400, 0.01)
-    noise = EigenvalueNoise(even * np.sqrt(0.75), even, np.zeros(400), even)
+    none = np.zeros(400)
+    noise = EigenvalueNoise(even * np.sqrt(0.75), none, none, even, none, even)
     xi0 = np.linspace(0.25, 0.25 + 0.75 * 0.01 * (THETA[-1] + 4), 400)
     rest = (1 - xi0) / 3
-    found = corrected(np.stack([xi0, rest, rest, rest], axis=-1), noise)
+    found = corrected(np.stack([xi0, rest, rest, rest], axis=-1), noise, np.eye(16))
     for values in (found.xi0, *found.interval_68, *found.interval_95):
         steps = np.diff(values)
         assert np.all(steps > 0)
