@@ -3,8 +3,8 @@
     python benchmarks/xi0_coverage.py [--pixels 4000]
 
 An entry is the part of the truths, %, within the 68 and the 95 % interval: the least and the most of those of three
-light levels where the mask says that xi0 can be known. Below them: the worst of twelve single processes; it is on average
-over processes that intervals hold.
+light levels where the mask says that xi0 can be known. Below them: the worst of twelve single processes; what holds
+is the average over processes.
 """
 
 from __future__ import annotations
