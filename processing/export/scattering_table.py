@@ -10,10 +10,7 @@ import numpy as np
 from processing.doors import require_place
 from processing.errors import ProcessError
 from processing.export.csv_file import write_csv
-from processing.reflectance.tables import ScatteringTable
-
-#: Of the columns before the quantities.
-ANGLES = ("theta_h_deg", "theta_d_deg", "phi_d_deg")
+from processing.reflectance.tables import AXES, ScatteringTable
 
 
 def table_to_csv(source: Path, out: Path, quantities: Sequence[str] = (), overwrite: bool = False) -> list[Path]:
@@ -40,7 +37,7 @@ def table_to_csv(source: Path, out: Path, quantities: Sequence[str] = (), overwr
     # In the order of the axes, not in that of the first samples.
     order = np.argsort(table.bins)
     centres = table.axes.angles(table.bins[order])
-    columns = {name: np.rad2deg(angle).round(9) for name, angle in zip(ANGLES, centres, strict=True)}
+    columns = {name: np.rad2deg(angle).round(9) for name, angle in zip(AXES, centres, strict=True)}
     columns["samples"] = table.count[order]
     mean, variance = table.mean[:, order], table.variance[:, order]
     for k, name in enumerate(table.quantities):
@@ -52,5 +49,5 @@ def table_to_csv(source: Path, out: Path, quantities: Sequence[str] = (), overwr
         "layout": table.axes.layout,
         "frames": table.frames or "none: scalars",
     }
-    write_csv(path, facts, dict.fromkeys(ANGLES, "degree"), columns)
+    write_csv(path, facts, dict.fromkeys(AXES, "degree"), columns)
     return [path]

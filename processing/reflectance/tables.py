@@ -20,9 +20,15 @@ from processing.errors import ProcessError
 from processing.geometry.rusinkiewicz import Angles
 from processing.reflectance.table_axes import SHAPE, Layout, TableAxes
 from processing.storage.h5_door import damage_as, mark_of, open_h5, require_dataset
+from processing.storage.nexus import add_group, add_scales, attach, declare, default_plot, describe_light
 from processing.storage.provenance import Step, read_steps, sign, write_steps
 
-SCHEMA_VERSION = 1
+#: 1 had everything in the root, without NeXus groups.
+SCHEMA_VERSION = 2
+
+
+#: Centres of the bins along each axis, degrees.
+AXES = ("theta_h_deg", "theta_d_deg", "phi_d_deg")
 
 
 class TableError(ProcessError):
@@ -156,17 +162,43 @@ class ScatteringTable:
             h5.attrs["layout"] = self.axes.layout
             h5.attrs["simulated"] = self.simulated
             h5.attrs["frames"] = self.frames
-            h5.attrs["quantities"] = list(self.quantities)
-            for name in ("theta_h_deg", "theta_d_deg", "phi_d_deg"):
-                h5[name] = getattr(self.axes, name)
-            options: dict[str, Any] = {"compression": "gzip", "shuffle": True} if self.bins.size else {}
-            h5.create_dataset("bin", data=self.bins, **options)
-            h5.create_dataset("count", data=self.count, **options)
-            h5.create_dataset("sum", data=self._sum, **options)
-            h5.create_dataset("sum_of_squares", data=self._square, **options)
-            write_steps(h5, steps)
+            h5.attrs.update({"quantities": list(self.quantities), "default": "entry"})
+            entry = add_group(h5, "entry", "NXentry")
+            entry.attrs.update({"default": "data", "simulated": self.simulated})
+            title = f"{', '.join(self.quantities)} over scattering angles, {self.wavelength_nm:g} nm"
+            entry["title"] = title
+            declare(entry)
+            describe_light(entry, self.wavelength_nm, "those of the captures in the table")
+            self._lay_out_bins(add_group(entry, "data", "NXdata"), title)
+            sums = add_group(entry, "sums", "NXcollection")
+            for name, values in (("sum", self._sum), ("sum_of_squares", self._square)):
+                _put(sums, name, values, entry["data"], ("quantity", "bin"), "", f"{name} over the samples of a bin")
+            for name in AXES:
+                sums[name] = getattr(self.axes, name)
+                sums[name].attrs.update({"units": "degree", "long_name": "centres of all bins along the axis"})
+            write_steps(entry, steps)
             sign(h5, steps)
         partial.replace(path)
+
+    def _lay_out_bins(self, data: h5py.Group, title: str) -> None:
+        """What people look at: of each bin that has samples their mean and variance, their number, and its angles."""
+        add_scales(data, {"quantity": len(self.quantities)})
+        _put(data, "bin", self.bins, data, (), "", "number of the bin, counted over theta_h, theta_d, phi_d")
+        data["bin"].make_scale("bin")
+        data["quantity_name"] = [name.encode() for name in self.quantities]
+        attach(data["quantity_name"], data, ["quantity"])
+        _put(data, "count", self.count, data, ["bin"], "", "samples in the bin")
+        for name, angle in zip(AXES, self.axes.angles(self.bins), strict=True):
+            _put(data, name, np.rad2deg(angle).round(9), data, ["bin"], "degree", "centre of the bin")
+        _put(data, "mean", self.mean, data, ("quantity", "bin"), "", "mean of the samples in the bin")
+        _put(
+            data, "sample_variance", self.variance, data, ("quantity", "bin"), "", "variance of the samples in the bin"
+        )
+        default_plot(data, "mean", ("quantity", "bin"), title)
+        data["mean"].attrs["coordinates"] = " ".join([*AXES, "count", "quantity_name"])
+        for name in (*AXES, "count"):
+            data.attrs[f"{name}_indices"] = 1
+        data.attrs["quantity_name_indices"] = 0
 
     @classmethod
     def load(cls, path: Path | str) -> ScatteringTable:
@@ -176,6 +208,12 @@ class ScatteringTable:
             if "umov_table" not in h5.attrs:
                 raise TableError(f"{path} is no scattering table. `process table` makes one.")
             a = h5.attrs
+            if int(a["umov_table"]) > SCHEMA_VERSION:
+                raise TableError(
+                    f"{path} has table version {a['umov_table']}; this program reads up to {SCHEMA_VERSION}."
+                )
+            first = int(a["umov_table"]) == 1
+            data, sums = (h5, h5) if first else (h5["entry/data"], h5["entry/sums"])
             table = cls(
                 tuple(str(q) for q in a["quantities"]),
                 float(a["wavelength_nm"]),
@@ -183,15 +221,15 @@ class ScatteringTable:
                 bool(a["simulated"]),
                 str(a["frames"]),
             )
-            if not np.allclose(h5["theta_h_deg"][...], table.axes.theta_h_deg):
+            if not np.allclose(sums["theta_h_deg"][...], table.axes.theta_h_deg):
                 raise TableError(f"{path}: its theta_h axis is not that of layout {a['layout']!r}")
-            bins = require_dataset(h5, "bin", (None,), "i")[...]
+            bins = require_dataset(data, "bin", (None,), "i")[...]
             n, q = bins.size, len(table.quantities)
             if n and not (bins.min() >= 0 and bins.max() < table._row.size and np.unique(bins).size == n):
                 raise ValueError("bins outside the axes, or given twice")
-            table.bins, table.count = bins, require_dataset(h5, "count", (n,), "i")[...]
-            table._sum = require_dataset(h5, "sum", (q, n), "f")[...]
-            table._square = require_dataset(h5, "sum_of_squares", (q, n), "f")[...]
+            table.bins, table.count = bins, require_dataset(data, "count", (n,), "i")[...]
+            table._sum = require_dataset(sums, "sum", (q, n), "f")[...]
+            table._square = require_dataset(sums, "sum_of_squares", (q, n), "f")[...]
         table._row[table.bins] = np.arange(table.bins.size, dtype=np.int32)
         return table
 
@@ -205,7 +243,23 @@ def table_steps(path: Path | str) -> tuple[Step, ...]:
     """Steps that led to a table, oldest first."""
     failing = damage_as(TableError, f"{path} cannot be read as a scattering table")
     with failing, open_h5(Path(path), TableError) as h5:
-        return read_steps(h5)
+        return read_steps(h5.get("entry", h5))
+
+
+def _put(
+    group: h5py.Group,
+    name: str,
+    values: NDArray[Any],
+    scales: h5py.Group,
+    dimensions: Sequence[str],
+    units: str,
+    long_name: str,
+) -> None:
+    """Store an array, compressed, its dimensions named by scales."""
+    options: dict[str, Any] = {"compression": "gzip", "shuffle": True} if values.size else {}
+    dataset = group.create_dataset(name, data=values, **options)
+    dataset.attrs.update({"units": units, "long_name": long_name})
+    attach(dataset, scales, dimensions)
 
 
 def _kind(simulated: bool) -> str:

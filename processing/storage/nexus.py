@@ -24,6 +24,7 @@ LONG_NAMES = {
     "x": "column of the picture, from the left",
     "row": "row of the Mueller matrix",
     "column": "column of the Mueller matrix",
+    "quantity": "number of the quantity; quantity_name has its name",
 }
 _PIXEL = "pixel"
 

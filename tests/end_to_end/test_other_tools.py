@@ -44,6 +44,17 @@ def product(capture) -> Path:
     return Reduction(capture).make(capture.with_suffix(".mueller.h5"))
 
 
+@pytest.fixture
+def table(tmp_path):
+    rng = np.random.default_rng(5)
+    bins = ScatteringTable(("xi0", "xi0_variance"), 662, "renderer", simulated=True)
+    angles = Angles(*(rng.uniform(0, most, 400) for most in (0.5, 1.2, 3.0)))
+    bins.add(angles, rng.normal(0.8, 0.05, (2, 400)))
+    bins.add(Angles(*(angle[:200] for angle in angles)), rng.normal(0.8, 0.05, (2, 200)))
+    bins.save(tmp_path / "table.h5")
+    return tmp_path / "table.h5"
+
+
 def test_the_lines_in_the_docs_open_both_with_xarray(capture, product, monkeypatch):
     code = re.search(r"```python\n(.*?)```", (DOCS / "other-tools.md").read_text(), re.DOTALL)
     monkeypatch.chdir(capture.parents[1])
@@ -62,6 +73,19 @@ def test_the_lines_in_the_docs_open_both_with_xarray(capture, product, monkeypat
         assert not [name for name in (*frames.dims, *image.dims) if name.startswith("phony")]
 
 
+def test_xarray_sees_the_bins_of_a_scattering_table(table):
+    there = ScatteringTable.load(table)
+    with xr.open_dataset(table, engine="h5netcdf", group="entry/data") as bins:
+        assert bins["mean"].dims == ("quantity", "bin")
+        assert [*bins["quantity_name"].values.astype(str)] == list(there.quantities)
+        np.testing.assert_array_equal(bins["mean"], there.mean)
+        np.testing.assert_array_equal(bins["sample_variance"], there.variance)
+        np.testing.assert_array_equal(bins["bin"], there.bins)
+        at = Angles(*(np.deg2rad(bins[name].values) for name in ("theta_h_deg", "theta_d_deg", "phi_d_deg")))
+        np.testing.assert_array_equal(there.axes.bins(at), there.bins)
+        assert set(bins["mean"].coords) >= {"theta_h_deg", "theta_d_deg", "phi_d_deg", "count", "quantity_name"}
+
+
 def test_a_product_of_an_earlier_version_has_its_flags(product):
     with h5py.File(product, "r+") as h5:
         h5.move("entry/data/pixel_flags", "entry/data/pixel_mask")
@@ -78,8 +102,8 @@ def test_a_whole_capture_is_a_tree_for_xarray(capture):
         assert tree["entry/instrument/detector/row_crc32"].dims == ("state", "channel", "y")
 
 
-def test_the_default_plot_has_its_axes_and_coordinates(capture, product):
-    for path in (capture, product):
+def test_the_default_plot_has_its_axes_and_coordinates(capture, product, table):
+    for path in (capture, product, table):
         with h5py.File(path) as h5:
             entry = h5[h5.attrs["default"]]
             data = entry[entry.attrs["default"]]
@@ -91,8 +115,8 @@ def test_the_default_plot_has_its_axes_and_coordinates(capture, product):
                 assert len(data[name]) == signal.shape[data.attrs[f"{name}_indices"]]
 
 
-def test_every_number_has_units_and_every_error_its_value(capture, product):
-    for path in (capture, product):
+def test_every_number_has_units_and_every_error_its_value(capture, product, table):
+    for path in (capture, product, table):
         missing, errors = [], []
 
         def look(name: str, node: object, missing: list = missing, errors: list = errors) -> None:
@@ -108,8 +132,8 @@ def test_every_number_has_units_and_every_error_its_value(capture, product):
         assert all(errors)
 
 
-def test_what_the_nexus_definition_requires_is_there(capture, product):
-    for path in (capture, product):
+def test_what_the_nexus_definition_requires_is_there(capture, product, table):
+    for path in (capture, product, table):
         with h5py.File(path) as h5:
             entry = h5["entry"]
             assert entry["definition"].asstr()[()] == "NXoptical_spectroscopy"
@@ -231,13 +255,8 @@ def test_exported_tables_read_back_exactly(exported, product, capture):
     assert [float(line.split(",")[at]) for line in lines[1:]] == list(open_dataset(capture)["psa_deg"].values)
 
 
-def test_an_exported_scattering_table_reads_back_exactly(tmp_path, capsys):
-    rng = np.random.default_rng(5)
-    table = ScatteringTable(("xi0", "xi0_variance"), 662, "renderer", simulated=True)
-    angles = Angles(*(rng.uniform(0, most, 400) for most in (0.5, 1.2, 3.0)))
-    table.add(angles, rng.normal(0.8, 0.05, (2, 400)))
-    table.add(Angles(*(angle[:200] for angle in angles)), rng.normal(0.8, 0.05, (2, 200)))
-    table.save(tmp_path / "table.h5")
+def test_an_exported_scattering_table_reads_back_exactly(tmp_path, table, capsys):
+    table = ScatteringTable.load(table)
     assert _process("export", tmp_path / "table.h5", "--to", "csv") == 0
     path = tmp_path / "table.csv"
     assert capsys.readouterr().out.split() == [str(path)]

@@ -6,7 +6,8 @@ import pytest
 
 from processing.geometry.rusinkiewicz import Angles
 from processing.reflectance.table_axes import SHAPE, TableAxes
-from processing.reflectance.tables import ScatteringTable, TableError
+from processing.reflectance.tables import ScatteringTable, TableError, table_steps
+from processing.storage.provenance import Step
 
 
 def random_angles(count: int, seed: int = 0) -> Angles:
@@ -91,7 +92,27 @@ def test_file_round_trip_keeps_growing_and_merging(tmp_path):
     probe = random_angles(500, 4)
     np.testing.assert_allclose(loaded.lookup(probe), whole.lookup(probe))
     with h5py.File(tmp_path / "t.h5") as h5:
-        np.testing.assert_allclose(h5["theta_h_deg"][...], 90 * (np.arange(91) / 90) ** 2)
+        np.testing.assert_allclose(h5["entry/sums/theta_h_deg"][...], 90 * (np.arange(91) / 90) ** 2)
+
+
+def test_a_table_of_the_first_version_is_read(tmp_path):
+    """It had all arrays in the root."""
+    table = ScatteringTable(("xi0",), 451, "renderer", True)
+    table.add(random_angles(400, 1), np.random.default_rng(3).normal(size=(1, 400)))
+    table.save(tmp_path / "t.h5", steps=[Step("table", {})])
+    with h5py.File(tmp_path / "t.h5", "r+") as h5:
+        for name in ("data/bin", "data/count", "sums/sum", "sums/sum_of_squares", "sums/theta_h_deg", "process_1"):
+            h5.copy(f"entry/{name}", h5, name.split("/")[-1])
+        del h5["entry"]
+        h5.attrs["umov_table"] = 1
+    loaded = ScatteringTable.load(tmp_path / "t.h5")
+    np.testing.assert_array_equal(loaded.mean, table.mean)
+    np.testing.assert_array_equal(loaded.variance, table.variance)
+    assert [step.name for step in table_steps(tmp_path / "t.h5")] == ["table"]
+    with h5py.File(tmp_path / "t.h5", "r+") as h5:
+        h5.attrs["umov_table"] = 3
+    with pytest.raises(TableError, match="table version 3; this program reads up to 2"):
+        ScatteringTable.load(tmp_path / "t.h5")
 
 
 def test_what_does_not_belong_together_is_refused(tmp_path):
