@@ -86,7 +86,7 @@ class Config(BaseModel):
         default=True, description="take the time of an exposure from behind the image, where the camera can send it"
     )
     mosaic_binning: Literal["like_with_like"] | None = Field(
-        default=None, description="on a polarization mosaic the camera bins pixels behind the same polarizer alone"
+        default=None, description="on a mosaic the camera bins pixels behind the same polarizer and colour alone"
     )
     answers_early: bool = Field(
         default=False,

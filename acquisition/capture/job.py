@@ -90,8 +90,9 @@ def check_with_devices(job: Job, rig: Rig, folder: Path) -> list[Check]:
         read_back_s = settings.exposure_s or float(exposure_s)
         close = abs(read_back_s - exposure_s) <= max(0.02 * exposure_s, 5e-5)
         checks.append(Check("camera exposure", close, f"asked {exposure_s:g} s, read back {read_back_s:g} s"))
-    if job.instrument.mosaic is not None:
-        checks.append(_check_mosaic(job.instrument, rig))
+    mosaic = _check_mosaic(job.instrument, rig)
+    if job.instrument.mosaic is not None or not mosaic.passed:
+        checks.append(mosaic)
     rows, columns = frame_shape(rig)
     if job.instrument.beams is not None:
         checks.append(_check_beams(job.instrument.beams, rows, columns))

@@ -14,9 +14,16 @@ def seen_by_camera(instrument: InstrumentModel, camera: Camera) -> InstrumentMod
     ------
     AcquisitionError
         The camera mirrors, bins or leaves out pixels, so which analyzer or colour filter a pixel has cannot be known,
-        the frames hold parts of super-pixels, or the camera names the analyzers otherwise than the instrument.
+        the frames hold parts of super-pixels, the camera names the analyzers otherwise than the instrument,
+        or sends a mosaic that the instrument has not.
     """
     settings, who = camera.settings, camera.describe()
+    if instrument.mosaic is None and who.polarized:
+        raise AcquisitionError(
+            f"pixel format {who.pixel_format} is that of a polarization sensor, and the instrument file has no mosaic, "
+            "as if its pixels saw through no polarizer. Lay the analyzers out as `mosaic` there (see "
+            "mosaic_polarimeter.yaml), or use another camera for this mode"
+        )
     if instrument.mosaic is None and not who.colour:
         return instrument
     wrong = _unknown(settings, camera.bins_like_with_like)

@@ -13,7 +13,9 @@ from tests.conftest import ROOT
 
 def colour_camera(**settings: object) -> SimpleNamespace:
     known = CameraSettings(offset_x=0, offset_y=0, width=20, height=16).model_copy(update=settings)
-    return SimpleNamespace(settings=known, bins_like_with_like=False, describe=lambda: SimpleNamespace(colour=True))
+    return SimpleNamespace(
+        settings=known, bins_like_with_like=False, describe=lambda: SimpleNamespace(colour=True, polarized=False)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -56,3 +58,10 @@ def test_analyzers_that_the_camera_names_are_those_of_the_instrument(told, decla
             seen_by_camera(stokes, camera)
     else:
         assert seen_by_camera(stokes, camera).mosaic == declared
+
+
+def test_a_polarization_sensor_is_no_plain_camera(instrument):
+    camera = colour_camera()
+    camera.describe = lambda: SimpleNamespace(colour=False, polarized=True, pixel_format="PolarizeMono8")
+    with pytest.raises(AcquisitionError, match="PolarizeMono8 is that of a polarization sensor"):
+        seen_by_camera(instrument, camera)

@@ -196,3 +196,13 @@ def test_an_instrument_that_names_the_analyzers_otherwise_than_the_camera_is_ref
     # A raw mosaic is whatever the instrument file says.
     code, err, _ = stokes(MONO, region | {"pixel_format": "PolarizeMono8"}, "--dry-run", mosaic=other)
     assert code == 0, err
+
+
+def test_an_instrument_without_a_mosaic_is_refused_before_anything_moves(
+    acquire: Acquire, small_rig: Callable[..., Path], short_plan: Callable[[str], Path], tmp_path: Path
+) -> None:
+    camera = {"kind": "aravis", "packet_size": 9000, "settings": {"pixel_format": "PolarizeMono12p"}}
+    rig = small_rig(top={"camera": camera}, camera=MONO)
+    code, _, err = acquire("--rig", rig, "--plan", short_plan("drr"), "--sample", "air", "--omega", 180, "--dry-run")
+    assert code != 0
+    assert "mosaic: pixel format PolarizeMono12p is that of a polarization sensor" in " ".join(err.split())
