@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -17,20 +17,42 @@ BINS = 64
 
 def last_frame_png(pixels: NDArray[np.uint16], black: float, full_scale: int) -> bytes:
     """The frame, grey from black level to full scale (square root), saturated pixels red."""
-    thin = thinned(pixels)
-    grey = np.sqrt(np.clip((thin.astype(np.float32) - black) / (full_scale - black), 0, 1)) * 255
-    image = np.repeat(grey.astype(np.uint8)[..., np.newaxis], 3, axis=2)
+    counts = np.arange(full_scale + 1, dtype=np.float32)
+    tones = (np.sqrt(np.clip((counts - black) / (full_scale - black), 0, 1)) * 255).astype(np.uint8)
+    grey = tones[np.minimum(thinned(pixels), full_scale)]
+    if int(pixels.max()) < full_scale:
+        return _png(grey)
+    image = np.repeat(grey[..., np.newaxis], 3, axis=2)
     # A saturated pixel must show even where thinning left it out.
     image[_thin_largest(pixels)[: image.shape[0], : image.shape[1]] >= full_scale] = (40, 40, 255)
     return _png(image)
 
 
-def modulation_png(frames: Sequence[NDArray[np.uint16]], black: float) -> bytes | None:
-    """(max - min) / (max + min) of each pixel of thinned frames; None with fewer than two."""
-    if len(frames) < 2:
-        return None
-    stack = np.stack(frames).astype(np.float32) - black
-    low, high = stack.min(axis=0), stack.max(axis=0)
+class Modulation:
+    """How much each pixel is modulated over a rotation, from its least and most counts so far; thinned frames."""
+
+    def __init__(self) -> None:
+        self._states = 0
+
+    def add(self, pixels: NDArray[np.uint16]) -> None:
+        """One more state with light."""
+        thin = thinned(pixels)
+        if self._states == 0:
+            self._low, self._high = thin.copy(), thin.copy()
+        else:
+            # New arrays: a picture of those before may be in the drawing.
+            self._low, self._high = np.minimum(self._low, thin), np.maximum(self._high, thin)
+        self._states += 1
+
+    def drawing(self, black: float) -> Callable[[], bytes | None]:
+        """Draws (max - min) / (max + min) of the states so far when called; None of fewer than two."""
+        if self._states < 2:
+            return lambda: None
+        low, high = self._low, self._high
+        return lambda: _modulation_png(low.astype(np.float32) - black, high.astype(np.float32) - black)
+
+
+def _modulation_png(low: NDArray[np.float32], high: NDArray[np.float32]) -> bytes:
     return _map_png((high - low) / np.maximum(low + high, 1.0), high)
 
 

@@ -14,7 +14,6 @@ import secrets
 import socket
 import sys
 import threading
-from collections import deque
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
@@ -24,7 +23,7 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 from numpy.typing import NDArray
 
-from acquisition.screen.live_images import dolp_png, histogram, last_frame_png, modulation_png, thinned
+from acquisition.screen.live_images import Modulation, dolp_png, histogram, last_frame_png
 from processing.reports.design import style
 
 Frame = NDArray[np.uint16]
@@ -46,20 +45,20 @@ class Shown:
         self._lock = threading.Lock()
         self._view: dict[str, Any] = {}
         self._frame: Frame | None = None
-        # Every light state thinned out, for the quick look of a rotation.
-        self._thin: deque[Frame] = deque(maxlen=64)
+        # Of every state with light, for the quick look of a rotation.
+        self._modulation = Modulation()
         self._drawn: dict[str, Any] = {}
 
     def update(self, view: dict[str, Any], frame: Frame | None) -> None:
         """Take a view, and the frame that came with it if there is one."""
         with self._lock:
             if view["title"] != self._view.get("title") or view["done"] < self._view.get("done", 0):
-                self._thin.clear()
+                self._modulation = Modulation()
             self._view = view
             if frame is not None:
                 self._frame, self._drawn = frame, {}
                 if view["role"] != "dark":
-                    self._thin.append(thinned(frame).copy())
+                    self._modulation.add(frame)
 
     def snapshot(self) -> dict[str, Any]:
         """What the page asks for twice a second, ready for JSON."""
@@ -75,14 +74,14 @@ class Shown:
     def picture(self, name: str) -> bytes | None:
         """The last frame or the quick look as PNG; None while there is not enough for it."""
         with self._lock:
-            frame, view, thin = self._frame, dict(self._view), list(self._thin)
+            frame, view, modulation = self._frame, dict(self._view), self._modulation.drawing(self._black)
         if frame is None:
             return None
         if name == "frame.png":
             return self._once(name, lambda: last_frame_png(frame, self._black, self._full_scale))
         mosaic = view.get("mosaic")
         if mosaic is None:
-            return self._once(name, lambda: modulation_png(thin, self._black))
+            return self._once(name, modulation)
         if view["role"] == "dark":
             return None
         return self._once(name, lambda: dolp_png(frame, mosaic, self._black))

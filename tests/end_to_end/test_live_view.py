@@ -15,6 +15,7 @@ import urllib.error
 import urllib.request
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -272,6 +273,41 @@ def test_a_picture_is_drawn_once_and_from_the_last_frame(tmp_path):
     assert shown.picture("frame.png") != first[0]
     assert drawn == ["frame.png", "frame.png"]
     assert shown.picture("quick.png")[:4] == b"\x89PNG"
+
+
+def _drawn(png):
+    return cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+
+
+def test_a_saturated_pixel_shows_red_even_where_thinning_leaves_it_out():
+    from acquisition.screen.live_images import last_frame_png
+
+    pixels = np.full((1000, 1200), 1000, np.uint16)
+    grey = _drawn(last_frame_png(pixels, 64.0, 4095))
+    pixels[500, 601] = 4095
+    red = (_drawn(last_frame_png(pixels, 64.0, 4095)) != grey).any(axis=2)
+    assert red.sum() == 1
+    assert red[500 // 3, 601 // 3]
+
+
+def test_the_quick_look_of_a_rotation_is_of_its_light_states_alone():
+    """Against a second run that is shown the extremes only; darks and runs before leave no trace."""
+    from acquisition.screen import live_process
+
+    view = {"title": "x", "done": 1, "role": "sample", "mosaic": None}
+    light = np.random.default_rng(3).integers(500, 4000, size=(12, 64, 80), dtype=np.uint16)
+    whole, extremes = (live_process.Shown(64.0, 4095, True) for _ in range(2))
+    whole.update(view | {"title": "before"}, np.full((32, 32), 4000, np.uint16))
+    for done, frame in enumerate(light, start=1):
+        whole.update(view | {"done": done}, frame)
+        assert (whole.picture("quick.png") is None) == (done == 1)
+    whole.update(view | {"done": 13, "role": "dark"}, np.full((64, 80), 60, np.uint16))
+    for done, frame in enumerate((light.min(axis=0), light.max(axis=0)), start=1):
+        extremes.update(view | {"done": done}, frame)
+    assert whole.picture("quick.png") == extremes.picture("quick.png")
+    low, high = light.min(axis=0) - 64.0, light.max(axis=0) - 64.0
+    tones = (255 * (high - low) / (high + low)).astype(np.uint8)
+    assert np.array_equal(_drawn(whole.picture("quick.png")), cv2.applyColorMap(tones, cv2.COLORMAP_VIRIDIS))
 
 
 def test_the_run_goes_on_when_the_process_of_the_page_is_killed():
