@@ -33,7 +33,7 @@ class Xi0Estimate:
     xi0_stderr, m00_stderr : their standard errors (first order). With no variance given they come
         from the residual of the fit and are NaN if nothing is left over (K < 3).
     condition : condition number of Phi; large where the modelled light has no polarization to modulate.
-    valid : finite, positive M00, condition and standard error within the limits asked for.
+    valid : finite, positive M00, condition and noise (standard error, were xi0 1/4) within the limits asked for.
     unphysical : valid, but outside [1/4, 1] by more than its standard error.
     chi_square : weighted sum of squared residuals over K - 2; NaN for an unweighted fit.
     alpha_0_stderr : standard error of alpha_0 = M00 (4 xi0 - 1)/3, the weight of m0 in the matrix.
@@ -71,7 +71,7 @@ def estimate(
     w : (K, 16), measurement matrix, rows kron(a, g). For a mosaic under one generator state, its 4 channels.
     m0 : (..., 4, 4), dominant Mueller-Jones matrix with element 00 equal to 1; NaN outside the object.
     weighted : weigh by 1/variance; else equal weights as in Jarecki and Kupinski, with the variance propagated.
-    max_condition, max_stderr : limits of the validity mask.
+    max_condition, max_stderr : limits of the validity mask, the second on the error that xi0 would have at 1/4.
 
     Raises
     ------
@@ -159,8 +159,10 @@ class _Sums:
             xi0_stderr = np.sqrt(u * u * cov[0] + 2 * u * v * cov[1] + v * v * cov[2])
             m00_stderr = np.sqrt(cov[0] + 2 * cov[1] + cov[2])
             condition = _condition(self.g)
+            # The error that xi0 would have at 1/4: a limit on its own error would select by outcome.
+            noise = 0.75 * np.sqrt(cov[0]) / total
             # With no degree of freedom there is no residual to judge by: the condition alone decides.
-            precise = (xi0_stderr <= max_stderr) | (not self.have_variance and free == 0)
+            precise = (noise <= max_stderr) | (not self.have_variance and free == 0)
             valid = np.isfinite(xi0) & (total > 0) & (condition <= max_condition) & precise
             slack = np.nan_to_num(xi0_stderr)
             unphysical = valid & ((xi0 < 0.25 - slack) | (xi0 > 1 + slack))

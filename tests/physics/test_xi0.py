@@ -70,6 +70,20 @@ def test_quoted_standard_errors_give_pulls_of_unit_variance(red, weighted):
         assert np.mean(e.chi_square) == pytest.approx(1, abs=0.03)
 
 
+def test_the_mask_looks_at_the_noise_and_not_at_xi0(red):
+    # Read noise that makes an error near the limit of 0.1, which is less at xi0 = 1 than at 1/4.
+    m0 = np.tile(red.mueller_jones(surface(1), 662), (3000, 1, 1))
+    w, random = linear_stokes(VERTICAL), np.random.default_rng(8)
+    shares = []
+    for xi0 in (0.25, 0.6, 1.0):
+        p = measured(triply_degenerate.mueller_matrix(m0, xi0), w)
+        sigma = 0.034
+        e = estimate(p + random.normal(0, sigma, p.shape), np.full_like(p, sigma**2), w, m0)
+        shares.append(e.valid.mean())
+    assert 0.2 < shares[0] < 0.8
+    assert np.ptp(shares) < 0.04
+
+
 def test_without_variance_the_residual_gives_the_error_bars(red, configs):
     rgb950 = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
     w = rgb950.rows(rotating_retarders(1.0).angles_deg).reshape(-1, 16)
