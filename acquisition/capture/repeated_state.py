@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-#: Noise is averaged over so many blocks a side, those with less light than this part of the brightest are left out.
-BLOCKS = 16
+#: Noise is averaged over so many blocks a side, of at least so many pixels a side; blocks with less light than this part
+#: of the brightest are left out.
+BLOCKS, BLOCK_PIXELS = 16, 8
 LIT = 0.2
 #: Changes that are told: of all the light, and from block to block (standard deviation).
 CHANGED = 0.01
@@ -64,6 +65,6 @@ class RepeatedState:
         )
 
     def _means(self, frame: NDArray[np.generic]) -> NDArray[np.float64]:
-        rows, columns = min(BLOCKS, frame.shape[0]), min(BLOCKS, frame.shape[1])
+        rows, columns = (max(1, min(BLOCKS, size // BLOCK_PIXELS)) for size in frame.shape)
         means = cv2.resize(np.asarray(frame, dtype=np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
         return np.asarray(means, dtype=float) - self._black
