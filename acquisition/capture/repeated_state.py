@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-#: Noise is averaged over so many blocks a side, of at least so many pixels a side; blocks with less light than this part
-#: of the brightest are left out.
+#: Noise is averaged over so many blocks a side, each of so many pixels a side at least; those with less light than this
+#: part of the brightest are left out.
 BLOCKS, BLOCK_PIXELS = 16, 8
 LIT = 0.2
 #: Changes that are told: of all the light, and from block to block (standard deviation).
