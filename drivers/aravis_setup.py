@@ -270,12 +270,11 @@ class Setup:
             ("OffsetX", "Width", settings.offset_x, settings.width),
             ("OffsetY", "Height", settings.offset_y, settings.height),
         ):
-            if length is None:
-                with self._features.asking(f"read the limits of {size}"):
-                    length = scale * self._camera.get_integer_bounds(size)[1] - (start or 0)
-            self._features.set_number((size,), self._whole(size, length, scale))
-            if start:
-                self._features.set_number((offset,), self._whole(offset, start, scale))
+            first = self._whole(offset, start or 0, scale)
+            most = self._features.largest(size, first) if length is None else self._whole(size, length, scale)
+            self._features.set_number((size,), most)
+            if first:
+                self._features.set_number((offset,), first)
 
     def _whole(self, name: str, pixels: int, scale: int) -> int:
         if pixels % scale:

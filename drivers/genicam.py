@@ -285,12 +285,22 @@ class Features:
         if not low <= value <= high:
             raise self._refused(f"set {name} to {value:g}", f"its limits are {low:g} to {high:g} now")
 
-    def _check_increment(self, name: str, value: int, low: int) -> None:
+    def largest(self, name: str, taken: int) -> int:
+        """Largest value of a feature of whole numbers that leaves `taken` below its limit, in its steps."""
+        with self.asking(f"read the limits of {name}"):
+            low, high = (int(bound) for bound in self._camera.get_integer_bounds(name))
+            step = self._increment(name)
+        return low + max(0, high - taken - low) // step * step
+
+    def _increment(self, name: str) -> int:
         try:
-            step = max(1, round(self._camera.get_integer_increment(name)))
+            return max(1, int(self._camera.get_integer_increment(name)))
         except self._glib_error:
             # Aravis' error for a bit field whose description states no step.
-            step = 1
+            return 1
+
+    def _check_increment(self, name: str, value: int, low: int) -> None:
+        step = self._increment(name)
         below = low + (value - low) // step * step
         if below != value:
             raise self._refused(f"set {name} to {value}", f"it goes in steps of {step}: {below} or {below + step}")

@@ -123,6 +123,18 @@ def test_the_region_keeps_to_the_steps_of_the_maker(maker: MakersCamera) -> None
             camera.configure(CameraSettings(binning=2))
 
 
+def test_a_region_without_a_size_is_as_large_as_the_steps_allow(tmp_path: Path) -> None:
+    table = tmp_path / "steps.yaml"
+    steps = {"Width": 16, "Height": 2, "OffsetX": 2, "OffsetY": 1}
+    table.write_text(node_map("lucid_tri050s_p").model_copy(update={"step": steps}).model_dump_json())
+    with ExitStack() as stack:
+        camera = MakersCamera(str(table), stack).open(bits=8)
+        back = camera.configure(CameraSettings(exposure_s=1e-4, offset_x=2, offset_y=1))
+        assert (back.width, back.height, back.offset_x, back.offset_y) == (48, 46, 2, 1)
+        with pytest.raises(SettingRefused, match="steps of 16: 48 or 64"):
+            camera.configure(CameraSettings(width=60))
+
+
 @pytest.mark.parametrize("registers", [(DECIMATION_X, DECIMATION_Y), (DECIMATION_Y,)])
 def test_pixels_that_are_left_out_by_a_feature_of_the_maker_s_own_are_noticed(registers: tuple[int, ...]) -> None:
     with ExitStack() as stack:
