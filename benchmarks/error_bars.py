@@ -1,6 +1,6 @@
 """Pull, bias and coverage of every quoted error bar: quantity x light level x sample, by Monte Carlo.
 
-    python benchmarks/error_bars.py [--pixels 1000] [--out table.md]
+    python benchmarks/error_bars.py [--pixels 1000] [--states "24 random states"] [--out table.md]
 
 Each of five samples is measured many times at 20, 200 and 20 000 electrons a state with own Poisson and read noise
 (`noisy_images.py`), and goes through the same functions as `process quantities` and `process xi0`. An entry is
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from noisy_images import LIGHT_LEVELS, five_samples, noisy_image
+from noisy_images import LIGHT_LEVELS, five_samples, noisy_image, state_tables
 
 from processing.maps.quantities import EXTRA, quantities_block
 from processing.maps.xi0 import eigenvalue_block
@@ -42,11 +42,13 @@ class Entry(NamedTuple):
     coverage: float
 
 
-def entries(sample: str, electrons: float, pixels: int, extra: tuple[str, ...] = ()) -> Iterator[Entry]:
-    """Every quantity of one sample at one light level."""
+def entries(
+    sample: str, electrons: float, pixels: int, extra: tuple[str, ...] = (), w: np.ndarray | None = None
+) -> Iterator[Entry]:
+    """Every quantity of one sample at one light level, with the RGB950's states or those of w (N, 16)."""
     matrix = five_samples()[sample]
-    truth = quantities_block(noisy_image(matrix[None], BRIGHT, 0), extra, PAPER_PAIRS)
-    image = noisy_image(np.tile(matrix, (pixels, 1, 1)), electrons, 7)
+    truth = quantities_block(noisy_image(matrix[None], BRIGHT, 0, w), extra, PAPER_PAIRS)
+    image = noisy_image(np.tile(matrix, (pixels, 1, 1)), electrons, 7, w)
     found = quantities_block(image, extra, PAPER_PAIRS)
     for name in found:
         if f"{name}_errors" in found and name not in ("coherency_eigenvalues", "eigenvalue_deviation"):
@@ -82,14 +84,14 @@ def _entry(
     )
 
 
-def table(pixels: int, extra: tuple[str, ...] = EXTRA) -> str:
+def table(pixels: int, extra: tuple[str, ...] = EXTRA, w: np.ndarray | None = None) -> str:
     """The whole table in Markdown."""
     samples = list(five_samples())
     cells = {
         (e.quantity, e.electrons, e.sample): _cell(e)
         for sample in samples
         for electrons in LIGHT_LEVELS
-        for e in entries(sample, electrons, pixels, extra)
+        for e in entries(sample, electrons, pixels, extra, w)
     }
     names = list(dict.fromkeys(name for name, _, _ in cells))
     lines = [f"| quantity | electrons | {' | '.join(samples)} |", "|---|---|" + "---|" * len(samples)]
@@ -110,9 +112,10 @@ def _cell(e: Entry) -> str:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pixels", type=int, default=1000)
+    parser.add_argument("--states", choices=state_tables(), default="RGB950's 40", help="good and poor states")
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
-    text = table(arguments.pixels)
+    text = table(arguments.pixels, w=state_tables()[arguments.states])
     if arguments.out:
         arguments.out.write_text(text, encoding="utf-8")
     print(text)

@@ -43,14 +43,16 @@ PLANES = {
     "s1_errors": Plane((), "count", "standard errors of s1"),
     "s2_errors": Plane((), "count", "standard errors of s2"),
     "stokes_covariance": Plane((6,), "count2", _COVARIANCE),
-    "dolp": Plane((), "", "degree of linear polarization, sqrt(S1^2 + S2^2)/S0; noise biases it upwards near 0"),
-    "dolp_errors": Plane((), "", "standard errors of dolp, first order"),
+    "dolp": Plane((), "", "degree of linear polarization, without what noise adds to S1^2 + S2^2; over S0"),
+    "dolp_errors": Plane((), "", "standard errors of dolp; NaN: not above three of them, an upper limit"),
     "aolp_deg": Plane((), "degree", "angle of linear polarization, 0 to 180, from +x of the analyzer frame"),
-    "aolp_deg_errors": Plane((), "degree", "standard errors of aolp_deg, first order; meaningless where dolp is noise"),
+    "aolp_deg_errors": Plane((), "degree", "standard errors of aolp_deg; NaN: dolp is noise, no angle is determined"),
     "closure": Plane((), "count", "what the model cannot explain of the four channels: I0 + I90 - I45 - I135 if ideal"),
     "pixel_flags": Plane((), "", f"0 = good; bits: {Mask.meaning()}", np.uint8),
 }
 
+#: A degree of polarization has an error bar, and so an angle, above this many of its errors.
+SEEN = 3.0
 #: Without light there is no degree and no angle of polarization; S itself is a measurement all the same.
 RATIOS = ("dolp", "dolp_errors", "aolp_deg", "aolp_deg_errors")
 
@@ -189,6 +191,10 @@ def stokes(
         cross = u * c01 + v * c02
         dolp_variance = (along - 2 * dolp * cross + dolp**2 * c00) / s0**2
         dolp_errors, aolp_errors = np.sqrt(np.maximum(dolp_variance, 0.0)), 0.5 * np.sqrt(across) / linear
+        noise = ~(dolp > SEEN * dolp_errors)
+        dolp_errors[noise] = aolp_errors[noise] = np.nan
+        # Noise across the vector (S1, S2) adds its square.
+        dolp = np.sqrt(np.maximum(linear**2 - across, 0.0)) / s0
     found = {
         "s0": s0,
         "s1": s1,
@@ -259,8 +265,8 @@ def _facts(
         "noise": noise.source if noise else "estimated from the closure",
         "median_closure_over_s0": float(np.median(closure)) if lit.any() else float("nan"),
         "rms_closure_over_s0": float(np.sqrt(np.mean(closure**2))) if lit.any() else float("nan"),
-        "median_dolp": float(np.median(found["dolp"][lit])) if lit.any() else float("nan"),
-        "median_dolp_error": float(np.median(found["dolp_errors"][lit])) if lit.any() else float("nan"),
+        "median_dolp": _median(found["dolp"][lit]),
+        "median_dolp_error": _median(found["dolp_errors"][lit]),
         "pixels": mask.size,
         "pixels_with_light": int(np.sum(found["s0"] > LIT_ERRORS * found["s0_errors"])),
         "masked": counts,
@@ -272,3 +278,8 @@ def condition_number_linear(analyzers: NDArray[np.float64]) -> float:
     """Condition number of the analyzer matrix (channels, 3)."""
     singular = np.linalg.svd(analyzers, compute_uv=False)
     return float(singular[0] / singular[-1])
+
+
+def _median(values: NDArray[Any]) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else float("nan")

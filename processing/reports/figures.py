@@ -122,7 +122,7 @@ def mueller_figure(elements: NDArray[Any], lit: NDArray[np.bool_], title: str, s
 
 def stokes_figure(maps: dict[str, NDArray[Any]], title: str, simulated: bool) -> Figure:
     """S0 (grey), degree of linear polarization with its standard error, and its angle on a cyclic colour map."""
-    angle = np.where(maps["aolp_deg_errors"] > WORST_ORIENTATION_DEG, np.nan, maps["aolp_deg"])
+    angle = np.where(maps["aolp_deg_errors"] <= WORST_ORIENTATION_DEG, maps["aolp_deg"], np.nan)
     panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = [
         ("$S_0$ / counts", maps["s0"], {"cmap": "gray", "vmin": 0}),
         ("degree of linear polarization", maps["dolp"], {"cmap": "viridis", "vmin": 0}),

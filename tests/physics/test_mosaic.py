@@ -9,10 +9,11 @@ import pytest
 
 from processing.reduction.mosaic.fused import bilinear_stokes
 from processing.reduction.mosaic.layout import MosaicError, MosaicLayout
+from processing.reduction.mosaic.merge import MergedFrame
 from processing.reduction.mosaic.methods import METHODS, REACH, demosaic
 from processing.reduction.mosaic.noise import stokes_covariance
 from processing.reduction.mosaic.oriented import directions
-from processing.reduction.stokes import DEFAULT_METHOD
+from processing.reduction.stokes import DEFAULT_METHOD, stokes
 
 NAMES = ("0", "45", "90", "135")
 LAYOUT = MosaicLayout.of((("90", "45"), ("135", "0")), NAMES)
@@ -90,6 +91,33 @@ def test_noise_of_stokes_is_what_the_covariance_says(method: str) -> None:
         measured = np.mean(deviation[:, a] * deviation[:, b])
         scale = np.sqrt(np.mean(told[a][inner]) * np.mean(told[b][inner]))
         assert measured / scale == pytest.approx(np.mean(told[k][inner]) / scale, abs=0.06), (a, b)
+
+
+@pytest.mark.parametrize("electrons", [60.0, 200.0, 20_000.0])
+@pytest.mark.parametrize("polarized", [0.0, 0.4])
+def test_degree_and_angle_of_polarization_have_an_error_bar_where_they_are_seen(
+    polarized: float, electrons: float
+) -> None:
+    random, size = np.random.default_rng(6), (160, 160)
+    light = electrons * np.array([2.0, 2 * polarized * 0.6, -2 * polarized * 0.8])
+    expected = mosaic(np.broadcast_to((ANALYZERS @ light)[:, None, None], (4, *size)))
+    frame = (random.poisson(expected) + random.normal(0, 2.3, size)).astype(np.float32)
+    one = np.ones((1, 1), np.float32)
+    merged = MergedFrame(frame, np.zeros(size, np.uint8), one, one * np.float32(2.3**2))
+    channels = demosaic(frame, LAYOUT, DEFAULT_METHOD)
+    found = stokes(channels, ANALYZERS, LAYOUT, DEFAULT_METHOD, merged, frame)
+    known = np.isfinite(found["dolp_errors"])
+    assert np.array_equal(known, np.isfinite(found["aolp_deg_errors"]))
+    if not polarized:
+        # Above three errors by noise alone: exp(-4.5) = 1.1 %, not all pixels being independent.
+        assert known.mean() < 0.025
+        return
+    assert known.mean() > 0.95
+    turn = (found["aolp_deg"] - np.rad2deg(np.arctan2(-0.8, 0.6)) / 2 + 90) % 180 - 90
+    for error, name in ((found["dolp"] - polarized, "dolp_errors"), (turn, "aolp_deg_errors")):
+        pull = (error / found[name])[known]
+        assert np.sqrt(np.mean(pull**2)) == pytest.approx(1, abs=0.08), name
+        assert abs(np.mean(pull)) < 0.1, name
 
 
 def test_noise_along_edges_is_that_of_the_kernels_there() -> None:
