@@ -207,7 +207,8 @@ def reduce_mueller(
     cut_off = [*left_out.warnings, *cut_off]
     changes = capture_changes(capture, model, states)
     w = measurement_matrix(capture, model, states, changes)
-    inversion = Inversion.of(w.reshape(-1, 16), f"{capture.path}: ", determined_basis(model))
+    what = "".join(f"{text}: " for text in (capture.path, *cut_off))
+    inversion = Inversion.of(w.reshape(-1, 16), what, determined_basis(model))
     correction = correction or Correction.of(capture)
     struck = _among(left_out.hits, every, states)
     reader = BlockReader(capture, states, correction, counts_correction(changes, model), struck)

@@ -202,8 +202,11 @@ def test_polarized_light_has_maps_of_what_the_sample_sends_back(name, weighted, 
 
 def test_states_that_see_less_than_the_instrument_can_are_refused(noisy, tmp_path):
     path, model, _ = noisy("rotating_retarder_stokes", {"psa": np.array([0.0, 90, 180, 270])})
-    with Capture(path) as capture, pytest.raises(NotDetermined, match=r"rank \d, and 4 are needed"):
+    with Capture(path) as capture, pytest.raises(NotDetermined, match=r"rank \d, and 4 are needed") as told:
         reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
+    # Nothing of elements that it never sees, nor of angles of two retarders.
+    assert "m30" in str(told.value)
+    assert not any(word in str(told.value) for word in ("m01", "4.91"))
 
 
 def test_what_needs_the_whole_matrix_says_so(noisy, configs, tmp_path):

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from processing.errors import NotDetermined
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
 from processing.polarization import mueller
@@ -48,6 +49,13 @@ def test_they_are_left_out_and_named(make, tmp_path):
     (warning,) = (text for text in facts["warnings"] if "cut off at zero" in text)
     assert all(str(k) in warning for k in np.flatnonzero(cut))
     assert MuellerImage.load(tmp_path / "m.h5").w.shape[0] == 40 - cut.sum()
+
+
+def test_too_many_left_out_are_named_where_the_rest_is_not_enough(make, tmp_path):
+    path, cut = make(28)
+    with Capture(path) as capture, pytest.raises(NotDetermined, match="cut off at zero") as told:
+        reduce_mueller(capture, capture.instrument, tmp_path / "m.h5", ())
+    assert all(str(k) in str(told.value) for k in np.flatnonzero(cut))
 
 
 def test_nothing_is_left_out_where_counts_are_just_low(make, tmp_path):

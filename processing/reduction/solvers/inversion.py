@@ -54,7 +54,7 @@ class Inversion:
         seen = w @ basis
         found = rank(w)
         if found < basis.shape[1]:
-            raise NotDetermined(_missing(w, found, basis.shape[1], what))
+            raise NotDetermined(_missing(w, found, basis, what))
         u, size, _ = np.linalg.svd(seen, full_matrices=True)
         pinv = basis @ np.linalg.pinv(seen)
         null = np.array(u[:, basis.shape[1] :].T, dtype=float)
@@ -121,14 +121,17 @@ def mueller_planes(
     return out
 
 
-def _missing(w: NDArray[np.float64], found: int, need: int, what: str) -> str:
+def _missing(w: NDArray[np.float64], found: int, basis: NDArray[np.float64], what: str) -> str:
     # An element of M is not determined if its unit vector leaves the row space of W.
     _, _, vt = np.linalg.svd(w, full_matrices=False)
     row_space = vt[:found]
     outside = 1.0 - np.sum(row_space**2, axis=0)
-    lost = [f"m{k // 4}{k % 4}" for k in np.flatnonzero(outside > 1e-6)]
+    could = np.sum(np.linalg.qr(basis)[0] ** 2, axis=1) > 1 - 1e-6
+    lost = ", ".join(f"m{k // 4}{k % 4}" for k in np.flatnonzero((outside > 1e-6) & could))
+    need = basis.shape[1]
+    advice = "an analyzer ratio of 4.91 with 40 states gives rank 16, a ratio of exactly 5 only 12"
     return (
         f"{what}the measurement matrix W has rank {found}, and {need} are needed: {w.shape[0]} intensities a pixel "
-        f"do not determine {', '.join(lost)} (each alone or in combination). Take states at more, or at less "
-        "regular, angles: an analyzer ratio of 4.91 with 40 states gives rank 16, a ratio of exactly 5 only 12."
+        f"do not determine {lost or 'what the instrument can'} (each alone or in combination). Take states at more, or "
+        f"at less regular, angles{': ' + advice if need == basis.shape[0] else ''}."
     )
