@@ -283,8 +283,8 @@ def image(options: list[str], cuts: int, seed: int = 1) -> int:
     device, mount = WORK / "device.img", WORK / "captures"
     status, total = run(options, mount / "whole", lambda calls: calls.arm(0))
     assert status == 0, status
-    chance, lost, worst = random.Random(seed), 0, 0
-    for number in sorted(chance.sample(range(1, total + 1), min(cuts, total))):
+    chosen, lost, worst = random.Random(seed).sample(range(1, total + 1), min(cuts, total)), 0, 0
+    for number in sorted(chosen):
         _fresh_device(device, mount)
         log = WORK / "reported"
         log.unlink(missing_ok=True)
@@ -303,10 +303,12 @@ def image(options: list[str], cuts: int, seed: int = 1) -> int:
                 pass
             finally:
                 os._exit(0)
-        os.waitpid(child, os.WUNTRACED)
+        _, status = os.waitpid(child, os.WUNTRACED)
         shutil.copy(device, WORK / "copy.img")
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
+        # A run that makes a call less than the first one came to its end.
+        if os.WIFSTOPPED(status):
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
         subprocess.run(["umount", mount], check=True)
         copy = WORK / "copy"
         copy.mkdir(exist_ok=True)
@@ -320,7 +322,7 @@ def image(options: list[str], cuts: int, seed: int = 1) -> int:
         if reported - there > 1 or unreadable:
             lost += 1
             print(f"cut at call {number}: {reported} reported, {there} there; {unreadable}", flush=True)
-    print(f"{cuts} copies of the block device: at most {worst} reported states lost, {lost} beyond the bound")
+    print(f"{len(chosen)} copies of the block device: at most {worst} reported states lost, {lost} beyond the bound")
     return lost
 
 
