@@ -6,6 +6,7 @@ import os
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from processing.reflectance.tables import ScatteringTable, is_table, table_steps
 from processing.storage.capture import Capture
 from processing.storage.capture_schema import CaptureHeader
 from processing.storage.product import Product, is_product
-from processing.storage.provenance import MADE_OF, Step, made_of
+from processing.storage.provenance import MADE_OF, Step, content_of, file_identity, made_of
 
 #: Part of the pixels of a state beyond which its saturation is pointed out.
 SATURATED = 0.001
@@ -211,16 +212,32 @@ def _origin(steps: tuple[Step, ...]) -> tuple[tuple[dict[str, Any], ...], str]:
 
 
 def made_from(entry: Entry, entries: list[Entry], root: Path) -> list[tuple[str, str, Entry | None]]:
-    """Inputs of a file: role, path, and the file in the folder that it is, by content or else by path."""
-    by_content = {e.content: e for e in entries if e.content is not None}
-    by_path = {str(root / e.name): e for e in entries}
+    """Inputs of a file: role, path, and the file in the folder that it is."""
+    return [
+        (str(identity.get("role", "")), str(identity.get("path", "")), input_of(identity, entries, root))
+        for identity in entry.inputs
+    ]
 
-    def found(identity: dict[str, Any]) -> tuple[str, str, Entry | None]:
-        path = str(identity.get("path", ""))
-        source = by_content.get(str(identity.get(MADE_OF))) or by_path.get(path)
-        return str(identity.get("role", "")), path, source
 
-    return [found(identity) for identity in entry.inputs]
+def input_of(identity: dict[str, Any], entries: list[Entry], root: Path) -> Entry | None:
+    """The file in the folder that an input was: by what it was made of, by its path, or moved with its folder."""
+    path, known = str(identity.get("path", "")), identity.get(MADE_OF)
+    if known is not None and (same := next((e for e in entries if e.content == known), None)):
+        return same
+    if same := next((e for e in entries if f"{root}/{e.name}" == path), None):
+        return same
+    # A capture elsewhere: its content is read only where name and size are right.
+    name, size = path.rpartition("/")[2], identity.get("bytes")
+    alike = (e for e in entries if e.kind == "capture" and e.size == size and e.name.rpartition("/")[2] == name)
+    return next((e for e in alike if _content(root / e.name, e.changed_s) == content_of(identity)), None)
+
+
+@lru_cache(maxsize=4096)
+def _content(path: Path, changed_s: float) -> str | None:
+    try:
+        return content_of(file_identity(path))
+    except OSError:
+        return None
 
 
 def made_into(entry: Entry, entries: list[Entry], root: Path) -> list[Entry]:

@@ -17,7 +17,7 @@ from processing.storage.capture import Capture
 from processing.storage.images import MuellerImage
 from processing.storage.product import Product
 from viewer.frames import chosen
-from viewer.library import Library
+from viewer.library import Library, input_of
 from viewer.mosaic_probing import SuperPixelReducer
 from viewer.pages import file_of, pages_of
 from viewer.probing import PixelReducer, Region, curve, finite, mask_words, matrix, raw_curve
@@ -143,9 +143,14 @@ def capture_of(product: Product, library: Library) -> tuple[Path, Path | None] |
     reductions = [step for step in product.steps if step.name == "reduce"]
     if not reductions:
         return None
-    inputs = {str(i.get("role")): Path(str(i.get("path"))) for i in reductions[0].inputs}
-    path = inputs.get("capture")
-    instrument = inputs.get("instrument")
-    if path is None or not library.holds(path):
+    inputs = {str(i.get("role")): i for i in reductions[0].inputs}
+    if "capture" not in inputs:
         return None
+    path = Path(str(inputs["capture"].get("path")))
+    if not library.holds(path):
+        moved = input_of(inputs["capture"], library.entries(), library.root)
+        if moved is None:
+            return None
+        path = library.root / moved.name
+    instrument = Path(str(inputs["instrument"].get("path"))) if "instrument" in inputs else None
     return path, instrument if instrument is not None and instrument.exists() else None

@@ -155,3 +155,21 @@ def test_orientations_either_side_of_their_wrap_are_neighbours(name, period, cli
     (found,) = client.get("/probe", params={"file": "a.h5", "x0": 0, "x1": 2, "y0": 0, "y1": 1}).json()["planes"]
     assert (found["value"][0] + 10) % period == pytest.approx(10, abs=1e-6)
     assert found["error"][0] == pytest.approx(2 / 2**0.5)
+
+
+def test_a_folder_that_was_moved_keeps_what_was_made_from_what(lab, client, products):
+    """A night copied to another disc: provenance has the old paths."""
+    (lab / "night").mkdir()
+    for path in lab.glob("*.h5"):
+        path.rename(lab / "night" / path.name)
+    pixel = {"file": "night/one.mueller.h5", "x0": 3, "y0": 2}
+    there = client.get("/probe", params=pixel).json()
+    assert "fit" in there, there["told"]
+    page = client.get("/product", params={"file": "night/one.mueller.h5"}).text
+    assert re.search(r'capture\s+<a href="[^"]*capture\?file=night', page)
+    # Another capture of the same name and size is not its source.
+    capture = lab / "night" / "one.h5"
+    raw = bytearray(capture.read_bytes())
+    raw[-1] ^= 1
+    capture.write_bytes(raw)
+    assert "not in the folder" in client.get("/probe", params=pixel).json()["told"]

@@ -66,7 +66,8 @@ async function drawHistogram() {
 
 function told(k) {
   const angles = Object.entries(states.angles_deg).map(([name, values]) => `${name} ${values[k] === null ? "?" : (((values[k] % 360) + 360) % 360).toFixed(2)}°`);
-  byId("which").textContent = `state ${states.number[k]}, ${states.role[k]}${narrow() ? "" : `, ${angles.join(", ")}, ${states.exposure_s[k] ?? "?"} s`}`;
+  const more = narrow() ? [] : [...angles, `${states.exposure_s[k] ?? "?"} s`];
+  byId("which").textContent = [`state ${states.number[k]}`, states.role[k], ...more].join(", ");
 }
 
 async function show() {
