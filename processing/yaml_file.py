@@ -18,7 +18,7 @@ from ruamel.yaml.events import AliasEvent
 
 from processing.doors import MOST_DEPTH, one_line, read_text
 from processing.errors import ProcessError
-from processing.yaml_words import names_in, words_of
+from processing.yaml_words import mistakes_of, names_in, words_of
 
 Model = TypeVar("Model", bound=BaseModel)
 #: Keys that lead to a value or to a key, and it.
@@ -90,7 +90,7 @@ def parse_yaml(text: str, model: type[Model], source: str = "text") -> Model:
     try:
         value = model.model_validate(_plain(tree))
     except ValidationError as error:
-        lines = _described(source, tree, model, error.errors())
+        lines = _described(source, tree, model, mistakes_of(error))
         told = {line.split(" ", 1)[0] for line in lines}
         more = [line for line in _not_finite(source, tree, _scalars(tree)) if line.split(" ", 1)[0] not in told]
         raise _refusal(source, lines + more) from error

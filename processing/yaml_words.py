@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
 from typing import Any
 
-from pydantic import BaseModel, PydanticUserError
+from pydantic import BaseModel, PydanticUserError, ValidationError
 
 #: By the library's name of the mistake; `{...}` are what it tells beside the name.
 WORDS = {
@@ -71,6 +71,23 @@ def _properties(schema: Any) -> Iterator[str]:
         for word, part in schema.items():
             # A model may have a key of the name of one of the schema's own words.
             yield from _properties(list(part.values()) if word in ("properties", "$defs") else part)
+
+
+def mistakes_of(error: ValidationError) -> list[Any]:
+    """The entries of an error, without that a list is too short where it has entries that could not be read.
+
+    pydantic counts only those that it could read.
+    """
+    entries = error.errors()
+    # Places above each mistake.
+    above = {entry["loc"][:depth] for entry in entries for depth in range(len(entry["loc"]))}
+    return [
+        entry
+        for entry in entries
+        if entry["type"] != "too_short"
+        or entry["loc"] not in above
+        or len(entry["input"]) < int(entry["ctx"]["min_length"])
+    ]
 
 
 def words_of(entry: Any, names: Sequence[str] = ()) -> str:

@@ -20,7 +20,7 @@ from processing.instrument.states import (
 )
 from processing.storage.capture_schema import Sample
 from processing.yaml_file import ConfigError, load_yaml
-from processing.yaml_words import NAME_PATTERN, words_of
+from processing.yaml_words import NAME_PATTERN, mistakes_of, words_of
 
 #: Name of a mode of the rig file; file names of captures hold it.
 Mode = Annotated[str, Field(pattern=NAME_PATTERN)]
@@ -154,7 +154,7 @@ class MeasurementPlan(_Part):
         try:
             return MeasurementPlan.model_validate(self.model_dump() | chosen)
         except ValidationError as error:
-            lines = [": ".join(filter(None, (".".join(map(str, e["loc"])), words_of(e)))) for e in error.errors()]
+            lines = [": ".join(filter(None, (".".join(map(str, e["loc"])), words_of(e)))) for e in mistakes_of(error)]
             raise ConfigError("\n".join(lines)) from error
 
     def state_table(self, pose_deg: Mapping[str, float], exposure_s: float) -> StateTable:

@@ -12,7 +12,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from acquisition.rig.sections import AxisEntry, RigSections
 from acquisition.rig.soundness import Mistake, find_mistakes
 from processing.yaml_file import ConfigError, load_yaml
-from processing.yaml_words import names_in, words_of
+from processing.yaml_words import mistakes_of, names_in, words_of
 
 
 class RigConfig(RigSections):
@@ -30,7 +30,7 @@ class RigConfig(RigSections):
             if not isinstance(data, dict):
                 raise
             rig, valid = _readable(data), None
-            wrong = [(entry["loc"], words_of(entry, names_in(cls))) for entry in error.errors()]
+            wrong = [(entry["loc"], words_of(entry, names_in(cls))) for entry in mistakes_of(error)]
         wrong += find_mistakes(rig)
         if valid is None or wrong:
             raise ValidationError.from_exception_data(cls.__name__, [_details(where, why) for where, why in wrong])

@@ -71,6 +71,14 @@ def test_all_mistakes_at_once_in_words_of_our_own():
     assert str(error.value) == TOLD
 
 
+def test_a_list_whose_entries_are_wrong_is_not_empty():
+    """To the library it is: it counts what could be read."""
+    mistaken = "address: a\narea_m2: 1\nheated: yes\ncolour: red\npets:\n  - {kind: cat, names: [[], {}]}\n"
+    with pytest.raises(ConfigError) as error:
+        parse_yaml(mistaken, House, "x.yaml")
+    assert str(error.value) == "x.yaml:6: pets.0.names.0: must be text\nx.yaml:6: pets.0.names.1: must be text"
+
+
 def test_a_file_of_another_kind_is_told_by_that_alone():
     with pytest.raises(ConfigError) as error:
         parse_yaml("kind: cat\nnames: [a]\n", Dog, "x.yaml")
