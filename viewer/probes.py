@@ -12,9 +12,10 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 
 from processing.errors import ProcessError
+from processing.maps.extrapolation import EXTRAPOLATED
+from processing.maps.quantities import image_of
 from processing.reports.colours import period_deg
 from processing.storage.capture import Capture
-from processing.storage.images import MuellerImage
 from processing.storage.product import Product
 from viewer.frames import chosen
 from viewer.library import Library, input_of
@@ -92,8 +93,8 @@ def _of_product(path: Path, query: Any, library: Library) -> dict[str, Any]:
         if "pixel_flags" in product.names:
             bits = product.get("pixel_flags", region.rows)[:, region.columns]
             found["mask"] = mask_words(int(bits.max())) if bits.any() else "valid"
-        if product.kind == "mueller" and region.pixels == 1:
-            image = MuellerImage.of(product, region.rows)
+        if product.kind in ("mueller", EXTRAPOLATED) and region.pixels == 1:
+            image = image_of(product, region.rows)
             found["matrix"] = matrix(image.at(np.array([region.columns.start])))
         source = capture_of(product, library)
     if source is None:

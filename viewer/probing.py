@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from processing.errors import ProcessError
 from processing.instrument.determined import determined_basis
+from processing.maps.extrapolation import ExtrapolatedImage
 from processing.maps.quantities import quantities_block
 from processing.reduction.counts_to_signal import saturation
 from processing.reduction.facts import determined_words
 from processing.reduction.mueller import Choice, field_of, measurement_matrix
-from processing.reduction.solvers.inversion import ELEMENTS, Inversion
+from processing.reduction.solvers.inversion import Inversion
 from processing.reduction.solvers.plain import MuellerSolver
 from processing.storage.capture import Capture
 from processing.storage.images import MuellerImage
@@ -211,11 +212,11 @@ def curve(reducer: PixelReducer, region: Region) -> dict[str, Any]:
     }
 
 
-def matrix(image: MuellerImage) -> dict[str, Any]:
+def matrix(image: MuellerImage | ExtrapolatedImage) -> dict[str, Any]:
     """Mueller matrix over m00 with its standard errors, and what it decomposes into."""
-    seen = image.seen.reshape(4, 4)
+    seen = (image.seen if isinstance(image, MuellerImage) else np.ones(16, dtype=bool)).reshape(4, 4)
     m, errors = (np.where(seen, v.reshape(4, 4), np.nan).astype(float) for v in (image.values, image.errors))
-    derived = quantities_block(image, (), {}) if int(image.facts.get("rank", 16)) == ELEMENTS else {}
+    derived = quantities_block(image, (), {}) if seen.all() else {}
     named = {name: values.reshape(-1).astype(float) for name, values in derived.items()}
     with np.errstate(divide="ignore", invalid="ignore"):
         normalized = m / m[0, 0]

@@ -10,7 +10,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response
 
 from processing.errors import ProcessError
-from processing.reports.colours import ALL, LIGHT, SIGNED, Scale, scale_of, steps
+from processing.reports.colours import ALL, LIGHT, SIGNED, Scale, period_deg, scale_of, steps
 from processing.reports.fact_words import fact_words
 from processing.storage.product import LIT_ERRORS, Product
 from processing.storage.provenance import steps_text
@@ -78,14 +78,23 @@ def plane(request: Request) -> Response:
 
 
 def read_map(opened: Product, name: str, index: int, window: Window) -> NDArray[np.float32]:
-    """One map of a product in a window; NaN where no valid mask of the product holds."""
-    planes = opened.get(name, window.rows)
-    values = window.every(planes.reshape(-1, *planes.shape[-2:])[index]).astype(np.float32)
+    """One map of a product in a window; NaN where no valid mask of the product holds, or no angle is determined."""
+    values = _element(opened, name, index, window).astype(np.float32)
     if name not in ("lit", "valid", "pixel_flags"):
         for mask in ("lit", "valid"):
             if mask in opened.names:
                 values[window.every(opened.get(mask, window.rows)) == 0] = np.nan
+    if f"{name}_errors" in opened.names and period_deg(name, opened.units(name)) is not None:
+        # An angle without an error bar is that of noise, and would show in every colour.
+        errors = _element(opened, f"{name}_errors", index, window)
+        if np.isfinite(errors).any():
+            values[np.isnan(errors)] = np.nan
     return np.asarray(values)
+
+
+def _element(opened: Product, name: str, index: int, window: Window) -> NDArray[Any]:
+    planes = opened.get(name, window.rows)
+    return np.asarray(window.every(planes.reshape(-1, *planes.shape[-2:])[index]))
 
 
 def named(opened: Product, query: Any) -> tuple[str, int]:

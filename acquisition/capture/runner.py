@@ -180,7 +180,6 @@ class CaptureRunner:
         exposure_s = np.array([float(f"{factor * value:.3g}") for value in self.table.exposure_s])
         self.table = replace(self.table, exposure_s=exposure_s)
         self.writer.set_exposure(exposure_s)
-        self.messages.add(f"exposure {', '.join(f'{value:g}' for value in np.unique(exposure_s))} s")
 
     def warn(self, text: str) -> None:
         """Keep a warning for the closing record and tell the observers."""

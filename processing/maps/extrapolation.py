@@ -90,6 +90,11 @@ class ExtrapolatedImage:
         names = ("mueller", "mueller_errors", "m00_correlation")
         return cls(*(product.get(name, rows) for name in names))
 
+    def at(self, pixels: NDArray[np.int64]) -> Self:
+        """The image of some pixels alone (n rows of one), given by their numbers in row-major order."""
+        parts = (self.values, self.errors, self.correlation)
+        return type(self)(*(part.reshape(*part.shape[:-2], -1)[..., pixels, None] for part in parts))
+
     @property
     def matrices(self) -> NDArray[np.float32]:
         """View (rows, columns, 4, 4)."""

@@ -172,7 +172,7 @@ def _maps(product: Product, extra: Sequence[str], pairs: Pairs) -> _Maps:
         )
     return _Maps(
         _with_errors(maps) | _NOISE,
-        lambda rows: quantities_block(_image(product, rows), extra, pairs),
+        lambda rows: quantities_block(image_of(product, rows), extra, pairs),
         lambda writer: _facts(writer, maps),
     )
 
@@ -209,7 +209,7 @@ def _with_errors(maps: Mapping[str, Plane]) -> dict[str, Plane]:
     return planes
 
 
-def _image(product: Product, rows: slice) -> MuellerImage | ExtrapolatedImage:
+def image_of(product: Product, rows: slice) -> MuellerImage | ExtrapolatedImage:
     if product.kind == EXTRAPOLATED:
         return ExtrapolatedImage.of(product, rows)
     return MuellerImage.of(product, rows)

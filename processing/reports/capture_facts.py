@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from processing.storage.capture import Capture
 from processing.storage.capture_schema import CaptureHeader
 
 
 def facts_of(capture: Capture) -> list[tuple[str, str]]:
-    """Names and texts: sample, mode, wavelength, Omega, states, frame."""
+    """Names and texts: sample, mode, wavelength, Omega, states, exposure, frame."""
     header, (rows, columns) = capture.header, capture.frame_shape
     roles = ", ".join(f"{capture.role.count(role)} {role}" for role in dict.fromkeys(capture.role))
     done = f"{len(capture.role)} of {capture.planned_states}, {capture.status}"
@@ -18,8 +20,18 @@ def facts_of(capture: Capture) -> list[tuple[str, str]]:
         ("wavelength", f"{header.wavelength_nm:g} nm"),
         ("Omega", "not stated" if header.omega_deg is None else f"{header.omega_deg:g} degrees"),
         ("states", f"{done}: {roles}" if roles else done),
+        ("exposure", _exposure(capture)),
         ("frame", f"{columns} x {rows}, {capture.channels} channel(s), {capture.dtype}"),
     ]
+
+
+def _exposure(capture: Capture) -> str:
+    exposures = np.unique(capture.column("exposure_s"))
+    if not np.all(exposures > 0):
+        return "not stated"
+    if len(exposures) > 4:
+        return f"{exposures[0]:.4g} to {exposures[-1]:.4g} s"
+    return ", ".join(f"{value:.4g}" for value in exposures) + " s"
 
 
 def papers_of(header: CaptureHeader) -> list[tuple[str, str]]:

@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 
+from processing.maps.extrapolation import EXTRAPOLATED, PLANES
 from processing.reports.colours import colours_of, scale_of
 from processing.steps.maps import Quantities
 from processing.steps.reduction import Reduction
@@ -155,6 +156,40 @@ def test_orientations_either_side_of_their_wrap_are_neighbours(name, period, cli
     (found,) = client.get("/probe", params={"file": "a.h5", "x0": 0, "x1": 2, "y0": 0, "y1": 1}).json()["planes"]
     assert (found["value"][0] + 10) % period == pytest.approx(10, abs=1e-6)
     assert found["error"][0] == pytest.approx(2 / 2**0.5)
+
+
+def test_an_angle_that_is_noise_has_no_colour(client, lab):
+    header = CaptureHeader(title="", simulated=True, mode="stokes", wavelength_nm=662, detector=Detector())
+    planes = {"aolp_deg": Plane((), "degree", "an angle"), "aolp_deg_errors": Plane((), "degree", "its errors")}
+    for file, errors in (("some", [[1.0, np.nan]]), ("unknown", [[np.nan, np.nan]])):
+        with ProductWriter(lab / f"{file}.h5", "stokes", header, (1, 2), planes, ()) as writer:
+            writer.write(slice(0, 1), aolp_deg=np.array([[10.0, 120.0]]), aolp_deg_errors=np.array(errors))
+            writer.seal({"warnings": []})
+    shown = {
+        file: plane(client.get("/plane", params={"file": f"{file}.h5", "name": "aolp_deg"}))[0]
+        for file in ("some", "unknown")
+    }
+    np.testing.assert_array_equal(shown["some"], [[[10, np.nan]]])
+    np.testing.assert_array_equal(shown["unknown"], [[[10, 120]]])
+
+
+def test_a_pixel_of_an_extrapolated_image_has_its_matrix_with_errors(client, lab):
+    header = CaptureHeader(title="", simulated=True, mode="stokes", wavelength_nm=662, detector=Detector())
+    mueller = np.diag([200.0, 100.0, 80.0, 60.0])[..., None, None].repeat(2, axis=-1)
+    with ProductWriter(lab / "e.h5", EXTRAPOLATED, header, (1, 2), PLANES, ()) as writer:
+        writer.write(
+            slice(0, 1),
+            mueller=mueller,
+            mueller_errors=mueller / 100,
+            m00_correlation=np.zeros((1, 2)),
+            valid=np.ones((1, 2)),
+        )
+        writer.seal({"warnings": []})
+    there = client.get("/probe", params={"file": "e.h5", "x0": 1, "y0": 0}).json()["matrix"]
+    assert (there["m00"], there["m00_error"]) == (200, 2)
+    np.testing.assert_allclose(np.diag(there["mueller"]), [1, 0.5, 0.4, 0.3], rtol=1e-6)
+    # One percent of alpha_0 and one of m00, which are not correlated here.
+    assert there["mueller_errors"][1][1] == pytest.approx(0.5 * 0.01 * 2**0.5, rel=1e-4)
 
 
 def test_a_folder_that_was_moved_keeps_what_was_made_from_what(lab, client, products):
