@@ -97,3 +97,26 @@ def test_a_page_that_speaks_of_the_paper_names_it():
 def test_every_page_of_the_docs_is_in_the_site():
     named = set(re.findall(r"[\w-]+\.md", (ROOT / "mkdocs.yml").read_text(encoding="utf-8")))
     assert named == {page.name for page in (ROOT / "docs").glob("*.md")}
+
+
+def _kinds_by_name(folder: Path) -> list[str]:
+    """Where the kind of an effect or candidate is compared with a string."""
+    found = []
+    for path in sorted(folder.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            sides = [node.left, *node.comparators] if isinstance(node, ast.Compare) else []
+            kind = any(isinstance(side, ast.Attribute) and side.attr == "kind" for side in sides)
+            if kind and any(isinstance(side, ast.Constant) and isinstance(side.value, str) for side in sides):
+                found.append(f"{path.name}:{node.lineno}")
+    return found
+
+
+@pytest.mark.parametrize("room", ["search", "instrument", "surface"])
+def test_the_diagnosis_asks_for_types_and_not_for_names_of_effects(room):
+    """An effect is a file that can be added and deleted: nothing else knows its name."""
+    assert _kinds_by_name(ROOT / "processing" / "diagnosis" / room) == []
+
+
+def test_a_kind_that_is_compared_with_a_name_is_seen(tmp_path):
+    (tmp_path / "x.py").write_text('def f(c):\n    return c.kind == "slip"\n')
+    assert _kinds_by_name(tmp_path) == ["x.py:2"]

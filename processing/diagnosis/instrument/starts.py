@@ -8,12 +8,12 @@ import numpy as np
 
 from processing.arrays import Array, BoolArray
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.candidate import Candidate, NominalValue
 from processing.diagnosis.search.fit import Fit, minimize
 from processing.diagnosis.search.posterior import Say
 from processing.diagnosis.search.rules import FAR_OFF, NEAR_ENOUGH
 from processing.diagnosis.search.space import Space
-from processing.instrument.effects.base import SourceEffect, ValuePerState
+from processing.instrument.effects.base import ChannelLevels, SourceEffect, ValuePerState
 
 STARTS = 24
 #: Half widths of the starts of nominal values, in degrees: azimuths, which come round again; retardances of plates of a
@@ -46,7 +46,8 @@ def _searched(problem: InstrumentProblem, base: Space, pool: Sequence[Candidate]
     free = [
         c
         for c in pool
-        if c.kind == "channel_gain" or (isinstance(c.effect, SourceEffect) and isinstance(c.effect, ValuePerState))
+        if isinstance(c.effect, ChannelLevels)
+        or (isinstance(c.effect, SourceEffect) and isinstance(c.effect, ValuePerState))
     ]
     wide = Space((*base.candidates, *free))
     values = np.concatenate([fit.values, np.zeros(wide.size - base.size)])
@@ -99,7 +100,7 @@ def _widths(space: Space, retardance: float) -> Array:
 
 def _anywhere(candidate: Candidate) -> bool:
     """A nominal value that may be far off: no window, no diattenuation."""
-    return candidate.kind == "calibrate" and candidate.parameters[0].typical >= NEAR
+    return isinstance(candidate.effect, NominalValue) and candidate.parameters[0].typical >= NEAR
 
 
 def _far(problem: InstrumentProblem, pool: Sequence[Candidate], fit: Fit) -> Values:
@@ -115,7 +116,7 @@ def _far(problem: InstrumentProblem, pool: Sequence[Candidate], fit: Fit) -> Val
 def along_wavelengths(problem: InstrumentProblem, base: Space, say: Say) -> Values:
     """One wavelength from many starts, the others one after the other as their neighbours point, then all together."""
     wavelengths = sorted(set(problem.wavelengths_nm))
-    space = Space((*base.candidates, *(c for c in problem.pool() if c.kind == "channel_gain")))
+    space = Space((*base.candidates, *(c for c in problem.pool() if isinstance(c.effect, ChannelLevels))))
     each = [_AtOne(problem.at(w), space, w) for w in wavelengths]
     best: Fit | None = None
     for first in (len(wavelengths) // 2, 0, len(wavelengths) - 1):
@@ -142,7 +143,8 @@ class _AtOne:
         self.problem, self.wavelength_nm = problem, wavelength_nm
         self.space = space.acting(0, wavelength_nm).space
 
-        large = (_anywhere(c) or c.kind != "calibrate" for c in self.space.candidates for _ in c.parameters)
+        candidates = self.space.candidates
+        large = (_anywhere(c) or not isinstance(c.effect, NominalValue) for c in candidates for _ in c.parameters)
         self._large = np.array(list(large))
 
     def searched(self) -> Values:

@@ -50,6 +50,10 @@ class OpticsEffect(InstrumentEffect):
     """Changes the polarization elements or the detector channels; a known surface shows it too."""
 
 
+class ChannelLevels(OpticsEffect):
+    """Changes how bright the channels are against each other, and nothing of their polarization."""
+
+
 class LevelEffect(InstrumentEffect):
     """Changes all channels of a state by one factor: a source whose level is free (`free_source`) takes it up."""
 

@@ -12,10 +12,11 @@ from processing.arrays import Array
 from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
 from processing.instrument.effects._channel import ChannelEffect
+from processing.instrument.effects.base import ChannelLevels
 from processing.instrument.model import InstrumentModel
 
 
-class ChannelGain(ChannelEffect):
+class ChannelGain(ChannelEffect, ChannelLevels):
     """Gain error of each channel but the first, relative to the first; a common factor is throughput."""
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
