@@ -1,7 +1,8 @@
 """A text with space taken for what it will be: as long as it is for every reader, and longer when it is written again.
 
 HDF5 keeps the length of a text in the type of its dataset, four bytes of the header, and the room in its layout. A room
-that is larger than the text is as good to every reader.
+that is larger than the text is as good to every reader (HDF5 File Format Specification 3.0, sections IV.A.1.a, "Version
+1 Data Object Header Prefix", IV.A.2.d, "Datatype Message", and IV.A.2.i, "Data Layout Message").
 """
 
 from __future__ import annotations

@@ -22,12 +22,12 @@ from processing.storage.images import StokesImage
 from simulators.camera.node_map import node_map
 
 Acquire = Callable[..., tuple[int, str, str]]
-Region = tuple[int, int]
+Offset = tuple[int, int]
 
 EVERY = bool(os.environ.get("UMOV_EVERY_TABLE"))
 MONO, COLOUR = "lucid_tri050s_p", "lucid_tri050s_q"
 ANGLES = "PolarizedAngles_0d_45d_90d_135d_"
-PHASES: list[Region] = [(0, 0), (1, 0), (0, 1), (1, 1)]
+PHASES: list[Offset] = [(0, 0), (1, 0), (0, 1), (1, 1)]
 
 SENSOR = (("90", "45"), ("135", "0"))
 COLOURS = np.array([["red", "green"], ["green", "blue"]]).repeat(2, 0).repeat(2, 1)
@@ -94,7 +94,15 @@ def formats_of(table: str, *, angles: bool) -> list[str]:
     return [name for name in node_map(table).pixel_formats if pixel_format(name).angles == angles]
 
 
-def raw_cases() -> list[tuple[str, Region]]:
+def taken(stokes, table: str, region: dict[str, object]) -> Path:
+    """The capture of a region, which is taken without a mistake."""
+    code, err, out = stokes(table, region)
+    assert code == 0, err
+    (path,) = out.glob("*.h5")
+    return Path(path)
+
+
+def raw_cases() -> list[tuple[str, Offset]]:
     if EVERY:
         return list(product(formats_of(MONO, angles=False), PHASES))
     return [
@@ -107,12 +115,10 @@ def raw_cases() -> list[tuple[str, Region]]:
 
 
 @pytest.mark.parametrize(("name", "offset"), raw_cases())
-def test_light_reads_as_it_is_wherever_the_region_begins(stokes, name: str, offset: Region) -> None:
+def test_light_reads_as_it_is_wherever_the_region_begins(stokes, name: str, offset: Offset) -> None:
     x, y = offset
     region = {"width": 40, "height": 24, "offset_x": x, "offset_y": y, "pixel_format": name}
-    code, err, out = stokes(MONO, region)
-    assert code == 0, err
-    (path,) = out.glob("*.h5")
+    path = taken(stokes, MONO, region)
     with Capture(path) as capture:
         assert capture.header.mosaic == tuple(map(tuple, np.roll(SENSOR, (-y, -x), axis=(0, 1))))
         assert capture.instrument is not None
@@ -120,7 +126,7 @@ def test_light_reads_as_it_is_wherever_the_region_begins(stokes, name: str, offs
     assert_light(path)
 
 
-def colour_cases() -> list[tuple[str, Region]]:
+def colour_cases() -> list[tuple[str, Offset]]:
     if not EVERY:
         return [("BayerRG12p", (3, 1))]
     every_phase = list(product(range(4), range(4)))
@@ -130,12 +136,11 @@ def colour_cases() -> list[tuple[str, Region]]:
 
 
 @pytest.mark.parametrize(("name", "offset"), colour_cases())
-def test_each_colour_reads_the_light_as_it_is_wherever_the_region_begins(stokes, name: str, offset: Region) -> None:
+def test_each_colour_reads_the_light_as_it_is_wherever_the_region_begins(stokes, name: str, offset: Offset) -> None:
     x, y = offset
     region = {"width": 64, "height": 56, "offset_x": x, "offset_y": y, "pixel_format": name}
-    code, err, out = stokes(COLOUR, region)
-    assert code == 0, err
-    (path,) = out.glob("*.h5")
+    path = taken(stokes, COLOUR, region)
+    out = path.parent
     with Capture(path) as capture:
         assert capture.header.mosaic == tuple(map(tuple, np.roll(SENSOR, (-y, -x), axis=(0, 1))))
         assert capture.header.colours == tuple(map(tuple, np.roll(COLOURS, (-y, -x), axis=(0, 1))))
@@ -148,12 +153,10 @@ def test_each_colour_reads_the_light_as_it_is_wherever_the_region_begins(stokes,
 
 @pytest.mark.parametrize("name", formats_of(MONO, angles=True) if EVERY else [f"{ANGLES}Mono12p"])
 @pytest.mark.parametrize("offset", PHASES if EVERY else [(1, 1)])
-def test_counts_that_are_sent_by_angle_begin_with_a_whole_super_pixel(stokes, name: str, offset: Region) -> None:
+def test_counts_that_are_sent_by_angle_begin_with_a_whole_super_pixel(stokes, name: str, offset: Offset) -> None:
     x, y = offset
     region = {"width": 40, "height": 24, "offset_x": 2 * x, "offset_y": 2 * y, "pixel_format": name}
-    code, err, out = stokes(MONO, region)
-    assert code == 0, err
-    (path,) = out.glob("*.h5")
+    path = taken(stokes, MONO, region)
     with Capture(path) as capture:
         assert capture.header.mosaic == SENSOR
         assert (capture.camera_nodes["OffsetX"], capture.camera_nodes["OffsetY"]) == (str(x), str(y))
@@ -162,7 +165,7 @@ def test_counts_that_are_sent_by_angle_begin_with_a_whole_super_pixel(stokes, na
 
 @pytest.mark.parametrize("name", formats_of(MONO, angles=True) if EVERY else [f"{ANGLES}Mono12p"])
 @pytest.mark.parametrize("offset", PHASES[1:] if EVERY else PHASES[1:2])
-def test_half_a_super_pixel_of_counts_that_are_sent_by_angle_is_refused(stokes, name: str, offset: Region) -> None:
+def test_half_a_super_pixel_of_counts_that_are_sent_by_angle_is_refused(stokes, name: str, offset: Offset) -> None:
     region = {"width": 40, "height": 24, "offset_x": offset[0], "offset_y": offset[1], "pixel_format": name}
     code, err, _ = stokes(MONO, region)
     assert code != 0

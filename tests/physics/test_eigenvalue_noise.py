@@ -53,7 +53,8 @@ def test_intervals_cover_where_one_direction_is_much_noisier(states, truth):
     # Condition numbers 26, 51 and 80; the first has a direction of 12 times the usual variance.
     w = state_tables()[states]
     matrices = triply_degenerate.mueller_matrix(random_processes(PIXELS, 3), truth)
-    for electrons in (2000, 20_000)[states == "24 others" :]:
+    # At 2000 the last ones do not determine m00.
+    for electrons in (20_000,) if states == "24 others" else (2000, 20_000):
         found = eigenvalue_block(noisy_image(matrices, electrons, 5, w))
         assert found["valid"].all()
         assert_covered(found, truth)
