@@ -22,6 +22,16 @@ def test_chance_that_m_gets_worse_is_that_of_draws_from_the_posterior() -> None:
         assert change.after**2 == pytest.approx(np.mean(after), rel=0.03)
 
 
+def test_where_no_cause_is_sure_what_is_left_counts_against_the_change() -> None:
+    """A shadow that turns is described in part by a beam that wanders: of 725 of chi-square 125 are left."""
+    told = predicted_change(np.array([1e-3]), np.array([[1e-10]]), np.eye(1))
+    assert told.chance_worse < 1e-6
+    assert told.beside(0.0, 600.0).chance_worse == pytest.approx(told.chance_worse)
+    assert told.beside(6.0, 600.0).chance_worse < 1e-6
+    assert told.beside(125.0, 600.0).chance_worse == pytest.approx(0.137, abs=0.005)
+    assert told.beside(125.0, 0.0).chance_worse == pytest.approx(0.309, abs=0.005)
+
+
 def test_of_tied_values_the_sum_that_the_data_tell_counts() -> None:
     # Two azimuths of which the sum is known to 0.01 and the difference not at all, which M hardly notices.
     tied = 0.01**2 * np.ones((2, 2)) / 4 + 0.3**2 * np.array([[1.0, -1.0], [-1.0, 1.0]])

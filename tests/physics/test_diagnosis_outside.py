@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from processing.diagnosis.instrument.doubts import WAVE, WAVE_AS_WELL, _wave
 from processing.diagnosis.instrument.nameless import NamelessWaves
 from processing.diagnosis.instrument.run import diagnose_captures
 from processing.diagnosis.search.result import Diagnosis
@@ -75,8 +76,8 @@ def test_optics_that_differ_from_part_to_part_are_not_called_by_their_name(confi
     assert not found.applied()
 
 
-@pytest.mark.parametrize(("wave", "doubted"), [(120.0, True), (93.0, True), (90.0, False)])
-def test_no_name_is_sure_beside_a_wave_that_explains_nearly_as_much(wave, doubted):
+@pytest.mark.parametrize(("wave", "reason"), [(120.0, WAVE), (99.0, WAVE_AS_WELL), (93.0, WAVE_AS_WELL), (90.0, None)])
+def test_no_name_is_sure_beside_a_wave_that_explains_nearly_as_much(wave, reason):
     def explaining(chi_square):
         return np.eye(1), np.array([math.sqrt(chi_square)])
 
@@ -88,4 +89,4 @@ def test_no_name_is_sure_beside_a_wave_that_explains_nearly_as_much(wave, doubte
         without=lambda state, group: state,
         given_others=lambda state: [explaining(100.0), explaining(wave)],
     )
-    assert waves.explain_as_well(cause) is doubted
+    assert _wave(waves.gain_over(cause)) == reason

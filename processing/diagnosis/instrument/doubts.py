@@ -20,6 +20,7 @@ from processing.diagnosis.search.rules import (
     EDGES,
     LIMIT,
     ONE_PATTERN,
+    SURE,
     TESTABLE,
     TIMES,
     UNEVEN,
@@ -43,7 +44,9 @@ PATTERN = "its values follow one wave or jump over the states, as a beat or a fr
 #: The same of an effect in whose place a source with one wave fits better, or as well with a frequency of its own.
 BEAT = "a source that beats explains as much as it does"
 #: The same where a plate that turns has a wave of its own that is not in the list.
-WAVE = "a plate that changes two to four times a turn explains as much as it does"
+WAVE = "a plate that changes two to four times a turn explains more than it does"
+#: Here either may be the truth: it is not used, and what stands beside both is.
+WAVE_AS_WELL = "a plate that changes two to four times a turn explains as much as it does"
 #: The image does not move where that would be seen best.
 STANDS = "the edges, which were left out of the fit, do not move as it says"
 #: Optics and mechanics are the same for the whole image.
@@ -70,7 +73,7 @@ def doubts(
     for cause in causes:
         reason = STANDS if cause in still else _of_itself(problem, found, solved, cause, causes)
         if reason is None and waves is not None and _is_one_name(cause):
-            reason = WAVE if waves.explain_as_well(cause) else None
+            reason = _wave(waves.gain_over(cause))
         if reason is not None:
             out[cause] = reason
         if reason == PATTERN:
@@ -82,7 +85,8 @@ def doubts(
         if cause not in out and isinstance(first.effect, SourceEffect) and first.capture in patterned:
             out[cause] = BESIDE_PATTERN
     # What follows a pattern is no effect of the list: what it took away is left over as well.
-    left += sum(2 * cause.log_odds * found.samples.best.unit for cause, why in out.items() if why in ELSE)
+    other = (*ELSE, WAVE_AS_WELL)
+    left += sum(2 * cause.log_odds * found.samples.best.unit for cause, why in out.items() if why in other)
     for rank, cause in enumerate(causes, 1):
         if problem.noise_known:
             weak = 2 * cause.log_odds * found.samples.best.unit < TIMES * rank**2 * left
@@ -96,6 +100,13 @@ def doubts(
         if cause not in out and cause.log_odds < uneven:
             out[cause] = "it may be a part of what is uneven over the image"
     return out
+
+
+def _wave(gain: float) -> str | None:
+    """The reason where a wave gains so much over a cause; of two that are as likely none is sure."""
+    if gain > 0:
+        return WAVE
+    return WAVE_AS_WELL if gain > -2 * np.log(SURE / (1 - SURE)) else None
 
 
 def _of_itself(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,6 +84,14 @@ class PredictedChange:
         if self.size <= LEAST_NOISE:
             return 0.0
         return float(ndtr(-self.size / (2 * self.stderr))) if self.stderr > 0 else 0.0
+
+    def beside(self, left: float, explained: float) -> PredictedChange:
+        """Where no cause is beyond doubt and structure is left: as wrong, along itself, as that is to what it explains.
+
+        `left` and `explained` are chi-squares, of which the roots are amounts.
+        """
+        wrong = np.sqrt(left / explained) if explained > 0 else 1.0
+        return replace(self, stderr=float(np.hypot(self.stderr, wrong * self.size)))
 
 
 NOTHING = PredictedChange(0.0, 0.0, 0.0, 0.0)

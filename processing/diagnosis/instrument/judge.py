@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.instrument.doubts import BESIDE_PATTERN, ELSE, acts_on_unknown, doubts, testable
+from processing.diagnosis.instrument.doubts import BESIDE_PATTERN, ELSE, WAVE_AS_WELL, acts_on_unknown, doubts, testable
 from processing.diagnosis.instrument.empirical import empirical
 from processing.diagnosis.instrument.evidence import wanted_for_evidence, would_be_seen
 from processing.diagnosis.instrument.guard import chances, checks, lasts, predicted_changes, refusal
@@ -104,10 +104,13 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
         found, solved = quiet, solution(bench, quiet, unfit)
         after = tuple(residual(asked, k, solved.space, solved.fit) for k in captures)
         here, later = predicted_changes(asked, found, solved)
+    sure = [c for c in named if c.answer != "unknown" and c not in doubt]
+    if not sure:
+        over = sum(_left(problem, r) for r in after)
+        here, later = (c.beside(over, solved.before.excess - solved.after.excess) for c in (here, later))
     lasting = lasts(later, doubt.values())
     guard, chance = checks(asked, solved), chances(here, later, lasting)
     refused = f"change this first: {wiring.told}" if wiring is not None else refusal((*guard, *chance))
-    sure = [c for c in named if c.answer != "unknown" and c not in doubt]
     switched = told_switches(asked, solved)
     verdict = _verdict((*named, *switched), (*sure, *switched), structure or bool(untold))
     if wiring is not None or (refusal(guard) is not None and named):
@@ -168,9 +171,9 @@ def _unfit(
 ) -> list[Candidate]:
     """What is not used where an unknown sample takes up a part of it, for it may be any structure or a part of such."""
     # Values that are not random, or as many as the data have; and those of a source that were found beside them.
-    unfit = [*untold, *(cause for cause, reason in doubt.items() if reason in (*ELSE, BESIDE_PATTERN))]
+    unfit = [*untold, *(cause for cause, reason in doubt.items() if reason in (*ELSE, WAVE_AS_WELL, BESIDE_PATTERN))]
     found = [c for cause in unfit for c in cause.candidates]
-    if any(reason in ELSE for reason in doubt.values()):
+    if untold or any(reason in ELSE for reason in doubt.values()):
         # Something is there that is not in the list: only what has a name of its own is no part of it.
         own = {c for cause in named if cause not in doubt for c in (*cause.candidates, *cause.alternatives)}
         found += [

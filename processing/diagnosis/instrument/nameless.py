@@ -17,7 +17,6 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause
 from processing.diagnosis.search.linearized import quadratic
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import SURE
 from processing.diagnosis.search.sets import Group, Sets, State
 from processing.diagnosis.search.space import Space
 from processing.effect import Parameter
@@ -83,15 +82,15 @@ class NamelessWaves:
         few = problem.holds_out_states or not problem.noise_known
         return None if fields or few or not _waves(problem) else cls(problem, found)
 
-    def explain_as_well(self, cause: Cause) -> bool:
-        """Whether in a cause's place one of the waves fits better, or so well that no name is sure beside it.
+    def gain_over(self, cause: Cause) -> float:
+        """Chi-square that the best of the waves explains in a cause's place beyond what that does.
 
-        Every value of either costs two of chi-square.
+        Every value of either costs two.
         """
         own = self._labels.index(cause.candidates[0])
         given = self._sets.given_others(self._sets.without(self._state, own))
         most = max(_explained(*given[g]) for g in range(len(self._labels), len(self._sets.groups)))
-        return bool(most > _explained(*given[own]) - 2 * np.log(SURE / (1 - SURE)))
+        return most - _explained(*given[own])
 
 
 def _waves(problem: InstrumentProblem) -> list[Candidate]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -17,8 +17,18 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.fit import Fit, held_out, minimize, prior, score
 from processing.diagnosis.search.likely_set import everything
-from processing.diagnosis.search.posterior import Posterior, Say, posterior, resampled
-from processing.diagnosis.search.rules import DECISIVE, FAR_OFF, GROWTH, LIKELY, REFUTED, ROUNDS, SHARES, TAKES_PART
+from processing.diagnosis.search.posterior import Posterior, Say, first_look, posterior, resampled
+from processing.diagnosis.search.rules import (
+    DECISIVE,
+    FAR_OFF,
+    GROWTH,
+    LIKELY,
+    MISSED,
+    REFUTED,
+    ROUNDS,
+    SHARES,
+    TAKES_PART,
+)
 from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import (
@@ -30,6 +40,9 @@ from processing.instrument.effects.base import (
     ValuePerState,
 )
 from processing.storage.capture import CaptureError
+
+#: Times that the noise is taken from a first look at the counts before anything is weighed.
+FIRST_LOOKS = 4
 
 
 def predicts(problem: InstrumentProblem) -> InstrumentProblem:
@@ -77,6 +90,7 @@ class WholeBench:
         """The posterior; again with the noise that its light tells, and with what varies over the image."""
         plain = [c for c in self.pool if self._offered(c)]
         fixed = [*self.base.candidates, *self._clipped()]
+        self._take_noise_of_light([*fixed, *plain], fixed)
         found = self._posterior([*fixed, *plain], fixed)
         if too_many := self.as_many_as_intensities(found, TAKES_PART):
             self.say(f"without {', '.join(c.label for c in too_many)}: it would be a value for each intensity")
@@ -86,14 +100,30 @@ class WholeBench:
         if fields and not self.whole.holds_out_states:
             found = self._with_fields(found, fixed, fields)
         solved = applied(found, self.base)
-        if self.whole.noise_known and self.whole.adopt_noise(*solved):
+        if self.whole.noise_known and self._adopt_noise(*solved):
             self.say("the same with the noise that this light has")
-            if self.whole is not self.problem:
-                self.problem.adopt_noise(*solved)
             again = self._posterior(list(found.space.candidates), fixed, found)
             # Nobody knows the noise to a thousandth, and of many pixels that would be structure: what was found stays.
             found = again if again.samples.best.unit <= GROWTH * found.samples.best.unit else found
         return found
+
+    def _take_noise_of_light(self, candidates: Sequence[Candidate], fixed: Sequence[Candidate]) -> None:
+        """Take the noise from the light that a first look tells, until it stays.
+
+        Behind a bent response the noise that counts should have is wrong by percents. Of many pixels that is more than
+        most causes explain, and some other bend, with others to undo it, would be found for it.
+        """
+        space = Space(tuple(candidates))
+        start = self._values_at_start(space)
+        for _ in range(FIRST_LOOKS if self.whole.noise_known else 0):
+            if not self._adopt_noise(space, first_look(self.whole, space, fixed, start)):
+                break
+
+    def _adopt_noise(self, space: Space, values: Array) -> bool:
+        taken = self.whole.adopt_noise(space, values)
+        if taken and self.whole is not self.problem:
+            self.problem.adopt_noise(space, values)
+        return taken
 
     def _with_what_scatters_so(self, found: Posterior, fixed: Sequence[Candidate]) -> Posterior:
         """Without corrections of the counts whose light would scatter otherwise than the counts do.
@@ -186,11 +216,13 @@ class WholeBench:
         self, candidates: Sequence[Candidate], fixed: Sequence[Candidate], old: Posterior | None = None
     ) -> Posterior:
         space = Space(tuple(candidates))
+        return posterior(self.whole, space, fixed, self._values_at_start(space, old), self.say)
+
+    def _values_at_start(self, space: Space, old: Posterior | None = None) -> Array:
         start = dict(self._start)
         if old is not None:
             start |= {c: old.values[p] for c, p in zip(old.space.candidates, old.space.slices, strict=True)}
-        x = np.concatenate([np.zeros(0), *(start.get(c, np.zeros(c.size)) for c in space.candidates)])
-        return posterior(self.whole, space, fixed, x, self.say)
+        return np.concatenate([np.zeros(0), *(start.get(c, np.zeros(c.size)) for c in space.candidates)])
 
     def _clipped(self) -> list[Candidate]:
         """The switch that leaves clipped pixels out, if they say something else than the others."""
@@ -231,14 +263,35 @@ def applied(found: Posterior, base: Space, unfit: Sequence[Candidate] = ()) -> t
         if cause.probability >= LIKELY:
             shares = [by_label[c] for c in cause.alternatives if found.samples.probability[by_label[c]] > SHARES]
             keep |= {found.space.candidates[m] for g in shares for m in found.members[g]} | set(cause.candidates)
-    for g, probability in enumerate(found.samples.probability):
-        if probability > TAKES_PART:
-            keep |= {found.space.candidates[m] for m in found.members[g]}
+    for g in _least_needed(found, keep):
+        keep |= {found.space.candidates[m] for m in found.members[g]}
     keep -= set(unfit)
     order = [*base.candidates, *(c for c in found.space.candidates if c in keep and c not in base.candidates)]
     part = dict(zip(found.space.candidates, found.space.slices, strict=True))
     values = [found.values[part[c]] for c in order]
     return Space(tuple(order)), np.concatenate([np.zeros(0), *values])
+
+
+def _least_needed(found: Posterior, keep: Collection[Candidate]) -> list[int]:
+    """Groups beside those to `keep` that are likely enough to take part, and as many more as the fit would miss.
+
+    Several that are unlikely one by one can be one cause together: the mean has a part of each, which are nothing
+    without each other.
+    """
+    space, form = found.space, found.sets.form
+    order = np.argsort(-found.samples.probability)
+    kept = np.concatenate([np.zeros(0, dtype=bool), *(np.full(c.size, c in keep) for c in space.candidates)])
+    mean = found.values / space.joined("typical")
+    told = form.at(mean)
+    out: list[int] = []
+    for g in order:
+        left = form.at(np.where(kept, mean, 0.0)) - told
+        if found.samples.probability[g] <= TAKES_PART and left <= MISSED * found.samples.best.unit:
+            break
+        out.append(int(g))
+        for m in found.members[g]:
+            kept[space.slices[m]] = True
+    return out
 
 
 def solution(bench: WholeBench, found: Posterior, unfit: Sequence[Candidate] = ()) -> Solution:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
@@ -69,13 +70,7 @@ def improved(
 
     The descent begins at the best of some places (K,).
     """
-    index = np.concatenate(
-        [np.zeros(0, dtype=np.int64)]
-        + [g.index for g, p in zip(groups, samples.probability, strict=True) if p > TAKES_PART]
-    )
-    chosen = [k for k, part in enumerate(space.slices) if part.start in set(index.tolist())]
-    part = Space(tuple(space.candidates[k] for k in chosen))
-    positions = np.concatenate([np.zeros(0, dtype=np.int64), *(np.r_[space.slices[k]] for k in chosen)]).astype(int)
+    part, positions = _part_of(space, [g for g, p in zip(groups, samples.probability, strict=True) if p > TAKES_PART])
     typical = space.joined("typical")[positions]
     width = np.sqrt(np.diag(samples.covariance) + samples.mean**2)[positions] * typical
     weak = samples.best.unit / np.maximum(width, 1e-3 * typical) ** 2
@@ -86,6 +81,29 @@ def improved(
         best = int(np.argmin(np.nan_to_num(left, nan=np.inf)))
         out[positions] = descend(problem, part, places[best], weak, steps)
     return out
+
+
+def minimum_of(problem: Problem, space: Space, sets: Sets, state: State) -> Array:
+    """Values (K,) at the minimum of chi-square and prior of one set, from where it is if the problem is linear."""
+    fit, on = sets.fitted(state), state.tau > 0
+    part, positions = _part_of(space, [g for g, there in zip(sets.groups, on, strict=True) if there])
+    linear, tau = np.zeros(space.size), np.zeros(space.size)
+    linear[fit.active] = fit.mean
+    for k in np.flatnonzero(on):
+        tau[sets.groups[k].index] = state.tau[k]
+    typical = space.joined("typical")
+    out = np.zeros(space.size)
+    weak = state.unit / (tau * typical)[positions] ** 2
+    out[positions] = descend(problem, part, (linear * typical)[positions], weak)
+    return out
+
+
+def _part_of(space: Space, groups: Sequence[Group]) -> tuple[Space, NDArray[np.int64]]:
+    """The candidates of some groups, and their positions (J,) in the common vector."""
+    index = {int(i) for g in groups for i in g.index}
+    chosen = [k for k, part in enumerate(space.slices) if part.start in index]
+    positions = np.concatenate([np.zeros(0, dtype=np.int64), *(np.r_[space.slices[k]] for k in chosen)])
+    return Space(tuple(space.candidates[k] for k in chosen)), positions.astype(np.int64)
 
 
 def _penalized(sums: Sums, weak: Array, values: Array, reference: float | None = None) -> float:

@@ -13,15 +13,15 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.descent import STEPS, all_at_once, improved, mean_over_sets, next_values
+from processing.diagnosis.search.descent import STEPS, all_at_once, improved, mean_over_sets, minimum_of, next_values
 from processing.diagnosis.search.down_to_noise import down_to_noise
 from processing.diagnosis.search.likely_set import climb, likely_set
 from processing.diagnosis.search.linearized import grouped, noise_of, quadratic
 from processing.diagnosis.search.problem import Problem
-from processing.diagnosis.search.rules import BENT, CHANGES, GROWTH, ROUNDS, SAMPLES, TAU
+from processing.diagnosis.search.rules import BENT, CHANGES, GROWTH, HOPE, ROUNDS, SAMPLES, SAMPLES_BEFORE, TAU
 from processing.diagnosis.search.sampling import Samples, sample
-from processing.diagnosis.search.sets import Group, Sets, State
-from processing.diagnosis.search.space import Space
+from processing.diagnosis.search.sets import Group, Noise, Sets, State
+from processing.diagnosis.search.space import Space, Sums
 from processing.diagnosis.search.stays import stay
 
 #: Called with a line that says what is being done.
@@ -82,34 +82,111 @@ def posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start:
     return _posterior_of(problem, space, members, sets, samples, about)
 
 
-def _found(
-    problem: Problem, space: Space, fixed: Sequence[Candidate], groups: Sequence[Group], start: Array
-) -> tuple[Array, Sets, State]:
-    """Values (K,) about which it was linearized last, the sets there, and the likeliest of them."""
-    x = about = start
-    rounds = ROUNDS if problem.noise_known else FEWER_ROUNDS
-    for left in reversed(range(rounds)):
+@dataclass(frozen=True)
+class _Round:
+    """The problem linearized `about` values (K,), with the `excess` there, and a likely set in it."""
+
+    about: Array
+    excess: float
+    sets: Sets
+    state: State
+
+    @property
+    def score(self) -> float:
+        return self.sets.fitted(self.state).score
+
+
+#: Linearizes about values (K,); None where the model has no intensities.
+Look = Callable[[Array], _Round | None]
+
+
+def _looking(
+    problem: Problem,
+    space: Space,
+    groups: Sequence[Group],
+    climbed: Callable[[Sets], State],
+    noise: Noise | None = None,
+) -> Look:
+    """What linearizes a problem and finds a set; with the noise that is there unless one is given."""
+
+    def look(x: Array) -> _Round | None:
         problem.relinearize(space, x)
         sums = problem.sums(space, x)
         form = quadratic(problem, space, x, sums)
         if not (np.isfinite(form.excess) and np.all(np.isfinite(form.curvature))):
-            # The step went where the model has no intensities: what was found before it stays.
-            problem.relinearize(space, about)
-            break
-        about = x
-        sets = Sets(form, groups, noise_of(problem, sums))
-        state = likely_set(sets)
-        if left == rounds - 1 and (state.unit > BENT or not problem.noise_known):
-            # Several large causes, none of which explains much alone, or far from linear: all of them at once first.
-            x = all_at_once(problem, space, fixed, x, sets.noise, TAU[-1])
-            continue
-        settled = left == 0
-        if not settled:
-            new, settled = next_values(problem, space, sets, state, x)
-            x = x if settled else new
+            return None
+        sets = Sets(form, groups, noise or noise_of(problem, sums))
+        return _Round(x, _total(problem, sums), sets, climbed(sets))
+
+    return look
+
+
+def first_look(problem: Problem, space: Space, fixed: Sequence[Candidate], start: Array) -> Array:
+    """Values (K,), mean over the sets that are likely where the problem is linearized about `start` (K,) alone."""
+    first = _looking(problem, space, grouped(space, fixed)[1], likely_set)(start)
+    return start if first is None else mean_over_sets(space, sample(first.sets, first.state, SAMPLES_BEFORE), start)
+
+
+def _total(problem: Problem, sums: Sums) -> float:
+    return float(sums.excess.sum()) + (0.0 if problem.noise_known else float(sums.freedom.sum()))
+
+
+def _found(
+    problem: Problem, space: Space, fixed: Sequence[Candidate], groups: Sequence[Group], start: Array
+) -> tuple[Array, Sets, State]:
+    """Values (K,) about which it was linearized, the sets there, and the likeliest of them."""
+    look = _looking(problem, space, groups, likely_set)
+    first = look(start)
+    assert first is not None, "the instrument as declared has no intensities"
+    rounds = ROUNDS if problem.noise_known else FEWER_ROUNDS
+    if first.state.unit > BENT or not problem.noise_known:
+        # Several large causes, none of which explains much alone, or far from linear: all of them at once first.
+        x = all_at_once(problem, space, fixed, start, first.sets.noise, TAU[-1])
+        first, rounds = look(x) or first, rounds - 1
+    last = _without_alternatives(problem, space, _settled(problem, space, first, look, rounds), look, rounds)
+    return last.about, last.sets, last.state
+
+
+def _without_alternatives(problem: Problem, space: Space, found: _Round, look: Look, rounds: int) -> _Round:
+    """The same from a start without what is one of many alternatives, where that is likelier.
+
+    An axis that slips by degrees where hardly anything depends on it is a place of its own: about it no straight line
+    leads back to nothing.
+    """
+    chosen = (found.state.tau > 0) & (found.sets.share > 1)
+    if not chosen.any():
+        return found
+    without = found.sets.settled(State(np.where(chosen, 0.0, found.state.tau), found.state.unit))
+    first = look(minimum_of(problem, space, found.sets, without))
+    other = None if first is None else _settled(problem, space, first, look, rounds)
+    if other is not None and other.score > found.score:
+        return other
+    problem.relinearize(space, found.about)
+    return found
+
+
+def _settled(problem: Problem, space: Space, first: _Round, look: Look, rounds: int) -> _Round:
+    """Linearized anew about what was found, at most so many times, until it stays.
+
+    Values that the data hardly tell can move on and on beside each other, to where the problem is another one. So it
+    ends before a round that is less likely than one that the counts bear out.
+    """
+    now, score = first, -np.inf
+    for _ in range(rounds - 1):
+        x, settled = next_values(problem, space, now.sets, now.state, now.about)
         if settled:
             break
-    return about, sets, state
+        new = look(x)
+        if new is None:
+            break
+        noise, told = now.sets.noise, now.sets.form.at(x / space.joined("typical"))
+        if noise.unit(new.excess) <= GROWTH * noise.unit(told):
+            score = max(score, now.score)
+        if new.score < score + HOPE:
+            break
+        now = new
+    problem.relinearize(space, now.about)
+    return now
 
 
 def _averaged(sets: Sets, state: State) -> Samples:
@@ -119,16 +196,13 @@ def _averaged(sets: Sets, state: State) -> Samples:
 
 def resampled(problem: Problem, found: Posterior, rounds: int) -> Posterior:
     """The same with other weights of the captures, from the likeliest set on; linearized anew at most so many times."""
-    x, space = found.values, found.space
-    for left in reversed(range(rounds)):
-        sets = Sets(quadratic(problem, space, x, problem.sums(space, x)), found.sets.groups, found.sets.noise)
-        state = climb(sets, found.samples.best)
-        new, settled = next_values(problem, space, sets, state, x) if left else (x, True)
-        if settled:
-            break
-        x = new
-        problem.relinearize(space, x)
-    return _posterior_of(problem, space, found.members, sets, _averaged(sets, state), x)
+    space, old = found.space, found.sets
+    look = _looking(problem, space, old.groups, lambda sets: climb(sets, found.samples.best), old.noise)
+    first = look(found.values)
+    if first is None:
+        return found
+    last = _settled(problem, space, first, look, rounds)
+    return _posterior_of(problem, space, found.members, last.sets, _averaged(last.sets, last.state), last.about)
 
 
 def _posterior_of(
@@ -136,11 +210,10 @@ def _posterior_of(
 ) -> Posterior:
     """The posterior of a problem linearized `about` values (K,)."""
     typical, values = space.joined("typical"), mean_over_sets(space, samples, np.ones(space.size))
-    z, form = values / typical, sets.form
-    told = float(form.excess + 2 * form.gradient @ z + z @ form.curvature @ z)
     there = problem.sums(space, values, derivatives=False)
-    left = float(there.excess.sum()) + (0.0 if problem.noise_known else float(there.freedom.sum()))
-    if not sets.noise.unit(left) <= GROWTH * sets.noise.unit(told):
+    # Of the directions over which structure spreads, also where the sets counted every intensity in full.
+    noise = noise_of(problem, there)
+    if not noise.unit(_total(problem, there)) <= GROWTH * noise.unit(sets.form.at(values / typical)):
         # The least certain values lie along a bent valley, in which the straight line to their mean does not stay.
         values = improved(problem, space, sets.groups, samples, [about], 2 * STEPS)
     return Posterior(space, members, sets, samples, values, samples.covariance * np.outer(typical, typical))

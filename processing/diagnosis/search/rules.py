@@ -115,7 +115,8 @@ BENT = 2.0
 SHRUNK = 0.3
 #: [of the unit of chi-square] That a round of such a search may leave of the one before, or it ends.
 GAINING = 0.5
-#: [log odds] Loss of a change of the set that is still tried: the unit of chi-square may fall with it.
+#: [log odds] Loss of a change of the set, or of a new linearization, that is still tried: the unit of chi-square may
+#: fall with it.
 HOPE = -6.0
 #: [log odds] From which on a group is not taken away any more on the way down from all groups.
 NEEDED = 12.0
@@ -126,7 +127,7 @@ DECISIVE = 25.0
 #: its own: 0.4 GB, or 300 values for 40 states of an unknown sample. The likeliest values are taken.
 BESIDE_FIELD = 5e7
 #: [1] Growth of the unit of chi-square, by what the tests of the residual find, from which on the sets are visited
-#: again; and at the mean of the sets beyond what a straight line to it promised, from which on a descent replaces it.
+#: again; and at values beyond what a straight line to them promised, from which on it is not believed.
 GROWTH = 1.05
 
 # ---- wiring --------------------------------------------------------------------------------------------------------
@@ -139,6 +140,9 @@ WIRING = 5.0
 TAKES_PART = 0.25
 #: [probability] From which on a member of a class that is likely as a whole takes its share in the correction.
 SHARES = 0.01
+#: [unit of chi-square] That the fit may lose by what takes no part: several causes that are unlikely one by one can be
+#: one that is certain, and what is left over without them is no structure.
+MISSED = 4.0
 #: [1] Growth of the residual on held-out data that is still put down to chance.
 WORSE = 1.002
 #: [probability] That the error of M grows by a correction, up to which it is written: what is changed has to be 4.65

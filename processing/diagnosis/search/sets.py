@@ -32,6 +32,10 @@ class Quadratic:
     gradient: Array
     curvature: Array
 
+    def at(self, x: Array) -> float:
+        """Chi-square at x (K,)."""
+        return float(self.excess + 2 * self.gradient @ x + x @ self.curvature @ x)
+
 
 @dataclass(frozen=True)
 class Group:

@@ -175,10 +175,11 @@ def test_noise_that_looks_like_structure_takes_nothing_away(monkeypatch: Patch, 
     """Of many pixels a thousandth of the noise is structure, in the light of which seven causes became nothing."""
     found = [Some(samples=Some(best=Some(unit=u)), space=Space(())) for u in (1.0, unit)]
     each = iter(found)
-    whole = Some(noise_known=True, adopt_noise=lambda *of: True, holds_out_states=False)
+    whole = Some(noise_known=True, holds_out_states=False)
     tried = bench(pool=(), whole=whole, problem=whole)
     monkeypatch.setattr(whole_bench, "applied", lambda *of: ())
-    for name, answer in (("_clipped", []), ("as_many_as_intensities", set())):
+    nothing = {"_clipped": [], "as_many_as_intensities": set(), "_take_noise_of_light": None, "_adopt_noise": True}
+    for name, answer in nothing.items():
         monkeypatch.setattr(whole_bench.WholeBench, name, lambda self, *of, answer=answer: answer)
     monkeypatch.setattr(whole_bench.WholeBench, "_posterior", lambda self, *of: next(each))
     monkeypatch.setattr(whole_bench.WholeBench, "_with_what_scatters_so", lambda self, found, fixed: found)

@@ -6,9 +6,10 @@ import numpy as np
 from rule_decisions import Patch, cause, decides, made
 
 from processing.diagnosis.instrument import empirical, guard, judge, least_change, whole_bench, wiring
-from processing.diagnosis.instrument.doubts import PART_OF_LEFT, WAVE
+from processing.diagnosis.instrument.doubts import PART_OF_LEFT, WAVE, WAVE_AS_WELL
 from processing.diagnosis.search import causes
 from processing.diagnosis.search.result import Empirical
+from processing.diagnosis.search.sets import Quadratic
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import FieldEffect, GeneralEffect
 
@@ -30,14 +31,16 @@ def test_decisive(m: Patch) -> bool:
     return miswired(m, 28.0, 0.5) and not miswired(m, 23.0, 0.5)
 
 
-def takes_part(m: Patch, probabilities: list[float], told: causes.Cause | None = None) -> list[str]:
+def takes_part(m: Patch, probabilities: list[float], told: causes.Cause | None = None, mean: float = 0.0) -> list[str]:
+    """Places that take part in a correction; each of them takes its mean squared of chi-square away."""
     space = Space(tuple(made(place=str(k)) for k in range(len(probabilities))))
     found = Some(
         space=space,
         members=[(k,) for k in range(len(probabilities))],
         label=lambda g: space.candidates[g],
-        samples=Some(probability=np.array(probabilities)),
-        values=np.zeros(space.size),
+        samples=Some(probability=np.array(probabilities), best=Some(unit=1.0)),
+        sets=Some(form=Quadratic(0.0, np.full(space.size, -mean), np.eye(space.size))),
+        values=np.full(space.size, mean),
     )
     names = ()
     if told is not None:
@@ -49,6 +52,13 @@ def takes_part(m: Patch, probabilities: list[float], told: causes.Cause | None =
 @decides
 def test_takes_part(m: Patch) -> bool:
     return takes_part(m, [0.23, 0.27]) == ["1"]
+
+
+@decides
+def test_missed(m: Patch) -> bool:
+    # Without the second one 3.9 is left, without both twice as much; or 2.05 of each of three.
+    two = takes_part(m, [0.2, 0.1], mean=np.sqrt(3.9))
+    return two == ["0"] and takes_part(m, [0.2, 0.1, 0.05], mean=np.sqrt(2.05)) == ["0", "1"]
 
 
 @decides
@@ -120,6 +130,10 @@ def test_beside_what_is_in_no_list_only_what_has_a_name_of_its_own_is_used() -> 
     doubt = {told[0]: WAVE, told[2]: PART_OF_LEFT}
     assert judge._unfit(problem, solved, told, [], doubt) == [waved, likely, nameless]
     assert judge._unfit(problem, solved, told, [], {told[2]: PART_OF_LEFT}) == []
+    # Where the wave only does as well, what stands beside both stays; as many values as the data have may be anything.
+    assert judge._unfit(problem, solved, told, [], {told[0]: WAVE_AS_WELL, told[2]: PART_OF_LEFT}) == [waved]
+    untold = told[0]
+    assert judge._unfit(problem, solved, told[1:], [untold], {told[2]: PART_OF_LEFT}) == [waved, likely, nameless]
     # A sample that is known takes up nothing.
     problem.captures[0].sample = "air"
     assert judge._unfit(problem, solved, told, [], doubt) == []
