@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from collections.abc import Callable
+from functools import cache
 from importlib.metadata import entry_points
 from typing import Any
 
@@ -43,6 +44,7 @@ def _entries(function: str, emulator: Emulator, port: str) -> list[Any]:
     return list(getattr(module, function)(emulator, port)) if hasattr(module, function) else []
 
 
+@cache
 def served_kinds() -> dict[str, Callable[[ServeOptions], Emulator]]:
     """Find what can be served: the `SERVES` table of every module in `simulators/controllers/`, and of plug-ins.
 
