@@ -68,8 +68,11 @@ def test_the_capture_says_what_it_is(acquire, small_rig, tmp_path):
 
 
 def test_same_plan_and_seed_give_the_same_bytes(acquire, small_rig, tmp_path):
+    plan = tmp_path / "plan.yaml"
+    plan.write_text("kind: plan\ndarks: 2\nstates: {kind: rotating_retarders, states: 20, step_deg: 18}\n")
+
     def frames(folder, seed):
-        code, out, err = acquire("--omega", 35, "--rig", small_rig(), "--seed", seed, "--out", tmp_path / folder)
+        code, out, err = acquire("--plan", plan, "--rig", small_rig(), "--seed", seed, "--out", tmp_path / folder)
         assert code == 0, err
         with h5py.File(_path(out)) as file:
             return file["entry/instrument/detector/data"][...]
