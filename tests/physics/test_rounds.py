@@ -80,3 +80,25 @@ def test_one_of_many_alternatives_is_left_where_less_is_likelier(monkeypatch, sp
     problem = Some(relinearize=lambda space, x: None)
     assert (posterior._without_alternatives(problem, space, found, lambda x: other, 7) is other) is likelier
     assert asked == [[1.0, 0.0]]
+
+
+@pytest.mark.parametrize(("second", "best", "others"), [(60.0, 1, ()), (45.0, 0, (1,)), (52.0, 1, (0,)), (40.0, 0, ())])
+def test_another_bend_is_asked_about_its_own_values(monkeypatch, space, second, best, others):
+    """About one bend another looks worse than it is; both are told where they do as well."""
+    form = Quadratic(0.0, np.zeros(2), np.eye(2))
+    sets = Sets(form, [Group(np.array([0])), Group(np.array([1]))], Noise(True, 1.0))
+    rounds = [
+        Some(about=np.full(2, k), sets=sets, state=State(np.eye(2)[k]), score=s) for k, s in ((0, 50.0), (1, second))
+    ]
+    asked = []
+
+    def minimum(problem, space, sets, state):
+        asked.append(state.tau.tolist())
+        return np.zeros(2)
+
+    monkeypatch.setattr(posterior, "minimum_of", minimum)
+    problem = Some(relinearize=lambda space, x: None)
+    found, beside = posterior._of_bends(problem, space, rounds[0], [0, 1], lambda x: rounds[1])
+    assert found is rounds[best]
+    assert beside == {best: others}
+    assert asked == [[0.0, 1.0]]

@@ -38,7 +38,7 @@ def seen_in(cycles, captures=1, beside=None):
     sets = Sets(form, groups, Noise(known=True, directions=30.0, slack=1e9))
     samples = sample(sets, State(np.array([3.0, 0.0])), 1)
     samples = SimpleNamespace(**{**vars(samples), "best": State(np.array([3.0, 0.0])), "any_of": lambda members: 1.0})
-    return Posterior(space, ((0,), tuple(range(1, captures + 1))), sets, samples, np.zeros(space.size), np.eye(1))
+    return Posterior(space, ((0,), tuple(range(1, captures + 1))), sets, samples, np.zeros(space.size), np.eye(1), {})
 
 
 def turning(captures=1):

@@ -73,6 +73,7 @@ def causes(found: Posterior, left: float) -> tuple[Cause, ...]:
             at = np.flatnonzero((fit.active >= part.start) & (fit.active < part.stop))
             values.append(fit.mean[at] * typical[part])
             errors.append(fit.covariance[np.ix_(at, at)] * np.outer(typical[part], typical[part]))
+        others += [j for j in found.others.get(k, ()) if j not in others]
         members = [k, *others, *_alternatives_of_family(found, k)]
         names = tuple(found.space.candidates[found.members[j][0]] for j in others)
         # The sets that were visited, and the odds beside the likeliest, each err on the sure side.

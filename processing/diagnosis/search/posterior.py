@@ -6,7 +6,7 @@ captures are one group; a slip is one of as many alternatives as there are state
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,11 +18,23 @@ from processing.diagnosis.search.down_to_noise import down_to_noise
 from processing.diagnosis.search.likely_set import climb, likely_set
 from processing.diagnosis.search.linearized import grouped, noise_of, quadratic
 from processing.diagnosis.search.problem import Problem
-from processing.diagnosis.search.rules import BENT, CHANGES, GROWTH, HOPE, ROUNDS, SAMPLES, SAMPLES_BEFORE, TAU
+from processing.diagnosis.search.rules import (
+    ALTERNATIVE,
+    BENT,
+    CHANGES,
+    GROWTH,
+    HOPE,
+    ROUNDS,
+    SAMPLES,
+    SAMPLES_BEFORE,
+    SHRUNK,
+    TAU,
+)
 from processing.diagnosis.search.sampling import Samples, sample
 from processing.diagnosis.search.sets import Group, Noise, Sets, State
 from processing.diagnosis.search.space import Space, Sums
 from processing.diagnosis.search.stays import stay
+from processing.instrument.effects.base import PointwiseEffect
 
 #: Called with a line that says what is being done.
 Say = Callable[[str], None]
@@ -39,6 +51,7 @@ class Posterior:
     ----------
     space : all candidates; members : numbers of the candidates of each group.
     sets, samples : the last linearization, and the sets that were visited in it.
+    others : by a group that is there, those that do as well in its place where each is linearized about its own values.
     values : (K,) mean; covariance : (K, K), both in the units of the parameters.
     """
 
@@ -48,6 +61,7 @@ class Posterior:
     samples: Samples
     values: Array
     covariance: Array
+    others: Mapping[int, tuple[int, ...]]
 
     @property
     def score(self) -> float:
@@ -68,21 +82,22 @@ def posterior(problem: Problem, space: Space, fixed: Sequence[Candidate], start:
     start : (K,) values to begin with.
     """
     members, groups = grouped(space, fixed)
-    about, sets, state = _found(problem, space, fixed, groups, start)
+    bends = [g for g, own in enumerate(members) if isinstance(space.candidates[own[0]].effect, PointwiseEffect)]
+    about, sets, state, others = _found(problem, space, fixed, groups, start, bends)
     if problem.noise_known and state.unit > BENT:
         say("structure is left: once more, with every intensity counted in full")
         explained = down_to_noise(problem, space, fixed, groups, start, sets.noise, state.unit)
         if explained is None:
             problem.relinearize(space, about)
         else:
-            about, sets, state = explained
+            (about, sets, state), others = explained, {}
     samples = _averaged(sets, state)
     there = [space.candidates[members[g][0]].label for g in np.flatnonzero((samples.probability > 0.5) & sets.free)]
     say(f"likely: {', '.join(there) or 'nothing'}; unit of chi-square {state.unit:.3g}")
-    return _posterior_of(problem, space, members, sets, samples, about)
+    return _posterior_of(problem, space, members, sets, samples, about, others)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Round:
     """The problem linearized `about` values (K,), with the `excess` there, and a likely set in it."""
 
@@ -132,19 +147,54 @@ def _total(problem: Problem, sums: Sums) -> float:
 
 
 def _found(
-    problem: Problem, space: Space, fixed: Sequence[Candidate], groups: Sequence[Group], start: Array
-) -> tuple[Array, Sets, State]:
-    """Values (K,) about which it was linearized, the sets there, and the likeliest of them."""
+    problem: Problem,
+    space: Space,
+    fixed: Sequence[Candidate],
+    groups: Sequence[Group],
+    start: Array,
+    bends: Sequence[int],
+) -> tuple[Array, Sets, State, dict[int, tuple[int, ...]]]:
+    """Values (K,) about which it was linearized, the sets there, the likeliest of them, and what does as well."""
     look = _looking(problem, space, groups, likely_set)
     first = look(start)
     assert first is not None, "the instrument as declared has no intensities"
     rounds = ROUNDS if problem.noise_known else FEWER_ROUNDS
     if first.state.unit > BENT or not problem.noise_known:
-        # Several large causes, none of which explains much alone, or far from linear: all of them at once first.
-        x = all_at_once(problem, space, fixed, start, first.sets.noise, TAU[-1])
-        first, rounds = look(x) or first, rounds - 1
+        # Several large causes, none of which explains much alone, or far from linear: all of them at once first, with
+        # the least values, which are the likeliest and where a straight line holds, or as large as they may be.
+        widths = (SHRUNK, TAU[-1]) if problem.noise_known else TAU[-1:]
+        begun = [look(all_at_once(problem, space, fixed, start, first.sets.noise, w)) for w in widths]
+        first = max((one for one in begun if one is not None), key=lambda one: one.score, default=first)
+        problem.relinearize(space, first.about)
+        rounds -= 1
     last = _without_alternatives(problem, space, _settled(problem, space, first, look, rounds), look, rounds)
-    return last.about, last.sets, last.state
+    last, others = _of_bends(problem, space, last, bends if problem.noise_known else (), look)
+    return last.about, last.sets, last.state, others
+
+
+def _of_bends(
+    problem: Problem, space: Space, found: _Round, bends: Sequence[int], look: Look
+) -> tuple[_Round, dict[int, tuple[int, ...]]]:
+    """The likeliest, of this and of those with another of the `bends` (groups) in the place of one that is there.
+
+    Corrections of counts are expanded about what was found, where the right one may look worse than a wrong one. Also
+    which others do as well as each that is there, about their own values.
+    """
+    rounds = [found]
+    for k in (g for g in bends if found.state.tau[g] > 0):
+        for j in (g for g in bends if found.state.tau[g] == 0):
+            state = found.sets.without(found.state, k)
+            state.tau[j] = found.state.tau[k]
+            other = look(minimum_of(problem, space, found.sets, found.sets.settled(state)))
+            rounds += [other] if other is not None else []
+    best = max(rounds, key=lambda one: one.score)
+    problem.relinearize(space, best.about)
+
+    def there(one: _Round) -> set[int]:
+        return {g for g in bends if one.state.tau[g] > 0}
+
+    own, likely = there(best), [there(one) for one in rounds if one.score > best.score - ALTERNATIVE]
+    return best, {k: tuple(sorted({j for on in likely if k not in on for j in on - own})) for k in own}
 
 
 def _without_alternatives(problem: Problem, space: Space, found: _Round, look: Look, rounds: int) -> _Round:
@@ -202,11 +252,18 @@ def resampled(problem: Problem, found: Posterior, rounds: int) -> Posterior:
     if first is None:
         return found
     last = _settled(problem, space, first, look, rounds)
-    return _posterior_of(problem, space, found.members, last.sets, _averaged(last.sets, last.state), last.about)
+    samples = _averaged(last.sets, last.state)
+    return _posterior_of(problem, space, found.members, last.sets, samples, last.about, found.others)
 
 
 def _posterior_of(
-    problem: Problem, space: Space, members: tuple[tuple[int, ...], ...], sets: Sets, samples: Samples, about: Array
+    problem: Problem,
+    space: Space,
+    members: tuple[tuple[int, ...], ...],
+    sets: Sets,
+    samples: Samples,
+    about: Array,
+    others: Mapping[int, tuple[int, ...]],
 ) -> Posterior:
     """The posterior of a problem linearized `about` values (K,)."""
     typical, values = space.joined("typical"), mean_over_sets(space, samples, np.ones(space.size))
@@ -216,4 +273,4 @@ def _posterior_of(
     if not noise.unit(_total(problem, there)) <= GROWTH * noise.unit(sets.form.at(values / typical)):
         # The least certain values lie along a bent valley, in which the straight line to their mean does not stay.
         values = improved(problem, space, sets.groups, samples, [about], 2 * STEPS)
-    return Posterior(space, members, sets, samples, values, samples.covariance * np.outer(typical, typical))
+    return Posterior(space, members, sets, samples, values, samples.covariance * np.outer(typical, typical), others)
