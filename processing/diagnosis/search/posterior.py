@@ -160,15 +160,19 @@ def _found(
     assert first is not None, "the instrument as declared has no intensities"
     rounds = ROUNDS if problem.noise_known else FEWER_ROUNDS
     if first.state.unit > BENT or not problem.noise_known:
-        # Several large causes, none of which explains much alone, or far from linear: all of them at once first, with
-        # the least values, which are the likeliest and where a straight line holds, or as large as they may be.
-        widths = (SHRUNK, TAU[-1]) if problem.noise_known else TAU[-1:]
-        begun = [look(all_at_once(problem, space, fixed, start, first.sets.noise, w)) for w in widths]
+        # Several large causes, none of which explains much alone, or far from linear: all of them at once first, as
+        # large as they may be; or with the least values, where a straight line holds, if they leave nothing but noise.
+        begun = [look(all_at_once(problem, space, fixed, start, first.sets.noise, TAU[-1]))]
+        if problem.noise_known:
+            least = look(all_at_once(problem, space, fixed, start, first.sets.noise, SHRUNK))
+            begun += [least] if least is not None and least.state.unit <= BENT else []
         first = max((one for one in begun if one is not None), key=lambda one: one.score, default=first)
         problem.relinearize(space, first.about)
         rounds -= 1
     last = _without_alternatives(problem, space, _settled(problem, space, first, look, rounds), look, rounds)
-    last, others = _of_bends(problem, space, last, bends if problem.noise_known else (), look)
+    down = problem.noise_known and last.state.unit <= BENT
+    # Structure is described by whatever comes nearest to it: what is found beside it is not compared so closely.
+    last, others = _of_bends(problem, space, last, bends if down else (), look)
     return last.about, last.sets, last.state, others
 
 
