@@ -9,13 +9,9 @@ import pytest
 from bench_capture import bench_capture
 
 from processing.commands import diagnose as cli
-from processing.diagnosis.captured.read_capture import read_capture
-from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.residual_file import read_residuals
 from processing.diagnosis.instrument.run import diagnose_captures
-from processing.diagnosis.instrument.unevenness import unevenness
 from processing.diagnosis.search.result import Diagnosis
-from processing.diagnosis.search.space import Space
 from processing.instrument.model import EffectParameter, InstrumentModel
 from processing.storage.capture import Capture
 from processing.storage.capture_schema import Sample
@@ -212,19 +208,6 @@ def test_what_changes_in_a_part_of_the_image_is_no_source(configs, tmp_path):
     assert found.verdict == "unexplained"
 
 
-def test_a_source_whose_size_is_told_too_small_is_as_even_as_one_that_is_told_right(configs, tmp_path):
-    """Values that shrink to their prior leave a part of themselves in the whole image; that is no variation over it."""
-    bench = Bench(rows=40, columns=40)
-    bench.level.append(lambda k, a: 1 + 0.05 * k / (STATES - 1))
-    model = InstrumentModel.load(configs / "instruments/rgb950.yaml").nominal_at(662)
-    with Capture(capture(tmp_path, configs, bench, air=True)) as taken:
-        problem = InstrumentProblem(model, [read_capture(taken, model)])
-    drift = next(c for c in problem.pool() if c.kind == "source_drift")
-    for size in (0.05, 0.02):
-        excess, terms = unevenness(problem, drift, Space((drift,)), np.array([size, 0.0]))
-        assert excess < 4 * np.sqrt(2 * terms)
-
-
 def test_what_is_written_is_used_and_nothing_is_overwritten(configs, tmp_path, capsys):
     path = capture(tmp_path, configs, Bench(dg=np.deg2rad(129.0)), air=True)
     instrument, new = configs / "instruments/rgb950.yaml", tmp_path / "new.yaml"
@@ -269,7 +252,6 @@ def test_what_is_written_is_used_and_nothing_is_overwritten(configs, tmp_path, c
 def test_reduce_with_the_written_model_is_closer_to_the_truth(configs, tmp_path):
     from processing.diagnosis.instrument_file import write_instrument
     from processing.reduction.mueller import reduce_mueller
-    from processing.storage.capture import Capture
     from processing.storage.images import MuellerImage
     from processing.storage.product import Step
 

@@ -10,7 +10,7 @@ from processing.diagnosis.instrument.edges import at_edges
 from processing.diagnosis.instrument.nameless import NamelessWaves
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.source_patterns import beat_explains_as_well, chance_of_pattern, patterned
-from processing.diagnosis.instrument.unevenness import unevenness
+from processing.diagnosis.instrument.unevenness import Evenness
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause, shown
 from processing.diagnosis.search.posterior import Posterior
@@ -70,8 +70,9 @@ def doubts(
     uneven, patterned = 0.0, set[int | None]()
     waves = NamelessWaves.beside(problem, found) if causes else None
     still = _standing(problem, solved, causes)
+    even = Evenness(problem, solved.space, solved.fit.values)
     for cause in causes:
-        reason = STANDS if cause in still else _of_itself(problem, found, solved, cause, causes)
+        reason = STANDS if cause in still else _of_itself(problem, found, solved, cause, causes, even)
         if reason is None and waves is not None and _is_one_name(cause):
             reason = _wave(waves.gain_over(cause))
         if reason is not None:
@@ -110,7 +111,12 @@ def _wave(gain: float) -> str | None:
 
 
 def _of_itself(
-    problem: InstrumentProblem, found: Posterior, solved: Solution, cause: Cause, causes: Sequence[Cause]
+    problem: InstrumentProblem,
+    found: Posterior,
+    solved: Solution,
+    cause: Cause,
+    causes: Sequence[Cause],
+    even: Evenness,
 ) -> str | None:
     """The reason that a cause gives by itself, whatever is left of the others."""
     effect = cause.candidates[0].effect
@@ -121,10 +127,10 @@ def _of_itself(
             return "as many values as the data have"
         return PATTERN if _one_pattern(problem, found, cause) else None
     if isinstance(effect, SourceEffect):
-        return OF_THE_SAMPLE if any(_uneven(problem, solved, c, cause) for c in cause.candidates) else None
+        return OF_THE_SAMPLE if any(_uneven(even, solved, c, cause) for c in cause.candidates) else None
     # Channels that look at places apart leave something where the image is curved: that is not alike either.
     alike = isinstance(effect, CountsEffect) or any(c.place_px is not None for c in problem.captures)
-    if not alike and any(_uneven(problem, solved, c, cause) for c in cause.candidates):
+    if not alike and any(_uneven(even, solved, c, cause) for c in cause.candidates):
         return NOT_ALIKE
     return (
         BEAT if problem.noise_known and _is_one_name(cause) and beat_explains_as_well(problem, found, cause) else None
@@ -203,9 +209,9 @@ def acts_on_unknown(problem: InstrumentProblem, candidate: Candidate) -> bool:
     return any(c.sample is None and candidate.acts(k, c.wavelength_nm) for k, c in enumerate(problem.captures))
 
 
-def _uneven(problem: InstrumentProblem, solved: Solution, candidate: Candidate, cause: Cause) -> bool:
+def _uneven(even: Evenness, solved: Solution, candidate: Candidate, cause: Cause) -> bool:
     """A source, or a train, that changes does so alike in the whole image; what differs from part to part is none."""
     if candidate not in solved.space.candidates or any(isinstance(c.effect, FieldEffect) for c in solved.effects):
         return False
-    excess, terms = unevenness(problem, candidate, solved.space, solved.fit.values)
+    excess, terms = even.varies(candidate)
     return bool(excess > max(UNEVEN * np.sqrt(2 * terms), UNEVEN_SHARE * 2 * cause.log_odds))

@@ -132,6 +132,13 @@ class Projected:
             curvature[np.ix_(counted, counted)] += _flat(of_counts) @ _flat(of_counts).T
         return gradient, pull, curvature
 
+    def of_each(self, da: Array) -> tuple[Array, Array]:
+        """Half gradient (T,) of the excess of each part by one value, and its curvature (T,), of da (L, K')."""
+        da = self.outside @ da
+        unknowns = self._y.transpose(0, 2, 1) @ self._back
+        gradient = np.sum(da * (self._carried @ self._back - self.residual @ unknowns), axis=(1, 2))
+        return gradient, np.sum((da @ unknowns.transpose(0, 2, 1)) ** 2, axis=(1, 2))
+
     def _weighted(self, c: Array) -> Array:
         """Sum (T, L, R) of the features, each times its coefficient (T or 1, F, L)."""
         used = np.flatnonzero(np.any(c, axis=(0, 2)))

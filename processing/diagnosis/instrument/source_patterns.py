@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.special import betaincc
 
 from processing.arrays import Array
@@ -56,14 +58,18 @@ def beat_explains_as_well(problem: InstrumentProblem, found: Posterior, cause: C
     beats, turns, cost = 0.0, 0.0, 0.0
     for g in source:
         curvature, gradient = given[g]
-        last = 0
+        beating, turning, last = [], [], 0
         for m in found.members[g]:
             candidate = found.space.candidates[m]
             part = slice(last, last := last + candidate.size)
             asked = curvature[part, part], gradient[part]
-            beats += _best(*asked)
-            turns += max((_held(wave, *asked) for wave in _turns(problem, candidate)), default=0.0)
+            beating.append(_best(*asked))
+            held = partial(_held, curvature=asked[0], gradient=asked[1])
+            turning.append(max(_turns(problem, candidate), key=held, default=np.zeros((candidate.size, 2))))
             cost += 2 * ONE_WAVE
+        # All captures at once: what they share beside the waves must not be counted for each of them.
+        beats += _held(block_diag(*beating), curvature, gradient)
+        turns += _held(block_diag(*turning), curvature, gradient)
     odds = 2 * np.log(SURE / (1 - SURE)) if beats - turns > cost else 0.0
     return bool(beats - cost > _explained(*given[own]) - odds)
 
@@ -79,17 +85,17 @@ def _turns(problem: InstrumentProblem, candidate: Candidate) -> Iterator[Array]:
 
 
 def _held(wave: Array, curvature: Array, gradient: Array) -> float:
-    """Chi-square that values along a wave (N, 2) explain."""
+    """Chi-square that values along a wave (N, 2), or one in each capture (N, 2 captures), explain."""
     return _explained(wave.T @ curvature @ wave, wave.T @ gradient)
 
 
-def _best(curvature: Array, gradient: Array) -> float:
-    """Most chi-square that one wave of values with a curvature (N, N) and a gradient (N,) explains."""
-
+def _best(curvature: Array, gradient: Array) -> Array:
+    """The wave (N, 2) that explains most of values with a curvature (N, N) and a gradient (N,)."""
+    held = partial(_held, curvature=curvature, gradient=gradient)
     cycles, step = _cycles(gradient.size)
-    near = cycles[int(np.argmax([_held(wave, curvature, gradient) for wave in waves(cycles, gradient.size)]))]
+    near = cycles[int(np.argmax([held(wave) for wave in waves(cycles, gradient.size)]))]
     closely = near + step * np.linspace(-1, 1, 2 * CLOSELY + 1)
-    return max(_held(wave, curvature, gradient) for wave in waves(closely, gradient.size))
+    return max(waves(closely, gradient.size), key=held)
 
 
 def _cycles(n: int) -> tuple[Array, float]:

@@ -114,9 +114,8 @@ def test_of_what_is_hardly_beyond_noise_no_pattern_is_told(monkeypatch):
 
 def uneven(m: Patch, excess: float, odds: float) -> bool:
     told = cause(odds)
-    m.setattr(doubts, "unevenness", lambda *a: (excess, 2))
-    solved = Some(space=Space(told.candidates), effects=(), fit=Some(values=None))
-    return doubts._uneven(None, solved, told.candidates[0], told)
+    even = Some(varies=lambda candidate: (excess, 2))
+    return doubts._uneven(even, Some(space=Space(told.candidates), effects=()), told.candidates[0], told)
 
 
 @decides
@@ -194,7 +193,7 @@ def doubted(m: Patch, odds: float, known: bool, left: float) -> bool:
     m.setattr(doubts.NamelessWaves, "beside", lambda *of: None)
     found = Some(samples=Some(best=Some(unit=1.0)), sets=Some(noise=Some(directions=1.0)), members=())
     told = cause(odds)
-    solved = Some(space=Space(()))
+    solved = Some(space=Space(()), fit=Some(values=None))
     return told in doubts.doubts(Some(noise_known=known, captures=()), found, solved, [told], left)
 
 
@@ -212,7 +211,8 @@ def test_one_wave(m: Patch) -> bool:
     )
 
     def beats(explained: float) -> bool:
-        m.setattr(source_patterns, "_best", lambda *of: explained)
+        m.setattr(source_patterns, "_best", lambda *of: np.full((1, 2), 7.0))
+        m.setattr(source_patterns, "_held", lambda wave, curvature, gradient: explained if 7.0 in wave else 50.0)
         m.setattr(source_patterns, "_explained", lambda *of: 50.0)
         source = made(type("Source", (SourceEffect, ValuePerState), {}))
         told = cause()
@@ -235,7 +235,7 @@ def test_what_is_one_of_several_is_not_asked_whether_a_source_beats(monkeypatch)
     told, problem = cause(), Some(noise_known=True, captures=())
     solved = Some(space=Space(()))
     either = replace(told, alternatives=(made(),))
-    reasons = [doubts._of_itself(problem, None, solved, c, [c]) for c in (told, either)]
+    reasons = [doubts._of_itself(problem, None, solved, c, [c], None) for c in (told, either)]
     assert reasons == [doubts.BEAT, None]
 
 
