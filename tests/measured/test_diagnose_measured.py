@@ -105,8 +105,10 @@ def test_the_telescope_at_one_wavelength(shared_data, configs, tmp_path):
     plain = tuple(name for name in model.calibrate if not name.endswith("depolarization"))
     belongs = {name: rule for name, rule in model.belongs_to.items() if not name.endswith("depolarization")}
     d = diagnose_captures([path], model.model_copy(update={"calibrate": plain, "belongs_to": belongs}))[0].diagnosis
-    # One angle for each ratio of two channels would leave less than the photon noise of 0.01 %.
-    assert 0.05 < d.error_after.rms_percent < 0.25
+    # One angle for each ratio of two channels would leave less than the photon noise of 0.01 %. Whether what is found
+    # is used is another question: one wavelength tells so little of M that it gets worse by a chance of 0.6 to 4 %.
+    left = next(check.after for check in d.correction.checks if check.name.startswith("rms on held-out data"))
+    assert 0.05 < left < 0.25
 
 
 def held_out_of_each(

@@ -75,11 +75,11 @@ def dark_margin(state: int, electrons):
 )
 def test_noise_is_told_and_does_not_alarm(taken, configs, name, bench, words, air):
     data, tests, chi2 = read(taken(spoiled(name, 3, **bench), air), configs)
-    assert len(data.noise_told) == (words is not None), data.noise_told
-    assert words is None or words in data.noise_told[0], data.noise_told
+    assert len(data.told_of_noise) == (words is not None), data.told_of_noise
+    assert words is None or words in data.told_of_noise[0], data.told_of_noise
     if name == "black_jitter":
         # 3 electrons, of 2 counts each.
-        assert float(data.noise_told[0].split()[-3]) == pytest.approx(6.0, rel=0.25)
+        assert float(data.told_of_noise[0].split()[-3]) == pytest.approx(6.0, rel=0.25)
     assert data.noise_estimated == (name == "gain_not_stated")
     assert max(tests.values()) < 5, tests
     assert chi2 == pytest.approx(1.0, abs=0.03)
@@ -106,4 +106,4 @@ def test_a_fault_of_the_optics_is_no_noise(taken, configs):
     bench.transfer.append(lambda e: e - 3e-6 * e**2)
     bench.light.append(dark_margin)
     data, _, _ = read(taken(bench, air=False), configs)
-    assert not data.noise_told
+    assert not data.told_of_noise

@@ -50,12 +50,23 @@ def test_what_a_fit_leaves_of_the_optics_is_no_noise(configs, tmp_path):
 
 @pytest.mark.parametrize("stated", [True, False])
 def test_noise_follows_the_light_unless_it_is_stated(configs, tmp_path, stated):
-    model, data = captured(tmp_path, configs, Bench(rows=SIDE, columns=SIDE, electrons=6000.0))
+    bench = Bench(rows=SIDE, columns=SIDE, electrons=6000.0)
+    bench.stored.append(lambda counts: counts + 400)
+    model, data = captured(tmp_path, configs, bench)
     if stated:
         data = replace(data, slope=np.zeros_like(data.slope), noise_source="stated per state")
     problem = InstrumentProblem(model, [data], folds=1)
     offset = next(c for c in problem.pool() if c.kind == "detector_offset")
     assert problem.adopt_noise(Space((offset,)), np.array([400.0])) is not stated
+
+
+def test_the_noise_of_light_that_does_not_scatter_so_is_not_taken(configs, tmp_path):
+    model, data = captured(tmp_path, configs, Bench(rows=SIDE, columns=SIDE, electrons=6000.0))
+    problem = InstrumentProblem(model, [data], folds=1)
+    bend = next(c for c in problem.pool() if c.kind == "detector_nonlinearity")
+    before = problem.moments[0].sigma
+    assert not problem.adopt_noise(Space((bend,)), np.array([0.2]))
+    assert np.array_equal(problem.moments[0].sigma, before)
 
 
 def test_pixels_at_an_edge_are_left_out_and_those_of_a_slope_are_not(configs, tmp_path):

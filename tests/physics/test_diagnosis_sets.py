@@ -202,3 +202,18 @@ def test_a_descent_stays_where_the_model_has_numbers():
 
     problem = SimpleNamespace(relinearize=lambda space, x: False, sums=sums)
     assert descend(problem, space, np.zeros(1), np.zeros(1)) == 0.0
+
+
+def test_of_those_that_may_be_there_alone_never_two_are():
+    """Two curves and a third cause beside each other describe nearly anything; a detector has one."""
+    random = np.random.default_rng(9)
+    design = random.standard_normal((200, 6))
+    design[:, 1] = design[:, 0] + 0.05 * design[:, 1]
+    quadratic = form(20 * design, np.array([2.0, -1.0, 0.5, 0.0, 0.0, 0.0]))
+    alike = [Group(np.array([k]), alone=k < 2) for k in range(6)]
+    sets = Sets(quadratic, alike, Noise(known=True, directions=30.0, slack=1e9))
+    assert likely_set(Sets(quadratic, groups(*(1,) * 6), sets.noise)).tau[:2].all()
+    state = likely_set(sets)
+    assert np.sum(state.tau[:2] > 0) == 1
+    for samples in (sample(sets, state, 200), stay(sets, state, 400)):
+        assert float(samples.weight @ samples.sets[:, :2].all(axis=1)) == 0

@@ -79,6 +79,8 @@ class CaptureData:
     clipped : (rows, columns) True where some state is at the top of the range.
     clipped_states : (N,) True for states in which some pixel is.
     noise_estimated : slope and floor describe the scatter of these very counts, not the photons and the read-out.
+    noise_factors : by which slope and floor were changed from what is stated, since the images show so.
+    noise_level : by which both were scaled beside that.
     true_variance : (N, channels, rows, columns) where the variance is not a line in the counts any more.
     moved_px : (N, 2) by how much each frame was moved back, from what it had moved to the right and down; pixels here.
         That averages the noise of neighbours, and adds no information.
@@ -87,7 +89,8 @@ class CaptureData:
     steep : (rows, columns) True where a pixel is left out because it lies at a sharp edge; None: nowhere.
     cut_off : numbers of states that do not count because their counts are cut off at zero.
     shared : what pixels have of their noise in common; slope and floor are those of wide patterns.
-    noise_told : sentences about the noise where it is not what is declared.
+    noise_told : what patterns of the noise are not declared, in sentences; white_told : how its variance differs, which
+        holds while `noise_factors` are not one.
     left_out : frames, hits and pixels that are no measurement of the sample.
     place_px : (channels, 2) where in a super-pixel each channel looks, from its middle to the right and down; pixels
         here. None: all look at the same place.
@@ -115,12 +118,22 @@ class CaptureData:
     steep: NDArray[np.bool_] | None = None
     cut_off: tuple[int, ...] = ()
     noise_estimated: bool = False
+    noise_factors: tuple[float, float] = (1.0, 1.0)
+    noise_level: float = 1.0
     true_variance: NDArray[np.float32] | None = None
     moved_px: Array | None = None
     place_px: Array | None = None
     left_out: LeftOut = field(default_factory=LeftOut)
     shared: SharedNoise = field(default_factory=SharedNoise)
     noise_told: tuple[str, ...] = ()
+    white_told: str | None = None
+
+    @property
+    def told_of_noise(self) -> tuple[str, ...]:
+        """Sentences about the noise where it is not what is declared."""
+        if self.white_told is None or self.noise_factors == (1.0, 1.0):
+            return self.noise_told
+        return (*self.noise_told, self.white_told)
 
     @property
     def values_per_pixel(self) -> int:

@@ -50,12 +50,15 @@ def checked_noise(data: CaptureData, a: Array) -> CaptureData:
     for name, part in zip(("row", "column"), lines, strict=True):
         if part > 0:
             told.append(_in_counts(f"every {name} of a frame has an offset of its own", part, data))
-    shot, dark = _factors(found, shared.shown, data.noise_estimated)
-    if not data.noise_estimated and (shot, dark) != (1.0, 1.0):
-        told.append(_white_in_words(data, found.white / shared.shown, shot, dark))
+    shot, dark = factors = noise_factors(found, shared.shown, data.noise_estimated)
+    white = None
+    if not data.noise_estimated and factors != (1.0, 1.0):
+        white = _white_in_words(data, found.white / shared.shown, shot, dark)
     # What is common to a line is a part of the variance of its pixels, and more of that of wide patterns.
     slope, floor = data.slope * shot * shared.wide, (data.floor * dark + sum(lines)) * shared.wide
-    return replace(data, slope=slope, floor=floor, shared=shared, noise_told=tuple(told))
+    return replace(
+        data, slope=slope, floor=floor, shared=shared, noise_factors=factors, noise_told=tuple(told), white_told=white
+    )
 
 
 def _in_counts(what: str, variance: float, data: CaptureData) -> str:
@@ -89,7 +92,7 @@ def _lines(shared: SharedNoise, data: CaptureData) -> tuple[float, float]:
     return shared.rows * usual, shared.columns * usual
 
 
-def _factors(found: DetectorNoise, shown: float, estimated: bool) -> tuple[float, float]:
+def noise_factors(found: DetectorNoise, shown: float, estimated: bool) -> tuple[float, float]:
     """Factors on the variance with and without light; one where the images agree with what is declared."""
     both = np.array([found.shot, found.dark]) / shown
     white = found.white / shown

@@ -33,7 +33,8 @@ class DetectorNoise:
 
     Attributes
     ----------
-    white, white_error : variance of a pixel over what is declared.
+    white, white_error : variance of a pixel over what is declared; each : mean of that over all pixels, whatever their
+        light.
     shot, dark, covariance : the parts of the variance with and without light over what is declared, (2, 2);
         light_share : part of the variance declared that goes with the light.
     right, down : correlation of neighbours across and down; alike_error : its standard error.
@@ -44,6 +45,7 @@ class DetectorNoise:
 
     white: float
     white_error: float
+    each: float
     shot: float
     dark: float
     covariance: Array
@@ -107,6 +109,7 @@ def _compared(r: Array, light: Array, dark: Array, free: float) -> DetectorNoise
     return DetectorNoise(
         white=white,
         white_error=error,
+        each=float(np.mean([_of_each(r, expected, lag) for lag in FAR])),
         shot=shot,
         dark=floor,
         covariance=covariance,
@@ -131,6 +134,14 @@ def _half_square(r: Array, expected: Array, lag: int, axis: int) -> float:
     first, second = _pairs(r, lag, axis)
     one, other = _pairs(expected, lag, axis)
     return float(np.nansum((first - second) ** 2) / np.nansum(np.where(np.isfinite(first - second), one + other, 0)))
+
+
+def _of_each(r: Array, expected: Array, lag: int) -> float:
+    """Squares of differences across so many pixels over the variance that is expected of all rows, mean over pixels."""
+    first, second = _pairs(r, lag, 2)
+    one, other = _pairs(expected, lag, 2)
+    with np.errstate(invalid="ignore"):
+        return float(np.nanmean(np.sum((first - second) ** 2, axis=0) / np.sum(one + other, axis=0)))
 
 
 def _common(r: Array, expected: Array, axis: int) -> float:

@@ -44,7 +44,7 @@ def screened(data: CaptureData, model: InstrumentModel, say: Callable[[str], Non
         say(f"left out of {data.name}: state {', '.join(map(str, misfits))}, which belongs to nothing")
     # After the hits, which are steep as well.
     data = checked_noise(without_steep_pixels(data) if data.noise_known else data, a)
-    for line in data.noise_told:
+    for line in data.told_of_noise:
         say(f"the noise of {data.name} is not what is declared: {line}")
     return _as_fitted(data, say)
 

@@ -27,12 +27,15 @@ def scatter_prefers(problem: InstrumentProblem, space: Space, values: Array, new
     """Log likelihood of the residual with the noise of the counts that `new` undoes, over that with `old`.
 
     The residual is that of the captures at `values` (K,), the same in both. Of many pixels the noise's own error
-    (`NOISE_LEVEL`) is larger than what chance does to their scatter: they say no more than it lets them.
+    (`NOISE_LEVEL`) is larger than what chance does to their scatter: they say no more than it lets them. Noise that was
+    taken from the counts has what an offset lacks or adds in it already, and says nothing.
     """
     problem.relinearize(space, values)
     near, local = problem.near(space, values)
     gain = pairs = 0.0
     for k, (data, still) in enumerate(zip(near.captures, problem.still, strict=True)):
+        if still.noise_estimated or still.told_of_noise:
+            continue
         rest, free = _rest(near, k, space, local)
         share, good = free * near.moments[k].left, data.usable & ~data.clipped
         before, after = (

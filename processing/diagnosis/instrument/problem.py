@@ -25,6 +25,7 @@ from processing.diagnosis.instrument.moments import (
     holds_out_states,
     moments_of,
 )
+from processing.diagnosis.instrument.noise_level import with_noise_of_light
 from processing.diagnosis.instrument.projection import RANK, add_block, noise_information
 from processing.diagnosis.instrument.slopes import Columns, slopes_of_counts, slopes_of_rows
 from processing.diagnosis.instrument.tile_sums import add_tiles, tile_columns
@@ -185,10 +186,25 @@ class InstrumentProblem:
         stated = not any(c.slope.any() for c in self.captures)
         if near or stated or any(c.noise_estimated for c in self.captures):
             return False
+        if not self.level_noise(space, values):
+            return False
         self._noise_at = at
-        self.still = tuple(
-            c.with_noise_of(undoing(c, at)) if at else replace(c, true_variance=None) for c in self.still
-        )
+        return True
+
+    def level_noise(self, space: Space, values: Array) -> bool:
+        """Take the noise that light and differences of pixels tell beside these values, for all that follows.
+
+        False, and all as before, if the counts of a capture do not scatter as its light would.
+        """
+        at, still = exactly_undone(space, values, pointwise=True), []
+        for k, (data, nm) in enumerate(zip(self.still, self.wavelengths_nm, strict=True)):
+            acting = space.acting(k, nm)
+            rows = self.columns(k, self.changes(k, acting.space, acting.of(values))) * self.moments[k].sigma[:, None]
+            leveled = with_noise_of_light(data, rows, {c: v for c, v in at.items() if c.acts(k, nm)})
+            if leveled is None:
+                return False
+            still.append(leveled)
+        self.still = tuple(still)
         self.captures = _moved_back(self.still, self.own_px)
         self.moments = tuple(moments_of(c, self.folds) for c in self.captures)
         self.spread = max(m.spread for m in self.moments)

@@ -286,7 +286,7 @@ def not_measured(problem: InstrumentProblem) -> tuple[NotMeasured, ...]:
 def noise_report(problem: InstrumentProblem) -> NoiseReport:
     """Whether the noise is what is declared."""
     several = len(problem.captures) > 1
-    told = tuple(f"{c.name}: {line}" if several else line for c in problem.captures for line in c.noise_told)
+    told = tuple(f"{c.name}: {line}" if several else line for c in problem.captures for line in c.told_of_noise)
     if told:
         return NoiseReport(verdict="not_as_declared", told=told)
     if not problem.noise_known:

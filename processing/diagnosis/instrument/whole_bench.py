@@ -98,7 +98,8 @@ class WholeBench:
         found = self._with_what_scatters_so(found, fixed)
         fields = [c for c in self.pool if isinstance(c.effect, FieldEffect)]
         if fields and not self.whole.holds_out_states:
-            found = self._with_fields(found, fixed, fields)
+            beside = self._with_fields(found, fixed, fields)
+            found = found if beside is found else self._with_what_scatters_so(beside, [*fixed, *fields])
         solved = applied(found, self.base)
         if self.whole.noise_known and self._adopt_noise(*solved):
             self.say("the same with the noise that this light has")
@@ -108,16 +109,26 @@ class WholeBench:
         return found
 
     def _take_noise_of_light(self, candidates: Sequence[Candidate], fixed: Sequence[Candidate]) -> None:
-        """Take the noise from the light that a first look tells, until it stays.
+        """Take the noise from the light that a first look tells, until it stays, or what is left of the counts grows.
 
         Behind a bent response the noise that counts should have is wrong by percents. Of many pixels that is more than
-        most causes explain, and some other bend, with others to undo it, would be found for it.
+        most causes explain, and some other bend, with others to undo it, would be found for it. A bend that is not well
+        known makes it as wrong: too little noise is structure, beside which nothing is found.
         """
         space = Space(tuple(candidates))
-        start = self._values_at_start(space)
-        for _ in range(FIRST_LOOKS if self.whole.noise_known else 0):
-            if not self._adopt_noise(space, first_look(self.whole, space, fixed, start)):
+        start = told = self._values_at_start(space)
+        if not self.whole.noise_known:
+            return
+        self.whole.level_noise(space, start)
+        seen, unit = first_look(self.whole, space, fixed, start)
+        for _ in range(FIRST_LOOKS):
+            if not self._adopt_noise(space, seen):
                 break
+            now, left = first_look(self.whole, space, fixed, start)
+            if left > GROWTH * unit:
+                self._adopt_noise(space, told)
+                break
+            told, seen, unit = seen, now, left
 
     def _adopt_noise(self, space: Space, values: Array) -> bool:
         taken = self.whole.adopt_noise(space, values)
@@ -130,15 +141,14 @@ class WholeBench:
 
         Unless nothing else explains the counts: then it is the noise that is not what is declared.
         """
-        # Noise that was taken from the counts has what an offset lacks or adds in it already.
-        if not self.whole.noise_known or any(c.noise_estimated or c.noise_told for c in self.whole.captures):
+        if not self.whole.noise_known:
             return found
-        # Where one is gone another may stand in for it; each round has fewer of them.
+        # Where one is gone another may stand in for it, and one that stood beside it may be right.
         while against := self._refuted_by_scatter(found):
-            self.say(f"the noise speaks against {', '.join(c.label for c in against)}")
-            rest = [c for c in found.space.candidates if c not in against]
-            other = self._posterior(rest, fixed, found)
-            if not other.score > found.score + sum(against.values()):
+            worst = min(against, key=lambda c: against[c])
+            self.say(f"the noise speaks against {worst.label}")
+            other = self._posterior([c for c in found.space.candidates if c != worst], fixed, found)
+            if not other.score > found.score + against[worst]:
                 break
             found = other
         return found

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.diagnosis.search.rules import HOPE, NEEDED, PATIENCE
-from processing.diagnosis.search.sets import Sets, State
+from processing.diagnosis.search.sets import NEVER, Sets, State
 
 STEPS = 60
 
@@ -66,7 +66,9 @@ def thinned(sets: Sets) -> State:
         odds = np.where((state.tau > 0) & sets.free, c.log_odds, np.inf)
         if odds.min(initial=np.inf) > NEEDED:
             return kept
-        worst = np.argsort(odds)[: max(1, int(np.sum(odds < 0)) // 6)]
+        # Of those that may be there alone one after the other: the last is not impossible any more.
+        at_once = 1 if odds.min() < NEVER / 2 else max(1, int(np.sum(odds < 0)) // 6)
+        worst = np.argsort(odds)[:at_once]
         state.tau[worst] = 0.0
         retune(sets, state)
         sets.settled(state)

@@ -12,6 +12,7 @@ from processing.diagnosis.search.problem import Problem
 from processing.diagnosis.search.rules import LEAST_NOISE, NOISE_LEVEL, NOMINAL_TAU, SLACK
 from processing.diagnosis.search.sets import Group, Noise, Quadratic
 from processing.diagnosis.search.space import Space, Sums
+from processing.instrument.effects.base import ResponseCurve
 
 
 def grouped(space: Space, fixed: Sequence[Candidate]) -> tuple[tuple[tuple[int, ...], ...], list[Group]]:
@@ -24,7 +25,8 @@ def grouped(space: Space, fixed: Sequence[Candidate]) -> tuple[tuple[tuple[int, 
     for mine, family in zip(by_key.values(), families, strict=True):
         index = np.concatenate([np.r_[space.slices[k]] for k in mine]).astype(np.int64)
         always = space.candidates[mine[0]] in fixed
-        groups.append(Group(index, float(families.count(family)), NOMINAL_TAU if always else None))
+        curve = isinstance(space.candidates[mine[0]].effect, ResponseCurve)
+        groups.append(Group(index, float(families.count(family)), NOMINAL_TAU if always else None, curve))
     return tuple(tuple(m) for m in by_key.values()), groups
 
 

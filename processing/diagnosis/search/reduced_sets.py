@@ -6,6 +6,8 @@ they are projected out, and come back into mean and covariance afterwards.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,6 +32,8 @@ class ReducedSets:
         self._whole, self._state = whole, state
         certain, odds = _worth(whole, state)
         plausible = (whole.share == 1) | (odds > np.log(SHARES / (1 - SHARES)))
+        if (certain & whole.alone).any():
+            plausible &= ~whole.alone
         self.certain, self.kept = np.flatnonzero(certain), np.flatnonzero(plausible & ~certain)
         self._out, self._in = _positions(whole, self.certain), _positions(whole, self.kept)
         unit, form = state.unit, whole.form
@@ -90,6 +94,6 @@ def _renumbered(sets: Sets, groups: NDArray[np.int64]) -> list[Group]:
     out, first = [], 0
     for k in groups:
         size = sets.groups[k].index.size
-        out.append(Group(np.arange(first, first + size), sets.groups[k].share))
+        out.append(replace(sets.groups[k], index=np.arange(first, first + size)))
         first += size
     return out

@@ -20,8 +20,9 @@ from scipy.special import betaln
 from processing.arrays import Array
 from processing.diagnosis.search.rules import FEW_CAUSES, MANY, TAU, TAU_WEIGHT, TAU_WEIGHT_OF_MANY
 
-#: Probability of what cannot be, for its logarithm.
+#: Probability of what cannot be, for its logarithm; and log odds of it, beyond what any data speak for.
 LEAST_WEIGHT = 1e-300
+NEVER = -1e9
 
 
 @dataclass(frozen=True)
@@ -46,11 +47,13 @@ class Group:
     index : positions in x.
     share : it is one of so many alternatives of which one may be there (states at which an axis slips).
     fixed_tau : it is always there, with this standard deviation; None: it may be absent.
+    alone : of all groups that are, one may be there.
     """
 
     index: NDArray[np.int64]
     share: float = 1.0
     fixed_tau: float | None = None
+    alone: bool = False
 
 
 @dataclass(frozen=True)
@@ -135,6 +138,7 @@ class Sets:
         self.form, self.groups, self.noise, self.beside = form, tuple(groups), noise, beside
         self.free = np.array([g.fixed_tau is None for g in groups], dtype=bool)
         self.share = np.array([g.share for g in groups])
+        self.alone = np.array([g.alone for g in groups], dtype=bool)
         self.size = form.gradient.size
         # The alternatives of one group count once.
         self.count = float(np.sum(1 / self.share[self.free])) if count is None else count
@@ -177,13 +181,15 @@ class Sets:
         """Log probability of a set: how likely a group is is learnt from how many there are (beta-binomial)."""
         k, n = float(there.sum()) + self.beside, self.count
         count = betaln(1 + k, max(n - k, 0.0) + FEW_CAUSES * n) - betaln(1, (1 + FEW_CAUSES) * n)
-        return float(count - np.log(self.share[there]).sum())
+        too_many = max(float((there & self.alone).sum()) - 1, 0.0)
+        return float(count - np.log(self.share[there]).sum()) + NEVER * too_many
 
     def prior_odds(self, there: NDArray[np.bool_]) -> Array:
         """Log odds (G,) of each group to be there, of the prior, given the others of a set."""
         others = self.beside + there.sum() - there
         rest = np.maximum((1 + FEW_CAUSES) * self.count - others - 1, 0.1)
-        return np.asarray(np.log((1 + others) / rest / self.share))
+        beside = np.where(self.alone, (there & self.alone).sum() - (there & self.alone), 0.0)
+        return np.asarray(np.log((1 + others) / rest / self.share)) + NEVER * beside
 
     def fitted(self, state: State) -> Fitted:
         """Posterior of the parameters that are there."""

@@ -80,6 +80,10 @@ class PointwiseEffect(CountsEffect):
         """Signal (counts over full scale) without the effect, exactly, and its slope."""
 
 
+class ResponseCurve(PointwiseEffect):
+    """The curve from light to counts: a detector has one, whichever of these describes it."""
+
+
 class ImageShift(CountsEffect):
     """Moves the image (`Changes.shift_px`); undone by moving the frames back."""
 

@@ -14,11 +14,11 @@ import numpy as np
 from processing.arrays import Array
 from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import GeneralEffect, PointwiseEffect
+from processing.instrument.effects.base import GeneralEffect, ResponseCurve
 from processing.instrument.model import InstrumentModel
 
 
-class DetectorNonlinearity(PointwiseEffect, GeneralEffect):
+class DetectorNonlinearity(ResponseCurve, GeneralEffect):
     """Fraction c of the signal that is lost at full scale."""
 
     describes = "response"

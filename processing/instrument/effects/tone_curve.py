@@ -13,14 +13,14 @@ import numpy as np
 from processing.arrays import Array
 from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import PointwiseEffect
+from processing.instrument.effects.base import ResponseCurve
 from processing.instrument.model import InstrumentModel
 
 #: Signal over full scale below which the curve is taken as straight.
 TINY = 1e-6
 
 
-class ToneCurve(PointwiseEffect):
+class ToneCurve(ResponseCurve):
     """gamma - 1; light = full scale * (counts / full scale)^gamma."""
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:

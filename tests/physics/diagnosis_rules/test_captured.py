@@ -11,6 +11,7 @@ from processing.diagnosis.captured import bad_frames, black_jitter, checked_nois
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.common_rest import Whitened
 from processing.diagnosis.captured.steep_pixels import without_steep_pixels
+from processing.diagnosis.instrument import noise_level
 from processing.instrument.changes import Conditions
 
 STATES = 40
@@ -251,12 +252,24 @@ def shown(shot: float, dark_part: float, error: float = 1e-3, white: float | Non
         bent=1.0,
         light_share=0.9,
     )
-    return checked_noise._factors(found, mixed, False)
+    return checked_noise.noise_factors(found, mixed, False)
 
 
 @decides
 def test_noise_off(m: Patch) -> bool:
     return shown(1.055, 1.055) == (1.0, 1.0) and shown(1.065, 1.065) != (1.0, 1.0)
+
+
+@decides
+def test_gain_off(m: Patch) -> bool:
+    def taken(white: float) -> bool:
+        m.setattr(noise_level, "detector_noise", lambda *of: Some(white=white, white_error=0.0, each=white))
+        m.setattr(noise_level, "noise_factors", lambda *of, estimated: (1.0, 1.0))
+        # A bend that changes nothing.
+        m.setattr(noise_level, "undoing", lambda *of: lambda signal: (signal, np.ones(())))
+        return noise_level.with_noise_of_light(images(np.ones((2, 2)), 1.0), np.ones((2, 1)), {"bend": 0}) is not None
+
+    return taken(1.028) and not taken(1.032) and taken(0.972) and not taken(0.968)
 
 
 @decides

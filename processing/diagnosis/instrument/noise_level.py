@@ -1,0 +1,70 @@
+"""How large the noise of a capture is where corrections of its counts are undone, as its own pixels show it.
+
+Photon noise follows the light, not the counts. A gain is stated to some percent, and behind a bend that is not well
+known the noise is as uncertain. Of a hundred thousand intensities one percent of their variance is twenty standard
+deviations: too little noise looks like structure beside which no cause is worth anything, and too much hides some.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from processing.arrays import Array
+from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captured.checked_noise import noise_factors
+from processing.diagnosis.captured.detector_noise import DetectorNoise, detector_noise
+from processing.diagnosis.instrument.undone import undoing
+from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.rules import GAIN_OFF, NOISE_OFF
+
+
+def with_noise_of_light(data: CaptureData, a: Array, bends: Mapping[Candidate, Array]) -> CaptureData | None:
+    """The same counts with the noise of the light that they tell, as large as differences of pixels show it.
+
+    Whether it is what is stated is asked anew behind these `bends`. Then both of its parts are scaled, by no more than
+    labs mistake. None where no such gain goes with these bends: counts do not scatter as the light would.
+
+    Parameters
+    ----------
+    data : not moved; a (L, K) : rows of its model, not weighted.
+    """
+    shared = data.shared.shown < 1 or data.shared.wide > 1
+    if not data.noise_known or data.noise_estimated or shared:
+        return _of_light(data, bends)
+    least, usual = max(abs(data.noise_level - 1), GAIN_OFF), (1.0, 1.0)
+    # An offset looks like another read-out noise, and the reverse.
+    data = _scaled(data, usual if bends else data.noise_factors, 1.0)
+    found = _shown(data, a, bends)
+    if found is None:
+        return _of_light(data, bends)
+    factors = noise_factors(found, 1.0, estimated=False) if bends else data.noise_factors
+    if bends and factors == usual and abs(found.white - 1) > least:
+        return None
+    if factors != data.noise_factors:
+        data = _scaled(data, factors, 1.0)
+        found = _shown(data, a, bends) or found
+    return _of_light(_scaled(data, factors, _level(found)), bends)
+
+
+def _level(found: DetectorNoise) -> float:
+    """How much larger the noise is than is stated: of few pixels the gain is known better than they show it."""
+    shown = (GAIN_OFF / 2) ** 2 / ((GAIN_OFF / 2) ** 2 + found.white_error**2)
+    return float(np.clip(1 + shown * (found.each - 1), 1 - NOISE_OFF, 1 + NOISE_OFF))
+
+
+def _scaled(data: CaptureData, factors: tuple[float, float], level: float) -> CaptureData:
+    """The capture with another noise than is stated, by factors on its parts with and without light and on both."""
+    slope, floor = (new * level / old / data.noise_level for new, old in zip(factors, data.noise_factors, strict=True))
+    return replace(data, slope=data.slope * slope, floor=data.floor * floor, noise_factors=factors, noise_level=level)
+
+
+def _of_light(data: CaptureData, bends: Mapping[Candidate, Array]) -> CaptureData:
+    return data.with_noise_of(undoing(data, bends)) if bends else replace(data, true_variance=None)
+
+
+def _shown(data: CaptureData, a: Array, bends: Mapping[Candidate, Array]) -> DetectorNoise | None:
+    corrected = _of_light(data, bends)
+    return detector_noise(corrected.undone(undoing(data, bends)) if bends else corrected, a)

@@ -1,0 +1,63 @@
+"""Noise as large as the pixels show it: a gain stated a little wrong, an offset that looks like read-out noise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bench_capture import read
+
+from processing.diagnosis.captured.screening import screened
+from processing.diagnosis.instrument.judge import diagnose
+from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.storage.capture_schema import Sample
+from simulators.blind.real_bench import Disc
+from simulators.blind.suite import state_angles
+from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
+
+SIDE, STATES = 64, 40
+
+
+def captured(folder, configs, bench, scene=None):
+    """A capture as `diagnose` reads it: of air, or of an unknown sample."""
+    random, file = np.random.default_rng(11), configs / "instruments/rgb950.yaml"
+    angles = state_angles(STATES, bench.mosaic, bench.zigzag)
+    seen = Scene(random, np.eye(4)) if scene is None else scene(random, None)
+    sample = Sample(kind="air" if scene is None else "unknown")
+    path = folder / f"{sample.kind}.h5"
+    write_capture(path, bench, digitize(bench, expose(bench, seen, angles), random), angles, sample, file.read_text())
+    return read(path, file)
+
+
+def said(model, *captures):
+    """What `diagnose` says of captures, by kind whether a name is sure."""
+    found = diagnose(InstrumentProblem(model, list(captures)), lambda line: None).diagnosis
+    return found, {e.kind: e.answer for e in found.effects if e.confident}
+
+
+@pytest.mark.parametrize("times", [0.965, 1.04])
+def test_a_gain_that_is_stated_some_percent_wrong_hides_no_cause(configs, tmp_path, times):
+    """Four percent of the variance of 160 000 intensities is eleven standard deviations of their sum of squares."""
+    bench = Bench(rows=SIDE, columns=SIDE)
+    bench.dg += np.deg2rad(0.4)
+    bench.ellipticity = np.deg2rad(0.5)
+    bench.level.append(lambda k, a: 1 + 0.01 * k / (STATES - 1))
+    model, data = captured(tmp_path, configs, bench)
+    found, sure = said(model, replace(data, slope=times * data.slope, floor=times * data.floor))
+    assert found.verdict == "explained"
+    assert {"psg_retardance", "source_drift"} <= set(sure)
+    assert found.error_after.chi2_reduced == pytest.approx(1.0, abs=0.01)
+
+
+def test_an_offset_is_no_other_read_noise(configs, tmp_path):
+    """A ball before a dark wall: what is added to all counts takes photon noise along in what is expected of them."""
+    bench = Bench(rows=SIDE, columns=SIDE, read_noise=3.0)
+    bench.da += np.deg2rad(0.5)
+    bench.stored.append(lambda counts: counts + 60)
+    model, ball = captured(tmp_path, configs, bench, Disc)
+    _, air = captured(tmp_path, configs, bench)
+    told = []
+    ball, air = (screened(d, model, told.append) for d in (ball, air))
+    assert any("variance of a pixel" in line for line in told)
+    found, sure = said(model, ball, air)
+    assert found.noise.verdict == "as_declared"
+    assert {"psa_retardance", "detector_offset"} <= set(sure)
