@@ -71,7 +71,7 @@ class Story:
     def writes(self) -> bool:
         """Whether a file could hold something of what was found."""
         found = self.diagnosis
-        return bool(found.effects if self.of_surface else found.applied() or found.calibrated)
+        return bool(found.effects) if isinstance(found, SurfaceDiagnosis) else found.corrects
 
 
 class Diagnoses:

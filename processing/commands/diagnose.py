@@ -69,6 +69,8 @@ def diagnose_command(
         from processing.diagnosis.instrument_file import write_instrument
 
         write_instrument(write, model, judged.diagnosis)
+        if not judged.diagnosis.corrects:
+            say("nothing is corrected: the file adds how wrong M may be, for the error bars of `process reduce`")
         typer.echo(str(write))
 
 

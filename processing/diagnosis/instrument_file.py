@@ -19,16 +19,19 @@ def extended(model: InstrumentModel, diagnosis: Diagnosis) -> InstrumentModel:
     """The instrument model (as in its file, at all its wavelengths) with the diagnosis put in.
 
     Effects come behind those that it has; values that the file calls nominal are replaced by what was fitted. An
-    effect of the same kind, place and wavelength is replaced: its new values are on top of the old ones.
+    effect of the same kind, place and wavelength is replaced: its new values are on top of the old ones. Where nothing
+    is corrected, what is known of how wrong M may be is put in all the same, in place of what was known of it.
     """
     values: dict[str, dict[str, Dispersive]] = {}
-    for name, entry in diagnosis.calibrated.items():
+    for name, entry in diagnosis.calibrated.items() if diagnosis.corrects else ():
         element, _, field = name.rpartition(".")
         old: Dispersive = next(getattr(e, field) for e in model.elements() if e.name == element)
         values.setdefault(element, {})[field] = _merged(old, entry, diagnosis.wavelengths_nm)
+    systematic = diagnosis.systematic()
+    told = [s.wavelength_nm for s in systematic]
     update = {
         "effects": (*model.effects, *diagnosis.applied()),
-        "systematic": (*model.systematic, *diagnosis.systematic()),
+        "systematic": (*(s for s in model.systematic if s.wavelength_nm not in told), *systematic),
     }
     return model.with_values(values).model_copy(update=update)
 
@@ -65,9 +68,9 @@ def write_instrument(path: Path, model: InstrumentModel, diagnosis: Diagnosis, n
     ProcessError
         The file exists.
     """
-    if diagnosis.correction is not None and diagnosis.correction.refused is not None:
-        raise WriteError(f"{path} was not written: {diagnosis.correction.refused}.")
-    if not diagnosis.applied() and not diagnosis.calibrated:
+    if not diagnosis.corrects and not diagnosis.systematic():
+        if diagnosis.correction is not None and diagnosis.correction.refused is not None:
+            raise WriteError(f"{path} was not written: {diagnosis.correction.refused}.")
         raise WriteError(f"nothing was found that could go into {path}; it was not written.")
     text = dump_yaml(extended(model, diagnosis))
     try:
@@ -76,4 +79,5 @@ def write_instrument(path: Path, model: InstrumentModel, diagnosis: Diagnosis, n
         raise WriteError(
             f"{error}: what was found is too much for one file. Diagnose fewer captures at once."
         ) from error
-    write_new_text(path, file_head(f"Written by `diagnose`: {diagnosis.verdict}, see `effects`.", note) + text)
+    holds = "see `effects`" if diagnosis.corrects else "nothing is corrected; `systematic` is how wrong M may be"
+    write_new_text(path, file_head(f"Written by `diagnose`: {diagnosis.verdict}, {holds}.", note) + text)

@@ -89,7 +89,7 @@ class Linearized:
         part = Space(tuple(space.candidates[k] for k in lasts))
         slopes, light = mueller_slopes(other, part, np.zeros(part.size))
         products = np.zeros((space.size, space.size))
-        products[np.ix_(index, index)] = slopes * np.outer(part.joined("typical"), part.joined("typical"))
+        products[np.ix_(index, index)] = slopes.sum(axis=0) * np.outer(part.joined("typical"), part.joined("typical"))
         return cls(space, form.curvature, noise_of(fitted, sums), products / light / ELEMENTS)
 
     def draws(self, count: int, seed: int = 0) -> Iterator[tuple[Reached, Reached, Reached]]:

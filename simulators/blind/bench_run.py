@@ -31,7 +31,7 @@ def judge_bench(
     declared = InstrumentModel.load(configs / "instruments" / truth.instrument)
     captures = [folder / truth.name / f"{name}.h5" for name in GIVEN[given]]
     begun = time.perf_counter()
-    result, corrected = _diagnosed(captures, declared)
+    result, corrected, corrects = _diagnosed(captures, declared)
     seconds = time.perf_counter() - begun
     away = folder / "truth" / truth.name
     covered = coverage_of(away / f"{VALIDATION}_noisy.h5", corrected, _truth(away, VALIDATION))
@@ -47,7 +47,7 @@ def judge_bench(
         own={name: (_error(away, name, declared), _error(away, name, corrected)) for name in GIVEN[given]},
         coverage_pixels=covered.pixels,
         coverage_patches=covered.patches,
-        written=corrected is not declared,
+        written=corrects,
         causes=names_of(result, truth, GIVEN[given]),
         matters=told_of(result, truth, GIVEN[given]),
         wiring=wiring_of(result, truth),
@@ -57,15 +57,14 @@ def judge_bench(
     return judgement, result
 
 
-def _diagnosed(captures: Sequence[Path], declared: InstrumentModel) -> tuple[dict[str, Any], InstrumentModel]:
-    """The result as JSON has it, and the instrument as it would be written; as declared if nothing would be."""
+def _diagnosed(captures: Sequence[Path], declared: InstrumentModel) -> tuple[dict[str, Any], InstrumentModel, bool]:
+    """The result as JSON has it, the instrument as it would be written, and whether it is another one."""
     try:
         judged, _ = diagnose_captures(captures, declared)
     except Exception as error:  # noqa: BLE001 - a crash is a wrong answer of this bench, not the end of the suite
-        return {"verdict": f"crashed: {type(error).__name__}: {error}", "effects": []}, declared
+        return {"verdict": f"crashed: {type(error).__name__}: {error}", "effects": []}, declared, False
     diagnosis = judged.diagnosis
-    nothing = not diagnosis.applied() and not diagnosis.calibrated
-    return json.loads(diagnosis.model_dump_json()), declared if nothing else extended(declared, diagnosis)
+    return json.loads(diagnosis.model_dump_json()), extended(declared, diagnosis), diagnosis.corrects
 
 
 def _truth(away: Path, capture: str) -> Any:

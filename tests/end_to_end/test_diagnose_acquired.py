@@ -1,11 +1,13 @@
 """`diagnose` on what `acquire` writes: the rig as it is described, and with a fault that nobody declared."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 
 from processing.commands import diagnose as cli
+from processing.instrument.model import InstrumentModel
 
 
 @pytest.fixture
@@ -18,20 +20,31 @@ def diagnosed(acquire, small_rig, configs, tmp_path):
         )
         assert code == 0, err
         (capture,) = Path(tmp_path).glob("*.h5")
-        out = tmp_path / "said.json"
+        out, new = tmp_path / "said.json", tmp_path / "new.yaml"
+        instrument = configs / "instruments/rgb950.yaml"
         with pytest.raises(SystemExit) as ended:
-            cli.main([str(capture), "--instrument", str(configs / "instruments/rgb950.yaml"), "--json", str(out)])
+            cli.main([str(capture), "--instrument", str(instrument), "--json", str(out), "--write", str(new)])
         assert ended.value.code == 0
         return json.loads(out.read_text())
 
     return run
 
 
-def test_a_rig_as_described_is_consistent(diagnosed):
+def test_a_rig_as_described_is_consistent(diagnosed, configs, tmp_path, capfd):
     said = diagnosed([])
     assert said["verdict"] == "consistent"
     assert said["error_before"]["chi2_reduced"] == pytest.approx(1, abs=0.03)
     assert said["captures"][0]["dark_fraction"] > 0.3
+    # Nothing is corrected, and by how much M may be off all the same is told, and written for its error bars.
+    assert said["error_after"] == said["error_before"]
+    told = capfd.readouterr()
+    assert "nothing is corrected" in told.out
+    assert "nothing is corrected" in told.err
+    assert re.search(r"M/m00 may still be off by [\d.e-]+ \(rms of its elements\), most in M\d\d by", told.out)
+    declared, new = (InstrumentModel.load(f) for f in (configs / "instruments/rgb950.yaml", tmp_path / "new.yaml"))
+    assert new.model_copy(update={"systematic": ()}) == declared
+    assert new.systematic[0].rms_over_m00 == pytest.approx(said["correction"]["mueller"]["rms"])
+    assert "nothing is corrected" in (tmp_path / "new.yaml").read_text().splitlines()[0]
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from types import SimpleNamespace as Some
 import numpy as np
 import pytest
 
-from processing.diagnosis.instrument.systematic import MOST, _leading
+from processing.diagnosis.instrument.systematic import MOST, _leading, _missed
 from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.search.likely_set import likely_set
 from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets
@@ -40,3 +40,11 @@ def test_what_varies_over_the_image_is_asked_for_beside_all_groups():
     assert state.unit > 1000
     assert WholeBench._least_unit(Some(whole=Some(noise_known=True)), found) < 10
     assert WholeBench._least_unit(Some(whole=Some(noise_known=False)), found) == state.unit
+
+
+def test_what_is_found_and_not_used_is_uncertain_as_a_whole():
+    candidates = ["drift", "flicker", "path"]
+    slices = (slice(0, 1), slice(1, 3), slice(3, 4))
+    found = Some(values=np.array([1.0, 2.0, 3.0, 4.0]), space=Some(candidates=candidates, slices=slices))
+    used = Some(space=Some(candidates=candidates[1:2], slices=(slice(0, 2),)), fit=Some(values=np.array([2.0, 2.5])))
+    assert _missed(found, used).tolist() == [1.0, 0.0, 0.5, 4.0]

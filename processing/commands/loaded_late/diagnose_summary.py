@@ -48,7 +48,7 @@ def show(d: Diagnosis) -> None:
     for effect in d.effects:
         _show_effect(effect)
     if d.correction is not None:
-        _show_correction(d.correction)
+        _show_correction(d.correction, d.corrects)
     if d.unexplained is not None:
         _show_unexplained(d.unexplained)
     if d.unobservable:
@@ -95,13 +95,16 @@ def _show_effect(effect: FoundEffect) -> None:
         typer.echo(f"      cannot be told from: {', '.join(effect.indistinguishable_from)}")
 
 
-def _show_correction(correction: Correction) -> None:
+def _show_correction(correction: Correction, corrects: bool) -> None:
     """What would be written, apart from names: how much of it, and the figures that were looked at."""
-    kinds = ", ".join(dict.fromkeys(e.kind for e in correction.effects)) or "nothing"
+    kinds = ", ".join(dict.fromkeys(e.kind for e in correction.effects))
     fate = f"refused: {correction.refused}" if correction.refused else "holds"
-    typer.echo(f"  correction (means over what the data leave open): {kinds}; {fate}")
+    told = f"{kinds or 'the nominal values'}; {fate}" if kinds or corrects else "nothing is corrected"
+    typer.echo(f"  correction (means over what the data leave open): {told}")
     for c in correction.combinations:
         typer.echo(f"      determined together: {_combination(c)}")
+    if correction.mueller is not None:
+        typer.echo(f"      {correction.mueller.told}")
     for check in correction.checks:
         typer.echo(f"      {check.name}: {check.before:.4g} -> {check.after:.4g}")
 

@@ -147,7 +147,7 @@ def slopes_of(problem: InstrumentProblem, found: Posterior, solved: Solution) ->
         index,
         np.concatenate([np.full(c.size, c in correction) for c in part]),
         np.concatenate([np.full(c.size, scope_of(c) == "instrument") for c in part]),
-        products / (max(light, 1e-300) * ELEMENTS),
+        products.sum(axis=0) / (max(light, 1e-300) * ELEMENTS),
     )
 
 

@@ -126,10 +126,10 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
         )
         unexplained = Unexplained(description=lines, tried=tried, empirical=empirical(found, solved))
     unseen = unobservable(bench.whole, found)
-    correction_told = correction(
-        problem, found, solved, bool(named or untold or switched), (*guard, *chance), refused, lasting
-    )
-    kept = solved if refused is None else _nothing(solved)
+    any_cause = bool(named or untold or switched)
+    corrects = refused is None and (any_cause or bool(solved.base.size))
+    kept = solved if corrects else _nothing(solved)
+    correction_told = correction(problem, found, solved, any_cause, (*guard, *chance), refused, lasting, kept)
     diagnosis = Diagnosis(
         verdict=verdict,
         error_before=error(asked, solved.before),
@@ -155,7 +155,7 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
         left_out=not_measured(problem),
         noise=noise_report(problem),
     )
-    return Judged(diagnosis, kept, before, after if refused is None else before)
+    return Judged(diagnosis, kept, before, after if corrects else before)
 
 
 def _grown(units: Array, unit: float) -> bool:

@@ -16,15 +16,15 @@ from processing.instrument.changes import Changes
 def mueller_slopes(
     problem: InstrumentProblem, space: Space, values: Array, left: Array | None = None
 ) -> tuple[Array, float]:
-    """Products (K, K) of the derivatives of M, and the sum of m00 squared, over all pixels.
+    """Products (16, K, K) of the derivatives of each element of M, and the sum of m00 squared, over all pixels.
 
-    The products are summed over elements and pixels, a common factor of M left out. `left` (captures,) is what the
+    The products are summed over the pixels, a common factor of M left out. `left` (captures,) is what the
     intensities of each are known to, in units of noise (default: 1). What they do not tell of M, within the size of its
     elements, is not made wrong by an instrument either.
     """
     left = np.ones(len(problem.captures)) if left is None else left
     problem, values = problem.near(space, values)
-    products, light = np.zeros((space.size, space.size)), 0.0
+    products, light = np.zeros((16, space.size, space.size)), 0.0
     for k, moments in enumerate(problem.moments):
         acting = space.acting(k, problem.wavelengths_nm[k])
         mine, own = acting.space, acting.of(values)
@@ -47,8 +47,8 @@ def mueller_slopes(
                 slopes[j] += back @ (np.einsum("fl,flr->lr", dc[j], block.z) * scale)
             bright = float(m[0] @ m[0])
             slopes -= (slopes[:, 0] @ m[0] / max(bright, 1e-300))[:, None, None] * m
-            flat = slopes.reshape(mine.size, m.size)
-            products[np.ix_(acting.index, acting.index)] += acting.spread_products(flat @ flat.T)
+            for element, of_all in enumerate(np.moveaxis(slopes, 1, 0)):
+                products[element][np.ix_(acting.index, acting.index)] += acting.spread_products(of_all @ of_all.T)
             light += bright
     return products, light
 

@@ -1,10 +1,12 @@
-"""What stays uncertain after a correction, as a Mueller matrix notices it: the covariance of all values, in directions.
+"""How wrong a Mueller matrix may be still: the values of all effects about those that are applied, in directions.
 
 Directions that an unknown sample absorbs (a common azimuth, a retardance) keep the variance of their prior. They are
-not applied, and show up here.
+not applied, and show up here; so does what was found and is not used.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +14,10 @@ from numpy.typing import NDArray
 from processing.arrays import Array
 from processing.diagnosis.instrument.mueller_slopes import mueller_slopes
 from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import TAKES_PART, UNSEEN
+from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.search.stored import by_wavelength, parameters_of, scope_of
 from processing.instrument.effects.base import FieldEffect, Switch
@@ -27,18 +31,37 @@ SMALL = 0.03
 ELEMENTS = 15
 
 
-def systematic_error(problem: InstrumentProblem, found: Posterior) -> SystematicError | None:
-    """The covariance of the posterior as directions of one standard deviation; None where nothing is uncertain."""
+@dataclass(frozen=True)
+class Uncertain:
+    """What stays uncertain of M/m00.
+
+    Attributes
+    ----------
+    error : as an instrument file stores it.
+    of_elements : (4, 4) standard errors of the elements of M/m00, rms over the pixels of these captures.
+    most : the candidate that the largest of them owes most to.
+    """
+
+    error: SystematicError
+    of_elements: Array
+    most: Candidate
+
+
+def systematic_error(problem: InstrumentProblem, found: Posterior, used: Solution) -> Uncertain | None:
+    """Second moments of all values about those `used`, in directions of one standard deviation; None without any."""
     chosen = [k for k, c in enumerate(found.space.candidates) if _takes_part(found, k)]
     space = Space(tuple(found.space.candidates[k] for k in chosen))
     if not space.size:
         return None
     index = np.concatenate([np.r_[found.space.slices[k]] for k in chosen])
     products, light = mueller_slopes(problem, space, found.values[index])
-    covariance = (found.covariance + _unseen(found))[np.ix_(index, index)]
-    total = float(np.sum(covariance * products))
-    if total <= 0 or light <= 0:
+    missed = _missed(found, used)
+    covariance = (found.covariance + _unseen(found) + np.outer(missed, missed))[np.ix_(index, index)]
+    of_elements = np.sum(covariance * products, axis=(1, 2))
+    if of_elements.sum() <= 0 or light <= 0:
         return None
+    largest = products[int(np.argmax(of_elements))]
+    products = products.sum(axis=0)
     lasts = np.array([c.capture is None for c in space.candidates for _ in c.parameters])
     size, directions = _leading(covariance, products, lasts)
     enough = int(np.searchsorted(np.cumsum(size), SHARE * size.sum())) + 1
@@ -47,11 +70,26 @@ def systematic_error(problem: InstrumentProblem, found: Posterior) -> Systematic
     for direction in directions.T[: min(enough, MOST)]:
         weight = np.abs(direction) * np.sqrt(np.maximum(np.diag(products), 0.0))
         told.append(_as_effects(space, direction, weight > SMALL * weight.max(), names))
-    return SystematicError(
+    error = SystematicError(
         directions=tuple(told),
-        rms_over_m00=float(np.sqrt(total / light / ELEMENTS)),
+        rms_over_m00=float(np.sqrt(of_elements.sum() / light / ELEMENTS)),
         wavelength_nm=problem.wavelengths_nm[0] if len(set(problem.wavelengths_nm)) == 1 else None,
     )
+    alone = [float(np.sum((covariance * largest)[p, p])) for p in space.slices]
+    return Uncertain(
+        error,
+        np.sqrt(np.maximum(of_elements, 0.0) / light).reshape(4, 4),
+        space.candidates[int(np.argmax(alone))],
+    )
+
+
+def _missed(found: Posterior, used: Solution) -> Array:
+    """By how much the mean of the posterior differs from what is applied (K,)."""
+    missed = found.values.copy()
+    part = dict(zip(found.space.candidates, found.space.slices, strict=True))
+    for candidate, values in zip(used.space.candidates, used.space.slices, strict=True):
+        missed[part[candidate]] -= used.fit.values[values]
+    return missed
 
 
 def _leading(covariance: Array, products: Array, lasts: NDArray[np.bool_]) -> tuple[Array, Array]:

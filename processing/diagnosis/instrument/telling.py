@@ -10,7 +10,7 @@ from processing.diagnosis.instrument.doubts import PART_OF_LEFT
 from processing.diagnosis.instrument.evidence import information
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.structure import Residual
-from processing.diagnosis.instrument.systematic import systematic_error
+from processing.diagnosis.instrument.systematic import Uncertain, systematic_error
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Answer, Cause, shown
 from processing.diagnosis.search.fit import HeldOut
@@ -21,6 +21,7 @@ from processing.diagnosis.search.result import (
     Correction,
     Error,
     FoundEffect,
+    MuellerError,
     NoiseReport,
     NotMeasured,
     Ranked,
@@ -134,9 +135,10 @@ def correction(
     guard: tuple[Check, ...],
     refused: str | None,
     lasts: bool,
+    used: Solution,
 ) -> Correction:
     """What an instrument file would hold: means, with the spread over the sets; for these captures alone unless it
-    `lasts`."""
+    `lasts`. Of it `used` is applied."""
     part = dict(zip(found.space.candidates, found.space.slices, strict=True))
     chance = {found.space.candidates[m]: p for g, p in enumerate(found.samples.probability) for m in found.members[g]}
     effects = []
@@ -156,9 +158,22 @@ def correction(
                     wavelength_nm=_wavelength(problem, one),
                 )
             )
-    error = systematic_error(problem, found)
-    together = combinations(found, solved) if any_cause else ()
-    return Correction(effects=tuple(effects), systematic=error, combinations=together, checks=guard, refused=refused)
+    # Values that are merely nominal are nowhere near what is true.
+    known = refused is None or not solved.base.size
+    uncertain = systematic_error(problem, found, used) if known else None
+    return Correction(
+        effects=tuple(effects),
+        systematic=None if uncertain is None else uncertain.error,
+        mueller=None if uncertain is None else _mueller_error(uncertain),
+        combinations=combinations(found, solved) if any_cause else (),
+        checks=guard,
+        refused=refused,
+    )
+
+
+def _mueller_error(uncertain: Uncertain) -> MuellerError:
+    elements = tuple(float(x) for x in uncertain.of_elements.ravel())
+    return MuellerError(elements=elements, rms=uncertain.error.rms_over_m00, most=uncertain.most.short)
 
 
 def _wavelength(problem: InstrumentProblem, candidate: Candidate) -> float | None:

@@ -93,13 +93,37 @@ class Combination(_Part):
     open_by: dict[str, float]
 
 
+class MuellerError(_Part):
+    """How wrong M/m00 of these captures may still be, whatever the noise, with the instrument that would be written.
+
+    Attributes
+    ----------
+    elements : standard errors of the 16 elements, row by row, rms over the pixels; rms : over 15 of them.
+    most : the effect that the largest owes most to.
+    """
+
+    elements: tuple[float, ...]
+    rms: float
+    most: str
+
+    @property
+    def told(self) -> str:
+        """In words."""
+        largest = max(range(len(self.elements)), key=lambda k: self.elements[k])
+        row, column = divmod(largest, 4)
+        return (
+            f"M/m00 may still be off by {self.rms:.2g} (rms of its elements), most in M{row}{column} by "
+            f"{self.elements[largest]:.2g}, where {self.most} counts most"
+        )
+
+
 class Correction(_Part):
     """What would be written: means of the posterior, apart from names, and whether it may be used.
 
     Attributes
     ----------
     effects : as an instrument file stores them, with their standard errors.
-    systematic : what stays uncertain, as a Mueller matrix notices it.
+    systematic : what stays uncertain, as a Mueller matrix notices it; `mueller` tells it.
     combinations : what is determined of values that are not determined one by one.
     checks : figures before and after; one that gets worse refuses the correction.
     refused : why nothing is written; None if the correction holds.
@@ -107,6 +131,7 @@ class Correction(_Part):
 
     effects: tuple[AppliedEffect, ...]
     systematic: SystematicError | None = None
+    mueller: MuellerError | None = None
     combinations: tuple[Combination, ...] = ()
     checks: tuple[Check, ...] = ()
     refused: str | None = None
@@ -204,9 +229,13 @@ class Diagnosis(_Part):
             return ()
         return self.correction.effects
 
+    @property
+    def corrects(self) -> bool:
+        """Whether an instrument file would measure otherwise with what was found."""
+        refused = self.correction is not None and self.correction.refused is not None
+        return bool(self.applied() or self.calibrated) and not refused
+
     def systematic(self) -> tuple[SystematicError, ...]:
-        """What an instrument file stores of the uncertainty; nothing where nothing is written."""
-        if not self.applied() and not self.calibrated:
-            return ()
+        """What an instrument file stores of the uncertainty, also where nothing is corrected; wiring comes first."""
         told = self.correction.systematic if self.correction is not None else None
-        return () if told is None else (told,)
+        return () if told is None or self.wiring is not None else (told,)
