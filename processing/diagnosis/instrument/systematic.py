@@ -58,6 +58,8 @@ def systematic_error(problem: InstrumentProblem, found: Posterior, used: Solutio
     missed = _missed(found, used)
     covariance = (found.covariance + _unseen(found) + np.outer(missed, missed))[np.ix_(index, index)]
     of_elements = np.sum(covariance * products, axis=(1, 2))
+    # That of M/m00 is one, whatever m00 is.
+    of_elements[0] = 0.0
     if of_elements.sum() <= 0 or light <= 0:
         return None
     largest = products[int(np.argmax(of_elements))]
