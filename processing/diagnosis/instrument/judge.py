@@ -109,7 +109,8 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
         over = sum(_left(problem, r) for r in after)
         here, later = (c.beside(over, solved.before.excess - solved.after.excess) for c in (here, later))
     lasting = lasts(later, doubt.values())
-    guard, chance = checks(asked, solved), chances(here, later, lasting)
+    # Where there is nothing to apply, nothing is said of what it would do.
+    guard, chance = checks(asked, solved), chances(here, later, lasting) if solved.effects else ()
     refused = f"change this first: {wiring.told}" if wiring is not None else refusal((*guard, *chance))
     switched = told_switches(asked, solved)
     verdict = _verdict((*named, *switched), (*sure, *switched), structure or bool(untold))

@@ -1,7 +1,7 @@
 """How large the noise of a capture is where corrections of its counts are undone, as its own pixels show it.
 
 Photon noise follows the light, not the counts. A gain is stated to some percent, and behind a bend that is not well
-known the noise is as uncertain. Of a hundred thousand intensities one percent of their variance is twenty standard
+known the noise is as uncertain. Of a hundred thousand intensities three percent of their variance are seven standard
 deviations: too little noise looks like structure beside which no cause is worth anything, and too much hides some.
 """
 

@@ -91,11 +91,11 @@ NOISE_SURE = 6.0
 NOISE_OFF = 0.06
 #: [1] The same where neighbours share noise: how much a pixel shows of it is not known better.
 NOISE_OFF_MIXED = 0.15
-#: [1] Deviation of the variance from what is declared where a bend of the response is undone, beyond which that bend
-#: does not go with how the counts scatter: most gains are known as well.
-GAIN_OFF = 0.03
 #: [1] The same of the part of the variance without light: darks of a lab are as good.
 DARK_NOISE_OFF = 0.5
+#: [1] Deviation of the variance from what is declared where a bend of the response is undone, beyond which that bend
+#: does not go with how the counts scatter: two standard deviations of what labs know of a gain.
+GAIN_OFF = 0.03
 #: [correlation] Of neighbours, from which on they share noise.
 NOISE_ALIKE = 0.05
 #: [standard deviations] Up to which another gain alone, or another read noise alone, is as good as both.
