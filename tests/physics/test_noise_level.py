@@ -1,14 +1,18 @@
 """Noise as large as the pixels show it: a gain stated a little wrong, an offset that looks like read-out noise."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from bench_capture import read
 
 from processing.diagnosis.captured.screening import screened
+from processing.diagnosis.instrument import whole_bench
 from processing.diagnosis.instrument.judge import diagnose
 from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.whole_bench import WholeBench
+from processing.instrument.effects.field_retardance import FieldRetardance
 from processing.storage.capture_schema import Sample
 from simulators.blind.real_bench import Disc
 from simulators.blind.suite import state_angles
@@ -61,3 +65,19 @@ def test_an_offset_is_no_other_read_noise(configs, tmp_path):
     found, sure = said(model, ball, air)
     assert found.noise.verdict == "as_declared"
     assert {"psa_retardance", "detector_offset"} <= set(sure)
+
+
+def test_what_varies_over_the_image_may_be_absent_where_the_noise_is_asked_beside_it(monkeypatch):
+    """Asked again without a bend, a field is as free not to be there as it was."""
+    field = SimpleNamespace(effect=object.__new__(FieldRetardance))
+    bench, asked = object.__new__(WholeBench), []
+    bench.pool, bench.base = [field], SimpleNamespace(candidates=())
+    bench.whole = SimpleNamespace(noise_known=False, holds_out_states=False)
+    for name, answer in {"_offered": False, "_clipped": [], "_posterior": "plain", "_with_fields": "beside"}.items():
+        monkeypatch.setattr(bench, name, lambda *of, answer=answer: answer)
+    monkeypatch.setattr(bench, "_take_noise_of_light", lambda *of: None)
+    monkeypatch.setattr(bench, "as_many_as_intensities", lambda *of: set())
+    monkeypatch.setattr(bench, "_with_what_scatters_so", lambda found, fixed: asked.append((found, fixed)) or found)
+    monkeypatch.setattr(whole_bench, "applied", lambda *of: ())
+    assert bench.run() == "beside"
+    assert asked == [("plain", []), ("beside", [])]

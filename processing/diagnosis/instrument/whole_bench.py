@@ -99,9 +99,7 @@ class WholeBench:
         fields = [c for c in self.pool if isinstance(c.effect, FieldEffect)]
         if fields and not self.whole.holds_out_states:
             beside = self._with_fields(found, fixed, fields)
-            if beside is not found:
-                # As there: once left out, a field is not found again beside what then stands in for it.
-                found = self._with_what_scatters_so(beside, [*fixed, *fields])
+            found = found if beside is found else self._with_what_scatters_so(beside, fixed)
         solved = applied(found, self.base)
         if self.whole.noise_known and self._adopt_noise(*solved):
             self.say("the same with the noise that this light has")
