@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processing.diagnosis.instrument.doubts import OF_THE_SAMPLE, PART_OF_LEFT
+from processing.diagnosis.instrument.doubts import OF_THE_SAMPLE, PART_OF_LEFT, TURN
 from processing.diagnosis.instrument.guard import NOTHING, chances, lasts, predicted_change, predicted_change_of_part
 from processing.diagnosis.instrument.least_change import least_change
 
@@ -74,5 +74,6 @@ def test_what_is_open_is_used_to_leave_m_as_it_is() -> None:
 def test_beside_a_sample_that_changed_nothing_is_kept_for_later_captures() -> None:
     assert lasts(NOTHING, [PART_OF_LEFT])
     assert not lasts(NOTHING, [PART_OF_LEFT, OF_THE_SAMPLE])
+    assert not lasts(NOTHING, [TURN])
     told = [check.name for check in chances(NOTHING, NOTHING, lasting=False)]
     assert told[-1].endswith("so it is written for these captures alone")

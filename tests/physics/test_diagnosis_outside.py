@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from processing.diagnosis.instrument.doubts import WAVE, WAVE_AS_WELL, _wave
-from processing.diagnosis.instrument.nameless import NamelessWaves
+from processing.diagnosis.instrument.doubts import TURN, TURN_AS_WELL, WAVE, WAVE_AS_WELL, _in_its_place
+from processing.diagnosis.instrument.nameless import Nameless
 from processing.diagnosis.instrument.run import diagnose_captures
 from processing.diagnosis.search.result import Diagnosis
 from processing.instrument.model import InstrumentModel
@@ -76,17 +76,39 @@ def test_optics_that_differ_from_part_to_part_are_not_called_by_their_name(confi
     assert not found.applied()
 
 
-@pytest.mark.parametrize(("wave", "reason"), [(120.0, WAVE), (99.0, WAVE_AS_WELL), (93.0, WAVE_AS_WELL), (90.0, None)])
-def test_no_name_is_sure_beside_a_wave_that_explains_nearly_as_much(wave, reason):
+def test_a_sample_that_turns_is_not_angles_of_an_axis(configs, tmp_path, bench):
+    """Its azimuth drifts with all plates and polarizers; single angles of the analyzer can stand for that."""
+    bench.turned.append(lambda k: np.deg2rad(-0.8) * (k / (STATES - 1) - 0.5))
+    found = diagnosed(tmp_path, configs, bench)
+    assert "angle_per_state" in [e.kind for e in found.effects]
+    assert not sure(found)
+    assert not found.applied()
+
+
+@pytest.mark.parametrize(
+    ("wave", "turn", "one_name", "reason"),
+    [
+        (120.0, 0.0, True, WAVE),
+        (99.0, 0.0, True, WAVE_AS_WELL),
+        (93.0, 0.0, True, WAVE_AS_WELL),
+        (90.0, 0.0, True, None),
+        (120.0, 0.0, False, None),
+        (99.0, 120.0, True, TURN),
+        (0.0, 120.0, False, TURN),
+        (0.0, 93.0, False, TURN_AS_WELL),
+        (0.0, 90.0, False, None),
+    ],
+)
+def test_no_name_is_sure_beside_what_explains_nearly_as_much(wave, turn, one_name, reason):
     def explaining(chi_square):
         return np.eye(1), np.array([math.sqrt(chi_square)])
 
     cause = SimpleNamespace(candidates=("named",))
-    waves = NamelessWaves.__new__(NamelessWaves)
-    waves._labels, waves._state = ["named"], None
-    waves._sets = SimpleNamespace(
-        groups=("named", "wave"),
+    nameless = Nameless.__new__(Nameless)
+    nameless._labels, nameless._state = ["named"], None
+    nameless._waves, nameless._turns = range(1, 2), range(2, 3)
+    nameless._sets = SimpleNamespace(
         without=lambda state, group: state,
-        given_others=lambda state: [explaining(100.0), explaining(wave)],
+        given_others=lambda state: [explaining(100.0), explaining(wave), explaining(turn)],
     )
-    assert _wave(waves.gain_over(cause)) == reason
+    assert _in_its_place(*nameless.gains_over(cause), one_name) == reason

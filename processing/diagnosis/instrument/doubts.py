@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from processing.diagnosis.instrument.edges import at_edges
-from processing.diagnosis.instrument.nameless import NamelessWaves
+from processing.diagnosis.instrument.nameless import Nameless
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.source_patterns import beat_explains_as_well, chance_of_pattern, patterned
 from processing.diagnosis.instrument.unevenness import Evenness
@@ -47,17 +47,23 @@ BEAT = "a source that beats explains as much as it does"
 WAVE = "a plate that changes two to four times a turn explains more than it does"
 #: Here either may be the truth: it is not used, and what stands beside both is.
 WAVE_AS_WELL = "a plate that changes two to four times a turn explains as much as it does"
+#: The same of a sample that turns on its stage; nothing that is found beside it need be of the instrument.
+TURN = "a sample that turns during the capture explains more than it does"
+TURN_AS_WELL = "a sample that turns during the capture explains as much as it does"
 #: The image does not move where that would be seen best.
 STANDS = "the edges, which were left out of the fit, do not move as it says"
 #: Optics and mechanics are the same for the whole image.
 NOT_ALIKE = "it differs from part to part of the image, which nothing in the train does"
 #: Reasons that say that something else is there, of which what the cause explains is left over.
-ELSE = (PATTERN, BEAT, WAVE, STANDS, NOT_ALIKE)
+ELSE = (PATTERN, BEAT, WAVE, TURN, STANDS, NOT_ALIKE)
+#: Reasons that say that either may be there.
+AS_WELL = (WAVE_AS_WELL, TURN_AS_WELL)
 #: The reason of a source beside one that follows a pattern: where that is not used, neither is this.
 BESIDE_PATTERN = "it may be a part of a source that changes as no effect of the list does"
 #: The reason for which nothing is written for later captures: the sample or its light changed, and what is found beside
 #: that may be a part of it.
 OF_THE_SAMPLE = "it differs from part to part of the image, which a source does not"
+CHANGED = (OF_THE_SAMPLE, TURN, TURN_AS_WELL)
 #: The one reason that leaves a name likely.
 PART_OF_LEFT = "it may be a part of what is left unexplained"
 
@@ -68,13 +74,13 @@ def doubts(
     """Reasons by cause; a cause without one may be called by its name. `left` is the chi-square of structure."""
     out: dict[Cause, str] = {}
     uneven, patterned = 0.0, set[int | None]()
-    waves = NamelessWaves.beside(problem, found) if causes else None
+    nameless = Nameless.beside(problem, found) if causes else None
     still = _standing(problem, solved, causes)
     even = Evenness(problem, solved.space, solved.fit.values)
     for cause in causes:
         reason = STANDS if cause in still else _of_itself(problem, found, solved, cause, causes, even)
-        if reason is None and waves is not None and _is_one_name(cause):
-            reason = _wave(waves.gain_over(cause))
+        if reason is None and nameless is not None:
+            reason = _in_its_place(*nameless.gains_over(cause), _is_one_name(cause))
         if reason is not None:
             out[cause] = reason
         if reason == PATTERN:
@@ -86,7 +92,7 @@ def doubts(
         if cause not in out and isinstance(first.effect, SourceEffect) and first.capture in patterned:
             out[cause] = BESIDE_PATTERN
     # What follows a pattern is no effect of the list: what it took away is left over as well.
-    other = (*ELSE, WAVE_AS_WELL)
+    other = (*ELSE, *AS_WELL)
     left += sum(2 * cause.log_odds * found.samples.best.unit for cause, why in out.items() if why in other)
     for rank, cause in enumerate(causes, 1):
         if problem.noise_known:
@@ -103,11 +109,17 @@ def doubts(
     return out
 
 
-def _wave(gain: float) -> str | None:
-    """The reason where a wave gains so much over a cause; of two that are as likely none is sure."""
-    if gain > 0:
-        return WAVE
-    return WAVE_AS_WELL if gain > -2 * np.log(SURE / (1 - SURE)) else None
+def _in_its_place(wave: float, turn: float, one_name: bool) -> str | None:
+    """The reason where a wave of a plate, or a sample that turns, gains so much over a cause.
+
+    Of two that are as likely none is sure. A wave is asked in the place of one name alone.
+    """
+    nearly = -2 * np.log(SURE / (1 - SURE))
+    if one_name and wave > nearly and wave >= turn:
+        return WAVE if wave > 0 else WAVE_AS_WELL
+    if turn > nearly:
+        return TURN if turn > 0 else TURN_AS_WELL
+    return None
 
 
 def _of_itself(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from processing.arrays import Array
-from processing.diagnosis.instrument.doubts import OF_THE_SAMPLE
+from processing.diagnosis.instrument.doubts import CHANGED
 from processing.diagnosis.instrument.mueller_slopes import mueller_slopes
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.systematic import ELEMENTS
@@ -204,7 +204,7 @@ def lasts(later: PredictedChange, reasons: Collection[str] = ()) -> bool:
 
     Where the sample changed, what is found of the instrument may be a part of that.
     """
-    return later.chance_worse <= CHANCE_WORSE and OF_THE_SAMPLE not in reasons
+    return later.chance_worse <= CHANCE_WORSE and not any(reason in CHANGED for reason in reasons)
 
 
 def refusal(found: tuple[Check, ...]) -> str | None:

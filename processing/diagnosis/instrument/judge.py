@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.instrument.doubts import BESIDE_PATTERN, ELSE, WAVE_AS_WELL, acts_on_unknown, doubts, testable
+from processing.diagnosis.instrument.doubts import AS_WELL, BESIDE_PATTERN, ELSE, acts_on_unknown, doubts, testable
 from processing.diagnosis.instrument.empirical import empirical
 from processing.diagnosis.instrument.evidence import wanted_for_evidence, would_be_seen
 from processing.diagnosis.instrument.guard import chances, checks, lasts, predicted_changes, refusal
@@ -172,8 +172,8 @@ def _unfit(
 ) -> list[Candidate]:
     """What is not used where an unknown sample takes up a part of it, for it may be any structure or a part of such."""
     # Values that are not random, or as many as the data have; and those of a source that were found beside them.
-    unfit = [*untold, *(cause for cause, reason in doubt.items() if reason in (*ELSE, WAVE_AS_WELL, BESIDE_PATTERN))]
-    found = [c for cause in unfit for c in cause.candidates]
+    unfit = [*untold, *(cause for cause, reason in doubt.items() if reason in (*ELSE, *AS_WELL, BESIDE_PATTERN))]
+    found = [c for cause in unfit for c in (*cause.candidates, *cause.alternatives)]
     if untold or any(reason in ELSE for reason in doubt.values()):
         # Something is there that is not in the list: only what has a name of its own is no part of it.
         own = {c for cause in named if cause not in doubt for c in (*cause.candidates, *cause.alternatives)}

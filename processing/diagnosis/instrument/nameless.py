@@ -1,8 +1,9 @@
-"""Waves of a turning plate that no effect of the list is, asked in a cause's place.
+"""What no effect of the list is, asked in a cause's place: waves of a turning plate, and a sample that turns.
 
 A plate that is tilted in its mount has a retardance that changes twice a turn; bearings and windings make three or four
 periods of it. With an unknown sample such a wave may look like something else (a transmission twice a turn, in the
-light of a depolarizing sphere), and to the noise: then nothing in the data tells which of the two it is.
+light of a depolarizing sphere), and to the noise: then nothing in the data tells which of the two it is. A sample whose
+stage drifts about the line of sight has an azimuth that drifts with it, which angles of single states can describe.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from processing.diagnosis.search.sets import Group, Sets, State
 from processing.diagnosis.search.space import Space
 from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import FieldEffect, OpticsEffect, moving_axes
+from processing.instrument.effects.base import FieldEffect, OfOneCapture, OpticsEffect, moving_axes
 from processing.instrument.model import InstrumentModel, Retarder
 
 #: Periods a turn that no effect of the list has, of what a turning plate does.
@@ -58,39 +59,68 @@ class WaveOfAPlate(OpticsEffect):
             target[place] = target[place] + np.deg2rad(wave)
 
 
-class NamelessWaves:
-    """Every such wave beside the sets of a posterior, linearized about its values."""
+class TurningSample(OpticsEffect, OfOneCapture):
+    """The sample turns evenly about the line of sight; seen from it, everything else turns: degrees in all."""
+
+    kind = "turning_sample"
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        """The one sample."""
+        return ("",)
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        """From the first state to the last."""
+        return (Parameter("turn", "degree", -10.0, 10.0, 0.5),)
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        """Turn every element."""
+        for element in model.elements():
+            turned = np.deg2rad(values[0]) * changes.conditions.elapsed
+            changes.azimuth_rad[element.name] = changes.azimuth_rad[element.name] + turned
+
+
+class Nameless:
+    """Every such wave and turn beside the sets of a posterior, linearized about its values."""
 
     def __init__(self, problem: InstrumentProblem, found: Posterior) -> None:
         self._labels = [found.label(g) for g in range(len(found.members))]
-        waves = _waves(problem)
-        space = Space((*found.space.candidates, *waves))
+        waves, turns = _waves(problem), _turning(problem)
+        space = Space((*found.space.candidates, *waves, *turns))
         values = np.append(found.values, np.zeros(space.size - found.space.size))
         form = quadratic(problem, space, values, problem.sums(space, values))
         own = [Group(np.r_[part].astype(np.int64)) for part in space.slices[len(found.space.candidates) :]]
         self._sets = Sets(form, (*found.sets.groups, *own), found.sets.noise)
+        self._waves = range(len(self._labels), len(self._labels) + len(waves))
+        self._turns = range(self._waves.stop, len(self._sets.groups))
         best = found.samples.best
         self._state = State(np.append(best.tau, np.zeros(len(own))), best.unit)
 
     @classmethod
-    def beside(cls, problem: InstrumentProblem, found: Posterior) -> NamelessWaves | None:
-        """None where no plate turns far, or the waves could not be told from others.
+    def beside(cls, problem: InstrumentProblem, found: Posterior) -> Nameless | None:
+        """None where these could not be told from others.
 
         What varies over the image would need slopes in every part of it.
         """
         fields = any(isinstance(c.effect, FieldEffect) for c in found.space.candidates)
         few = problem.holds_out_states or not problem.noise_known
-        return None if fields or few or not _waves(problem) else cls(problem, found)
+        return None if fields or few else cls(problem, found)
 
-    def gain_over(self, cause: Cause) -> float:
-        """Chi-square that the best of the waves explains in a cause's place beyond what that does.
+    def gains_over(self, cause: Cause) -> tuple[float, float]:
+        """Chi-square that the best wave, and the best turn, explain in a cause's place beyond what that does.
 
-        Every value of either costs two.
+        Every value of each costs two. Minus infinity where there is none to ask.
         """
         own = self._labels.index(cause.candidates[0])
         given = self._sets.given_others(self._sets.without(self._state, own))
-        most = max(_explained(*given[g]) for g in range(len(self._labels), len(self._sets.groups)))
-        return most - _explained(*given[own])
+        wave, turn = (max((_explained(*given[g]) for g in of), default=-np.inf) for of in (self._waves, self._turns))
+        return wave - _explained(*given[own]), turn - _explained(*given[own])
+
+
+def _turning(problem: InstrumentProblem) -> list[Candidate]:
+    """One for each sample of unknown Mueller matrix: what is known is known as it stands."""
+    effect = TurningSample()
+    parameters = effect.parameters(problem.model, problem.captures[0].conditions, "")
+    return [Candidate(effect, "", parameters, k) for k, c in enumerate(problem.captures) if c.sample is None]
 
 
 def _waves(problem: InstrumentProblem) -> list[Candidate]:

@@ -190,7 +190,7 @@ def test_values_that_captures_share_count_once():
 
 
 def doubted(m: Patch, odds: float, known: bool, left: float) -> bool:
-    m.setattr(doubts.NamelessWaves, "beside", lambda *of: None)
+    m.setattr(doubts.Nameless, "beside", lambda *of: None)
     found = Some(samples=Some(best=Some(unit=1.0)), sets=Some(noise=Some(directions=1.0)), members=())
     told = cause(odds)
     solved = Some(space=Space(()), fit=Some(values=None))
