@@ -3,20 +3,20 @@
 import numpy as np
 import pytest
 
+from processing.diagnosis.instrument.cautious import less_far
 from processing.diagnosis.instrument.doubts import OF_THE_SAMPLE, PART_OF_LEFT, TURN
 from processing.diagnosis.instrument.guard import NOTHING, chances, lasts, predicted_change, predicted_change_of_part
-from processing.diagnosis.instrument.least_change import least_change
 
 
 def test_chance_that_m_gets_worse_is_that_of_draws_from_the_posterior() -> None:
     random = np.random.default_rng(0)
-    for size in (0.3, 1.0, 2.0):
+    for size, share in ((0.3, 1.0), (1.0, 1.0), (2.0, 1.0), (1.0, 0.6), (1.0, 1.3)):
         root, slopes = random.normal(size=(4, 4)), random.normal(size=(60, 4)) / 60
         mean = size * random.normal(size=4)
-        change = predicted_change(mean, root @ root.T, slopes.T @ slopes)
+        change = predicted_change(share * mean, mean, root @ root.T, slopes.T @ slopes)
         truth = mean + random.normal(size=(40_000, 4)) @ root.T
         before = np.sum((truth @ slopes.T) ** 2, axis=1)
-        after = np.sum(((truth - mean) @ slopes.T) ** 2, axis=1)
+        after = np.sum(((truth - share * mean) @ slopes.T) ** 2, axis=1)
         assert change.chance_worse == pytest.approx(np.mean(after > before), abs=0.01)
         assert change.before**2 == pytest.approx(np.mean(before), rel=0.03)
         assert change.after**2 == pytest.approx(np.mean(after), rel=0.03)
@@ -24,7 +24,7 @@ def test_chance_that_m_gets_worse_is_that_of_draws_from_the_posterior() -> None:
 
 def test_where_no_cause_is_sure_what_is_left_counts_against_the_change() -> None:
     """A shadow that turns is described in part by a beam that wanders: of 725 of chi-square 125 are left."""
-    told = predicted_change(np.array([1e-3]), np.array([[1e-10]]), np.eye(1))
+    told = predicted_change(np.array([1e-3]), np.array([1e-3]), np.array([[1e-10]]), np.eye(1))
     assert told.chance_worse < 1e-6
     assert told.beside(0.0, 600.0).chance_worse == pytest.approx(told.chance_worse)
     assert told.beside(6.0, 600.0).chance_worse < 1e-6
@@ -37,38 +37,37 @@ def test_of_tied_values_the_sum_that_the_data_tell_counts() -> None:
     tied = 0.01**2 * np.ones((2, 2)) / 4 + 0.3**2 * np.array([[1.0, -1.0], [-1.0, 1.0]])
     moves_with_the_sum = np.ones((2, 2)) + 1e-6 * np.eye(2)
     mean = np.array([0.05, 0.05])
-    assert predicted_change(mean, tied, moves_with_the_sum).chance_worse < 1e-6
-    assert predicted_change(mean, tied, np.eye(2)).chance_worse < 1e-6
-    assert predicted_change(mean, tied, np.diag([1.0, 0.0])).chance_worse > 0.4
+    assert predicted_change(mean, mean, tied, moves_with_the_sum).chance_worse < 1e-6
+    assert predicted_change(mean, mean, tied, np.eye(2)).chance_worse < 1e-6
+    assert predicted_change(mean, mean, tied, np.diag([1.0, 0.0])).chance_worse > 0.4
 
 
 def test_an_alternative_stands_in_for_what_is_applied() -> None:
     # A slip, or in one case of ten another that moves M in the same way: wrong about the name, right about M.
     mean, both = np.array([0.9, 0.1]), 0.09 * np.array([[1.0, -1.0], [-1.0, 1.0]]) + 1e-4 * np.eye(2)
-    first = np.array([True, False])
-    assert predicted_change_of_part(mean, both, np.ones((2, 2)), first).chance_worse < 1e-6
-    assert predicted_change_of_part(mean, both, np.eye(2), first).chance_worse > 0.05
+    first, given = np.array([True, False]), np.array([0.9, 0.0])
+    assert predicted_change_of_part(given, mean, both, np.ones((2, 2)), first).chance_worse < 1e-6
+    assert predicted_change_of_part(given, mean, both, np.eye(2), first).chance_worse > 0.05
     # What is open beside it and moves with it makes it no worse.
     beside = 0.09 * np.ones((2, 2)) + np.diag([0.0, 1.0])
-    alone = predicted_change_of_part(np.array([0.9, 0.0]), beside, np.diag([1.0, 0.0]), first)
-    assert predicted_change_of_part(np.array([0.9, 0.0]), beside, np.ones((2, 2)), first).stderr == pytest.approx(
-        alone.stderr
-    )
+    mean = np.array([0.9, 0.0])
+    alone = predicted_change_of_part(mean, mean, beside, np.diag([1.0, 0.0]), first)
+    assert predicted_change_of_part(mean, mean, beside, np.ones((2, 2)), first).stderr == pytest.approx(alone.stderr)
 
 
 def test_nothing_that_is_changed_makes_nothing_worse() -> None:
-    assert predicted_change(np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))).chance_worse == 0
-    assert predicted_change(np.array([1e-9]), np.eye(1), np.eye(1)).chance_worse == 0
+    assert predicted_change(np.zeros(0), np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))).chance_worse == 0
+    assert predicted_change(np.array([1e-9]), np.array([1e-9]), np.eye(1), np.eye(1)).chance_worse == 0
 
 
 def test_what_is_open_is_used_to_leave_m_as_it_is() -> None:
     # A sum that is known to 0.01; M follows the first value alone.
     known, open_ = np.ones((2, 2)) / 4, np.array([[1.0, -1.0], [-1.0, 1.0]])
     mean, products = np.array([0.05, 0.05]), np.diag([1.0, 0.0])
-    moved = least_change(mean, 0.01**2 * known + 0.3**2 * open_, products)
+    moved = less_far(mean, 0.01**2 * known + 0.3**2 * open_, products, 1e6)
     assert moved is not None
     np.testing.assert_allclose(moved, [0.0, 0.1], atol=1e-3)
-    assert least_change(mean, 0.01**2 * (known + open_), products) is None
+    assert less_far(mean, 0.01**2 * (known + open_), products, 1e6) is None
 
 
 def test_beside_a_sample_that_changed_nothing_is_kept_for_later_captures() -> None:

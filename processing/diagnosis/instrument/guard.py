@@ -70,12 +70,13 @@ class PredictedChange:
     Attributes
     ----------
     before, after : error without and with the correction.
-    size, stderr : of the change, and standard error of the true one along it.
+    size : of the change; expected, stderr : how far the true one goes along it, and the standard error of that.
     """
 
     before: float
     after: float
     size: float
+    expected: float
     stderr: float
 
     @property
@@ -83,7 +84,8 @@ class PredictedChange:
         """Chance that the error grows: that the true change goes less than half as far along this one."""
         if self.size <= LEAST_NOISE:
             return 0.0
-        return float(ndtr(-self.size / (2 * self.stderr))) if self.stderr > 0 else 0.0
+        beyond = self.expected - self.size / 2
+        return float(ndtr(-beyond / self.stderr)) if self.stderr > 0 else float(beyond < 0)
 
     def beside(self, left: float, explained: float) -> PredictedChange:
         """Where no cause is beyond doubt and structure is left: as wrong, along itself, as that is to what it explains.
@@ -94,23 +96,16 @@ class PredictedChange:
         return replace(self, stderr=float(np.hypot(self.stderr, wrong * self.size)))
 
 
-NOTHING = PredictedChange(0.0, 0.0, 0.0, 0.0)
+NOTHING = PredictedChange(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def predicted_changes(
-    problem: InstrumentProblem, found: Posterior, solved: Solution
-) -> tuple[PredictedChange, PredictedChange]:
+def predicted_changes(problem: InstrumentProblem, found: Posterior, solved: Solution) -> tuple[PredictedChange, ...]:
     """What a correction does to the captures it was found on, and what its part does that later ones have too."""
     slopes = slopes_of(problem, found, solved)
     if slopes is None:
         return NOTHING, NOTHING
-    mean, covariance = found.values[slopes.index], found.covariance[np.ix_(slopes.index, slopes.index)]
-    later = slopes.lasting
-    both = np.ix_(later, later)
-    return (
-        predicted_change_of_part(mean, covariance, slopes.products, slopes.applied),
-        predicted_change_of_part(mean[later], covariance[both], slopes.products[both], slopes.applied[later]),
-    )
+    everything = np.ones(slopes.index.size, dtype=bool)
+    return tuple(slopes.predicted_change(found, slopes.given, part) for part in (everything, slopes.lasting))
 
 
 @dataclass(frozen=True)
@@ -120,14 +115,24 @@ class Slopes:
     Attributes
     ----------
     index : (K,) their places in the posterior.
-    applied : (K,) those of the correction; lasting : (K,) those of effects that later captures have too.
+    given : (K,) as the correction has them, zero where it has none; applied : (K,) whether it has one.
+    lasting : (K,) those of effects that later captures have too.
     products : (K, K) of the slopes of M/m00, mean over pixels and elements.
     """
 
     index: NDArray[np.int64]
+    given: Array
     applied: NDArray[np.bool_]
     lasting: NDArray[np.bool_]
     products: Array
+
+    def predicted_change(self, found: Posterior, given: Array, part: NDArray[np.bool_]) -> PredictedChange:
+        """What values `given` (K,) do, of which only a `part` (K,) is there."""
+        index, own = self.index[part], np.ix_(part, part)
+        covariance = found.covariance[np.ix_(index, index)]
+        return predicted_change_of_part(
+            given[part], found.values[index], covariance, self.products[own], self.applied[part]
+        )
 
 
 def slopes_of(problem: InstrumentProblem, found: Posterior, solved: Solution) -> Slopes | None:
@@ -143,8 +148,10 @@ def slopes_of(problem: InstrumentProblem, found: Posterior, solved: Solution) ->
     }
     space, index = Space(tuple(part)), np.concatenate([*part.values()])
     products, light = mueller_slopes(problem, space, found.values[index], _left(problem, solved))
+    given = dict(zip(solved.space.candidates, solved.space.slices, strict=True))
     return Slopes(
         index,
+        np.concatenate([solved.fit.values[given[c]] if c in correction else np.zeros(c.size) for c in part]),
         np.concatenate([np.full(c.size, c in correction) for c in part]),
         np.concatenate([np.full(c.size, scope_of(c) == "instrument") for c in part]),
         products.sum(axis=0) / (max(light, 1e-300) * ELEMENTS),
@@ -159,9 +166,9 @@ def _left(problem: InstrumentProblem, solved: Solution) -> Array:
 
 
 def predicted_change_of_part(
-    mean: Array, covariance: Array, products: Array, applied: NDArray[np.bool_]
+    given: Array, mean: Array, covariance: Array, products: Array, applied: NDArray[np.bool_]
 ) -> PredictedChange:
-    """Where only those `applied` (K,) are corrected, of values with a mean (K,) and a covariance (K, K).
+    """Where only those `applied` (K,) are corrected, by values `given` (K,), of a mean (K,) and a covariance (K, K).
 
     Where an applied value is wrong, an alternative may stand in for it that moves M in the same way, as the covariance
     tells; that counts in its favour. What else is uncertain is so whatever is applied.
@@ -170,19 +177,22 @@ def predicted_change_of_part(
     with_others = covariance[:, applied] @ np.linalg.pinv(own, hermitian=True)
     alone = np.where(np.outer(applied, applied), covariance, 0.0)
     together = with_others @ own @ with_others.T
-    change = np.where(applied, mean, 0.0)
-    told = (predicted_change(change, errors, products) for errors in (alone, together))
+    true = np.where(applied, mean, 0.0)
+    told = (predicted_change(given, true, errors, products) for errors in (alone, together))
     return min(told, key=lambda one: one.chance_worse)
 
 
-def predicted_change(mean: Array, covariance: Array, products: Array) -> PredictedChange:
-    """Of values with a mean (K,) and a covariance (K, K); `products` (K, K) of the slopes of M/m00, averaged."""
+def predicted_change(given: Array, mean: Array, covariance: Array, products: Array) -> PredictedChange:
+    """Of values `given` (K,), where the true ones have a mean (K,) and a covariance (K, K).
+
+    `products` (K, K) of the slopes of M/m00, averaged.
+    """
     left = max(float(np.sum(products * covariance)), 0.0)
-    along = products @ mean
-    square = max(float(mean @ along), 0.0)
-    size = float(np.sqrt(square))
+    along, missed = products @ given, mean - given
+    size = float(np.sqrt(max(float(given @ along), 0.0)))
     stderr = float(np.sqrt(max(float(along @ covariance @ along), 0.0))) / max(size, 1e-300)
-    return PredictedChange(float(np.sqrt(left + square)), float(np.sqrt(left)), size, stderr)
+    before, after = (np.sqrt(left + max(float(v @ products @ v), 0.0)) for v in (mean, missed))
+    return PredictedChange(float(before), float(after), size, float(mean @ along) / max(size, 1e-300), stderr)
 
 
 def chances(here: PredictedChange, later: PredictedChange, lasting: bool) -> tuple[Check, ...]:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from processing.arrays import Array
+from processing.diagnosis.instrument.cautious import cautious
 from processing.diagnosis.instrument.doubts import AS_WELL, BESIDE_PATTERN, ELSE, acts_on_unknown, doubts, testable
 from processing.diagnosis.instrument.empirical import empirical
 from processing.diagnosis.instrument.evidence import wanted_for_evidence, would_be_seen
 from processing.diagnosis.instrument.guard import chances, checks, lasts, predicted_changes, refusal
-from processing.diagnosis.instrument.least_change import without_change
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.recommend import recommended
 from processing.diagnosis.instrument.structure import Residual, descriptions, residual
@@ -36,7 +36,7 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause, causes
 from processing.diagnosis.search.posterior import Posterior, Say
 from processing.diagnosis.search.result import Diagnosis, Unexplained, Verdict
-from processing.diagnosis.search.rules import CHANCE_WORSE, GROWTH, LIKELY, LIMIT, WHITE
+from processing.diagnosis.search.rules import GROWTH, LIKELY, LIMIT, WHITE
 from processing.diagnosis.search.solution import Solution
 from processing.instrument.effects.base import FieldEffect, ValuePerState
 from processing.instrument.model import InstrumentModel
@@ -99,9 +99,9 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
         solved = solution(bench, found, unfit)
         after = tuple(residual(asked, k, solved.space, solved.fit) for k in captures)
     here, later = predicted_changes(asked, found, solved)
-    quiet = None if here.chance_worse <= CHANCE_WORSE else without_change(asked, found, solved)
-    if quiet is not None:
-        found, solved = quiet, solution(bench, quiet, unfit)
+    careful = cautious(asked, found, solved)
+    if careful is not None:
+        solved = solution(bench, replace(found, values=careful), unfit)
         after = tuple(residual(asked, k, solved.space, solved.fit) for k in captures)
         here, later = predicted_changes(asked, found, solved)
     sure = [c for c in named if c.answer != "unknown" and c not in doubt]

@@ -5,7 +5,7 @@ from types import SimpleNamespace as Some
 import numpy as np
 from rule_decisions import Patch, cause, decides, made
 
-from processing.diagnosis.instrument import empirical, guard, judge, least_change, whole_bench, wiring
+from processing.diagnosis.instrument import cautious, empirical, guard, judge, whole_bench, wiring
 from processing.diagnosis.instrument.doubts import PART_OF_LEFT, WAVE, WAVE_AS_WELL
 from processing.diagnosis.search import causes
 from processing.diagnosis.search.result import Empirical
@@ -79,7 +79,7 @@ def test_worse(m: Patch) -> bool:
 
 
 def determined(size: float) -> bool:
-    change = guard.PredictedChange(before=0.005, after=0.001, size=size, stderr=0.001)
+    change = guard.PredictedChange(before=0.005, after=0.001, size=size, expected=size, stderr=0.001)
     return guard.refusal(guard.chances(change, change, lasting=True)) is None
 
 
@@ -91,7 +91,7 @@ def test_chance_worse(m: Patch) -> bool:
 @decides
 def test_as_good_as(m: Patch) -> bool:
     # M follows one value alone, which is so many standard deviations from zero.
-    there = [least_change.least_change(np.array([d]), np.eye(1), np.eye(1)) is not None for d in (0.95, 1.05)]
+    there = [cautious.less_far(np.array([d]), np.eye(1), np.eye(1), 1e6) is not None for d in (0.95, 1.05)]
     return there == [True, False]
 
 
