@@ -81,3 +81,27 @@ def test_what_varies_over_the_image_may_be_absent_where_the_noise_is_asked_besid
     monkeypatch.setattr(whole_bench, "applied", lambda *of: ())
     assert bench.run() == "beside"
     assert asked == [("plain", []), ("beside", [])]
+
+
+def test_a_bend_that_does_not_scatter_so_hides_no_noise_of_the_others(monkeypatch):
+    """The light of a tone curve and an offset was refused together, and the noise stayed that without any (6 % off)."""
+    tone, offset = "tone_curve", "detector_offset"
+    bench, adopted, stays = object.__new__(WholeBench), [], []
+    bench.whole = SimpleNamespace(noise_known=True, level_noise=lambda space, values: True)
+    monkeypatch.setattr(whole_bench, "Space", lambda candidates: SimpleNamespace(candidates=candidates))
+    monkeypatch.setattr(whole_bench, "first_look", lambda whole, space, fixed, start: (space.candidates, 1.0))
+    monkeypatch.setattr(bench, "_values_at_start", lambda space: space.candidates)
+    monkeypatch.setattr(
+        bench, "_refuted_by_scatter", lambda space, seen: {tone: -200.0, offset: -30.0} if tone in seen else {}
+    )
+
+    def adopt(space, seen):
+        if tone in seen or seen in stays:
+            return False
+        adopted.append(seen)
+        stays.append(seen)
+        return True
+
+    monkeypatch.setattr(bench, "_adopt_noise", adopt)
+    bench._take_noise_of_light([tone, offset], [])
+    assert adopted == [(offset,)]

@@ -116,19 +116,28 @@ class WholeBench:
         known makes it as wrong: too little noise is structure, beside which nothing is found.
         """
         space = Space(tuple(candidates))
-        start = told = self._values_at_start(space)
+        start = self._values_at_start(space)
         if not self.whole.noise_known:
             return
         self.whole.level_noise(space, start)
         seen, unit = first_look(self.whole, space, fixed, start)
+        told = space, start
         for _ in range(FIRST_LOOKS):
             if not self._adopt_noise(space, seen):
-                break
+                # Without the light that one of them would have, the others may have theirs.
+                against = self._refuted_by_scatter(space, seen)
+                if not against:
+                    break
+                worst = min(against, key=lambda c: against[c])
+                space = Space(tuple(c for c in space.candidates if c != worst))
+                start = self._values_at_start(space)
+                seen, unit = first_look(self.whole, space, fixed, start)
+                continue
             now, left = first_look(self.whole, space, fixed, start)
             if left > GROWTH * unit:
-                self._adopt_noise(space, told)
+                self._adopt_noise(*told)
                 break
-            told, seen, unit = seen, now, left
+            told, seen, unit = (space, seen), now, left
 
     def _adopt_noise(self, space: Space, values: Array) -> bool:
         taken = self.whole.adopt_noise(space, values)
@@ -144,7 +153,7 @@ class WholeBench:
         if not self.whole.noise_known:
             return found
         # Where one is gone another may stand in for it, and one that stood beside it may be right.
-        while against := self._refuted_by_scatter(found):
+        while against := self._refuted_by_scatter(*applied(found, self.base)):
             worst = min(against, key=lambda c: against[c])
             self.say(f"the noise speaks against {worst.label}")
             other = self._posterior([c for c in found.space.candidates if c != worst], fixed, found)
@@ -153,9 +162,8 @@ class WholeBench:
             found = other
         return found
 
-    def _refuted_by_scatter(self, found: Posterior) -> dict[Candidate, float]:
+    def _refuted_by_scatter(self, space: Space, values: Array) -> dict[Candidate, float]:
         """Corrections of the counts that the noise speaks against, with the log likelihood that they lose."""
-        space, values = applied(found, self.base)
         undone = exactly_undone(space, values, pointwise=True)
         far = {c: v for c, v in undone.items() if np.any(np.abs(v) > EXACT * c.typical)}
         gains = {c: scatter_prefers(self.whole, space, values, {c: v}, {}) for c, v in far.items()}
