@@ -151,8 +151,8 @@ WORSE = 1.002
 #: [probability] That the error of M grows by a correction, up to which it is written: what is changed has to be 4.65
 #: standard errors of the change, for the error grows where the truth goes less than half as far.
 CHANCE_WORSE = 0.01
-#: [standard deviations] From the mean of the posterior, up to which another correction is as good: one that leaves M as
-#: it is, where the data do not tell how it changes.
+#: [standard deviations] From the mean of the posterior, up to which another correction is as good: one that changes M
+#: less, where the data hardly tell how it changes.
 AS_GOOD_AS = 1.0
 #: [1] Growth of the condition number of W that a correction may cause: beyond it the states would be other ones.
 WORSE_CONDITION = 1.5
