@@ -86,20 +86,23 @@ def test_a_sample_that_turns_is_not_angles_of_an_axis(configs, tmp_path, bench):
 
 
 @pytest.mark.parametrize(
-    ("wave", "turn", "one_name", "reason"),
+    ("named", "wave", "turn", "one_name", "reason"),
     [
-        (120.0, 0.0, True, WAVE),
-        (99.0, 0.0, True, WAVE_AS_WELL),
-        (93.0, 0.0, True, WAVE_AS_WELL),
-        (90.0, 0.0, True, None),
-        (120.0, 0.0, False, None),
-        (99.0, 120.0, True, TURN),
-        (0.0, 120.0, False, TURN),
-        (0.0, 93.0, False, TURN_AS_WELL),
-        (0.0, 90.0, False, None),
+        (100.0, 120.0, 0.0, True, WAVE),
+        (100.0, 99.0, 0.0, True, WAVE_AS_WELL),
+        (100.0, 93.0, 0.0, True, WAVE_AS_WELL),
+        (100.0, 90.0, 0.0, True, None),
+        (100.0, 120.0, 0.0, False, None),
+        (100.0, 99.0, 120.0, True, TURN),
+        (100.0, 0.0, 120.0, False, TURN),
+        (100.0, 0.0, 105.0, False, TURN_AS_WELL),
+        (100.0, 0.0, 93.0, False, TURN_AS_WELL),
+        (100.0, 0.0, 90.0, False, None),
+        # What explains nothing is not there in the place of what explains little.
+        (10.0, 5.0, 5.0, True, None),
     ],
 )
-def test_no_name_is_sure_beside_what_explains_nearly_as_much(wave, turn, one_name, reason):
+def test_no_name_is_sure_beside_what_explains_nearly_as_much(named, wave, turn, one_name, reason):
     def explaining(chi_square):
         return np.eye(1), np.array([math.sqrt(chi_square)])
 
@@ -109,6 +112,6 @@ def test_no_name_is_sure_beside_what_explains_nearly_as_much(wave, turn, one_nam
     nameless._waves, nameless._turns = range(1, 2), range(2, 3)
     nameless._sets = SimpleNamespace(
         without=lambda state, group: state,
-        given_others=lambda state: [explaining(100.0), explaining(wave), explaining(turn)],
+        given_others=lambda state: [explaining(named), explaining(wave), explaining(turn)],
     )
     assert _in_its_place(*nameless.gains_over(cause), one_name) == reason

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from processing.diagnosis.instrument.edges import at_edges
-from processing.diagnosis.instrument.nameless import Nameless
+from processing.diagnosis.instrument.nameless import STANDS_OUT, Nameless
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.source_patterns import beat_explains_as_well, chance_of_pattern, patterned
 from processing.diagnosis.instrument.unevenness import Evenness
@@ -20,7 +20,6 @@ from processing.diagnosis.search.rules import (
     EDGES,
     LIMIT,
     ONE_PATTERN,
-    SURE,
     TESTABLE,
     TIMES,
     UNEVEN,
@@ -63,7 +62,7 @@ BESIDE_PATTERN = "it may be a part of a source that changes as no effect of the 
 #: The reason for which nothing is written for later captures: the sample or its light changed, and what is found beside
 #: that may be a part of it.
 OF_THE_SAMPLE = "it differs from part to part of the image, which a source does not"
-CHANGED = (OF_THE_SAMPLE, TURN, TURN_AS_WELL)
+CHANGED = (OF_THE_SAMPLE, TURN)
 #: The one reason that leaves a name likely.
 PART_OF_LEFT = "it may be a part of what is left unexplained"
 
@@ -112,13 +111,13 @@ def doubts(
 def _in_its_place(wave: float, turn: float, one_name: bool) -> str | None:
     """The reason where a wave of a plate, or a sample that turns, gains so much over a cause.
 
-    Of two that are as likely none is sure. A wave is asked in the place of one name alone.
+    Of two that are as likely none is sure. A wave is asked in the place of one name alone; that the sample turned, of
+    which all else may be a part, has to be sure itself.
     """
-    nearly = -2 * np.log(SURE / (1 - SURE))
-    if one_name and wave > nearly and wave >= turn:
+    if one_name and wave > -STANDS_OUT and wave >= turn:
         return WAVE if wave > 0 else WAVE_AS_WELL
-    if turn > nearly:
-        return TURN if turn > 0 else TURN_AS_WELL
+    if turn > -STANDS_OUT:
+        return TURN if turn > STANDS_OUT else TURN_AS_WELL
     return None
 
 

@@ -18,6 +18,7 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause
 from processing.diagnosis.search.linearized import quadratic
 from processing.diagnosis.search.posterior import Posterior
+from processing.diagnosis.search.rules import SURE
 from processing.diagnosis.search.sets import Group, Sets, State
 from processing.diagnosis.search.space import Space
 from processing.effect import Parameter
@@ -27,6 +28,9 @@ from processing.instrument.model import InstrumentModel, Retarder
 
 #: Periods a turn that no effect of the list has, of what a turning plate does.
 PERIODS = {"retardance": (2, 3, 4), "azimuth": (3, 4), "transmission": (3, 4)}
+
+#: Chi-square that has odds of 99 to 1.
+STANDS_OUT = 2 * float(np.log(SURE / (1 - SURE)))
 
 
 class WaveOfAPlate(OpticsEffect):
@@ -108,12 +112,13 @@ class Nameless:
     def gains_over(self, cause: Cause) -> tuple[float, float]:
         """Chi-square that the best wave, and the best turn, explain in a cause's place beyond what that does.
 
-        Every value of each costs two. Minus infinity where there is none to ask.
+        Every value of each costs two. Minus infinity where there is none that stands out by itself.
         """
         own = self._labels.index(cause.candidates[0])
         given = self._sets.given_others(self._sets.without(self._state, own))
-        wave, turn = (max((_explained(*given[g]) for g in of), default=-np.inf) for of in (self._waves, self._turns))
-        return wave - _explained(*given[own]), turn - _explained(*given[own])
+        most = (max((_explained(*given[g]) for g in of), default=0.0) for of in (self._waves, self._turns))
+        wave, turn = (one - _explained(*given[own]) if one > STANDS_OUT else -np.inf for one in most)
+        return wave, turn
 
 
 def _turning(problem: InstrumentProblem) -> list[Candidate]:
