@@ -76,8 +76,9 @@ class Changes:
     `depolarization`, `after` (a Mueller matrix (4, 4) that follows the element), `field_retardance_rad` (5,)
     coefficients of `field_terms`.
     Detector side: `gain` (N, channels), `stray` (fraction of the mean signal that bypasses the optics), `mixing`
-    (channels, channels). Count side, what is added to the counts: `response` by feature of the counts, () or
-    (N, channels); `shift_px` (N, 2), by how much the image has moved to the right and down.
+    (channels, channels), `lag` (share of a state that is read with the next one). Count side, what is added to the
+    counts: `response` by feature of the counts, () or (N, channels); `shift_px` (N, 2), by how much the image has moved
+    to the right and down.
     """
 
     conditions: Conditions
@@ -91,6 +92,7 @@ class Changes:
     gain: Array = field(init=False)
     stray: float = 0.0
     mixing: Array | None = None
+    lag: float = 0.0
     response: defaultdict[str, Array] = field(default_factory=_zeros)
     shift_px: Array = field(init=False)
     drop_clipped: bool = False

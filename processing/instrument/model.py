@@ -285,7 +285,11 @@ def _detected(w: Array, changes: Changes) -> Array:
         w[..., 0] += changes.stray * float(np.mean(w[..., 0]))
     if changes.mixing is not None:
         w = np.einsum("ck,nkj->ncj", changes.mixing, w)
-    return np.asarray(w * changes.gain[..., None])
+    w = w * changes.gain[..., None]
+    if changes.lag:
+        # What was before the first state is not known: as if it had been the same.
+        w = w + changes.lag * (np.concatenate([w[:1], w[:-1]]) - w)
+    return np.asarray(w)
 
 
 def _state_count(angles_deg: Mapping[str, ArrayLike]) -> int:

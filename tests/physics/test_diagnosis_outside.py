@@ -7,13 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from processing.diagnosis.instrument.doubts import TURN, TURN_AS_WELL, WAVE, WAVE_AS_WELL, _in_its_place
-from processing.diagnosis.instrument.nameless import Nameless
+from processing.diagnosis.instrument.doubts import LAG, TURN, TURN_AS_WELL, WAVE, WAVE_AS_WELL, _in_its_place
+from processing.diagnosis.instrument.nameless import ImageLag, Nameless, TurningSample, WaveOfAPlate
 from processing.diagnosis.instrument.run import diagnose_captures
 from processing.diagnosis.search.result import Diagnosis
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture_schema import Sample
-from simulators.blind.outside_list import ghost
+from simulators.blind.outside_list import ghost, image_lag
 from simulators.blind.real_bench import Disc
 from simulators.blind.suite import declared_bench, state_angles
 from simulators.blind.undeclared_captures import Bench, digitize, expose, write_capture
@@ -85,33 +85,42 @@ def test_a_sample_that_turns_is_not_angles_of_an_axis(configs, tmp_path, bench):
     assert not found.applied()
 
 
+def test_frames_that_are_read_with_the_next_ones_are_not_angles_of_an_axis(configs, tmp_path, bench):
+    image_lag(bench, np.random.default_rng(5), STATES)
+    found = diagnosed(tmp_path, configs, bench)
+    assert found.effects
+    assert not sure(found)
+    assert not found.applied()
+
+
 @pytest.mark.parametrize(
-    ("named", "wave", "turn", "one_name", "reason"),
+    ("named", "wave", "turn", "lag", "one_name", "reason"),
     [
-        (100.0, 120.0, 0.0, True, WAVE),
-        (100.0, 99.0, 0.0, True, WAVE_AS_WELL),
-        (100.0, 93.0, 0.0, True, WAVE_AS_WELL),
-        (100.0, 90.0, 0.0, True, None),
-        (100.0, 120.0, 0.0, False, None),
-        (100.0, 99.0, 120.0, True, TURN),
-        (100.0, 0.0, 120.0, False, TURN),
-        (100.0, 0.0, 105.0, False, TURN_AS_WELL),
-        (100.0, 0.0, 93.0, False, TURN_AS_WELL),
-        (100.0, 0.0, 90.0, False, None),
+        (100.0, 120.0, 0.0, 0.0, True, WAVE),
+        (100.0, 99.0, 0.0, 0.0, True, WAVE_AS_WELL),
+        (100.0, 93.0, 0.0, 0.0, True, WAVE_AS_WELL),
+        (100.0, 90.0, 0.0, 0.0, True, None),
+        (100.0, 120.0, 0.0, 0.0, False, None),
+        (100.0, 99.0, 120.0, 0.0, True, TURN),
+        (100.0, 0.0, 120.0, 0.0, False, TURN),
+        (100.0, 0.0, 105.0, 0.0, False, TURN_AS_WELL),
+        (100.0, 0.0, 93.0, 0.0, False, TURN_AS_WELL),
+        (100.0, 0.0, 90.0, 0.0, False, None),
+        (100.0, 120.0, 0.0, 121.0, True, LAG),
         # What explains nothing is not there in the place of what explains little.
-        (10.0, 5.0, 5.0, True, None),
+        (10.0, 5.0, 5.0, 0.0, True, None),
     ],
 )
-def test_no_name_is_sure_beside_what_explains_nearly_as_much(named, wave, turn, one_name, reason):
+def test_no_name_is_sure_beside_what_explains_nearly_as_much(named, wave, turn, lag, one_name, reason):
     def explaining(chi_square):
         return np.eye(1), np.array([math.sqrt(chi_square)])
 
     cause = SimpleNamespace(candidates=("named",))
     nameless = Nameless.__new__(Nameless)
     nameless._labels, nameless._state = ["named"], None
-    nameless._waves, nameless._turns = range(1, 2), range(2, 3)
+    nameless._groups = {WaveOfAPlate: range(1, 2), TurningSample: range(2, 3), ImageLag: range(3, 4)}
     nameless._sets = SimpleNamespace(
         without=lambda state, group: state,
-        given_others=lambda state: [explaining(named), explaining(wave), explaining(turn)],
+        given_others=lambda state: [explaining(x) for x in (named, wave, turn, lag)],
     )
-    assert _in_its_place(*nameless.gains_over(cause), one_name) == reason
+    assert _in_its_place(nameless.gains_over(cause), one_name) == reason

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from processing.diagnosis.instrument.edges import at_edges
-from processing.diagnosis.instrument.nameless import STANDS_OUT, Nameless
+from processing.diagnosis.instrument.nameless import STANDS_OUT, ImageLag, Nameless, TurningSample, WaveOfAPlate
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.source_patterns import beat_explains_as_well, chance_of_pattern, patterned
 from processing.diagnosis.instrument.unevenness import Evenness
@@ -32,6 +32,7 @@ from processing.instrument.effects.base import (
     FieldEffect,
     GeneralEffect,
     ImageShift,
+    OpticsEffect,
     PointwiseEffect,
     SourceEffect,
     ValuePerState,
@@ -49,14 +50,24 @@ WAVE_AS_WELL = "a plate that changes two to four times a turn explains as much a
 #: The same of a sample that turns on its stage; nothing that is found beside it need be of the instrument.
 TURN = "a sample that turns during the capture explains more than it does"
 TURN_AS_WELL = "a sample that turns during the capture explains as much as it does"
+#: The same of a detector that has not read all of a frame when the next one comes.
+LAG = "a part of each frame that is read with the next one explains more than it does"
+LAG_AS_WELL = "a part of each frame that is read with the next one explains as much as it does"
+#: For each, the gain in chi-square from which on it explains more, and the reasons. That the sample turned, of which
+#: all else may be a part, has to be sure.
+IN_ITS_PLACE = {
+    WaveOfAPlate: (0.0, WAVE, WAVE_AS_WELL),
+    TurningSample: (STANDS_OUT, TURN, TURN_AS_WELL),
+    ImageLag: (0.0, LAG, LAG_AS_WELL),
+}
 #: The image does not move where that would be seen best.
 STANDS = "the edges, which were left out of the fit, do not move as it says"
 #: Optics and mechanics are the same for the whole image.
 NOT_ALIKE = "it differs from part to part of the image, which nothing in the train does"
 #: Reasons that say that something else is there, of which what the cause explains is left over.
-ELSE = (PATTERN, BEAT, WAVE, TURN, STANDS, NOT_ALIKE)
+ELSE = (PATTERN, BEAT, WAVE, TURN, LAG, STANDS, NOT_ALIKE)
 #: Reasons that say that either may be there.
-AS_WELL = (WAVE_AS_WELL, TURN_AS_WELL)
+AS_WELL = (WAVE_AS_WELL, TURN_AS_WELL, LAG_AS_WELL)
 #: The reason of a source beside one that follows a pattern: where that is not used, neither is this.
 BESIDE_PATTERN = "it may be a part of a source that changes as no effect of the list does"
 #: The reason for which nothing is written for later captures: the sample or its light changed, and what is found beside
@@ -79,7 +90,7 @@ def doubts(
     for cause in causes:
         reason = STANDS if cause in still else _of_itself(problem, found, solved, cause, causes, even)
         if reason is None and nameless is not None:
-            reason = _in_its_place(*nameless.gains_over(cause), _is_one_name(cause))
+            reason = _in_its_place(nameless.gains_over(cause), _is_one_name(cause))
         if reason is not None:
             out[cause] = reason
         if reason == PATTERN:
@@ -108,17 +119,17 @@ def doubts(
     return out
 
 
-def _in_its_place(wave: float, turn: float, one_name: bool) -> str | None:
-    """The reason where a wave of a plate, or a sample that turns, gains so much over a cause.
+def _in_its_place(gains: Mapping[type[OpticsEffect], float], one_name: bool) -> str | None:
+    """The reason where something that has no name gains so much over a cause; of two that are as likely none is sure.
 
-    Of two that are as likely none is sure. A wave is asked in the place of one name alone; that the sample turned, of
-    which all else may be a part, has to be sure itself.
+    A wave is asked in the place of one name alone.
     """
-    if one_name and wave > -STANDS_OUT and wave >= turn:
-        return WAVE if wave > 0 else WAVE_AS_WELL
-    if turn > -STANDS_OUT:
-        return TURN if turn > STANDS_OUT else TURN_AS_WELL
-    return None
+    asked = {kind: gain for kind, gain in gains.items() if one_name or kind is not WaveOfAPlate}
+    best = max(asked, key=lambda kind: asked[kind], default=None)
+    if best is None or asked[best] <= -STANDS_OUT:
+        return None
+    least, more, as_well = IN_ITS_PLACE[best]
+    return more if asked[best] > least else as_well
 
 
 def _of_itself(

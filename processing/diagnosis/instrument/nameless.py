@@ -1,14 +1,17 @@
-"""What no effect of the list is, asked in a cause's place: waves of a turning plate, and a sample that turns.
+"""What no effect of the list is, asked in a cause's place: waves of a turning plate, a sample that turns, a lag.
 
 A plate that is tilted in its mount has a retardance that changes twice a turn; bearings and windings make three or four
 periods of it. With an unknown sample such a wave may look like something else (a transmission twice a turn, in the
 light of a depolarizing sphere), and to the noise: then nothing in the data tells which of the two it is. A sample whose
-stage drifts about the line of sight has an azimuth that drifts with it, which angles of single states can describe.
+stage drifts about the line of sight has an azimuth that drifts with it, which angles of single states can describe; so
+can they a detector that reads a part of each frame with the next one, to first order an error of all angles.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -83,19 +86,41 @@ class TurningSample(OpticsEffect, OfOneCapture):
             changes.azimuth_rad[element.name] = changes.azimuth_rad[element.name] + turned
 
 
+class ImageLag(OpticsEffect):
+    """A share of the charge of a state is read with the next one."""
+
+    kind = "image_lag"
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        """The one detector."""
+        return ("",)
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        """The share."""
+        return (Parameter("share", "1", -0.1, 0.1, 0.005),)
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        """Read it with the next one."""
+        changes.lag += float(values[0])
+
+
 class Nameless:
-    """Every such wave and turn beside the sets of a posterior, linearized about its values."""
+    """All of these beside the sets of a posterior, linearized about its values."""
 
     def __init__(self, problem: InstrumentProblem, found: Posterior) -> None:
         self._labels = [found.label(g) for g in range(len(found.members))]
-        waves, turns = _waves(problem), _turning(problem)
-        space = Space((*found.space.candidates, *waves, *turns))
+        asked: dict[type[OpticsEffect], list[Candidate]] = {
+            WaveOfAPlate: _waves(problem),
+            TurningSample: _turning(problem),
+            ImageLag: _once(ImageLag(), problem),
+        }
+        space = Space((*found.space.candidates, *(c for each in asked.values() for c in each)))
         values = np.append(found.values, np.zeros(space.size - found.space.size))
         form = quadratic(problem, space, values, problem.sums(space, values))
         own = [Group(np.r_[part].astype(np.int64)) for part in space.slices[len(found.space.candidates) :]]
         self._sets = Sets(form, (*found.sets.groups, *own), found.sets.noise)
-        self._waves = range(len(self._labels), len(self._labels) + len(waves))
-        self._turns = range(self._waves.stop, len(self._sets.groups))
+        ends = np.cumsum([len(self._labels), *map(len, asked.values())]).tolist()
+        self._groups = {effect: range(*pair) for effect, pair in zip(asked, pairwise(ends), strict=True)}
         best = found.samples.best
         self._state = State(np.append(best.tau, np.zeros(len(own))), best.unit)
 
@@ -109,23 +134,25 @@ class Nameless:
         few = problem.holds_out_states or not problem.noise_known
         return None if fields or few else cls(problem, found)
 
-    def gains_over(self, cause: Cause) -> tuple[float, float]:
-        """Chi-square that the best wave, and the best turn, explain in a cause's place beyond what that does.
+    def gains_over(self, cause: Cause) -> dict[type[OpticsEffect], float]:
+        """Chi-square that the best of each kind explains in a cause's place beyond what that does.
 
-        Every value of each costs two. Minus infinity where there is none that stands out by itself.
+        Every value of either costs two. Of those that stand out by themselves.
         """
         own = self._labels.index(cause.candidates[0])
         given = self._sets.given_others(self._sets.without(self._state, own))
-        most = (max((_explained(*given[g]) for g in of), default=0.0) for of in (self._waves, self._turns))
-        wave, turn = (one - _explained(*given[own]) if one > STANDS_OUT else -np.inf for one in most)
-        return wave, turn
+        most = {kind: max((_explained(*given[g]) for g in of), default=0.0) for kind, of in self._groups.items()}
+        return {kind: one - _explained(*given[own]) for kind, one in most.items() if one > STANDS_OUT}
+
+
+def _once(effect: OpticsEffect, problem: InstrumentProblem) -> list[Candidate]:
+    return [Candidate(effect, "", effect.parameters(problem.model, problem.captures[0].conditions, ""))]
 
 
 def _turning(problem: InstrumentProblem) -> list[Candidate]:
     """One for each sample of unknown Mueller matrix: what is known is known as it stands."""
-    effect = TurningSample()
-    parameters = effect.parameters(problem.model, problem.captures[0].conditions, "")
-    return [Candidate(effect, "", parameters, k) for k, c in enumerate(problem.captures) if c.sample is None]
+    unknown = [k for k, c in enumerate(problem.captures) if c.sample is None]
+    return [replace(one, capture=k) for k in unknown for one in _once(TurningSample(), problem)]
 
 
 def _waves(problem: InstrumentProblem) -> list[Candidate]:
