@@ -12,9 +12,10 @@ from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field, model_validator
+from pydantic import Field, field_serializer, field_validator, model_validator
 
 from processing.arrays import Array
+from processing.instrument import direction_text
 from processing.instrument.changes import Changes
 from processing.instrument.elements import AnyElement, Part
 from processing.instrument.elements import Dispersive as Dispersive
@@ -52,6 +53,10 @@ class AppliedEffect(Part):
     probability: float | None = None
 
 
+#: Values by name of effects by label; values of many states in one text.
+_AsWritten = dict[str, dict[str, float | str]]
+
+
 class SystematicError(Part):
     """What stays uncertain after a correction, as independent directions of one standard deviation each.
 
@@ -61,7 +66,8 @@ class SystematicError(Part):
     Attributes
     ----------
     directions
-        Effects of each direction, the one that a Mueller matrix notices most first.
+        Effects of each direction, the one that a Mueller matrix notices most first; in a file by label, with their
+        values alone (`direction_text`).
     rms_over_m00
         Standard error of the elements of M/m00 that all of them make in the captures they were found in.
     """
@@ -69,6 +75,19 @@ class SystematicError(Part):
     directions: tuple[tuple[AppliedEffect, ...], ...]
     rms_over_m00: float
     wavelength_nm: float | None = None
+
+    @field_validator(
+        "directions", mode="before", json_schema_input_type=tuple[_AsWritten | tuple[AppliedEffect, ...], ...]
+    )
+    @classmethod
+    def _read(cls, directions: Any) -> Any:
+        if not isinstance(directions, list | tuple):
+            return directions
+        return [direction_text.read(one) if isinstance(one, Mapping) else one for one in directions]
+
+    @field_serializer("directions", when_used="json")
+    def _told(self, directions: tuple[tuple[AppliedEffect, ...], ...]) -> list[_AsWritten]:
+        return [direction_text.told(effect.model_dump() for effect in one) for one in directions]
 
 
 class EffectParameter(Part):

@@ -6,12 +6,13 @@ import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from processing.diagnosis.instrument.run import diagnose_captures
-from processing.diagnosis.instrument_file import extended
+from processing.diagnosis.instrument_file import write_instrument
 from processing.instrument.model import InstrumentModel
 from simulators.blind.bench_judge import GIVEN, Judgement, names_of, told_of, wiring_of
 from simulators.blind.mueller_error import coverage_of, error_of
@@ -58,13 +59,18 @@ def judge_bench(
 
 
 def _diagnosed(captures: Sequence[Path], declared: InstrumentModel) -> tuple[dict[str, Any], InstrumentModel, bool]:
-    """The result as JSON has it, the instrument as it would be written, and whether it is another one."""
+    """The result as JSON has it, the instrument as it is written and read again, and whether it is another one."""
     try:
         judged, _ = diagnose_captures(captures, declared)
     except Exception as error:  # noqa: BLE001 - a crash is a wrong answer of this bench, not the end of the suite
         return {"verdict": f"crashed: {type(error).__name__}: {error}", "effects": []}, declared, False
     diagnosis = judged.diagnosis
-    return json.loads(diagnosis.model_dump_json()), extended(declared, diagnosis), diagnosis.corrects
+    corrected = declared
+    if diagnosis.corrects or diagnosis.systematic():
+        with TemporaryDirectory() as folder:
+            write_instrument(Path(folder) / "new.yaml", declared, diagnosis)
+            corrected = InstrumentModel.load(Path(folder) / "new.yaml")
+    return json.loads(diagnosis.model_dump_json()), corrected, diagnosis.corrects
 
 
 def _truth(away: Path, capture: str) -> Any:

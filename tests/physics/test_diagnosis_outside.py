@@ -103,9 +103,10 @@ def test_frames_that_are_read_with_the_next_ones_are_not_angles_of_an_axis(confi
         (100.0, 120.0, 0.0, 0.0, False, None),
         (100.0, 99.0, 120.0, 0.0, True, TURN),
         (100.0, 0.0, 120.0, 0.0, False, TURN),
-        (100.0, 0.0, 105.0, 0.0, False, TURN_AS_WELL),
-        (100.0, 0.0, 93.0, 0.0, False, TURN_AS_WELL),
-        (100.0, 0.0, 90.0, 0.0, False, None),
+        (100.0, 0.0, 105.0, 0.0, True, TURN_AS_WELL),
+        (100.0, 0.0, 93.0, 0.0, True, TURN_AS_WELL),
+        (100.0, 0.0, 105.0, 105.0, False, None),
+        (100.0, 0.0, 0.0, 110.0, False, LAG),
         (100.0, 120.0, 0.0, 121.0, True, LAG),
         # What explains nothing is not there in the place of what explains little.
         (10.0, 5.0, 5.0, 0.0, True, None),

@@ -122,9 +122,10 @@ def doubts(
 def _in_its_place(gains: Mapping[type[OpticsEffect], float], one_name: bool) -> str | None:
     """The reason where something that has no name gains so much over a cause; of two that are as likely none is sure.
 
-    A wave is asked in the place of one name alone.
+    What is told as one of several, and values for each state, are no one name yet: no wave is asked in their place, and
+    what else there is has to be sure.
     """
-    asked = {kind: gain for kind, gain in gains.items() if one_name or kind is not WaveOfAPlate}
+    asked = {kind: gain for kind, gain in gains.items() if one_name or (kind is not WaveOfAPlate and gain > STANDS_OUT)}
     best = max(asked, key=lambda kind: asked[kind], default=None)
     if best is None or asked[best] <= -STANDS_OUT:
         return None

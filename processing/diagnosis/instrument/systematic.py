@@ -147,8 +147,8 @@ def _as_effects(space: Space, direction: Array, matters: Array, names: tuple[str
                 AppliedEffect(
                     kind=one.kind,
                     element=one.place or None,
-                    parameters=_without_errors(parameters_of(one, values, values)),
-                    captures=names if one.capture is None else (names[one.capture],),
+                    parameters=_values_alone(parameters_of(one, values, values)),
+                    captures=() if scope_of(one) == "instrument" else _captures(one, names),
                     scope=scope_of(one),
                     wavelength_nm=one.wavelength_nm,
                 )
@@ -156,5 +156,19 @@ def _as_effects(space: Space, direction: Array, matters: Array, names: tuple[str
     return tuple(effects)
 
 
-def _without_errors(parameters: dict[str, EffectParameter]) -> dict[str, EffectParameter]:
-    return {name: p.model_copy(update={"stderr": None}) for name, p in parameters.items()}
+def _captures(candidate: Candidate, names: tuple[str, ...]) -> tuple[str, ...]:
+    return names if candidate.capture is None else (names[candidate.capture],)
+
+
+def _values_alone(parameters: dict[str, EffectParameter]) -> dict[str, EffectParameter]:
+    """Nobody reads their units, nor more than six of their digits."""
+
+    def rounded(value: float) -> float:
+        return float(f"{value:.6g}")
+
+    return {
+        name: EffectParameter(
+            value=tuple(map(rounded, p.value)) if isinstance(p.value, tuple) else rounded(p.value), unit=""
+        )
+        for name, p in parameters.items()
+    }

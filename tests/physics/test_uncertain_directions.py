@@ -1,0 +1,79 @@
+"""Directions of what is uncertain in an instrument file: by label, as short as they can be, and equal when read."""
+
+import math
+
+import pytest
+
+from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel, SystematicError
+from processing.yaml_file import ConfigError, dump_yaml, parse_yaml
+
+STATES = 40
+
+
+def effect(kind, element=None, capture=None, wavelength_nm=None, **values):
+    parameters = {name: EffectParameter(value=value, unit="") for name, value in values.items()}
+    own = {"captures": (capture,), "scope": "capture"} if capture else {}
+    return AppliedEffect(kind=kind, element=element, parameters=parameters, wavelength_nm=wavelength_nm, **own)
+
+
+@pytest.fixture
+def model(configs):
+    return InstrumentModel.load(configs / "instruments/rgb950.yaml")
+
+
+def uncertain(model, *directions):
+    error = SystematicError(directions=directions, rms_over_m00=0.001, wavelength_nm=662.0)
+    return model.model_copy(update={"systematic": (error,)})
+
+
+def test_what_is_written_is_read_as_it_was(model):
+    flicker = tuple(math.sin(k) / 1000 for k in range(STATES))
+    direction = (
+        effect("detector_offset", offset=-0.5),
+        effect("path_retardance", at_0=0.1, at_45=-0.2),
+        effect("psg_retardance", "psg_retarder", wavelength_nm=451.5, retardance=1e-7),
+        effect("rotation_slip", "psa@14", "flat in air (a.h5)", slip=0.3),
+        effect("source_flicker", None, "air (air.h5)", states=flicker),
+    )
+    written = uncertain(model, direction, (effect("stray_light", fraction=0.01),))
+    text = dump_yaml(written)
+    assert parse_yaml(text, InstrumentModel) == written
+    assert "source_flicker in air (air.h5):" in text
+    assert "psg_retardance[psg_retarder] at 451.5 nm:" in text
+    assert written.at(451).systematic == ()
+    assert [e.kind for e in written.at(662).systematic[0].directions[0]][2:] == ["rotation_slip", "source_flicker"]
+
+
+def test_a_file_of_an_earlier_version_is_read(model):
+    plain = dump_yaml(model)
+    old = "systematic:\n  - rms_over_m00: 0.1\n    directions:\n      - - kind: stray_light\n          parameters:\n"
+    old += "            fraction: {value: 0.01, unit: '1'}\n"
+    (error,) = parse_yaml(plain.replace("systematic: []\n", "") + old, InstrumentModel).systematic
+    assert error.directions[0][0].parameters["fraction"].value == 0.01
+
+
+def test_those_of_three_captures_leave_room_for_another_wavelength(model):
+    """20 directions of three captures with two values for each state each, as real benches have them."""
+    captures = [f"{name} ({name}.h5)" for name in ("sphere", "flat", "air")]
+    kinds = [("source_flicker", None), ("angle_per_state", "psa")]
+    each = tuple(effect(*kind, name, states=(0.1,) * STATES) for kind in kinds for name in captures)
+    few = tuple(effect("rotation_eccentricity", "psa", cos_1=0.1, sin_1=0.2, cos_2=0.3, sin_2=0.4) for _ in range(1))
+    error = uncertain(model, *[(*each, *few)] * 20).systematic[0]
+    both = model.model_copy(update={"systematic": (error, error.model_copy(update={"wavelength_nm": 451.0}))})
+    assert parse_yaml(dump_yaml(both), InstrumentModel) == both
+
+
+@pytest.mark.parametrize(
+    ("label", "values", "told"),
+    [
+        ("[psa]", "{fraction: 0.1}", "is not KIND[ELEMENT]"),
+        ("source_flicker", "{states: 0.1 fast}", "fast"),
+        ("source_flicker", "{states: 0.1 nan}", "finite"),
+    ],
+)
+def test_a_slip_in_a_direction_is_told(model, label, values, told):
+    head = dump_yaml(model).replace("systematic: []\n", "")
+    text = f"{head}systematic:\n  - rms_over_m00: 0.1\n    directions:\n      - '{label}': {values}\n"
+    with pytest.raises(ConfigError) as refused:
+        parse_yaml(text, InstrumentModel)
+    assert told in str(refused.value)
