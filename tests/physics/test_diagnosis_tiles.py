@@ -8,9 +8,12 @@ from bench_capture import bench_capture, read
 from steady_capture import steady_capture
 
 from processing.diagnosis.instrument.features import FEATURES
-from processing.diagnosis.instrument.moments import FOLDS_OF_TILES, features_of_tiles, moments_of
+from processing.diagnosis.instrument.moments import FOLDS_OF_TILES, moments_of
 from processing.diagnosis.instrument.projection import add_block
-from processing.diagnosis.instrument.tile_sums import add_tiles, tile_columns
+from processing.diagnosis.instrument.tile_features import features_of_tiles
+from processing.diagnosis.instrument.tile_rows import tile_columns
+from processing.diagnosis.instrument.tile_slopes import TileSlopes
+from processing.diagnosis.instrument.tile_sums import add_tiles
 from processing.diagnosis.search.space import Sums
 from processing.instrument.changes import Changes, field_terms
 from simulators.blind.undeclared_captures import Bench
@@ -61,15 +64,18 @@ def test_a_tile_is_where_its_light_is():
 def test_many_pixels_of_a_tile_are_as_few_as_their_products_need():
     random = np.random.default_rng(4)
     data = steady_capture(random.uniform(0.2, 0.8, (2, 72, 72)), 1e-3)
-    tiles = moments_of(data, FOLDS_OF_TILES).tiles
-    _, z, _ = features_of_tiles(data, tiles, [0, FEATURES.index("square")])
+    moments = moments_of(data, FOLDS_OF_TILES)
+    tiles, sigma = moments.tiles, moments.sigma[:, None]
+    _, z, _ = features_of_tiles(data, moments, tiles, [0, FEATURES.index("square")])
     assert z.shape == (256, 2, 2, 4)
+    z = z * sigma
     assert z[:, 0] @ z[:, 0].transpose(0, 2, 1) == pytest.approx(tiles.s, rel=1e-6)
     u = data.signal[:, 0, :5, :5].reshape(2, -1)[:, tiles.pick[:5, :5].reshape(-1)].astype(float)
     assert np.sum(z[0, 1, 1] * z[0, 0, 0]) == pytest.approx(1e6 * np.sum(u[1] ** 2 * u[0]), rel=1e-6)
-    again = features_of_tiles(data, tiles, [0])
-    assert again[0] == (0,)
-    assert again[1] @ again[1].transpose(0, 1, 3, 2) == pytest.approx(tiles.s[:, None], rel=1e-6)
+    known, counts, _ = features_of_tiles(data, moments, tiles, [0])
+    assert known == (0,)
+    counts = counts * sigma
+    assert counts @ counts.transpose(0, 1, 3, 2) == pytest.approx(tiles.s[:, None], rel=1e-6)
 
 
 @pytest.mark.parametrize("shifted", [False, True])
@@ -91,8 +97,9 @@ def test_tiles_that_are_all_alike_say_what_the_blocks_say(seen, shifted):
     for block in moments.blocks:
         add_block(block, a, c, da, dc, moments, blocks)
     count = moments.tiles.x.size
-    every = np.broadcast_to(a, (count, *a.shape)), np.broadcast_to(da[:, None], (4, count, *a.shape))
-    add_tiles(data, moments, moments.tiles, every[0], c, every[1], dc, tiles)
+    none, counted = np.zeros(0, dtype=int), np.array([2, 3])
+    slopes = TileSlopes(da[:, None], np.ones((1, count)), none, np.zeros((0, count, *a.shape)), counted, dc[counted])
+    add_tiles(data, moments, moments.tiles, np.broadcast_to(a, (count, *a.shape)), c, slopes, tiles)
     for name in ("excess", "freedom", "square", "count", "gradient", "curvature"):
         expected = getattr(blocks, name)
         assert getattr(tiles, name) == pytest.approx(expected, rel=1e-6, abs=1e-6 * np.abs(expected).max()), name

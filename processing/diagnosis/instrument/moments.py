@@ -9,7 +9,6 @@ The expected noise of every product is kept beside it, so that an excess over th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -77,7 +76,7 @@ class Tiles:
     boxes: tuple[tuple[slice, slice], ...]
     pick: NDArray[np.bool_]
     pixels: Array
-    #: `features_of_tiles` that are kept, by their numbers.
+    #: What `features_of_tiles` keeps, by the numbers of the features.
     features: dict[tuple[int, ...], tuple[Array, Array]] = field(default_factory=dict)
 
 
@@ -159,40 +158,6 @@ def moments_of(data: CaptureData, folds: int) -> Moments:
         noise_floor=noise_floor,
         held_out=held,
     )
-
-
-def features_of_tiles(data: CaptureData, tiles: Tiles, used: Sequence[int]) -> tuple[tuple[int, ...], Array, Array]:
-    """Which features, pseudo-pixels (T, F, L, R) of them in every tile, and their noise (T, L, F, F).
-
-    `used` are numbers of FEATURES in ascending order, of which the counts are the first; others may stand beside them.
-    """
-    if tuple(used) == (0,):
-        value, vector = np.linalg.eigh(tiles.s)
-        root = vector * np.sqrt(np.maximum(value, 0.0))[:, None]
-        return (0,), root[:, None], tiles.noise[..., None, None]
-    for known, (z, noise) in tiles.features.items():
-        if set(used) <= set(known):
-            return known, z, noise
-    # One set of them is kept, with all that was asked for before: they are large.
-    wanted = tuple(sorted(set(used).union(*tiles.features)))
-    tiles.features.clear()
-    tiles.features[wanted] = _features_of_tiles(data, tiles, list(wanted))
-    return wanted, *tiles.features[wanted]
-
-
-def _features_of_tiles(data: CaptureData, tiles: Tiles, used: list[int]) -> tuple[Array, Array]:
-    """The pixels of every tile, or as many pseudo-pixels as there are products to tell where they are fewer."""
-    pixels, count = Pixels(data), tiles.x.size
-    size = len(used) * len(pixels.u)
-    z = np.zeros((count, size, min(int(tiles.pixels.max()), size)))
-    noise = np.zeros((count, len(pixels.u), len(used), len(used)))
-    for t, (rows, columns) in enumerate(tiles.boxes):
-        part = pixels.part(rows, columns, np.float64)
-        of_part, of_pixels = part.weighted(np.flatnonzero(tiles.pick[rows, columns]))
-        flat = of_part[used].reshape(size, -1)
-        few = np.asarray(np.linalg.qr(flat.T, mode="r")).T if flat.shape[1] > size else flat
-        z[t, :, : few.shape[1]], noise[t] = few, of_pixels[:, used][:, :, used]
-    return z.reshape(count, len(used), len(pixels.u), -1), noise
 
 
 @dataclass(frozen=True)

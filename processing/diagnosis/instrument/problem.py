@@ -28,7 +28,9 @@ from processing.diagnosis.instrument.moments import (
 from processing.diagnosis.instrument.noise_level import with_noise_of_light
 from processing.diagnosis.instrument.projection import RANK, add_block, noise_information
 from processing.diagnosis.instrument.slopes import Columns, slopes_of_counts, slopes_of_rows
-from processing.diagnosis.instrument.tile_sums import add_tiles, tile_columns
+from processing.diagnosis.instrument.tile_rows import tile_columns
+from processing.diagnosis.instrument.tile_slopes import slopes_of_tiles
+from processing.diagnosis.instrument.tile_sums import add_tiles
 from processing.diagnosis.instrument.undone import distance, exactly_undone, movable, undoing
 from processing.diagnosis.search.candidate import Candidate, nominal_values, pool
 from processing.diagnosis.search.space import Space, Sums
@@ -340,15 +342,15 @@ class InstrumentProblem:
         data, moments = self.captures[k], self.moments[k]
         if moments.tiles is None:
             return
-        columns = partial(tile_columns, self.models[k], data, moments)
-        a, c = columns(changes), self.coefficients(k, changes)
-        da, dc = np.zeros((0, *a.shape)), np.zeros((0, *c.shape))
-        if derivatives:
-            da = self.slopes(k, space, values, a, columns)
-            dc = self.slopes_of_counts(k, space, values, c)
-        add_tiles(data, moments, moments.tiles, a, c, da, dc, out)
+        model, tiles = self.models[k], [moments.tiles]
         if moments.clipped is not None and not changes.drop_clipped:
-            add_tiles(data, moments, moments.clipped, a, c, da, dc, out)
+            tiles.append(moments.clipped)
+        a, c, slopes = tile_columns(model, data, moments, changes), self.coefficients(k, changes), None
+        if derivatives and space.size:
+            dc = self.slopes_of_counts(k, space, values, c)
+            slopes = slopes_of_tiles(model, data, moments, partial(self.changes, k, space), space, values, a, dc)
+        for each in tiles:
+            add_tiles(data, moments, each, a, c, slopes, out)
 
 
 def _moved_back(captures: Sequence[CaptureData], shifts_px: Sequence[Array]) -> tuple[CaptureData, ...]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import for_strips
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES, derivatives_of_part, features
 from processing.diagnosis.instrument.moments import Block, Moments
+from processing.diagnosis.instrument.noise_of_parts import NoiseOfParts, fitted
 from processing.diagnosis.search.space import Sums
 
 #: Singular values below this, relative to the largest, are none.
@@ -63,8 +66,12 @@ def add_block(
             c[used][:, rows].swapaxes(0, 1),
             around,
         )
-        slopes = da[:, rows], dc[:, used][:, :, rows].swapaxes(1, 2)
-        add_parts(part, *slopes, moments, rows, np.full(len(rows), float(block.pixels)), block.fold, out)
+        add_parts(part, moments, rows, np.full(len(rows), float(block.pixels)), block.fold, out)
+        if len(da):
+            gradient, stretch, curvature = part.slopes(da[:, rows], dc[:, used][:, :, rows].swapaxes(1, 2))
+            out.gradient[block.fold] += gradient
+            out.stretch[block.fold] += stretch
+            out.curvature[block.fold] += curvature
 
 
 def _by_state(rows: NDArray[np.int64], apart: int) -> list[NDArray[np.int64]]:
@@ -82,32 +89,41 @@ class Projected:
     Attributes
     ----------
     outside : (T, L, L) projection P; residual : (T, L, R) P y; expected : (T,) squares of noise alone.
+    unknowns : (T, R, K) A+ y, turned over.
     """
 
     def __init__(self, z: Array, noise: Array, a: Array, c: Array, around: NDArray[np.bool_]) -> None:
         """z (T, F, L, R), noise (T, L, F, F), a (T, L, K), c (T or 1, F, L); `around` (F,): which are derivatives."""
-        rows = a.shape[1]
         u, size, vt = np.linalg.svd(a, full_matrices=False)
         keep = size > RANK * size[:, :1]
         q = u * keep[:, None, :]
         # A+, turned over.
         self._back = q * np.where(keep, 1 / np.maximum(size, 1e-300), 0.0)[:, None, :] @ vt
-        hat = q @ q.transpose(0, 2, 1)
-        self.outside = np.eye(rows) - hat
+        self.outside = np.eye(a.shape[1]) - q @ q.transpose(0, 2, 1)
+        self._noise = NoiseOfParts(noise, q, self.outside, c, around)
         self._z = z
         if around.any():
             self._z = z.copy()
-            self._z[:, around] = hat[:, None] @ z[:, around]
-        self._y = np.einsum("tfl,tflr->tlr", c, self._z)
-        self.residual = self.outside @ self._y
-        # What takes the noise of each feature to the rows, and the mean product of the residual's noise with it.
-        takes = np.where(around[:, None], hat[:, :, None], np.eye(rows)[:, None])
-        onto = c.swapaxes(1, 2)[..., None] * takes
-        left = (self.outside @ onto.reshape(*hat.shape[:2], -1)).reshape(onto.shape)
-        mean = (left.transpose(0, 3, 1, 2) @ noise).transpose(0, 2, 3, 1)
-        self.expected = np.sum(mean * left, axis=(1, 2, 3))
-        self._carried = mean.reshape(*hat.shape[:2], -1) @ onto.reshape(*hat.shape[:2], -1).transpose(0, 2, 1)
-        self._of_features = np.sum(takes * mean, axis=3)
+            self._z[:, around] = fitted(q[:, None], z[:, around])
+        y = np.einsum("tfl,tflr->tlr", c, self._z)
+        self.residual, self.unknowns = self.outside @ y, y.transpose(0, 2, 1) @ self._back
+        self.expected = np.sum(c * self._noise.of_features, axis=(1, 2))
+
+    @cached_property
+    def by_rows(self) -> tuple[Array, Array]:
+        """Half gradients (T, L, K) by a: of the excess, and of its noise."""
+        carried = self._noise.carried(self._back)
+        return carried - self.residual @ self.unknowns, -carried
+
+    def pull_of_counts(self, dc: Array) -> Array:
+        """Half gradient (K,) of the noise by what changes the coefficients, dc (K, T or 1, F, L)."""
+        of_features = self._noise.of_features
+        return np.asarray(_flat(dc) @ (of_features.sum(axis=0) if dc.shape[1] == 1 else of_features).reshape(-1))
+
+    def moved_by_counts(self, dc: Array) -> Array:
+        """What (T, L, R) dc (T or 1, F, L) by one value does to the residual."""
+        used = np.flatnonzero(np.any(dc, axis=(0, 2)))
+        return np.asarray(self.outside @ np.einsum("tfl,tflr->tlr", dc[:, used], self._z[:, used]))
 
     def slopes(self, da: Array, dc: Array) -> tuple[Array, Array, Array]:
         """Half gradient (K,) of the excess and of its noise, and curvature (K, K) of the excess, summed over the parts.
@@ -115,16 +131,14 @@ class Projected:
         Of da (K, T, L, K') and dc (K, T or 1, F, L); from dr = -P dA A+ y + P dB z.
         """
         da = self.outside @ da
-        y = self._y.transpose(0, 2, 1)
-        of_features = self._of_features.swapaxes(1, 2)
-        pull = _flat(dc) @ (of_features.sum(axis=0) if dc.shape[1] == 1 else of_features).reshape(-1)
-        pull -= _flat(da) @ (self._carried @ self._back).reshape(-1)
-        gradient = -pull - _flat(da) @ (self.residual @ y @ self._back).reshape(-1)
-        unknowns = y @ self._back
+        of_excess, of_noise = self.by_rows
+        pull = self.pull_of_counts(dc) + _flat(da) @ of_noise.reshape(-1)
+        gradient = _flat(da) @ of_excess.reshape(-1) - self.pull_of_counts(dc)
+        unknowns = self.unknowns
         curvature = _flat(da @ (unknowns.transpose(0, 2, 1) @ unknowns)) @ _flat(da).T
         counted = np.flatnonzero(np.any(dc, axis=(1, 2, 3)))
         if counted.size:
-            of_counts = np.stack([self.outside @ self._weighted(dc[j]) for j in counted])
+            of_counts = np.stack([self.moved_by_counts(dc[j]) for j in counted])
             gradient[counted] += _flat(of_counts) @ self.residual.reshape(-1)
             across = _flat(of_counts @ unknowns) @ _flat(da).T
             curvature[counted] -= across
@@ -135,27 +149,13 @@ class Projected:
     def of_each(self, da: Array) -> tuple[Array, Array]:
         """Half gradient (T,) of the excess of each part by one value, and its curvature (T,), of da (L, K')."""
         da = self.outside @ da
-        unknowns = self._y.transpose(0, 2, 1) @ self._back
-        gradient = np.sum(da * (self._carried @ self._back - self.residual @ unknowns), axis=(1, 2))
-        return gradient, np.sum((da @ unknowns.transpose(0, 2, 1)) ** 2, axis=(1, 2))
-
-    def _weighted(self, c: Array) -> Array:
-        """Sum (T, L, R) of the features, each times its coefficient (T or 1, F, L)."""
-        used = np.flatnonzero(np.any(c, axis=(0, 2)))
-        return np.asarray(np.einsum("tfl,tflr->tlr", c[:, used], self._z[:, used]))
+        return np.sum(da * self.by_rows[0], axis=(1, 2)), np.sum((da @ self.unknowns.transpose(0, 2, 1)) ** 2, (1, 2))
 
 
 def add_parts(
-    parts: Projected,
-    da: Array,
-    dc: Array,
-    moments: Moments,
-    rows: NDArray[np.int64],
-    pixels: NDArray[np.floating],
-    fold: int,
-    out: Sums,
+    parts: Projected, moments: Moments, rows: NDArray[np.int64], pixels: NDArray[np.floating], fold: int, out: Sums
 ) -> None:
-    """Add what parts of one fold say, with derivatives da (K, T, L, K') and dc (K, T or 1, F, L).
+    """Add what parts of one fold leave.
 
     `rows` (T or 1, L) : of each part; `pixels` (T,) : how many stand behind it.
     """
@@ -165,11 +165,6 @@ def add_parts(
     out.freedom[fold] += left
     out.square[fold] += np.sum(squares * moments.sigma[rows] ** 2) * moments.relative
     out.count[fold] += np.sum(free * moments.left[rows])
-    if len(da):
-        gradient, stretch, curvature = parts.slopes(da, dc)
-        out.gradient[fold] += gradient
-        out.stretch[fold] += stretch
-        out.curvature[fold] += curvature
 
 
 def noise_information(block: Block, a: Array, dc: Array, moments: Moments) -> Array:
@@ -193,4 +188,4 @@ def noise_information(block: Block, a: Array, dc: Array, moments: Moments) -> Ar
 
 
 def _flat(x: Array) -> Array:
-    return x.reshape(len(x), -1)
+    return x.reshape(len(x), math.prod(x.shape[1:]))

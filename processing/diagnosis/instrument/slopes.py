@@ -10,7 +10,14 @@ from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import CountsEffect, FromAState, Switch, ValuePerState, turned_by
+from processing.instrument.effects.base import (
+    CountsEffect,
+    FromAState,
+    InstrumentEffect,
+    Switch,
+    ValuePerState,
+    turned_by,
+)
 from processing.instrument.model import InstrumentModel
 
 #: Makes A (..., L, K) of the changes of a capture.
@@ -29,13 +36,17 @@ def slopes_of_rows(
     values: Array,
     a: Array,
     columns: Columns,
+    leave_out: tuple[type[InstrumentEffect], ...] = (CountsEffect,),
 ) -> Array:
-    """Derivatives (values, ..., L, K) of a (..., L, K), which `columns` makes of the changes."""
+    """Derivatives (values, ..., L, K) of a (..., L, K), which `columns` makes of the changes.
+
+    Zero by the values of effects that are left out.
+    """
     da = np.zeros((space.size, *a.shape))
     channels = len(conditions.channels)
     whole: dict[str, Array] = {}
-    for candidate, part in _fitted(space):
-        if isinstance(candidate.effect, CountsEffect):
+    for candidate, part in fitted(space):
+        if isinstance(candidate.effect, leave_out):
             continue
         if isinstance(candidate.effect, ValuePerState):
             # Parameter n acts on state n alone: one step of all of them together gives every derivative.
@@ -57,7 +68,7 @@ def slopes_of_rows(
                 whole[axis] = (columns(turned) - a) / STEP
             da[part.start, ..., first * channels :, :] = whole[axis][..., first * channels :, :]
             continue
-        for j, (moved, step_j) in enumerate(_stepped(candidate, part, values)):
+        for j, (moved, step_j) in enumerate(stepped(candidate, part, values)):
             da[part.start + j] = (columns(changes_of(moved)) - a) / step_j
     return da
 
@@ -67,20 +78,20 @@ def slopes_of_counts(
 ) -> Array:
     """Derivatives (values, F, L) of the coefficients c (F, L) of the corrected counts."""
     dc = np.zeros((space.size, *c.shape))
-    for candidate, part in _fitted(space):
+    for candidate, part in fitted(space):
         if isinstance(candidate.effect, CountsEffect):
-            for j, (moved, step) in enumerate(_stepped(candidate, part, values)):
+            for j, (moved, step) in enumerate(stepped(candidate, part, values)):
                 dc[part.start + j] = (coefficients(changes_of(moved)) - c) / step
     return dc
 
 
-def _fitted(space: Space) -> list[tuple[Candidate, slice]]:
+def fitted(space: Space) -> list[tuple[Candidate, slice]]:
     """Candidates that have values to fit."""
     pairs = zip(space.candidates, space.slices, strict=True)
     return [(c, part) for c, part in pairs if not isinstance(c.effect, Switch)]
 
 
-def _stepped(candidate: Candidate, part: slice, values: Array) -> Iterator[tuple[Array, float]]:
+def stepped(candidate: Candidate, part: slice, values: Array) -> Iterator[tuple[Array, float]]:
     """All values with one of a candidate's after the other moved by a small step, and the step."""
     for j, step in enumerate(STEP * candidate.typical):
         moved = values.copy()

@@ -8,10 +8,11 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
-from processing.diagnosis.instrument.moments import Tiles, features_of_tiles
+from processing.diagnosis.instrument.moments import Tiles
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import Projected
 from processing.diagnosis.instrument.slopes import STEP
+from processing.diagnosis.instrument.tile_features import features_of_tiles
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import field_terms
@@ -65,15 +66,15 @@ class Evenness:
         """The tiles with the counts corrected: what a shift leaves of an image would seem to vary over it."""
         problem, local = self._near
         moments = problem.moments[k]
-        use, sigma = np.flatnonzero(moments.counts), moments.sigma[moments.counts]
+        use = np.flatnonzero(moments.counts)
         c = problem.coefficients(k, problem.changes(k, self._space, local))
         asked = np.flatnonzero(np.any(c, axis=1)).tolist()
-        known, z, noise = features_of_tiles(problem.captures[k], tiles, asked)
+        known, z, noise = features_of_tiles(problem.captures[k], moments, tiles, asked)
         used = np.array(known)
         rows = self._rows(k, local)
         return Projected(
-            z[:, :, use] / sigma[:, None],
-            noise[:, use] / (sigma**2)[:, None, None],
+            z,
+            noise,
             np.broadcast_to(rows, (tiles.x.size, *rows.shape)),
             c[None, used][:, :, use],
             used >= len(FEATURES) - DERIVATIVES,

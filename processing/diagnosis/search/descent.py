@@ -116,12 +116,12 @@ def descend(problem: Problem, space: Space, x: Array, weak: Array, steps: int = 
     """Values at the minimum of chi-square over its stretch, plus weak . x^2, near x (Levenberg-Marquardt, bounds)."""
     lower, upper = space.joined("lower"), space.joined("upper")
     problem.relinearize(space, x)
-    start = problem.sums(space, x, derivatives=False)
-    reference, damping = float(start.freedom.sum()), 0.0
+    sums = problem.sums(space, x)
+    reference, damping = float(sums.freedom.sum()), 0.0
 
-    least = _penalized(start, weak, x, reference)
-    for _ in range(steps):
-        sums = problem.sums(space, x)
+    least = _penalized(sums, weak, x, reference)
+    for step in range(steps):
+        sums = problem.sums(space, x) if step else sums
         freedom = max(float(sums.freedom.sum()), 1e-300)
         g = sums.gradient.sum(axis=0) - sums.excess.sum() / freedom * sums.stretch.sum(axis=0) + weak * x
         h = sums.curvature.sum(axis=0) + np.diag(weak)
