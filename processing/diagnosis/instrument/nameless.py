@@ -26,7 +26,7 @@ from processing.diagnosis.search.sets import Group, Sets, State
 from processing.diagnosis.search.space import Space
 from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import FieldEffect, OfOneCapture, OpticsEffect, moving_axes
+from processing.instrument.effects.base import OfOneCapture, OpticsEffect, moving_axes
 from processing.instrument.model import InstrumentModel, Retarder
 
 #: Periods a turn that no effect of the list has, of what a turning plate does.
@@ -126,13 +126,9 @@ class Nameless:
 
     @classmethod
     def beside(cls, problem: InstrumentProblem, found: Posterior) -> Nameless | None:
-        """None where these could not be told from others.
-
-        What varies over the image would need slopes in every part of it.
-        """
-        fields = any(isinstance(c.effect, FieldEffect) for c in found.space.candidates)
+        """None where these could not be told from others."""
         few = problem.holds_out_states or not problem.noise_known
-        return None if fields or few else cls(problem, found)
+        return None if few else cls(problem, found)
 
     def gains_over(self, cause: Cause) -> dict[type[OpticsEffect], float]:
         """Chi-square that the best of each kind explains in a cause's place beyond what that does.

@@ -7,7 +7,6 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.instrument.beside_fields import likeliest_that_fit
 from processing.diagnosis.instrument.features import MARGIN
 from processing.diagnosis.instrument.noise_of_light import scatter_prefers
 from processing.diagnosis.instrument.problem import EXACT, InstrumentProblem
@@ -268,8 +267,7 @@ class WholeBench:
         if gains[best] < DECISIVE:
             return found
         self.say(f"with {', '.join(c.label for c in fields)}")
-        beside = likeliest_that_fit(self.whole, found, [*fixed, *fields])
-        return self._posterior([*fixed, *beside, *fields], fixed)
+        return self._posterior([*found.space.candidates, *fields], fixed)
 
 
 def applied(found: Posterior, base: Space, unfit: Sequence[Candidate] = ()) -> tuple[Space, Array]:

@@ -126,9 +126,6 @@ NEEDED = 12.0
 #: [chi-square] Gain from which on something that needs a search of its own (a retardance that varies over the image,
 #: clipped pixels, a mistake of wiring) is looked into.
 DECISIVE = 25.0
-#: [numbers] Slopes of the rows of all tiles of a capture, by the values that take part where every tile has a matrix of
-#: its own: 0.4 GB, or 300 values for 40 states of an unknown sample. The likeliest values are taken.
-BESIDE_FIELD = 5e7
 #: [1] Growth of the unit of chi-square, by what the tests of the residual find, from which on the sets are visited
 #: again; and at values beyond what a straight line to them promised, from which on it is not believed.
 GROWTH = 1.05

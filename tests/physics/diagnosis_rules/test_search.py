@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rule_decisions import QUIET, Asked, Patch, bench, decides, made
 
-from processing.diagnosis.instrument import beside_fields, judge, starts, whole_bench
+from processing.diagnosis.instrument import judge, starts, whole_bench
 from processing.diagnosis.search import descent, down_to_noise, likely_set, posterior
 from processing.diagnosis.search.sets import Group, Quadratic, Sets, State
 from processing.diagnosis.search.space import Space, Sums
@@ -146,23 +146,6 @@ def test_needed(m: Patch) -> bool:
     likely_set.thinned(kept)
     likely_set.thinned(tried)
     return kept.conditionals == 1 < tried.conditionals
-
-
-@decides
-def test_beside_field(m: Patch) -> bool:
-    space = Space(tuple(made(place=str(k)) for k in range(500)))
-    odds = np.random.default_rng(0).permutation(500)
-    found = Some(
-        space=space,
-        members=[(k,) for k in range(500)],
-        samples=Some(best=None),
-        sets=Some(conditional=lambda best: Some(log_odds=odds)),
-    )
-    # In 256 tiles of 40 states of an unknown sample a value has 163 840 slopes, and one takes part already.
-    tiles, seen = Some(tiles=Some(x=np.zeros(256))), Some(values_per_pixel=40, sample=None)
-    problem = Some(captures=[seen], moments=[tiles], wavelengths_nm=(662.0,))
-    kept = beside_fields.likeliest_that_fit(problem, found, [made(kind="field")])
-    return {int(c.place) for c in kept} == set(np.argsort(-odds)[:304].tolist())
 
 
 @decides
