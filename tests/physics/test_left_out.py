@@ -70,6 +70,19 @@ def test_a_frame_that_belongs_to_nothing_is_found_among_faults(configs, tmp_path
     assert found.left_out.frames[state] > 0.1
 
 
+@pytest.mark.parametrize("air", [True, False])
+@pytest.mark.parametrize("pair", [(11, 12), (4, 30)])
+def test_two_frames_in_each_others_place_are_found_among_faults(configs, tmp_path, air, pair):
+    """Gains and angles of single states would describe them, and be called by those names."""
+    bench = Bench(rows=SIDE, columns=SIDE)
+    small_faults(bench)
+    bench.order = np.arange(STATES)
+    bench.order[list(pair)] = pair[::-1]
+    found = screened_capture(taken(tmp_path, configs, bench, 3, air), configs).left_out
+    assert tuple(found.frames) == found.exchanged == pair
+    assert min(found.frames.values()) > 0.1
+
+
 def test_cosmic_rays_and_hot_pixels_are_found_and_left_out(configs, tmp_path):
     bench = Bench(rows=SIDE, columns=SIDE)
     small_faults(bench)

@@ -1,9 +1,13 @@
-"""Frames that belong to nothing: a shutter half closed, an axis that stood elsewhere, a frame of another run."""
+"""Frames that belong to nothing: a shutter half closed, an axis that stood elsewhere, a frame of another run.
+
+And two that were stored in each other's place, of which single values for each state would make anything else.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,18 +17,24 @@ from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.search.rules import AGAINST_NEXT, LEAST_MISFIT, MOST_BAD_FRAMES, MOSTLY
 
 RANK = 1e-8
+#: States with most left over, of which pairs are tried in each other's place.
+SUSPECTS = 12
 
 
 @dataclass(frozen=True)
 class BadFrame:
-    """A state that belongs to nothing, and the rms of its misfit relative to the signal of all states."""
+    """A state that belongs to nothing, and the rms of its misfit relative to the signal of all states.
+
+    `instead` is the state in whose place its frame is.
+    """
 
     state: int
     misfit: float
+    instead: int | None = None
 
 
 def bad_frames(data: CaptureData, a: Array) -> tuple[BadFrame, ...]:
-    """States that the others do not predict, against rows a (L, K) of the model.
+    """States that the others do not predict, or else two in each other's place, against rows a (L, K) of the model.
 
     Faults of the model make many states misfit, none by itself.
     """
@@ -48,7 +58,7 @@ def bad_frames(data: CaptureData, a: Array) -> tuple[BadFrame, ...]:
             break
         found.append(before)
         left, before = rest, after
-    return tuple(found)
+    return tuple(found) or moments.exchanged(left)
 
 
 class _Moments:
@@ -90,3 +100,25 @@ class _Moments:
             if worst is None or misfit > worst.misfit:
                 worst = BadFrame(state, misfit)
         return worst
+
+    def exchanged(self, states: Sequence[int]) -> tuple[BadFrame, ...]:
+        """The two of which each fits in the other's place, and most of what is left over goes; or none."""
+        rows = self._rows(states)
+        p = self._outside(rows)
+        beyond = self._products[np.ix_(rows, rows)] - np.diag(self._noise[rows])
+        least, pair = (1 - MOSTLY) * max(float(np.sum(p * beyond)), 1e-300), None
+        where = np.arange(len(rows)).reshape(len(states), self._channels)
+        worst = np.argsort(-np.diag(p @ beyond @ p).reshape(where.shape).sum(axis=1))[:SUSPECTS]
+        for i, j in combinations(sorted(worst.tolist()), 2):
+            order = where.copy()
+            order[[i, j]] = order[[j, i]]
+            left = float(np.sum(p * beyond[np.ix_(order.reshape(-1), order.reshape(-1))]))
+            if left < least:
+                least, pair = left, (i, j)
+        if pair is None:
+            return ()
+        first, second = (where[k] for k in pair)
+        apart = beyond[first, first] + beyond[second, second] - 2 * beyond[first, second]
+        misfit = float(np.sqrt(max(apart.mean(), 0.0)))
+        i, j = (states[k] for k in pair)
+        return (BadFrame(i, misfit, j), BadFrame(j, misfit, i)) if misfit >= LEAST_MISFIT else ()

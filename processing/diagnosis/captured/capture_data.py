@@ -48,12 +48,14 @@ class LeftOut:
 
     Attributes
     ----------
-    frames : state to the rms by which it differs from what the others predict, relative to the signal.
+    frames : state to the rms by which it differs from what the others predict, relative to the signal;
+        exchanged : those of them that are in each other's place.
     hits : (H, 4) state, channel, row and column of single intensities; pixels : (B, 2) row and column of bad pixels.
     pitch : pixels of the sensor from one row or column of these to the next.
     """
 
     frames: dict[int, float] = field(default_factory=dict)
+    exchanged: tuple[int, ...] = ()
     hits: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 4), dtype=np.int64))
     pixels: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     pitch: int = 1

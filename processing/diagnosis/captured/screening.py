@@ -40,8 +40,10 @@ def screened(data: CaptureData, model: InstrumentModel, say: Callable[[str], Non
     frames = bad_frames(data, a)
     if frames:
         misfits = {f.state: f.misfit for f in frames}
-        data = replace(data, left_out=replace(data.left_out, frames=misfits))
-        say(f"left out of {data.name}: state {', '.join(map(str, misfits))}, which belongs to nothing")
+        exchanged = tuple(f.state for f in frames if f.instead is not None)
+        data = replace(data, left_out=replace(data.left_out, frames=misfits, exchanged=exchanged))
+        why = "each in the other's place" if exchanged else "which belongs to nothing"
+        say(f"left out of {data.name}: state {', '.join(map(str, misfits))}, {why}")
     # After the hits, which are steep as well.
     data = checked_noise(without_steep_pixels(data) if data.noise_known else data, a)
     for line in data.told_of_noise:

@@ -290,6 +290,7 @@ def not_measured(problem: InstrumentProblem) -> tuple[NotMeasured, ...]:
                     capture=data.name,
                     states=tuple(out.frames),
                     misfits_percent=tuple(100 * m for m in out.frames.values()),
+                    exchanged=out.exchanged,
                     hits=tuple((n, c, y * out.pitch, x * out.pitch) for n, c, y, x in out.hits.tolist()),
                     pixels=tuple((y * out.pitch, x * out.pitch) for y, x in out.pixels.tolist()),
                     pitch=out.pitch,

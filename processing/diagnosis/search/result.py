@@ -167,7 +167,7 @@ class NotMeasured(_Part):
     Attributes
     ----------
     states : numbers among the states of the sample; misfits_percent : by how much each differs from what the others
-        predict, rms, relative to the signal.
+        predict, rms, relative to the signal; exchanged : those that are in each other's place.
     hits : state, channel, row and column of single intensities that were struck (cosmic rays, bit errors).
     pixels : row and column of bad pixels. All are of the frames as stored, each the first of `pitch` x `pitch` pixels.
     """
@@ -175,6 +175,7 @@ class NotMeasured(_Part):
     capture: str
     states: tuple[int, ...] = ()
     misfits_percent: tuple[float, ...] = ()
+    exchanged: tuple[int, ...] = ()
     hits: tuple[tuple[int, int, int, int], ...] = ()
     pixels: tuple[tuple[int, int], ...] = ()
     pitch: int = 1
@@ -185,7 +186,8 @@ class NotMeasured(_Part):
         parts = []
         if self.states:
             misfits = ", ".join(f"{k} ({m:.0f} % off)" for k, m in zip(self.states, self.misfits_percent, strict=True))
-            parts.append(f"state{'s' if len(self.states) > 1 else ''} {misfits}, which the others do not predict")
+            why = "each in the other's place" if self.exchanged else "which the others do not predict"
+            parts.append(f"state{'s' if len(self.states) > 1 else ''} {misfits}, {why}")
         if self.hits:
             struck = len({h[2:] for h in self.hits})
             parts.append(f"{len(self.hits)} hits (as of cosmic rays) in {struck} pixels")

@@ -195,6 +195,9 @@ def bad_states(m: Patch, misfit: float, following: float, left: float = 0.1, sta
         def left(self, rest: list[int]) -> float:
             return left ** (states - len(rest))
 
+        def exchanged(self, rest: list[int]) -> tuple[()]:
+            return ()
+
     m.setattr(bad_frames, "_Moments", Moments)
     data = Some(
         signal=np.ones((states, 1, 1, 1)),
