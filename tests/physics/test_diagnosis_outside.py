@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from processing.diagnosis.instrument.doubts import LAG, TURN, TURN_AS_WELL, WAVE, WAVE_AS_WELL, _in_its_place
-from processing.diagnosis.instrument.nameless import ImageLag, Nameless, TurningSample, WaveOfAPlate
+from processing.diagnosis.instrument.nameless import Nameless
+from processing.diagnosis.instrument.nameless_effects import ImageLag, TurningSample, WaveOfAPlate
 from processing.diagnosis.instrument.run import diagnose_captures
 from processing.diagnosis.search.result import Diagnosis
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture_schema import Sample
-from simulators.blind.outside_list import ghost, image_lag
+from simulators.blind.outside_list import ghost, image_lag, lamp_jump
 from simulators.blind.real_bench import Disc
 from simulators.blind.suite import declared_bench, state_angles
 from simulators.blind.undeclared_captures import Bench, digitize, expose, write_capture
@@ -93,6 +94,16 @@ def test_frames_that_are_read_with_the_next_ones_are_not_angles_of_an_axis(confi
     assert not found.applied()
 
 
+def test_a_lamp_that_jumps_is_no_source_that_drifts(configs, tmp_path, bench):
+    lamp_jump(bench, np.random.default_rng(3), STATES)
+    found = diagnosed(tmp_path, configs, bench)
+    assert found.effects
+    assert not sure(found)
+    bench.level.clear()
+    bench.level.append(lambda k, a: 1 + 0.01 * k / (STATES - 1))
+    assert sure(diagnosed(tmp_path, configs, bench)) == ["source_drift"]
+
+
 @pytest.mark.parametrize(
     ("named", "wave", "turn", "lag", "one_name", "reason"),
     [
@@ -119,6 +130,7 @@ def test_no_name_is_sure_beside_what_explains_nearly_as_much(named, wave, turn, 
     cause = SimpleNamespace(candidates=("named",))
     nameless = Nameless.__new__(Nameless)
     nameless._labels, nameless._state = ["named"], None
+    nameless._choice = {}
     nameless._groups = {WaveOfAPlate: range(1, 2), TurningSample: range(2, 3), ImageLag: range(3, 4)}
     nameless._sets = SimpleNamespace(
         without=lambda state, group: state,

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from processing.diagnosis.instrument.edges import at_edges
-from processing.diagnosis.instrument.nameless import STANDS_OUT, ImageLag, Nameless, TurningSample, WaveOfAPlate
+from processing.diagnosis.instrument.nameless import STANDS_OUT, Nameless
+from processing.diagnosis.instrument.nameless_effects import ImageLag, JumpOfTheSource, TurningSample, WaveOfAPlate
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.source_patterns import beat_explains_as_well, chance_of_pattern, patterned
 from processing.diagnosis.instrument.unevenness import Evenness
@@ -32,7 +33,7 @@ from processing.instrument.effects.base import (
     FieldEffect,
     GeneralEffect,
     ImageShift,
-    OpticsEffect,
+    InstrumentEffect,
     PointwiseEffect,
     SourceEffect,
     ValuePerState,
@@ -53,21 +54,25 @@ TURN_AS_WELL = "a sample that turns during the capture explains as much as it do
 #: The same of a detector that has not read all of a frame when the next one comes.
 LAG = "a part of each frame that is read with the next one explains more than it does"
 LAG_AS_WELL = "a part of each frame that is read with the next one explains as much as it does"
+#: The same of a lamp that jumps once.
+JUMP = "a source that jumps once explains more than it does"
+JUMP_AS_WELL = "a source that jumps once explains as much as it does"
 #: For each, the gain in chi-square from which on it explains more, and the reasons. That the sample turned, of which
 #: all else may be a part, has to be sure.
 IN_ITS_PLACE = {
     WaveOfAPlate: (0.0, WAVE, WAVE_AS_WELL),
     TurningSample: (STANDS_OUT, TURN, TURN_AS_WELL),
     ImageLag: (0.0, LAG, LAG_AS_WELL),
+    JumpOfTheSource: (0.0, JUMP, JUMP_AS_WELL),
 }
 #: The image does not move where that would be seen best.
 STANDS = "the edges, which were left out of the fit, do not move as it says"
 #: Optics and mechanics are the same for the whole image.
 NOT_ALIKE = "it differs from part to part of the image, which nothing in the train does"
 #: Reasons that say that something else is there, of which what the cause explains is left over.
-ELSE = (PATTERN, BEAT, WAVE, TURN, LAG, STANDS, NOT_ALIKE)
+ELSE = (PATTERN, BEAT, WAVE, TURN, LAG, JUMP, STANDS, NOT_ALIKE)
 #: Reasons that say that either may be there.
-AS_WELL = (WAVE_AS_WELL, TURN_AS_WELL, LAG_AS_WELL)
+AS_WELL = (WAVE_AS_WELL, TURN_AS_WELL, LAG_AS_WELL, JUMP_AS_WELL)
 #: The reason of a source beside one that follows a pattern: where that is not used, neither is this.
 BESIDE_PATTERN = "it may be a part of a source that changes as no effect of the list does"
 #: The reason for which nothing is written for later captures: the sample or its light changed, and what is found beside
@@ -119,7 +124,7 @@ def doubts(
     return out
 
 
-def _in_its_place(gains: Mapping[type[OpticsEffect], float], one_name: bool) -> str | None:
+def _in_its_place(gains: Mapping[type[InstrumentEffect], float], one_name: bool) -> str | None:
     """The reason where something that has no name gains so much over a cause; of two that are as likely none is sure.
 
     What is told as one of several, and values for each state, are no one name yet: no wave is asked in their place, and
