@@ -86,8 +86,10 @@ def test_what_varies_over_the_image_may_be_absent_where_the_noise_is_asked_besid
 def test_a_bend_that_does_not_scatter_so_hides_no_noise_of_the_others(monkeypatch):
     """The light of a tone curve and an offset was refused together, and the noise stayed that without any (6 % off)."""
     tone, offset = "tone_curve", "detector_offset"
-    bench, adopted, stays = object.__new__(WholeBench), [], []
-    bench.whole = SimpleNamespace(noise_known=True, level_noise=lambda space, values: True)
+    bench, adopted = object.__new__(WholeBench), []
+    bench.whole = SimpleNamespace(
+        noise_known=True, level_noise=lambda space, values: True, has_noise_of=lambda space, seen: seen in adopted
+    )
     monkeypatch.setattr(whole_bench, "Space", lambda candidates: SimpleNamespace(candidates=candidates))
     monkeypatch.setattr(whole_bench, "first_look", lambda whole, space, fixed, start: (space.candidates, 1.0))
     monkeypatch.setattr(bench, "_values_at_start", lambda space: space.candidates)
@@ -96,11 +98,9 @@ def test_a_bend_that_does_not_scatter_so_hides_no_noise_of_the_others(monkeypatc
     )
 
     def adopt(space, seen):
-        if tone in seen or seen in stays:
-            return False
-        adopted.append(seen)
-        stays.append(seen)
-        return True
+        if tone not in seen:
+            adopted.append(seen)
+        return tone not in seen
 
     monkeypatch.setattr(bench, "_adopt_noise", adopt)
     bench._take_noise_of_light([tone, offset], [])

@@ -181,17 +181,19 @@ class InstrumentProblem:
         The evidence for an effect is always taken with one and the same noise; else a correction could gain by the
         noise that it pretends.
         """
+        if self.has_noise_of(space, values) or not self.level_noise(space, values):
+            return False
+        self._noise_at = exactly_undone(space, values, pointwise=True)
+        return True
+
+    def has_noise_of(self, space: Space, values: Array) -> bool:
+        """Whether the noise is that of the light that these values tell, or the same whatever the light."""
         at = exactly_undone(space, values, pointwise=True)
         gone = any(candidate not in at for candidate in self._noise_at)
-        near = not gone and distance(self._noise_at, space, values, pointwise=True) < EXACT
-        # Noise that is stated for each state is the same whatever the light.
+        if not gone and distance(self._noise_at, space, values, pointwise=True) < EXACT:
+            return True
         stated = not any(c.slope.any() for c in self.captures)
-        if near or stated or any(c.noise_estimated for c in self.captures):
-            return False
-        if not self.level_noise(space, values):
-            return False
-        self._noise_at = at
-        return True
+        return stated or any(c.noise_estimated for c in self.captures)
 
     def level_noise(self, space: Space, values: Array) -> bool:
         """Take the noise that light and differences of pixels tell beside these values, for all that follows.

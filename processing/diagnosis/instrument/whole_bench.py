@@ -93,11 +93,13 @@ class WholeBench:
         found = self._posterior([*fixed, *plain], fixed)
         if too_many := self.as_many_as_intensities(found, TAKES_PART):
             self.say(f"without {', '.join(c.label for c in too_many)}: it would be a value for each intensity")
-            found = self._posterior([*fixed, *(c for c in plain if c not in too_many)], fixed)
+            plain = [c for c in plain if c not in too_many]
+            found = self._posterior([*fixed, *plain], fixed)
         found = self._with_what_scatters_so(found, fixed)
         fields = [c for c in self.pool if isinstance(c.effect, FieldEffect)]
         if fields and not self.whole.holds_out_states:
-            beside = self._with_fields(found, fixed, fields)
+            # What the noise seemed to speak against may be right beside what varies over the image.
+            beside = self._with_fields(found, fixed, plain, fields)
             found = found if beside is found else self._with_what_scatters_so(beside, fixed)
         solved = applied(found, self.base)
         if self.whole.noise_known and self._adopt_noise(*solved):
@@ -122,8 +124,10 @@ class WholeBench:
         seen, unit = first_look(self.whole, space, fixed, start)
         told = space, start
         for _ in range(FIRST_LOOKS):
+            if self.whole.has_noise_of(space, seen):
+                break
             if not self._adopt_noise(space, seen):
-                # Without the light that one of them would have, the others may have theirs.
+                # The counts do not scatter so: without the light of one of them, the others may have theirs.
                 against = self._refuted_by_scatter(space, seen)
                 if not against:
                     break
@@ -255,8 +259,10 @@ class WholeBench:
             return found.samples.best.unit
         return min(found.samples.best.unit, found.sets.settled(everything(found.sets)).unit)
 
-    def _with_fields(self, found: Posterior, fixed: Sequence[Candidate], fields: Sequence[Candidate]) -> Posterior:
-        """The posterior with values that vary over the image, if they promise something beside all others."""
+    def _with_fields(
+        self, found: Posterior, fixed: Sequence[Candidate], plain: Sequence[Candidate], fields: Sequence[Candidate]
+    ) -> Posterior:
+        """The posterior of all with values that vary over the image, if they promise something beside the others."""
         space, values = applied(found, self.base)
         unit = self._least_unit(found)
         both = Space((*space.candidates, *fields))
@@ -267,7 +273,8 @@ class WholeBench:
         if gains[best] < DECISIVE:
             return found
         self.say(f"with {', '.join(c.label for c in fields)}")
-        return self._posterior([*found.space.candidates, *fields], fixed)
+        self._take_noise_of_light([*fixed, *plain, *fields], fixed)
+        return self._posterior([*fixed, *plain, *fields], fixed)
 
 
 def applied(found: Posterior, base: Space, unfit: Sequence[Candidate] = ()) -> tuple[Space, Array]:
