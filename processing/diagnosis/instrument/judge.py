@@ -15,7 +15,7 @@ from processing.diagnosis.instrument.evidence import wanted_for_evidence, would_
 from processing.diagnosis.instrument.guard import chances, checks, lasts, predicted_changes, refusal
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.recommend import recommended
-from processing.diagnosis.instrument.structure import Residual, descriptions, residual
+from processing.diagnosis.instrument.structure import Residual, beyond_chance, descriptions, residual
 from processing.diagnosis.instrument.telling import (
     calibrated,
     capture_report,
@@ -36,7 +36,7 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause, causes
 from processing.diagnosis.search.posterior import Posterior, Say
 from processing.diagnosis.search.result import Diagnosis, Unexplained, Verdict
-from processing.diagnosis.search.rules import GROWTH, LIKELY, LIMIT, WHITE
+from processing.diagnosis.search.rules import GROWTH, LIKELY, WHITE
 from processing.diagnosis.search.solution import Solution
 from processing.instrument.effects.base import FieldEffect, ValuePerState
 from processing.instrument.model import InstrumentModel
@@ -199,7 +199,7 @@ def _nothing(solved: Solution) -> Solution:
 
 def _structure(problem: InstrumentProblem, after: Sequence[Residual]) -> bool:
     if problem.noise_known:
-        return any(value > LIMIT for r in after for value in r.tests.values())
+        return any(beyond_chance(r.tests) for r in after)
     return any(not _white(r) for r in after)
 
 

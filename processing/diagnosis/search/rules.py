@@ -161,6 +161,8 @@ ALSO = 0.02
 # ---- structure -----------------------------------------------------------------------------------------------------
 #: [standard deviations] Beyond which a test of the residual says "structure".
 LIMIT = 5.0
+#: [standard deviations] The same of two of the six tests of one capture: as likely by chance as one beyond `LIMIT`.
+LIMIT_OF_TWO = 3.5
 #: [standard deviations] Autocorrelation over the states from which on the residual of few pixels is not white.
 WHITE = 4.0
 

@@ -19,6 +19,13 @@ def test_limit(m: Patch) -> bool:
     return seen == [False, True]
 
 
+@decides
+def test_limit_of_two(m: Patch) -> bool:
+    """Two tests together are beyond chance where one of them is not."""
+    seen = [judge._structure(Some(noise_known=True), [Some(tests={"a": 4.0, "b": t})]) for t in (3.4, 3.6)]
+    return seen == [False, True]
+
+
 def test_what_no_test_takes_for_structure_is_not_left():
     known, found = Some(noise_known=True), Some(tests={"a": 3.0, "b": -1.0}, left=50.0)
     assert judge._left(known, found) == 0.0
