@@ -11,7 +11,7 @@ from bench_capture import bench_capture
 from processing.commands import diagnose as cli
 from processing.diagnosis.instrument.residual_file import read_residuals
 from processing.diagnosis.instrument.run import diagnose_captures
-from processing.diagnosis.search.result import Diagnosis
+from processing.diagnosis.search.result import Diagnosis, FoundEffect
 from processing.instrument.model import EffectParameter, InstrumentModel
 from processing.storage.capture import Capture
 from processing.storage.capture_schema import Sample
@@ -295,3 +295,25 @@ def assert_no_file_that_cannot_be_read(path, model, diagnosis):
 )
 def test_a_value_is_told_as_far_as_it_is_known(value, stderr, told):
     assert EffectParameter(value=value, stderr=stderr, unit="1").told == told
+
+
+def test_states_at_which_an_axis_may_have_slipped_are_told_in_one():
+    others = (
+        "rotation_slip[psa@17]",
+        "analyzer_azimuth",
+        "rotation_slip[psa@2]",
+        "rotation_slip[psg@5]",
+        "psa_azimuth[p]",
+    )
+    told = FoundEffect(
+        kind="rotation_ratio",
+        element="psa",
+        parameters={},
+        evidence=7.0,
+        indistinguishable_from=others,
+        scope="instrument",
+        removal_chance=0.0,
+        confident=True,
+    ).could_be
+    states = "rotation_slip[psa] from one of the states 2 to 17"
+    assert told == (states, "analyzer_azimuth", "rotation_slip[psg@5]", "psa_azimuth[p]")

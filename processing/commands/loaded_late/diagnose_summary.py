@@ -92,7 +92,7 @@ def _show_effect(effect: FoundEffect) -> None:
         unit, note = "" if p.unit == "1" else f" {p.unit}", f" ({p.note})" if p.note else ""
         typer.echo(f"      {name}: {p.told}{unit}{note}")
     if effect.indistinguishable_from:
-        typer.echo(f"      cannot be told from: {', '.join(effect.indistinguishable_from)}")
+        typer.echo(f"      cannot be told from: {', '.join(effect.could_be)}")
 
 
 def _show_correction(correction: Correction, corrects: bool) -> None:

@@ -68,7 +68,7 @@ def _effects(judged: Judged) -> list[list[str]]:
             sure = e.answer or ""
             if e.probability is not None:
                 sure += f", {e.probability:.3f}" if e.probability < 0.999 else ", over 0.999"
-            whole = (kind, place, sure, f"{e.evidence:.0f}", ", ".join(e.indistinguishable_from))
+            whole = (kind, place, sure, f"{e.evidence:.0f}", ", ".join(e.could_be))
             first = whole if name == next(iter(e.parameters)) else ("",) * len(whole)
             # Non-breaking spaces: a number stays on one line with its error and unit.
             value = f"{p.told} {p.unit if p.unit != '1' else ''}".strip().replace(" ", "\u00a0")

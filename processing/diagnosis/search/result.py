@@ -43,6 +43,22 @@ class FoundEffect(_Part):
     probability: float | None = None
     answer: str | None = None
 
+    @property
+    def could_be(self) -> tuple[str, ...]:
+        """What it cannot be told from, with an effect from one state on or another once."""
+        states: dict[str, list[int]] = {}
+        for name in self.indistinguishable_from:
+            short, at, state = name.rstrip("]").rpartition("@")
+            states.setdefault(f"{short}]" if at else name, []).extend([int(state)] if at else [])
+        return tuple(
+            f"{name} from one of the states {min(n)} to {max(n)}"
+            if len(n) > 1
+            else f"{name[:-1]}@{n[0]}]"
+            if n
+            else name
+            for name, n in states.items()
+        )
+
 
 class Ranked(_Part):
     """A candidate of the first round: chi-square gain on held-out data, and the residual it would leave."""
