@@ -97,8 +97,8 @@ class JumpOfTheSource(LevelEffect, OfOneCapture):
     kind = "jump"
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
-        """All states but the first."""
-        return tuple(str(k) for k in range(1, conditions.states))
+        """All states but the first ones of runs: between these the list has a jump."""
+        return tuple(str(k) for k in np.flatnonzero(np.diff(conditions.run) == 0) + 1)
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         """The share."""
