@@ -105,29 +105,33 @@ def test_a_lamp_that_jumps_is_no_source_that_drifts(configs, tmp_path, bench):
 
 
 @pytest.mark.parametrize(
-    ("named", "wave", "turn", "lag", "one_name", "reason"),
+    ("named", "odds", "wave", "turn", "lag", "one_name", "reason"),
     [
-        (100.0, 120.0, 0.0, 0.0, True, WAVE),
-        (100.0, 99.0, 0.0, 0.0, True, WAVE_AS_WELL),
-        (100.0, 93.0, 0.0, 0.0, True, WAVE_AS_WELL),
-        (100.0, 90.0, 0.0, 0.0, True, None),
-        (100.0, 120.0, 0.0, 0.0, False, None),
-        (100.0, 99.0, 120.0, 0.0, True, TURN),
-        (100.0, 0.0, 120.0, 0.0, False, TURN),
-        (100.0, 0.0, 105.0, 0.0, True, TURN_AS_WELL),
-        (100.0, 0.0, 93.0, 0.0, True, TURN_AS_WELL),
-        (100.0, 0.0, 105.0, 105.0, False, None),
-        (100.0, 0.0, 0.0, 110.0, False, LAG),
-        (100.0, 120.0, 0.0, 121.0, True, LAG),
+        (100.0, 5.0, 120.0, 0.0, 0.0, True, WAVE),
+        (100.0, 5.0, 99.0, 0.0, 0.0, True, WAVE_AS_WELL),
+        (100.0, 5.0, 93.0, 0.0, 0.0, True, WAVE_AS_WELL),
+        (100.0, 5.0, 90.0, 0.0, 0.0, True, None),
+        (100.0, 5.0, 120.0, 0.0, 0.0, False, None),
+        (100.0, 5.0, 99.0, 120.0, 0.0, True, TURN),
+        (100.0, 5.0, 0.0, 120.0, 0.0, False, TURN),
+        (100.0, 5.0, 0.0, 105.0, 0.0, True, TURN_AS_WELL),
+        (100.0, 5.0, 0.0, 93.0, 0.0, True, TURN_AS_WELL),
+        (100.0, 5.0, 0.0, 105.0, 105.0, False, None),
+        (100.0, 5.0, 0.0, 0.0, 110.0, False, LAG),
+        (100.0, 5.0, 120.0, 0.0, 121.0, True, LAG),
+        # Forty values cost eighty, but not those that are as small as they are.
+        (-20.0, 60.0, 0.0, 0.0, 30.0, False, None),
+        (-20.0, 5.0, 0.0, 0.0, 30.0, False, LAG),
         # What explains nothing is not there in the place of what explains little.
-        (10.0, 5.0, 5.0, 0.0, True, None),
+        (10.0, 5.0, 5.0, 5.0, 0.0, True, None),
     ],
 )
-def test_no_name_is_sure_beside_what_explains_nearly_as_much(named, wave, turn, lag, one_name, reason):
+def test_no_name_is_sure_beside_what_explains_nearly_as_much(named, odds, wave, turn, lag, one_name, reason):
     def explaining(chi_square):
-        return np.eye(1), np.array([math.sqrt(chi_square)])
+        values = 1 if chi_square >= 0 else 40
+        return np.eye(values), np.full(values, math.sqrt((chi_square + 80 * (values > 1)) / values))
 
-    cause = SimpleNamespace(candidates=("named",))
+    cause = SimpleNamespace(candidates=("named",), alternatives=(), log_odds=odds)
     nameless = Nameless.__new__(Nameless)
     nameless._labels, nameless._state = ["named"], None
     nameless._choice = {}

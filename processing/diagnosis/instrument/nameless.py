@@ -61,9 +61,10 @@ class Nameless:
         return None if few else cls(problem, found)
 
     def gains_over(self, cause: Cause) -> dict[type[InstrumentEffect], float]:
-        """Chi-square that the best of each kind explains in a cause's place beyond what that does.
+        """Chi-square that the best of each kind explains in a cause's place, beyond it and what it cannot be told from.
 
-        Every value of either costs two, and a choice among many its logarithm. Of those that stand out by themselves.
+        Every value of either costs two, and a choice among many its logarithm; many values that are as small as they
+        are cost less, as the odds of the cause say. Of those that stand out by themselves.
         """
         own = self._labels.index(cause.candidates[0])
         given = self._sets.given_others(self._sets.without(self._state, own))
@@ -71,7 +72,9 @@ class Nameless:
             kind: max((_explained(*given[g]) for g in of), default=0.0) - self._choice.get(kind, 0.0)
             for kind, of in self._groups.items()
         }
-        return {kind: one - _explained(*given[own]) for kind, one in most.items() if one > STANDS_OUT}
+        named = [own, *(self._labels.index(other) for other in cause.alternatives)]
+        there = max(2 * cause.log_odds, *(_explained(*given[g]) for g in named))
+        return {kind: one - there for kind, one in most.items() if one > STANDS_OUT}
 
 
 def _once(effect: InstrumentEffect, problem: InstrumentProblem) -> list[Candidate]:
