@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -105,3 +106,23 @@ def test_a_bend_that_does_not_scatter_so_hides_no_noise_of_the_others(monkeypatc
     monkeypatch.setattr(bench, "_adopt_noise", adopt)
     bench._take_noise_of_light([tone, offset], [])
     assert adopted == [(offset,)]
+
+
+def test_beside_a_map_over_the_image_all_take_part_with_the_noise_of_their_light(monkeypatch):
+    """What was unlikely, or spoken against, where the map was missing: 300 values were kept, and a bend was dropped."""
+    bench, looked = object.__new__(WholeBench), []
+    field, found = Mock(label="field"), None
+    space = SimpleNamespace(candidates=(), size=0, slices=())
+    bench.base, bench.say = None, lambda line: None
+    bench.whole = SimpleNamespace(sums=lambda space, values: None)
+    both = SimpleNamespace(candidates=(field,), size=5, slices=(slice(0, 5),))
+    monkeypatch.setattr(whole_bench, "applied", lambda found, base: (space, np.zeros(0)))
+    monkeypatch.setattr(whole_bench, "Space", lambda candidates: both)
+    monkeypatch.setattr(whole_bench, "score", lambda *of: (1000.0,))
+    monkeypatch.setattr(whole_bench, "prior", lambda space: None)
+    monkeypatch.setattr(bench, "_least_unit", lambda found: 1.0)
+    monkeypatch.setattr(bench, "_take_noise_of_light", lambda candidates, fixed: looked.append(candidates))
+    monkeypatch.setattr(bench, "_posterior", lambda candidates, fixed: candidates)
+    kept = bench._with_fields(found, ["clipped"], ["bend", "unlikely"], [field])
+    assert kept == ["clipped", "bend", "unlikely", field]
+    assert looked == [kept]
