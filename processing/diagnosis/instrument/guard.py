@@ -17,7 +17,7 @@ from processing.diagnosis.instrument.systematic import ELEMENTS
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.result import Check
-from processing.diagnosis.search.rules import CHANCE_WORSE, LEAST_NOISE, WORSE, WORSE_CONDITION
+from processing.diagnosis.search.rules import CHANCE_WORSE, LEAST_CHANGE, WORSE, WORSE_CONDITION
 from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.search.stored import scope_of
@@ -82,7 +82,7 @@ class PredictedChange:
     @property
     def chance_worse(self) -> float:
         """Chance that the error grows: that the true change goes less than half as far along this one."""
-        if self.size <= LEAST_NOISE:
+        if self.size <= LEAST_CHANGE:
             return 0.0
         beyond = self.expected - self.size / 2
         return float(ndtr(-beyond / self.stderr)) if self.stderr > 0 else float(beyond < 0)

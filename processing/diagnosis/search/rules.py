@@ -39,8 +39,7 @@ SLACK = 2.0
 #: [of its variance] Standard error of the noise itself: no gain is known better than to half a percent. Of two million
 #: intensities that is five times what chance does to their sum of squares.
 NOISE_LEVEL = 0.005
-#: [of the signal] Least residual that is taken as noise where the noise is not known, and least change of M/m00 that is
-#: asked for its error: no bench repeats better.
+#: [of the signal] Least residual that is taken as noise where the noise is not known: no bench repeats better.
 LEAST_NOISE = 1e-4
 #: [log odds] Of the scatter of the counts against the noise that a correction of them tells, from which on it is
 #: dropped: 1 to 160 000.
@@ -148,6 +147,8 @@ WORSE = 1.002
 #: [probability] That the error of M grows by a correction, up to which it is written: what is changed has to be 4.65
 #: standard errors of the change, for the error grows where the truth goes less than half as far.
 CHANCE_WORSE = 0.01
+#: [of m00] Least change of M/m00 that is asked for its error: less is the rounding of counts.
+LEAST_CHANGE = 2e-5
 #: [standard deviations] From the mean of the posterior, up to which another correction is as good: one that changes M
 #: less, where the data hardly tell how it changes.
 AS_GOOD_AS = 1.0

@@ -89,6 +89,12 @@ def test_chance_worse(m: Patch) -> bool:
 
 
 @decides
+def test_least_change(m: Patch) -> bool:
+    small = [guard.PredictedChange(1e-4, 1e-4, size=size, expected=size, stderr=1e-4) for size in (1.9e-5, 2.1e-5)]
+    return [change.chance_worse > 0.4 for change in small] == [False, True]
+
+
+@decides
 def test_as_good_as(m: Patch) -> bool:
     # M follows one value alone, which is so many standard deviations from zero.
     there = [cautious.less_far(np.array([d]), np.eye(1), np.eye(1), 1e6) is not None for d in (0.95, 1.05)]
