@@ -75,18 +75,20 @@ class _Moments:
         q = u[:, size > RANK * size[0]]
         return np.asarray(np.eye(len(rows)) - q @ q.T)
 
+    def _fitted(self, states: Sequence[int]) -> tuple[Array, Array]:
+        """What (L', L') a fit to some states leaves of their rows, and their second moments (L', L') beyond noise."""
+        rows = self._rows(states)
+        return self._outside(rows), self._products[np.ix_(rows, rows)] - np.diag(self._noise[rows])
+
     def left(self, states: Sequence[int]) -> float:
         """Mean square beyond noise that a fit to some states leaves, summed over the states."""
-        rows = self._rows(states)
-        p = self._outside(rows)
-        beyond = self._products[np.ix_(rows, rows)] - np.diag(self._noise[rows])
+        p, beyond = self._fitted(states)
         return max(float(np.sum(p * beyond)), 1e-300)
 
     def suspect(self, states: Sequence[int]) -> BadFrame | None:
         """The state that differs most from what the others predict; None where they do not predict any."""
-        rows = self._rows(states)
-        p = self._outside(rows)
-        beyond = p @ (self._products[np.ix_(rows, rows)] - np.diag(self._noise[rows])) @ p
+        p, signal = self._fitted(states)
+        beyond = p @ signal @ p
         c = self._channels
         worst = None
         for j, state in enumerate(states):
@@ -103,11 +105,9 @@ class _Moments:
 
     def exchanged(self, states: Sequence[int]) -> tuple[BadFrame, ...]:
         """The two of which each fits in the other's place, and most of what is left over goes; or none."""
-        rows = self._rows(states)
-        p = self._outside(rows)
-        beyond = self._products[np.ix_(rows, rows)] - np.diag(self._noise[rows])
-        least, pair = (1 - MOSTLY) * max(float(np.sum(p * beyond)), 1e-300), None
-        where = np.arange(len(rows)).reshape(len(states), self._channels)
+        p, beyond = self._fitted(states)
+        least, pair = (1 - MOSTLY) * self.left(states), None
+        where = np.arange(len(p)).reshape(len(states), self._channels)
         worst = np.argsort(-np.diag(p @ beyond @ p).reshape(where.shape).sum(axis=1))[:SUSPECTS]
         for i, j in combinations(sorted(worst.tolist()), 2):
             order = where.copy()
