@@ -9,6 +9,8 @@ from steady_capture import steady_capture
 from processing.diagnosis.instrument.features import FEATURES
 from processing.diagnosis.instrument.moments import moments_of
 from processing.diagnosis.instrument.projection import add_block
+from processing.diagnosis.instrument.tile_slopes import TileSlopes
+from processing.diagnosis.instrument.tile_sums import add_tiles
 from processing.diagnosis.search.space import Sums
 
 CHANNELS, STATES, VALUES = 3, 6, 4
@@ -34,3 +36,32 @@ def test_states_apart_are_what_a_column_for_each_of_them_says(cut_off):
     for name in sizes:
         expected = getattr(together, name)
         assert getattr(apart, name) == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max()), name
+
+
+def test_states_apart_in_tiles_are_what_a_column_for_each_of_them_says():
+    random = np.random.default_rng(6)
+    rows, sizes = CHANNELS * STATES, ("excess", "freedom", "square", "count", "gradient", "stretch", "curvature")
+    data = steady_capture(random.uniform(0.2, 0.8, (rows, 32, 32)), 1e-2)
+    moments = moments_of(data, 2)
+    count = moments.tiles.x.size
+    a, at_nodes = random.normal(size=(count, rows, 1)), random.normal(size=(VALUES, 3, rows, 1))
+    c, dc = np.zeros((len(FEATURES), rows)), np.zeros((1, len(FEATURES), rows))
+    c[0], dc[0, FEATURES.index("square")] = 1.0, random.normal(size=rows)
+    of_state = np.arange(rows)[:, None] // CHANNELS == np.arange(STATES)
+    shares, sums = random.normal(size=(3, count)), []
+    for wide in (True, False):
+        there = of_state if wide else np.ones((rows, 1))
+        slopes = TileSlopes(
+            at_nodes=at_nodes * there,
+            shares=shares,
+            fields=np.array([1]),
+            da=(0.1 * np.ones((1, count, rows, 1))) * there,
+            counted=np.array([2]),
+            dc=dc,
+        )
+        out = Sums.empty(2, VALUES)
+        add_tiles(data, moments, moments.tiles, a * there, c, slopes, out, None if wide else CHANNELS)
+        sums.append(out)
+    for name in sizes:
+        expected = getattr(sums[0], name)
+        assert getattr(sums[1], name) == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max()), name

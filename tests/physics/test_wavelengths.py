@@ -1,5 +1,6 @@
 """Several wavelengths in one fit: mounts are shared, optics are not, and a free source counts for nothing."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -212,3 +213,28 @@ def test_the_file_has_a_value_for_each_wavelength_and_mechanics_for_all():
     assert between.generator[1].retardance_deg == pytest.approx(106.5)
     assert between.generator[1].azimuth_deg == 3.0
     assert [e.kind for e in between.effects] == ["rotation_eccentricity"]
+
+
+def test_a_free_source_is_free_in_every_tile_of_an_image():
+    model, nm = train(free_source=True), 600.0
+    random = np.random.default_rng(3)
+    steady, floor = captured(model, nm).signal, 1e-6
+    noise = random.normal(0, np.sqrt(floor), (*steady.shape[:2], 24, 24))
+    gain = random.uniform(0.5, 2.0, len(steady))
+    sums = []
+    for level in (np.ones(len(gain)), gain):
+        data = replace(
+            captured(model, nm),
+            signal=((steady + noise) * level[:, None, None, None]).astype(np.float32),
+            floor=floor * level**2,
+            usable=np.ones((24, 24), dtype=bool),
+            clipped=np.zeros((24, 24), dtype=bool),
+        )
+        problem = InstrumentProblem([model.at(nm)], [data])
+        varying = [c for c in problem.pool() if c.kind in ("field_retardance", "retarder_diattenuation")]
+        space = Space(tuple(varying))
+        sums.append(problem.sums(space, 0.2 * space.joined("typical")))
+    assert {c.kind for c in space.candidates} >= {"field_retardance"}
+    for name in ("excess", "gradient", "curvature"):
+        expected = getattr(sums[0], name)
+        assert getattr(sums[1], name) == pytest.approx(expected, rel=1e-3, abs=1e-4 * np.abs(expected).max()), name

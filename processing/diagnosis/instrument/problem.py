@@ -260,6 +260,10 @@ class InstrumentProblem:
     def _free_source(self, capture: int) -> bool:
         return self.models[capture].free_source and self.captures[capture].sample is not None
 
+    def _rows_apart(self, capture: int) -> int | None:
+        """How many rows a state has, where each has unknowns of its own."""
+        return len(self.captures[capture].conditions.channels) if self._free_source(capture) else None
+
     def coefficients(self, capture: int, changes: Changes) -> Array:
         """Coefficient of every feature (F, L) in the corrected counts."""
         rows = self.captures[capture].values_per_pixel
@@ -315,7 +319,6 @@ class InstrumentProblem:
 
     def _block_sums(self, k: int, space: Space, values: Array, changes: Changes, out: Sums, derivatives: bool) -> None:
         # With a level of the source in every state each state is projected by itself: one column serves all of them.
-        apart = len(self.captures[k].conditions.channels) if self._free_source(k) else None
         a, c = self._columns_of_one_source(k, changes), self.coefficients(k, changes)
         da, dc = np.zeros((0, *a.shape)), None
         if derivatives:
@@ -328,7 +331,7 @@ class InstrumentProblem:
                     continue
                 block = replace(block, rows=block.sound)
             if block.rows.size:
-                add_block(block, a, c, da, dc, self.moments[k], out, apart)
+                add_block(block, a, c, da, dc, self.moments[k], out, self._rows_apart(k))
 
     def slopes(self, k: int, space: Space, values: Array, a: Array, columns: Columns) -> Array:
         """Derivatives (values, ..., L, K) of the rows a (..., L, K) of a capture, which `columns` makes of changes."""
@@ -352,7 +355,7 @@ class InstrumentProblem:
             dc = self.slopes_of_counts(k, space, values, c)
             slopes = slopes_of_tiles(model, data, moments, partial(self.changes, k, space), space, values, a, dc)
         for each in tiles:
-            add_tiles(data, moments, each, a, c, slopes, out)
+            add_tiles(data, moments, each, a, c, slopes, out, self._rows_apart(k))
 
 
 def _moved_back(captures: Sequence[CaptureData], shifts_px: Sequence[Array]) -> tuple[CaptureData, ...]:

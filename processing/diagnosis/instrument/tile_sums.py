@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,27 +24,45 @@ TOGETHER = 32
 
 
 def add_tiles(
-    data: CaptureData, moments: Moments, tiles: Tiles, a: Array, c: Array, slopes: TileSlopes | None, out: Sums
+    data: CaptureData,
+    moments: Moments,
+    tiles: Tiles,
+    a: Array,
+    c: Array,
+    slopes: TileSlopes | None,
+    out: Sums,
+    apart: int | None = None,
 ) -> None:
-    """Add what tiles say of a (tiles, L, K) and coefficients c (F, L), with their derivatives by each value."""
+    """Add what tiles say of a (tiles, L, K) and coefficients c (F, L), with their derivatives by each value.
+
+    `apart` : rows of a state, where every state has unknowns of its own; None: all rows have the same unknowns.
+    """
     asked = np.any(c, axis=1) if slopes is None else np.any(c, axis=1) | np.any(slopes.dc, axis=(0, 2))
     used, use = np.flatnonzero(asked), np.flatnonzero(moments.counts)
     known, z, noise = features_of_tiles(data, moments, tiles, used.tolist())
     mine = np.searchsorted(known, used)
-    noise = noise if len(known) == used.size else noise[:, :, mine[:, None], mine]
     around = used >= len(FEATURES) - DERIVATIVES
-    c, a = c[None, used][:, :, use], a[:, use]
-    slopes = None if slopes is None else slopes.of_rows(use, used)
 
-    def projected(fold: int) -> Iterator[tuple[NDArray[np.int64], Projected]]:
+    def projected(fold: int, kept: slice) -> Iterator[tuple[NDArray[np.int64], Projected]]:
+        rows = use[kept]
+        scatter = noise[:, kept] if len(known) == used.size else noise[:, kept, mine[:, None], mine]
         here = np.flatnonzero(tiles.fold == fold)
         for some in np.split(here, range(TOGETHER, here.size, TOGETHER)):
-            part = Projected(z[some[:, None], mine], noise[some], a[some], c, around)
-            add_parts(part, moments, use[None], tiles.pixels[some], fold, out)
+            features = z[some[:, None], mine, kept]
+            part = Projected(features, scatter[some], a[some][:, rows], c[None, used][:, :, rows], around)
+            add_parts(part, moments, rows[None], tiles.pixels[some], fold, out)
             yield some, part
 
-    for fold in range(len(out.excess)):
-        if slopes is None:
-            deque(projected(fold), maxlen=0)
-        else:
-            add_slopes(projected(fold), slopes, fold, out)
+    for kept in _together(use, apart):
+        of_rows = None if slopes is None else slopes.of_rows(use[kept], used)
+        for fold in range(len(out.excess)):
+            if of_rows is None:
+                deque(projected(fold, kept), maxlen=0)
+            else:
+                add_slopes(projected(fold, kept), of_rows, fold, out)
+
+
+def _together(use: NDArray[np.int64], apart: int | None) -> list[slice]:
+    """Which of the rows in use have the same unknowns."""
+    bounds = [] if apart is None else (np.flatnonzero(np.diff(use // apart)) + 1).tolist()
+    return [slice(i, j) for i, j in pairwise([0, *bounds, use.size])]
