@@ -9,6 +9,7 @@ from scipy.special import betaln
 
 from processing.diagnosis.instrument.source_patterns import chance_of_pattern, patterned
 from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.descent import descend
 from processing.diagnosis.search.likely_set import likely_set
 from processing.diagnosis.search.rules import FEW_CAUSES, TAU, TAU_WEIGHT
@@ -17,6 +18,7 @@ from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets, Stat
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.search.stays import stay
 from processing.effect import Parameter
+from processing.instrument.effects.rotation_slip import RotationSlip
 
 #: Nothing but noise, whose unit is one.
 QUIET = Noise(known=True, directions=30.0, slack=1e9)
@@ -217,3 +219,31 @@ def test_of_those_that_may_be_there_alone_never_two_are():
     assert np.sum(state.tau[:2] > 0) == 1
     for samples in (sample(sets, state, 200), stay(sets, state, 400)):
         assert float(samples.weight @ samples.sets[:, :2].all(axis=1)) == 0
+
+
+def test_the_state_that_a_slip_begins_at_is_one_of_those_that_the_data_leave_open():
+    """That the axis slipped is certain, and one frame that hardly saw it tells from which state on."""
+    states = np.arange(40)
+    seen = np.where(states == 14, 0.02, 1.0)
+    design = 100 * np.column_stack([seen * (states >= first) for first in (13, 14, 15)])
+    space = Space(tuple(slipped(first) for first in (13, 14, 15)))
+    sets = Sets(form(design, np.array([0.0, 0.5, 0.0]), 30), groups(1, 1, 1), QUIET)
+    state = likely_set(sets)
+    samples = SimpleNamespace(best=state, any_of=lambda members: 1.0)
+    found = SimpleNamespace(
+        sets=sets,
+        samples=samples,
+        space=space,
+        members=((0,), (1,), (2,)),
+        label=lambda g: space.candidates[g],
+        others={},
+    )
+    (cause,) = causes(found, 0.0)
+    told = {c.place for c in (*cause.candidates, *cause.alternatives)}
+    assert cause.answer == "one of"
+    assert told == {"psg@14", "psg@15"}
+    assert cause.others == ()
+
+
+def slipped(first):
+    return Candidate(RotationSlip(), f"psg@{first}", (Parameter("slip", "degree", -45, 45, 1.0),), 0)

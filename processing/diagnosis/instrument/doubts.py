@@ -167,7 +167,7 @@ def _of_itself(
 
 def _is_one_name(cause: Cause) -> bool:
     """What is told as one of several is no name yet, and random values have no wave in their place."""
-    return not cause.alternatives and not isinstance(cause.candidates[0].effect, ValuePerState)
+    return not cause.others and not isinstance(cause.candidates[0].effect, ValuePerState)
 
 
 def _standing(problem: InstrumentProblem, solved: Solution, causes: Sequence[Cause]) -> list[Cause]:

@@ -39,6 +39,11 @@ class Cause:
     alternatives: tuple[Candidate, ...]
 
     @property
+    def others(self) -> tuple[Candidate, ...]:
+        """Alternatives that are another effect, not the same from another state on."""
+        return tuple(c for c in self.alternatives if c.family != self.candidates[0].family)
+
+    @property
     def answer(self) -> Answer:
         """How it is told."""
         if self.probability < LIKELY:
@@ -61,11 +66,7 @@ def causes(found: Posterior, left: float) -> tuple[Cause, ...]:
     for k in map(int, np.flatnonzero((state.tau > 0) & sets.free)):
         odds = sets.conditional(sets.without(state, k)).log_odds
         least = least_odds(odds[k], left / state.unit)
-        others = [
-            int(j)
-            for j in np.argsort(-odds)
-            if sets.free[j] and state.tau[j] == 0 and odds[j] > least and not _same_family(found, int(j), k)
-        ]
+        others = [int(j) for j in np.argsort(-odds) if sets.free[j] and state.tau[j] == 0 and odds[j] > least]
         candidates = tuple(found.space.candidates[m] for m in found.members[k])
         values, errors = [], []
         for m in found.members[k]:
@@ -74,7 +75,8 @@ def causes(found: Posterior, left: float) -> tuple[Cause, ...]:
             values.append(fit.mean[at] * typical[part])
             errors.append(fit.covariance[np.ix_(at, at)] * np.outer(typical[part], typical[part]))
         others += [j for j in found.others.get(k, ()) if j not in others]
-        members = [k, *others, *_alternatives_of_family(found, k)]
+        # From which state on it acts may be open where that it does is certain.
+        members = list(dict.fromkeys([k, *others, *_of_family(found, k)]))
         names = tuple(found.space.candidates[found.members[j][0]] for j in others)
         # The sets that were visited, and the odds beside the likeliest, each err on the sure side.
         total = float(np.logaddexp.reduce(odds[members]))
@@ -97,10 +99,6 @@ def least_odds(odds: float, left: float) -> float:
     return max(odds - max(ALTERNATIVE, ALIKE * odds, 0.5 * left), 0.0)
 
 
-def _same_family(found: Posterior, j: int, k: int) -> bool:
-    """Both are the same effect from one state on, or another."""
-    return found.label(j).family == found.label(k).family
-
-
-def _alternatives_of_family(found: Posterior, k: int) -> list[int]:
-    return [j for j in range(len(found.members)) if j != k and _same_family(found, j, k)]
+def _of_family(found: Posterior, k: int) -> list[int]:
+    """The same effect from one state on, or another."""
+    return [j for j in range(len(found.members)) if found.label(j).family == found.label(k).family]

@@ -6,7 +6,7 @@ from types import SimpleNamespace as Some
 import numpy as np
 from rule_decisions import Patch, cause, decides, made, one
 
-from processing.diagnosis.instrument import combinations, doubts, judge, source_patterns, telling
+from processing.diagnosis.instrument import combinations, doubts, outcome, source_patterns, telling
 from processing.diagnosis.search import causes
 from processing.diagnosis.search.causes import Cause
 from processing.diagnosis.search.space import Space
@@ -15,26 +15,26 @@ from processing.instrument.effects.base import ImageShift, SourceEffect, ValuePe
 
 @decides
 def test_limit(m: Patch) -> bool:
-    seen = [judge._structure(Some(noise_known=True), [Some(tests={"a": t})]) for t in (4.8, 5.2)]
+    seen = [outcome.has_structure(Some(noise_known=True), [Some(tests={"a": t})]) for t in (4.8, 5.2)]
     return seen == [False, True]
 
 
 @decides
 def test_limit_of_two(m: Patch) -> bool:
     """Two tests together are beyond chance where one of them is not."""
-    seen = [judge._structure(Some(noise_known=True), [Some(tests={"a": 4.0, "b": t})]) for t in (3.4, 3.6)]
+    seen = [outcome.has_structure(Some(noise_known=True), [Some(tests={"a": 4.0, "b": t})]) for t in (3.4, 3.6)]
     return seen == [False, True]
 
 
 def test_what_no_test_takes_for_structure_is_not_left():
     known, found = Some(noise_known=True), Some(tests={"a": 3.0, "b": -1.0}, left=50.0)
-    assert judge._left(known, found) == 0.0
-    assert judge._left(known, Some(tests={"a": 3.0, "b": 7.0}, left=50.0)) == 50.0
+    assert outcome.left_of(known, found) == 0.0
+    assert outcome.left_of(known, Some(tests={"a": 3.0, "b": 7.0}, left=50.0)) == 50.0
 
 
 @decides
 def test_white(m: Patch) -> bool:
-    turns = [judge._white(Some(mean=np.cos(2 * np.pi * t * np.arange(100) / 100))) for t in (19, 18)]
+    turns = [outcome.white(Some(mean=np.cos(2 * np.pi * t * np.arange(100) / 100))) for t in (19, 18)]
     return turns == [True, False]
 
 
@@ -241,7 +241,7 @@ def test_what_is_one_of_several_is_not_asked_whether_a_source_beats(monkeypatch)
     monkeypatch.setattr(doubts, "beat_explains_as_well", lambda *of: True)
     told, problem = cause(), Some(noise_known=True, captures=())
     solved = Some(space=Space(()))
-    either = replace(told, alternatives=(made(),))
+    either = replace(told, alternatives=(made(kind="another"),))
     reasons = [doubts._of_itself(problem, None, solved, c, [c], None) for c in (told, either)]
     assert reasons == [doubts.BEAT, None]
 

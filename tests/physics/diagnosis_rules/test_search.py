@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rule_decisions import QUIET, Asked, Patch, bench, decides, made
 
-from processing.diagnosis.instrument import judge, starts, whole_bench
+from processing.diagnosis.instrument import outcome, starts, whole_bench
 from processing.diagnosis.search import descent, down_to_noise, likely_set, posterior
 from processing.diagnosis.search.sets import Group, Quadratic, Sets, State
 from processing.diagnosis.search.space import Space, Sums
@@ -150,7 +150,7 @@ def test_needed(m: Patch) -> bool:
 
 @decides
 def test_growth(m: Patch) -> bool:
-    return judge._grown(np.array([1.06]), 1.0) and not judge._grown(np.array([1.04]), 1.0)
+    return outcome.grown(np.array([1.06]), 1.0) and not outcome.grown(np.array([1.04]), 1.0)
 
 
 @pytest.mark.parametrize(("unit", "kept"), [(330.0, 0), (1.02, 1)])

@@ -5,8 +5,9 @@ from types import SimpleNamespace as Some
 import numpy as np
 from rule_decisions import Patch, cause, decides, made
 
-from processing.diagnosis.instrument import cautious, empirical, guard, judge, whole_bench, wiring
+from processing.diagnosis.instrument import cautious, empirical, guard, whole_bench, wiring
 from processing.diagnosis.instrument.doubts import PART_OF_LEFT, WAVE, WAVE_AS_WELL
+from processing.diagnosis.instrument.names import Names, unfit
 from processing.diagnosis.search import causes
 from processing.diagnosis.search.result import Empirical
 from processing.diagnosis.search.sets import Quadratic
@@ -130,16 +131,15 @@ def test_also(m: Patch) -> bool:
 def test_beside_what_is_in_no_list_only_what_has_a_name_of_its_own_is_used() -> None:
     waved, named, likely, nameless = (made(kind=kind) for kind in ("waved", "named", "likely", "nameless"))
     field = made(FieldEffect)
-    told = [cause(candidate=c) for c in (waved, named, likely)]
+    told = tuple(cause(candidate=c) for c in (waved, named, likely))
     problem = Some(captures=[Some(sample=None, wavelength_nm=662.0)])
     solved = Some(effects=(waved, named, likely, nameless, field))
     doubt = {told[0]: WAVE, told[2]: PART_OF_LEFT}
-    assert judge._unfit(problem, solved, told, [], doubt) == [waved, likely, nameless]
-    assert judge._unfit(problem, solved, told, [], {told[2]: PART_OF_LEFT}) == []
+    assert unfit(problem, solved, Names(told, (), doubt)) == [waved, likely, nameless]
+    assert unfit(problem, solved, Names(told, (), {told[2]: PART_OF_LEFT})) == []
     # Where the wave only does as well, what stands beside both stays; as many values as the data have may be anything.
-    assert judge._unfit(problem, solved, told, [], {told[0]: WAVE_AS_WELL, told[2]: PART_OF_LEFT}) == [waved]
-    untold = told[0]
-    assert judge._unfit(problem, solved, told[1:], [untold], {told[2]: PART_OF_LEFT}) == [waved, likely, nameless]
+    assert unfit(problem, solved, Names(told, (), {told[0]: WAVE_AS_WELL, told[2]: PART_OF_LEFT})) == [waved]
+    assert unfit(problem, solved, Names(told[1:], told[:1], {told[2]: PART_OF_LEFT})) == [waved, likely, nameless]
     # A sample that is known takes up nothing.
     problem.captures[0].sample = "air"
-    assert judge._unfit(problem, solved, told, [], doubt) == []
+    assert unfit(problem, solved, Names(told, (), doubt)) == []
