@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -135,8 +135,24 @@ class Slopes:
         )
 
 
-def slopes_of(problem: InstrumentProblem, found: Posterior, solved: Solution) -> Slopes | None:
-    """Slopes of the values of a correction and of what may be there in their place; None where M follows none."""
+def predicted_change_of_each(
+    problem: InstrumentProblem, found: Posterior, solved: Solution
+) -> dict[str, PredictedChange]:
+    """What a correction does to each of several captures, by name; nothing is said of one by itself."""
+    out: dict[str, PredictedChange] = {}
+    for k, data in enumerate(problem.captures if len(problem.captures) > 1 else ()):
+        slopes = slopes_of(problem, found, solved, k)
+        if slopes is not None:
+            everything = np.ones(slopes.index.size, dtype=bool)
+            out[data.name] = slopes.predicted_change(found, slopes.given, everything)
+    return out
+
+
+def slopes_of(problem: InstrumentProblem, found: Posterior, solved: Solution, only: int | None = None) -> Slopes | None:
+    """Slopes of the values of a correction and of what may be there in their place; None where M follows none.
+
+    Of the pixels of all captures, or of `only` one.
+    """
     correction = {c for c in solved.effects if not isinstance(c.effect, FieldEffect | Switch)}
     if not correction:
         return None
@@ -147,7 +163,7 @@ def slopes_of(problem: InstrumentProblem, found: Posterior, solved: Solution) ->
         if c in correction or (not isinstance(c.effect, FieldEffect | Switch) and spread[p].any())
     }
     space, index = Space(tuple(part)), np.concatenate([*part.values()])
-    products, light = mueller_slopes(problem, space, found.values[index], _left(problem, solved))
+    products, light = mueller_slopes(problem, space, found.values[index], _left(problem, solved), only)
     given = dict(zip(solved.space.candidates, solved.space.slices, strict=True))
     return Slopes(
         index,
@@ -195,18 +211,35 @@ def predicted_change(given: Array, mean: Array, covariance: Array, products: Arr
     return PredictedChange(float(before), float(after), size, float(mean @ along) / max(size, 1e-300), stderr)
 
 
-def chances(here: PredictedChange, later: PredictedChange, lasting: bool) -> tuple[Check, ...]:
+def chances(
+    here: PredictedChange, later: PredictedChange, lasting: bool, each: Mapping[str, PredictedChange]
+) -> tuple[Check, ...]:
     """Error of M as the posterior expects it, and the chance that it grows: an explanation may be too vague to use.
 
-    What is too vague for later captures is written for these alone, where it takes part in more (`lasts`).
+    Of all captures together it decides. Of `each` of several it is told: a sample that hardly polarizes gains little
+    and may lose. What is too vague for later captures is written for these alone (`lasts`).
     """
     grows = "chance that the error of M/m00 grows"
     alone = "" if lasting else ", so it is written for these captures alone"
     return (
         Check(name="predicted error of M/m00, rms", before=here.before, after=here.after, holds=True),
-        Check(name=grows, before=0.0, after=here.chance_worse, holds=here.chance_worse <= CHANCE_WORSE),
-        Check(name=f"{grows} in later captures{alone}", before=0.0, after=later.chance_worse, holds=True),
+        Check(name=grows, before=0.0, after=_told(here), holds=here.chance_worse <= CHANCE_WORSE),
+        Check(name=f"{grows} in later captures{alone}", before=0.0, after=_told(later), holds=True),
+        *(
+            Check(
+                name=f"predicted error of M/m00 of {name}, rms, with a chance of {_told(change):.2g} to grow",
+                before=change.before,
+                after=change.after,
+                holds=True,
+            )
+            for name, change in each.items()
+        ),
     )
+
+
+def _told(change: PredictedChange) -> float:
+    """The chance that it makes M worse, with no more digits than a calibration can show."""
+    return round(change.chance_worse, 4)
 
 
 def lasts(later: PredictedChange, reasons: Collection[str] = ()) -> bool:

@@ -8,7 +8,14 @@ from dataclasses import dataclass
 from processing.diagnosis.instrument.cautious import cautious
 from processing.diagnosis.instrument.empirical import empirical
 from processing.diagnosis.instrument.evidence import wanted_for_evidence, would_be_seen
-from processing.diagnosis.instrument.guard import chances, checks, lasts, predicted_changes, refusal
+from processing.diagnosis.instrument.guard import (
+    chances,
+    checks,
+    lasts,
+    predicted_change_of_each,
+    predicted_changes,
+    refusal,
+)
 from processing.diagnosis.instrument.names import Names, names_of, unfit
 from processing.diagnosis.instrument.outcome import Outcome, left_of, outcome_of
 from processing.diagnosis.instrument.problem import InstrumentProblem
@@ -107,12 +114,15 @@ def _carefully(first: Outcome, names: Names) -> Outcome:
 def _guarded(used: Outcome, names: Names, wiring: Wiring | None) -> Guarded:
     asked, solved = used.asked, used.solved
     here, later = predicted_changes(asked, used.found, solved)
+    each = predicted_change_of_each(asked, used.found, solved)
     if not names.sure:
         left = sum(left_of(asked, r) for r in used.after)
-        here, later = (c.beside(left, solved.before.excess - solved.after.excess) for c in (here, later))
+        explained = solved.before.excess - solved.after.excess
+        here, later = (c.beside(left, explained) for c in (here, later))
+        each = {name: c.beside(left, explained) for name, c in each.items()}
     lasting = lasts(later, names.doubt.values())
     # Where there is nothing to apply, nothing is said of what it would do.
-    figures, chance = checks(asked, solved), chances(here, later, lasting) if solved.effects else ()
+    figures, chance = checks(asked, solved), chances(here, later, lasting, each) if solved.effects else ()
     refused = f"change this first: {wiring.told}" if wiring is not None else refusal((*figures, *chance))
     return Guarded((*figures, *chance), refused, lasting, refusal(figures) is None)
 

@@ -14,18 +14,20 @@ from processing.instrument.changes import Changes
 
 
 def mueller_slopes(
-    problem: InstrumentProblem, space: Space, values: Array, left: Array | None = None
+    problem: InstrumentProblem, space: Space, values: Array, left: Array | None = None, only: int | None = None
 ) -> tuple[Array, float]:
     """Products (16, K, K) of the derivatives of each element of M, and the sum of m00 squared, over all pixels.
 
-    The products are summed over the pixels, a common factor of M left out. `left` (captures,) is what the
-    intensities of each are known to, in units of noise (default: 1). What they do not tell of M, within the size of its
-    elements, is not made wrong by an instrument either.
+    The products are summed over the pixels of all captures, or of `only` one, a common factor of M left out. `left`
+    (captures,) is what the intensities of each are known to, in units of noise (default: 1). What they do not tell of
+    M, within the size of its elements, is not made wrong by an instrument either.
     """
     left = np.ones(len(problem.captures)) if left is None else left
     problem, values = problem.near(space, values)
     products, light = np.zeros((16, space.size, space.size)), 0.0
     for k, moments in enumerate(problem.moments):
+        if only not in (None, k):
+            continue
         acting = space.acting(k, problem.wavelengths_nm[k])
         mine, own = acting.space, acting.of(values)
         changes = problem.changes(k, mine, own)

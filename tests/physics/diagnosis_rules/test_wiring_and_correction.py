@@ -81,7 +81,7 @@ def test_worse(m: Patch) -> bool:
 
 def determined(size: float) -> bool:
     change = guard.PredictedChange(before=0.005, after=0.001, size=size, expected=size, stderr=0.001)
-    return guard.refusal(guard.chances(change, change, lasting=True)) is None
+    return guard.refusal(guard.chances(change, change, lasting=True, each={})) is None
 
 
 @decides
