@@ -178,6 +178,13 @@ def test_random_values_are_seldom_held_by_one_pattern():
     assert chance(np.where(k > 22, 0.8, -0.6) - 0.05 * k + 0.3 * random.standard_normal(40), information) < 0.01
 
 
+def test_random_values_that_drift_too_are_random():
+    """A lamp that flickers and warms up: an even drift is in the list, and values for each state take it up."""
+    k, random = np.arange(40), np.random.default_rng(2)
+    values = random.standard_normal(40) + 0.1 * (k - 19.5)
+    assert chance(values, 1e4 * np.eye(40)) > 0.1
+
+
 def test_random_gains_that_are_known_up_to_a_common_factor_are_random():
     """A factor that all gains share is taken up by the throughput: a constant is seen as the gains themselves."""
     gains = 0.003 * np.random.default_rng(4).standard_normal(40)

@@ -20,8 +20,8 @@ from processing.instrument.effects.base import SourceEffect, ValuePerState
 
 #: Frequencies of a wave over n states, for each state; and between two of them, where a wave is looked at closely.
 FREQUENCIES, CLOSELY = 8, 9
-#: Values of the largest pattern, a jump beside a drift and its bend.
-VALUES = 3
+#: Values of the largest pattern, beside a drift: a wave, or a jump and a bend.
+VALUES = 2
 
 
 def waves(cycles: Array, n: int) -> Array:
@@ -31,12 +31,11 @@ def waves(cycles: Array, n: int) -> Array:
 
 
 def jumps(n: int) -> Iterator[Array]:
-    """A jump beside a drift, (n, 3), at every state."""
+    """A jump beside the bend of a drift, (n, 2), at every state."""
     k = np.arange(n)
-    drift = np.stack([k / n, (k / n) ** 2], axis=1)
-    drift -= drift.mean(axis=0)
+    bend = (k / n) ** 2
     for first in range(2, n - 1):
-        yield np.column_stack([(k >= first) - 1 + first / n, drift])
+        yield np.column_stack([(k >= first) - 1 + first / n, bend - bend.mean()])
 
 
 def beat_explains_as_well(problem: InstrumentProblem, found: Posterior, cause: Cause) -> bool:
@@ -137,7 +136,7 @@ def chance_of_pattern(seen: Sequence[Patterned]) -> float:
 
 
 def patterned(values: Array, information: Array, covariance: Array) -> Patterned:
-    """What of values (N,) one sine over the states explains too, or a jump beside a drift.
+    """What of values (N,) one sine over the states explains too, or a jump and a bend, beside an even drift.
 
     `information` (N, N) is the curvature of the chi-square: patterns that the unknown sample takes up do not count.
     `covariance` (N, N) is that of the values, which shrink to their prior, and their noise with them.
@@ -146,15 +145,21 @@ def patterned(values: Array, information: Array, covariance: Array) -> Patterned
     power, vector = np.linalg.eigh(information)
     root = (vector * np.sqrt(np.maximum(power, 0.0))).T
     # All about their means: gains that all grow by one factor are taken up by the throughput, so that one constant for
-    # all is seen as these values themselves, with the other sign, and would be a pattern of any values.
+    # all is seen as these values themselves, with the other sign, and would be a pattern of any values. An even drift
+    # is in the list: values that are there anyway take it up, and it is no pattern of theirs.
+    drift = root @ (np.arange(n) / n - (n - 1) / (2 * n))
+    drift /= max(float(np.linalg.norm(drift)), 1e-300)
     seen = root @ (values - values.mean())
+    seen -= drift * (drift @ seen)
     kept = np.clip(np.linalg.eigvalsh(root @ covariance @ root.T), 0.0, 1.0)
     noise = float(kept @ kept)
     held = 0.0
     for pattern in (*waves(_cycles(n)[0], n), *jumps(n)):
-        u, size, _ = np.linalg.svd(root @ pattern, full_matrices=False)
+        beside = root @ pattern
+        beside -= np.outer(drift, drift @ beside)
+        u, size, _ = np.linalg.svd(beside, full_matrices=False)
         along = u[:, size > 1e-6 * size[0]].T @ seen
         held = max(held, float(along @ along))
-    # One direction is that of the mean.
-    directions = float(power.clip(0).sum() ** 2 / np.sum(power.clip(0) ** 2)) - 1
+    # One direction is that of the mean, one that of the drift.
+    directions = float(power.clip(0).sum() ** 2 / np.sum(power.clip(0) ** 2)) - 2
     return Patterned(held, float(seen @ seen) - noise, noise, directions, n)

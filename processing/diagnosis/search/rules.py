@@ -185,16 +185,16 @@ BOUND = 1e-3
 #: [log odds] By which a source that follows one wave has to fit better in a cause's place, for each capture: its
 #: frequency is free, which costs 7; what turns has two harmonics, two values more, and is the commoner fault.
 ONE_WAVE = 4.5
-#: [of their scatter] What a single wave, or a jump beside a drift, may hold of values that belong to one state each, if
-#: they are to be random; of a known sample, where they are what they are.
+#: [of their scatter] What a single wave, or one jump, beside a drift may hold of values that belong to one state each,
+#: if they are to be random; of a known sample, where they are what they are.
 ONE_PATTERN = 0.85
 #: [chance] That one of these holds as much of random values: below it they are not random, where an unknown sample may
 #: take up a part of them.
 CHANCE_OF_PATTERN = 0.01
 #: [of a shift, and of what is left at the edges] What sharp edges, which no fit saw, must show of an image that is said
 #: to move. Where it does they show 0.5 to 1.1 of it, and it explains 0.5 to 0.7 of what they do; of light that is
-#: added, or a spot that fades, one of the two is 0 to 0.25.
-EDGES = 0.35
+#: added, or a spot that fades, one of the two is 0 to 0.4.
+EDGES = 0.43
 #: [standard deviations] By which the size of an effect of source, optics or mechanics may differ over the image.
 UNEVEN = 6.0
 #: [of what it explains] The same, for a large effect.
