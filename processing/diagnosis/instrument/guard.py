@@ -227,7 +227,7 @@ def chances(
         Check(name=f"{grows} in later captures{alone}", before=0.0, after=_told(later), holds=True),
         *(
             Check(
-                name=f"predicted error of M/m00 of {name}, rms, with a chance of {_told(change):.2g} to grow",
+                name=f"predicted error of M/m00 of {name}, rms (it grows with a chance of {_in_words(change)})",
                 before=change.before,
                 after=change.after,
                 holds=True,
@@ -240,6 +240,10 @@ def chances(
 def _told(change: PredictedChange) -> float:
     """The chance that it makes M worse, with no more digits than a calibration can show."""
     return round(change.chance_worse, 4)
+
+
+def _in_words(change: PredictedChange) -> str:
+    return f"{_told(change):.2g}" if _told(change) > 0 else "less than 0.0001"
 
 
 def lasts(later: PredictedChange, reasons: Collection[str] = ()) -> bool:
