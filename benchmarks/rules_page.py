@@ -17,10 +17,19 @@ HEAD = """# Rules of the diagnosis
 
 Every constant by which `diagnose` decides, with its unit and its reason. This page is made of
 `processing/diagnosis/search/rules.py` by `python benchmarks/rules_page.py`. A test changes each by a fifth (a whole
-number by one) and holds that a decision is another one then (`tests/physics/diagnosis_rules`). Steps and
-tolerances of the fits, and sizes below which nothing can be told, stand beside the code that uses them.
+number by one) and holds that a decision is another one then (`tests/physics/diagnosis_rules`). [Last](#beside-the-code)
+stand numbers that are no such rule: steps and tolerances of the fits, sizes below which nothing can be told, memory.
+"""
+BESIDE = """
+## Beside the code
+
+Of all other files of `processing/diagnosis`: what a computer or a formula needs.
+
+| constant | value | where | what it is |
+|---|---|---|---|
 """
 CONSTANT = re.compile(r"((?:^#:[^\n]*\n)+)^([A-Z_]+) = (.+)$", re.MULTILINE)
+NUMBER = re.compile(r"([A-Z][A-Z_]+) = (-?[0-9][0-9_.e-]*|\(-?[0-9][0-9_.e, -]*\))$")
 SECTION = re.compile(r"^# ---- (.+?) -+$", re.MULTILINE)
 
 
@@ -39,7 +48,24 @@ def page() -> str:
         unit, _, reason = comment.removeprefix("[").partition("] ")
         value = m[3].removeprefix("np.array([").removesuffix("])")
         lines.append(f"| `{m[2]}` | {value} | {unit} | {reason} |\n")
-    return "".join(lines)
+    return "".join([*lines, BESIDE, *beside_the_code()])
+
+
+def beside_the_code() -> list[str]:
+    """A line for each number that has a name elsewhere in the diagnosis; those of one comment share it."""
+    lines = []
+    for file in sorted(SOURCE.parents[1].rglob("*.py")):
+        where, comment, old = file.relative_to(SOURCE.parents[1]).as_posix(), "", False
+        for line in file.read_text(encoding="utf-8").splitlines() if file != SOURCE else ():
+            if line.startswith("#:"):
+                comment, old = "" if old else comment, False
+                comment += line.removeprefix("#:")
+            elif named := NUMBER.match(line):
+                lines.append(f"| `{named[1]}` | {named[2]} | `{where}` | {comment.strip()} |\n")
+                old = True
+            else:
+                comment, old = "", False
+    return lines
 
 
 if __name__ == "__main__":

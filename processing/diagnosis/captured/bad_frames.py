@@ -16,6 +16,7 @@ from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.search.rules import AGAINST_NEXT, LEAST_MISFIT, MOST_BAD_FRAMES, MOSTLY
 
+#: Singular values below this, relative to the largest, are none.
 RANK = 1e-8
 #: States with most left over, of which pairs are tried in each other's place.
 SUSPECTS = 12

@@ -12,6 +12,7 @@ from processing.diagnosis.search.rules import DIM, FEWEST_DIM, NOISE_SURE
 
 #: Variance of a median over that of a mean.
 MEDIAN = np.pi / 2
+#: Singular values below this, relative to the largest, are none.
 RANK = 1e-8
 
 

@@ -13,6 +13,7 @@ from processing.diagnosis.search.rules import BEYOND_NOISE
 
 #: Robust standard deviations at which a residual is cut off before structure is looked for.
 CUT = 4.0
+#: Median of absolute values of normal ones, in standard deviations.
 NORMAL_MAD = 0.6745
 #: Pixels that tell a standard deviation to half a percent.
 PIXELS_OF_SCALE = 50_000

@@ -11,6 +11,7 @@ from processing.diagnosis.captured.capture_data import CaptureData
 
 #: Components of the states that count as signal: a Mueller matrix has 16 unknowns.
 COMPONENTS = 16
+#: Pixels that are looked at, and levels of the signal at which their scatter is told.
 PIXELS = 20_000
 LEVELS = 24
 

@@ -23,6 +23,7 @@ FEATURES = (
 )
 #: The last of them are derivatives of the image by position.
 DERIVATIVES = 5
+#: Signals below this have the logarithm of this.
 TINY = 1e-6
 NOTHING_SHARED = SharedNoise()
 #: Savitzky-Golay filters of seven points: value (third order), first and second derivative (fourth and fifth order).
@@ -30,6 +31,7 @@ VALUE = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21
 FIRST = np.array([22.0, -67.0, -58.0, 0.0, 58.0, 67.0, -22.0]) / 252
 SECOND = np.array([-13.0, 67.0, -19.0, -70.0, -19.0, 67.0, -13.0]) / 132
 FILTERS = (VALUE, FIRST, SECOND)
+#: Pixels at the rim that the filters do not reach.
 MARGIN = 3
 #: Order of each derivative down and across the image, as they stand in FEATURES.
 ORDERS = ((0, 1), (1, 0), (0, 2), (1, 1), (2, 0))

@@ -15,6 +15,7 @@ from processing.diagnosis.search.rules import FAR_OFF, NEAR_ENOUGH
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import ChannelLevels, SourceEffect, ValuePerState
 
+#: Places from which nominal values are fitted.
 STARTS = 24
 #: Half widths of the starts of nominal values, in degrees: azimuths, which come round again; retardances of plates of a
 #: known order, and of elements of which no more than "some retardance" is known.

@@ -23,6 +23,7 @@ from processing.instrument.changes import FIELD_TERMS, Changes, field_terms
 from processing.instrument.effects.base import ImageShift
 from processing.reduction.move_image import neighbour_noise
 
+#: Harmonics of a turn that are shown of a residual.
 HARMONICS = 4
 #: Pixels from which on tests by signal and by place are made.
 FEWEST_PIXELS = 30

@@ -15,6 +15,7 @@ from processing.diagnosis.search.sampling import Samples, sample
 from processing.diagnosis.search.sets import Group, Noise, Sets, State
 from processing.diagnosis.search.space import Space, Sums
 
+#: Steps of a descent.
 STEPS = 6
 #: Times that everything is linearized anew before groups are chosen.
 EXPANSIONS = 8

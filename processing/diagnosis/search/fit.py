@@ -15,6 +15,7 @@ from processing.instrument.effects.base import ValuePerState
 
 #: The prior that keeps unseen parameters still is this many times wider than a typical size.
 PRIOR_WIDTH = 10.0
+#: Steps of a fit.
 STEPS = 15
 #: What is held out is predicted to this fraction of the excess: a fit that ends earlier would still know it.
 MANY_STEPS, HELD_OUT_RELATIVE = 30, 1e-4

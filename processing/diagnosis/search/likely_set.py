@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from processing.diagnosis.search.rules import HOPE, NEEDED, PATIENCE
 from processing.diagnosis.search.sets import NEVER, Sets, State
 
+#: Changes of a set in one climb.
 STEPS = 60
 
 

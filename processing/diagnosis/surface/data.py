@@ -26,6 +26,7 @@ from processing.storage.capture import Capture
 
 #: Pixels of a capture that are used, evenly spread.
 MOST_PIXELS = 4000
+#: Below so many an object tells nothing.
 FEWEST_PIXELS = 100
 #: Rim that is left out, as part of the object's radius and in pixels of the camera: an object off its place, and
 #: interpolation of a mosaic, would mix object and background there.

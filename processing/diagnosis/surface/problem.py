@@ -26,6 +26,7 @@ from processing.instrument.model import InstrumentModel
 from processing.reflectance.changes import ReflectanceChanges
 from processing.reflectance.effects.base import MaterialEffect, ReflectanceEffect, reflectance_effects
 
+#: Step of a derivative, in typical sizes.
 STEP = 1e-4
 #: Smooth patterns over an object that a misfit can have: up to second order in the position.
 PATTERNS = 6

@@ -18,3 +18,9 @@ def test_every_constant_has_its_decision() -> None:
 
 def test_the_page_lists_them_as_they_are() -> None:
     assert rules_page.PAGE.read_text(encoding="utf-8") == rules_page.page()
+
+
+def test_every_other_number_says_what_it_is() -> None:
+    told = [line.strip().strip("|").split("|") for line in rules_page.beside_the_code()]
+    assert len(told) > 50
+    assert [cells[0] for cells in told if len(cells) != 4 or not cells[3].strip()] == []
