@@ -11,7 +11,11 @@ from processing.diagnosis.instrument.doubts import LAG, TURN, TURN_AS_WELL, WAVE
 from processing.diagnosis.instrument.nameless import Nameless
 from processing.diagnosis.instrument.nameless_effects import ImageLag, TurningSample, WaveOfAPlate
 from processing.diagnosis.instrument.run import diagnose_captures
+from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.result import Diagnosis
+from processing.instrument.effects.psa_retardance import PsaRetardance
+from processing.instrument.effects.psg_retardance import PsgRetardance
+from processing.instrument.effects.source_flicker import SourceFlicker
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture_schema import Sample
 from simulators.blind.outside_list import ghost, image_lag, lamp_jump
@@ -105,39 +109,44 @@ def test_a_lamp_that_jumps_is_no_source_that_drifts(configs, tmp_path, bench):
 
 
 @pytest.mark.parametrize(
-    ("named", "odds", "wave", "turn", "lag", "one_name", "reason"),
+    ("named", "odds", "wave", "turn", "lag", "told", "reason"),
     [
-        (100.0, 5.0, 120.0, 0.0, 0.0, True, WAVE),
-        (100.0, 5.0, 99.0, 0.0, 0.0, True, WAVE_AS_WELL),
-        (100.0, 5.0, 93.0, 0.0, 0.0, True, WAVE_AS_WELL),
-        (100.0, 5.0, 90.0, 0.0, 0.0, True, None),
-        (100.0, 5.0, 120.0, 0.0, 0.0, False, None),
-        (100.0, 5.0, 99.0, 120.0, 0.0, True, TURN),
-        (100.0, 5.0, 0.0, 120.0, 0.0, False, TURN),
-        (100.0, 5.0, 0.0, 105.0, 0.0, True, TURN_AS_WELL),
-        (100.0, 5.0, 0.0, 93.0, 0.0, True, TURN_AS_WELL),
-        (100.0, 5.0, 0.0, 105.0, 105.0, False, None),
-        (100.0, 5.0, 0.0, 0.0, 110.0, False, LAG),
-        (100.0, 5.0, 120.0, 0.0, 121.0, True, LAG),
+        (100.0, 5.0, 120.0, 0.0, 0.0, "one", WAVE),
+        (100.0, 5.0, 99.0, 0.0, 0.0, "one", WAVE_AS_WELL),
+        (100.0, 5.0, 93.0, 0.0, 0.0, "one", WAVE_AS_WELL),
+        (100.0, 5.0, 90.0, 0.0, 0.0, "one", None),
+        (100.0, 5.0, 120.0, 0.0, 0.0, "states", None),
+        (100.0, 5.0, 120.0, 0.0, 0.0, "set", WAVE),
+        (100.0, 5.0, 99.0, 0.0, 0.0, "set", None),
+        (100.0, 5.0, 99.0, 120.0, 0.0, "one", TURN),
+        (100.0, 5.0, 0.0, 120.0, 0.0, "set", TURN),
+        (100.0, 5.0, 0.0, 105.0, 0.0, "one", TURN_AS_WELL),
+        (100.0, 5.0, 0.0, 93.0, 0.0, "one", TURN_AS_WELL),
+        (100.0, 5.0, 0.0, 105.0, 105.0, "set", None),
+        (100.0, 5.0, 0.0, 0.0, 110.0, "set", LAG),
+        (100.0, 5.0, 120.0, 0.0, 121.0, "one", LAG),
         # Forty values cost eighty, but not those that are as small as they are.
-        (-20.0, 60.0, 0.0, 0.0, 30.0, False, None),
-        (-20.0, 5.0, 0.0, 0.0, 30.0, False, LAG),
+        (-20.0, 60.0, 0.0, 0.0, 30.0, "states", None),
+        (-20.0, 5.0, 0.0, 0.0, 30.0, "states", LAG),
         # What explains nothing is not there in the place of what explains little.
-        (10.0, 5.0, 5.0, 5.0, 0.0, True, None),
+        (10.0, 5.0, 5.0, 5.0, 0.0, "one", None),
     ],
 )
-def test_no_name_is_sure_beside_what_explains_nearly_as_much(named, odds, wave, turn, lag, one_name, reason):
+def test_no_name_is_sure_beside_what_explains_nearly_as_much(named, odds, wave, turn, lag, told, reason):
     def explaining(chi_square):
         values = 1 if chi_square >= 0 else 40
         return np.eye(values), np.full(values, math.sqrt((chi_square + 80 * (values > 1)) / values))
 
-    cause = SimpleNamespace(candidates=("named",), alternatives=(), log_odds=odds)
+    effect = SourceFlicker() if told == "states" else PsgRetardance()
+    mine = Candidate(effect, "", ())
+    others = (Candidate(PsaRetardance(), "", ()),) if told == "set" else ()
+    cause = SimpleNamespace(candidates=(mine,), alternatives=others, others=others, log_odds=odds)
     nameless = Nameless.__new__(Nameless)
-    nameless._labels, nameless._state = ["named"], None
+    nameless._labels, nameless._state = [mine, *others], None
     nameless._choice = {}
-    nameless._groups = {WaveOfAPlate: range(1, 2), TurningSample: range(2, 3), ImageLag: range(3, 4)}
+    nameless._groups = {WaveOfAPlate: range(2, 3), TurningSample: range(3, 4), ImageLag: range(4, 5)}
     nameless._sets = SimpleNamespace(
         without=lambda state, group: state,
-        given_others=lambda state: [explaining(x) for x in (named, wave, turn, lag)],
+        given_others=lambda state: [explaining(x) for x in (named, 0.0, wave, turn, lag)],
     )
-    assert _in_its_place(nameless.gains_over(cause), one_name) == reason
+    assert _in_its_place(nameless.gains_over(cause), cause) == reason

@@ -95,7 +95,7 @@ def doubts(
     for cause in causes:
         reason = STANDS if cause in still else _of_itself(problem, found, solved, cause, causes, even)
         if reason is None and nameless is not None:
-            reason = _in_its_place(nameless.gains_over(cause), _is_one_name(cause))
+            reason = _in_its_place(nameless.gains_over(cause), cause)
         if reason is not None:
             out[cause] = reason
         if reason == PATTERN:
@@ -124,18 +124,23 @@ def doubts(
     return out
 
 
-def _in_its_place(gains: Mapping[type[InstrumentEffect], float], one_name: bool) -> str | None:
+def _in_its_place(gains: Mapping[type[InstrumentEffect], float], cause: Cause) -> str | None:
     """The reason where something that has no name gains so much over a cause; of two that are as likely none is sure.
 
-    What is told as one of several, and values for each state, are no one name yet: no wave is asked in their place, and
-    what else there is has to be sure.
+    What is told as one of several is no one name yet: a wave has to explain more than any of them, and what else there
+    is has to be sure. So it has to beside values for each state, in whose place no wave is asked.
     """
-    asked = {kind: gain for kind, gain in gains.items() if one_name or (kind is not WaveOfAPlate and gain > STANDS_OUT)}
+    least = dict.fromkeys(IN_ITS_PLACE, -STANDS_OUT if _is_one_name(cause) else STANDS_OUT)
+    if cause.others:
+        least[WaveOfAPlate] = 0.0
+    if isinstance(cause.candidates[0].effect, ValuePerState):
+        least[WaveOfAPlate] = np.inf
+    asked = {kind: gain for kind, gain in gains.items() if gain > least[kind]}
     best = max(asked, key=lambda kind: asked[kind], default=None)
-    if best is None or asked[best] <= -STANDS_OUT:
+    if best is None:
         return None
-    least, more, as_well = IN_ITS_PLACE[best]
-    return more if asked[best] > least else as_well
+    from_here, more, as_well = IN_ITS_PLACE[best]
+    return more if asked[best] > from_here else as_well
 
 
 def _of_itself(
