@@ -23,7 +23,8 @@ stand numbers that are no such rule: steps and tolerances of the fits, sizes bel
 BESIDE = """
 ## Beside the code
 
-Of all other files of `processing/diagnosis`: what a computer or a formula needs.
+Of all other files of `processing/diagnosis`: steps, memory, formulas, and the least data that can tell anything. No test
+changes these one by one.
 
 | constant | value | where | what it is |
 |---|---|---|---|
@@ -54,9 +55,9 @@ def page() -> str:
 def beside_the_code() -> list[str]:
     """A line for each number that has a name elsewhere in the diagnosis; those of one comment share it."""
     lines = []
-    for file in sorted(SOURCE.parents[1].rglob("*.py")):
+    for file in sorted(set(SOURCE.parents[1].rglob("*.py")) - {SOURCE}):
         where, comment, old = file.relative_to(SOURCE.parents[1]).as_posix(), "", False
-        for line in file.read_text(encoding="utf-8").splitlines() if file != SOURCE else ():
+        for line in file.read_text(encoding="utf-8").splitlines():
             if line.startswith("#:"):
                 comment, old = "" if old else comment, False
                 comment += line.removeprefix("#:")

@@ -223,8 +223,8 @@ def chances(
     alone = "" if lasting else ", so it is written for these captures alone"
     return (
         Check(name="predicted error of M/m00, rms", before=here.before, after=here.after, holds=True),
-        Check(name=grows, before=0.0, after=_told(here), holds=here.chance_worse <= CHANCE_WORSE),
-        Check(name=f"{grows} in later captures{alone}", before=0.0, after=_told(later), holds=True),
+        Check(name=grows, before=0.0, after=_rounded(here), holds=here.chance_worse <= CHANCE_WORSE),
+        Check(name=f"{grows} in later captures{alone}", before=0.0, after=_rounded(later), holds=True),
         *(
             Check(
                 name=f"predicted error of M/m00 of {name}, rms (it grows with a chance of {_in_words(change)})",
@@ -237,13 +237,13 @@ def chances(
     )
 
 
-def _told(change: PredictedChange) -> float:
+def _rounded(change: PredictedChange) -> float:
     """The chance that it makes M worse, with no more digits than a calibration can show."""
     return round(change.chance_worse, 4)
 
 
 def _in_words(change: PredictedChange) -> str:
-    return f"{_told(change):.2g}" if _told(change) > 0 else "less than 0.0001"
+    return f"{_rounded(change):.2g}" if _rounded(change) > 0 else "less than 0.0001"
 
 
 def lasts(later: PredictedChange, reasons: Collection[str] = ()) -> bool:

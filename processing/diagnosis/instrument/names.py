@@ -59,8 +59,7 @@ def unfit(problem: InstrumentProblem, solved: Solution, names: Names) -> list[Ca
     """What is not used where an unknown sample takes up a part of it, for it may be any structure or a part of such."""
     # Values that are not random, or as many as the data have; and those of a source that were found beside them.
     reasons = (*ELSE, *AS_WELL, BESIDE_PATTERN)
-    causes = [*names.untold, *(cause for cause, reason in names.doubt.items() if reason in reasons)]
-    found = _candidates(causes)
+    found = _candidates([*names.untold, *(cause for cause, reason in names.doubt.items() if reason in reasons)])
     if names.untold or any(reason in ELSE for reason in names.doubt.values()):
         # Something is there that is not in the list: only what has a name of its own is no part of it.
         own = set(_candidates([cause for cause in names.named if cause not in names.doubt]))
@@ -70,5 +69,5 @@ def unfit(problem: InstrumentProblem, solved: Solution, names: Names) -> list[Ca
     return [c for c in dict.fromkeys(found) if acts_on_unknown(problem, c)]
 
 
-def _candidates(causes: Sequence[Cause]) -> list[Candidate]:
-    return [c for cause in causes for c in (*cause.candidates, *cause.alternatives)]
+def _candidates(of: Sequence[Cause]) -> list[Candidate]:
+    return [c for cause in of for c in (*cause.candidates, *cause.alternatives)]
