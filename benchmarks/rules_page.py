@@ -23,8 +23,8 @@ stand numbers that are no such rule: steps and tolerances of the fits, sizes bel
 BESIDE = """
 ## Beside the code
 
-Of all other files of `processing/diagnosis`: steps, memory, formulas, and the least data that can tell anything. No test
-changes these one by one.
+Of all other files of `processing/diagnosis`: steps, memory, formulas, and the least data that can tell anything. No
+test changes these one by one.
 
 | constant | value | where | what it is |
 |---|---|---|---|
