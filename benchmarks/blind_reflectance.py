@@ -23,7 +23,7 @@ import numpy as np
 
 from processing.diagnosis.search.fit import held_out, minimize
 from processing.diagnosis.search.space import Space
-from processing.diagnosis.surface.judge import DEGENERACY, SurfaceDiagnosis
+from processing.diagnosis.surface.diagnose import DEGENERACY, SurfaceDiagnosis
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.diagnosis.surface.run import diagnose_object
 from processing.instrument.model import InstrumentModel

@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from processing.diagnosis.instrument.residual_file import StoredResidual, read_residuals
 from processing.diagnosis.instrument_file import write_instrument
 from processing.diagnosis.search.result import Diagnosis
-from processing.diagnosis.surface.judge import SurfaceDiagnosis
+from processing.diagnosis.surface.diagnose import SurfaceDiagnosis
 from processing.diagnosis.surface.write import write_surface
 from processing.doors import read_json, read_text
 from processing.errors import ProcessError
@@ -70,8 +70,7 @@ class Story:
     @property
     def writes(self) -> bool:
         """Whether a file could hold something of what was found."""
-        found = self.diagnosis
-        return bool(found.effects) if isinstance(found, SurfaceDiagnosis) else found.corrects
+        return self.diagnosis.corrects
 
 
 class Diagnoses:

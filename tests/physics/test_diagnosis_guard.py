@@ -5,7 +5,8 @@ import pytest
 
 from processing.diagnosis.instrument.cautious import less_far
 from processing.diagnosis.instrument.doubts import OF_THE_SAMPLE, PART_OF_LEFT, TURN
-from processing.diagnosis.instrument.guard import NOTHING, chances, lasts, predicted_change, predicted_change_of_part
+from processing.diagnosis.instrument.guard import chances, lasts, predicted_change_of_part
+from processing.diagnosis.search.guard import NOTHING, predicted_change
 
 
 def test_chance_that_m_gets_worse_is_that_of_draws_from_the_posterior() -> None:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from measured_points import ReflectanceProblem
 
+from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.fit import held_out
 from processing.diagnosis.search.own_minima import OwnMinima
 from processing.diagnosis.search.space import Space
@@ -50,7 +51,7 @@ def test_first_surface_alone_lacks_polarized_diffuse(sphere):
     search = OwnMinima(problem, lambda line: None)
     found = search.run()
     assert [c.kind for c in found.space.candidates] == ["polarized_diffuse"]
-    (cause,) = search.causes(found, 0.0).values()
+    (cause,) = causes(search.posterior(found), 0.0)
     assert cause.answer == "sure"
     a, log_b = found.fit.values
     assert a == pytest.approx(constants.a, abs=0.02)

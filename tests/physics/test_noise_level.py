@@ -10,7 +10,7 @@ from bench_capture import read
 
 from processing.diagnosis.captured.screening import screened
 from processing.diagnosis.instrument import whole_bench
-from processing.diagnosis.instrument.judge import diagnose
+from processing.diagnosis.instrument.diagnose import diagnose
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.instrument.effects.field_retardance import FieldRetardance

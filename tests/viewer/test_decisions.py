@@ -5,7 +5,7 @@ import json
 import pytest
 
 from processing.diagnosis.search.result import Correction, Diagnosis, Error, FoundEffect
-from processing.diagnosis.surface.judge import SurfaceDiagnosis
+from processing.diagnosis.surface.diagnose import SurfaceDiagnosis
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import AppliedEffect, InstrumentModel
 from processing.reflectance.base import load_reflectance
@@ -131,9 +131,11 @@ def surface_diagnosed(lab, drr_capture, configs):
         FoundEffect(kind="arm_zero", element=None, parameters=arm, confident=True, **found),
         FoundEffect(kind="refractive_index", element=None, parameters={}, confident=True, **found),
     )
+    applied = tuple(AppliedEffect(kind=e.kind, parameters=e.parameters) for e in effects)
     diagnosis = SurfaceDiagnosis(
         **FOUND,
         effects=effects,
+        correction=Correction(effects=applied),
         recommendation="",
         material="red 3D print",
         constants={"n": 1.4, "k": 0.1, "a": 0.2, "b": 2.0},

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import typer
 
-from processing.diagnosis.surface.judge import SurfaceDiagnosis
+from processing.diagnosis.surface.diagnose import SurfaceDiagnosis
 from processing.doors import require_new
 from processing.errors import ProcessError
 

@@ -1,13 +1,12 @@
-"""Nothing is written that makes a measurement worse: figures before and after a correction."""
+"""What a correction of an instrument does to its captures, and to the Mueller matrices of these and later ones."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from processing.arrays import Array
 from processing.diagnosis.instrument.doubts import CHANGED
@@ -15,30 +14,26 @@ from processing.diagnosis.instrument.mueller_slopes import mueller_slopes
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.systematic import ELEMENTS
 from processing.diagnosis.search.fit import Fit
+from processing.diagnosis.search.guard import (
+    NOTHING,
+    PredictedChange,
+    chance_checks,
+    held_out_check,
+    predicted_change,
+    rows_checks,
+)
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.result import Check
-from processing.diagnosis.search.rules import CHANCE_WORSE, LEAST_CHANGE, WORSE, WORSE_CONDITION
+from processing.diagnosis.search.rules import CHANCE_WORSE
 from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.search.stored import scope_of
 from processing.instrument.effects.base import FieldEffect, Switch
 
-#: Singular values below this, relative to the largest, are none.
-RANK = 1e-6
-
 
 def checks(problem: InstrumentProblem, solved: Solution) -> tuple[Check, ...]:
     """Held-out residual, rank and condition of W, before and after: if one gets worse, it is no explanation."""
-    stretch = _stretch(problem, solved)
-    before, after = 100 * solved.before.rms, 100 * solved.after.rms / stretch
-    out = [
-        Check(
-            name="rms on held-out data, percent of the mean signal",
-            before=before,
-            after=after,
-            holds=bool(after <= WORSE * before),
-        )
-    ]
+    out = [held_out_check(solved, _stretch(problem, solved))]
     several = len(problem.captures) > 1
     for k, data in enumerate(problem.captures):
         if several:
@@ -46,57 +41,14 @@ def checks(problem: InstrumentProblem, solved: Solution) -> tuple[Check, ...]:
             old, new = (100 * found.rms_of(k) for found in (solved.before, solved.after))
             name = f"rms on held-out data of {data.name} at {data.wavelength_nm:g} nm, percent"
             out.append(Check(name=name, before=old, after=new, holds=True))
-        (rank, condition), (new_rank, new_condition) = (
-            _of_rows(problem, k, space, fit)
-            for space, fit in ((solved.base, solved.before_fit), (solved.space, solved.fit))
-        )
-        where = f"of the measurement matrix of {data.name}"
-        out.append(Check(name=f"rank {where}", before=rank, after=new_rank, holds=new_rank >= rank))
-        out.append(
-            Check(
-                name=f"condition {where}",
-                before=condition,
-                after=new_condition,
-                holds=bool(new_condition <= WORSE_CONDITION * condition),
-            )
+        out += rows_checks(
+            data.name,
+            *(
+                _rows(problem, k, space, fit)
+                for space, fit in ((solved.base, solved.before_fit), (solved.space, solved.fit))
+            ),
         )
     return tuple(out)
-
-
-@dataclass(frozen=True)
-class PredictedChange:
-    """What a correction does to M/m00, as the posterior expects it; all rms over pixels and elements.
-
-    Attributes
-    ----------
-    before, after : error without and with the correction.
-    size : of the change; expected, stderr : how far the true one goes along it, and the standard error of that.
-    """
-
-    before: float
-    after: float
-    size: float
-    expected: float
-    stderr: float
-
-    @property
-    def chance_worse(self) -> float:
-        """Chance that the error grows: that the true change goes less than half as far along this one."""
-        if self.size <= LEAST_CHANGE:
-            return 0.0
-        beyond = self.expected - self.size / 2
-        return float(ndtr(-beyond / self.stderr)) if self.stderr > 0 else float(beyond < 0)
-
-    def beside(self, left: float, explained: float) -> PredictedChange:
-        """Where no cause is beyond doubt and structure is left: as wrong, along itself, as that is to what it explains.
-
-        `left` and `explained` are chi-squares, of which the roots are amounts.
-        """
-        wrong = np.sqrt(left / explained) if explained > 0 else 1.0
-        return replace(self, stderr=float(np.hypot(self.stderr, wrong * self.size)))
-
-
-NOTHING = PredictedChange(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def predicted_changes(problem: InstrumentProblem, found: Posterior, solved: Solution) -> tuple[PredictedChange, ...]:
@@ -198,19 +150,6 @@ def predicted_change_of_part(
     return min(told, key=lambda one: one.chance_worse)
 
 
-def predicted_change(given: Array, mean: Array, covariance: Array, products: Array) -> PredictedChange:
-    """Of values `given` (K,), where the true ones have a mean (K,) and a covariance (K, K).
-
-    `products` (K, K) of the slopes of M/m00, averaged.
-    """
-    left = max(float(np.sum(products * covariance)), 0.0)
-    along, missed = products @ given, mean - given
-    size = float(np.sqrt(max(float(given @ along), 0.0)))
-    stderr = float(np.sqrt(max(float(along @ covariance @ along), 0.0))) / max(size, 1e-300)
-    before, after = (np.sqrt(left + max(float(v @ products @ v), 0.0)) for v in (mean, missed))
-    return PredictedChange(float(before), float(after), size, float(mean @ along) / max(size, 1e-300), stderr)
-
-
 def chances(
     here: PredictedChange, later: PredictedChange, lasting: bool, each: Mapping[str, PredictedChange]
 ) -> tuple[Check, ...]:
@@ -219,12 +158,12 @@ def chances(
     Of all captures together it decides. Of `each` of several it is told: a sample that hardly polarizes gains little
     and may lose. What is too vague for later captures is written for these alone (`lasts`).
     """
-    grows = "chance that the error of M/m00 grows"
+    predicted, grows = chance_checks("M/m00", here)
     alone = "" if lasting else ", so it is written for these captures alone"
     return (
-        Check(name="predicted error of M/m00, rms", before=here.before, after=here.after, holds=True),
-        Check(name=grows, before=0.0, after=_rounded(here), holds=here.chance_worse <= CHANCE_WORSE),
-        Check(name=f"{grows} in later captures{alone}", before=0.0, after=_rounded(later), holds=True),
+        predicted,
+        grows,
+        Check(name=f"{grows.name} in later captures{alone}", before=0.0, after=later.told, holds=True),
         *(
             Check(
                 name=f"predicted error of M/m00 of {name}, rms (it grows with a chance of {_in_words(change)})",
@@ -237,13 +176,8 @@ def chances(
     )
 
 
-def _rounded(change: PredictedChange) -> float:
-    """The chance that it makes M worse, with no more digits than a calibration can show."""
-    return round(change.chance_worse, 4)
-
-
 def _in_words(change: PredictedChange) -> str:
-    return f"{_rounded(change):.2g}" if _rounded(change) > 0 else "less than 0.0001"
+    return f"{change.told:.2g}" if change.told > 0 else "less than 0.0001"
 
 
 def lasts(later: PredictedChange, reasons: Collection[str] = ()) -> bool:
@@ -252,12 +186,6 @@ def lasts(later: PredictedChange, reasons: Collection[str] = ()) -> bool:
     Where the sample changed, what is found of the instrument may be a part of that.
     """
     return later.chance_worse <= CHANCE_WORSE and not any(reason in CHANGED for reason in reasons)
-
-
-def refusal(found: tuple[Check, ...]) -> str | None:
-    """Why a correction is not written, in words; None if every figure holds."""
-    worse = [f"{c.name}: {c.before:.4g} to {c.after:.4g}" for c in found if not c.holds]
-    return "it would make worse: " + "; ".join(worse) if worse else None
 
 
 def _stretch(problem: InstrumentProblem, solved: Solution) -> float:
@@ -270,9 +198,6 @@ def _stretch(problem: InstrumentProblem, solved: Solution) -> float:
     return float(np.sqrt(new / old)) if old > 0 else 1.0
 
 
-def _of_rows(problem: InstrumentProblem, k: int, space: Space, fit: Fit) -> tuple[int, float]:
+def _rows(problem: InstrumentProblem, k: int, space: Space, fit: Fit) -> Array:
     changes = problem.changes(k, space, fit.values)
-    w = problem.models[k].rows(problem.captures[k].conditions.angles_deg, changes).reshape(-1, 16)
-    size = np.linalg.svd(w, compute_uv=False)
-    size = size[size > RANK * size[0]]
-    return size.size, float(size[0] / size[-1])
+    return problem.models[k].rows(problem.captures[k].conditions.angles_deg, changes).reshape(-1, 16)

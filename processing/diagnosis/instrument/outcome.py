@@ -9,9 +9,10 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.structure import Residual, beyond_chance, residual
+from processing.diagnosis.instrument.structure import Residual, residual
 from processing.diagnosis.instrument.whole_bench import WholeBench, predicts, solution
 from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.judge import beyond_chance
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import GROWTH, WHITE
 from processing.diagnosis.search.solution import Solution

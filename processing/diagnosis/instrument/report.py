@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.instrument.judge import Judged
+from processing.diagnosis.instrument.diagnose import Judged
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import add_response
 from processing.diagnosis.instrument.structure import HARMONICS, Residual

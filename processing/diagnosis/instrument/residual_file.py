@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.diagnosis.instrument.judge import Judged
+from processing.diagnosis.instrument.diagnose import Judged
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.errors import ProcessError
 from processing.storage.h5_door import DAMAGE

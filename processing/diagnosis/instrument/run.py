@@ -9,7 +9,7 @@ from processing.computing.blas import one_blas_thread
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.captured.screening import screened
-from processing.diagnosis.instrument.judge import Judged, diagnose
+from processing.diagnosis.instrument.diagnose import Judged, diagnose
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.posterior import Say
 from processing.instrument.model import InstrumentModel

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,8 +16,8 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import add_response
 from processing.diagnosis.instrument.tile_rows import tile_columns
 from processing.diagnosis.search.fit import Fit
+from processing.diagnosis.search.judge import beyond_chance
 from processing.diagnosis.search.linearized import deviation_of
-from processing.diagnosis.search.rules import LIMIT, LIMIT_OF_TWO
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import FIELD_TERMS, Changes, field_terms
 from processing.instrument.effects.base import ImageShift
@@ -287,13 +287,6 @@ def descriptions(names: Sequence[str], left: Sequence[Residual]) -> tuple[str, .
         for name, found in zip(names, left, strict=True)
         for line in description(found)
     )
-
-
-def beyond_chance(tests: Mapping[str, float]) -> dict[str, float]:
-    """The tests of a capture that are beyond chance, one by itself or two together; the largest first."""
-    in_order = sorted(tests.items(), key=lambda item: -item[1])
-    two = dict(item for item in in_order if item[1] > LIMIT_OF_TWO)
-    return two if len(two) > 1 else dict(item for item in in_order if item[1] > LIMIT)
 
 
 def description(found: Residual) -> list[str]:

@@ -7,17 +7,17 @@ import numpy as np
 from processing.diagnosis.instrument.closure import closure
 from processing.diagnosis.instrument.combinations import combinations
 from processing.diagnosis.instrument.doubts import PART_OF_LEFT
-from processing.diagnosis.instrument.evidence import information
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.structure import Residual
 from processing.diagnosis.instrument.systematic import Uncertain, systematic_error
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Answer, Cause, shown
+from processing.diagnosis.search.evidence import information
 from processing.diagnosis.search.fit import HeldOut
+from processing.diagnosis.search.judge import Judgement
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.result import (
     CaptureReport,
-    Check,
     Correction,
     Error,
     FoundEffect,
@@ -132,8 +132,7 @@ def correction(
     found: Posterior,
     solved: Solution,
     any_cause: bool,
-    guard: tuple[Check, ...],
-    refused: str | None,
+    judgement: Judgement,
     lasts: bool,
     used: Solution,
 ) -> Correction:
@@ -159,15 +158,15 @@ def correction(
                 )
             )
     # Values that are merely nominal are nowhere near what is true.
-    known = refused is None or not solved.base.size
+    known = judgement.refused is None or not solved.base.size
     uncertain = systematic_error(problem, found, used) if known else None
     return Correction(
         effects=tuple(effects),
         systematic=None if uncertain is None else uncertain.error,
         mueller=None if uncertain is None else _mueller_error(uncertain),
         combinations=combinations(found, solved) if any_cause else (),
-        checks=guard,
-        refused=refused,
+        checks=judgement.checks,
+        refused=judgement.refused,
     )
 
 

@@ -58,30 +58,29 @@ def causes(found: Posterior, left: float) -> tuple[Cause, ...]:
 
     `left` is the chi-square of what no cause explains: less than that does not tell two of them apart.
     """
-    sets, samples = found.sets, found.samples
-    state = samples.best
-    fit = sets.fitted(state)
-    typical = found.space.joined("typical")
+    state, (values, covariance) = found.samples.best, found.of_likeliest()
     out = []
-    for k in map(int, np.flatnonzero((state.tau > 0) & sets.free)):
-        odds = sets.conditional(sets.without(state, k)).log_odds
+    for k in found.there:
+        odds = found.in_place_of(k)
         least = least_odds(odds[k], left / state.unit)
-        others = [int(j) for j in np.argsort(-odds) if sets.free[j] and state.tau[j] == 0 and odds[j] > least]
-        candidates = tuple(found.space.candidates[m] for m in found.members[k])
-        values, errors = [], []
-        for m in found.members[k]:
-            part = found.space.slices[m]
-            at = np.flatnonzero((fit.active >= part.start) & (fit.active < part.stop))
-            values.append(fit.mean[at] * typical[part])
-            errors.append(fit.covariance[np.ix_(at, at)] * np.outer(typical[part], typical[part]))
+        rivals = found.sets.free & (state.tau == 0) & (odds > least)
+        others = [int(j) for j in np.argsort(-odds) if rivals[j]]
         others += [j for j in found.others.get(k, ()) if j not in others]
+        parts = [found.space.slices[m] for m in found.members[k]]
         # From which state on it acts may be open where that it does is certain.
         members = list(dict.fromkeys([k, *others, *_of_family(found, k)]))
-        names = tuple(found.space.candidates[found.members[j][0]] for j in others)
         # The sets that were visited, and the odds beside the likeliest, each err on the sure side.
         total = float(np.logaddexp.reduce(odds[members]))
-        probability = min(samples.any_of(members), float(1 / (1 + np.exp(-np.clip(total, -50, 50)))))
-        out.append(Cause(candidates, tuple(values), tuple(errors), probability, float(odds[k]), names))
+        out.append(
+            Cause(
+                candidates=tuple(found.space.candidates[m] for m in found.members[k]),
+                values=tuple(values[p] for p in parts),
+                covariance=tuple(covariance[p, p] for p in parts),
+                probability=min(found.samples.any_of(members), float(1 / (1 + np.exp(-np.clip(total, -50, 50))))),
+                log_odds=float(odds[k]),
+                alternatives=tuple(found.space.candidates[found.members[j][0]] for j in others),
+            )
+        )
     return tuple(sorted(out, key=lambda c: -c.log_odds))
 
 

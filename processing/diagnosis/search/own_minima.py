@@ -7,20 +7,20 @@ gains; then every group of the likeliest set is exchanged for every other that p
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.causes import Cause, least_odds
 from processing.diagnosis.search.fit import Fit, minimize
 from processing.diagnosis.search.likely_set import retune
 from processing.diagnosis.search.linearized import grouped, noise_of, quadratic
-from processing.diagnosis.search.posterior import Say
+from processing.diagnosis.search.posterior import Posterior, Say
 from processing.diagnosis.search.problem import Problem
 from processing.diagnosis.search.rules import BOUND, EXPLAINS, HOPE, IMITATES, LEADERS
+from processing.diagnosis.search.sampling import Samples
 from processing.diagnosis.search.sets import Group, Sets, State
 from processing.diagnosis.search.space import Space
 
@@ -52,6 +52,12 @@ class Visited:
         edge = np.minimum(self.fit.values - lower, upper - self.fit.values)
         return bool(np.any(edge < BOUND * (upper - lower)))
 
+    @property
+    def covariance(self) -> Array:
+        """Covariance (K, K) of its values, in the units of the parameters."""
+        typical = self.space.joined("typical")
+        return self.sets.fitted(self.state).covariance * np.outer(typical, typical)
+
     def score_at(self, unit: float) -> float:
         """Log probability with a given unit of chi-square, a constant left out."""
         return self.sets.score_at(self.state, unit)
@@ -62,15 +68,15 @@ class OwnMinima:
 
     Attributes
     ----------
-    members : candidates of each group.
+    whole : all candidates; members : numbers of those of each group.
     visited : every set that was looked at.
     """
 
     def __init__(self, problem: Problem, say: Say) -> None:
         self.problem, self.say = problem, say
         self.whole = Space(problem.pool())
-        members, self.groups = grouped(self.whole, ())
-        self.members = [[self.whole.candidates[k] for k in mine] for mine in members]
+        self.members, self.groups = grouped(self.whole, ())
+        self._part = dict(zip(self.whole.candidates, self.whole.slices, strict=True))
         nothing = Space(())
         self.noise = noise_of(problem, problem.sums(nothing, np.zeros(0), derivatives=False))
         self.visited: dict[frozenset[int], Visited] = {}
@@ -86,10 +92,14 @@ class OwnMinima:
             best = best if other is best else self._climbed(other)
         return best
 
+    def candidates_of(self, group: int) -> list[Candidate]:
+        """The candidates of one group."""
+        return [self.whole.candidates[m] for m in self.members[group]]
+
     def at(self, groups: frozenset[int], near: Visited | None = None) -> Visited:
         """A set at its own minimum; the fit begins at the values of a set that is near."""
         if groups not in self.visited:
-            space = Space(tuple(c for g in sorted(groups) for c in self.members[g]))
+            space = Space(tuple(c for g in sorted(groups) for c in self.candidates_of(g)))
             start, unit = ({}, 1.0) if near is None else (values_of(near), near.state.unit)
             begin = np.concatenate([np.zeros(0), *(start.get(c, np.zeros(c.size)) for c in space.candidates)])
             self.visited[groups] = self._visit(groups, space, self._deepest(space, begin, unit))
@@ -102,7 +112,9 @@ class OwnMinima:
     def _visit(self, groups: frozenset[int], space: Space, fit: Fit) -> Visited:
         part = dict(zip(space.candidates, space.slices, strict=True))
         here = [
-            Group(np.concatenate([np.r_[part[c]] for c in self.members[g]]), self.groups[g].share)
+            Group(
+                np.concatenate([np.r_[part[self.whole.candidates[m]]] for m in self.members[g]]), self.groups[g].share
+            )
             for g in sorted(groups)
         ]
         # At a bound, or where a valley is too flat to follow, slopes are left; nothing can be gained by them.
@@ -177,37 +189,54 @@ class OwnMinima:
         order = [int(g) for g in np.argsort(-odds) if g not in here.groups and odds[g] > HOPE]
         return order[:LEADERS]
 
-    def causes(self, best: Visited, left: float) -> dict[int, Cause]:
-        """The groups of a set as causes, by number; `left` is the chi-square that nothing explains."""
-        unit = best.state.unit
-        odds = {g: self._odds(g, best, unit) for g in best.groups}
-        likely = np.exp([min(v.score_at(unit) - best.score_at(unit), 0.0) for v in self.visited.values()])
-        likely /= likely.sum()
-        fitted, typical = best.sets.fitted(best.state), best.space.joined("typical")
-        part = dict(zip(best.space.candidates, best.space.slices, strict=True))
-        out = {}
-        for g, mine in odds.items():
-            least = least_odds(mine[g], left / unit)
-            others = sorted((j for j in mine if j != g and mine[j] > least), key=lambda j: -mine[j])
-            seen = [not v.groups.isdisjoint({g, *others}) for v in self.visited.values()]
-            total = float(np.logaddexp.reduce([mine[j] for j in (g, *others)]))
-            out[g] = Cause(
-                candidates=tuple(self.members[g]),
-                values=tuple(best.fit.values[part[c]] for c in self.members[g]),
-                covariance=tuple(
-                    fitted.covariance[part[c], part[c]] * np.outer(typical[part[c]], typical[part[c]])
-                    for c in self.members[g]
-                ),
-                probability=min(float(likely @ seen), float(1 / (1 + np.exp(-np.clip(total, -50, 50))))),
-                log_odds=mine[g],
-                alternatives=tuple(self.members[j][0] for j in others),
-            )
+    def posterior(self, here: Visited) -> PosteriorOfMinima:
+        """What speaks for each group of a set, with every set that was visited at its own minimum."""
+        (sets, state), typical, unit = self.beside(here), self.whole.joined("typical"), here.state.unit
+        odds = {g: self._odds(g, here, unit) for g in here.groups}
+        visited = list(self.visited.values())
+        weight = np.exp([min(v.score_at(unit) - here.score_at(unit), 0.0) for v in visited])
+        weight /= weight.sum()
+        there = np.array([[g in v.groups for g in range(len(self.groups))] for v in visited])
+        index = np.concatenate([np.zeros(0, dtype=int), *(np.r_[self._part[c]] for c in here.space.candidates)])
+        values, covariance = np.zeros(typical.size), np.zeros((typical.size, typical.size))
+        values[index] = here.fit.values
+        covariance[np.ix_(index, index)] = here.covariance
+        return PosteriorOfMinima(
+            space=self.whole,
+            members=self.members,
+            sets=sets,
+            samples=Samples(
+                weight @ there, values / typical, covariance / np.outer(typical, typical), there, weight, state
+            ),
+            values=values,
+            covariance=covariance,
+            others={},
+            odds=odds,
+        )
+
+    def _odds(self, group: int, here: Visited, unit: float) -> Array:
+        """Log odds (G,) of a group of a set, and of each that was tried in its place, of being there."""
+        out = np.full(len(self.groups), -np.inf)
+        without = self.at(here.groups - {group}, here).score_at(unit)
+        for g, v in self.in_place_of(group, here).items():
+            out[g] = v.score_at(unit) - without
         return out
 
-    def _odds(self, group: int, best: Visited, unit: float) -> dict[int, float]:
-        """Log odds of a group, and of others in its place, of being there."""
-        without = self.at(best.groups - {group}, best).score_at(unit)
-        return {g: v.score_at(unit) - without for g, v in self.in_place_of(group, best).items()}
+
+@dataclass(frozen=True)
+class PosteriorOfMinima(Posterior):
+    """The posterior where every set has a minimum of its own; values and covariance are those of one set.
+
+    `odds` : by a group of it, log odds (G,) of every group in its place, each at its own minimum.
+    """
+
+    odds: Mapping[int, Array]
+
+    def in_place_of(self, group: int) -> Array:
+        return self.odds[group]
+
+    def of_likeliest(self) -> tuple[Array, Array]:
+        return self.values, self.covariance
 
 
 def log_odds(one: Visited, other: Visited) -> float:

@@ -68,6 +68,22 @@ class Posterior:
         """Log probability of the likeliest set, a constant left out."""
         return self.sets.fitted(self.samples.best).score
 
+    @property
+    def there(self) -> list[int]:
+        """Groups of the likeliest set that might be absent."""
+        return [int(k) for k in np.flatnonzero((self.samples.best.tau > 0) & self.sets.free)]
+
+    def in_place_of(self, group: int) -> Array:
+        """Log odds (G,) of every group to be there in the place of one of the likeliest set, its own among them."""
+        return self.sets.conditional(self.sets.without(self.samples.best, group)).log_odds
+
+    def of_likeliest(self) -> tuple[Array, Array]:
+        """Values (K,) and covariance (K, K) of the likeliest set alone, in the units of the parameters."""
+        typical, fit = self.space.joined("typical"), self.sets.fitted(self.samples.best)
+        values, covariance = np.zeros(typical.size), np.zeros((typical.size, typical.size))
+        values[fit.active], covariance[np.ix_(fit.active, fit.active)] = fit.mean, fit.covariance
+        return values * typical, covariance * np.outer(typical, typical)
+
     def label(self, group: int) -> Candidate:
         """A candidate that stands for a group."""
         return self.space.candidates[self.members[group][0]]

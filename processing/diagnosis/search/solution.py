@@ -35,3 +35,8 @@ class Solution:
     def effects(self) -> tuple[Candidate, ...]:
         """Effects of the correction."""
         return self.space.candidates[len(self.base.candidates) :]
+
+    @property
+    def undone(self) -> Solution:
+        """Nothing corrected."""
+        return Solution(self.base, self.before_fit, self.before, self.base, self.before_fit, self.before)

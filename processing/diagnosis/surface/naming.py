@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.causes import Cause
+from processing.diagnosis.search.causes import Cause, causes
 from processing.diagnosis.search.fit import LEAST_GAIN, Fit, held_out, minimize
 from processing.diagnosis.search.own_minima import OwnMinima, Visited
 from processing.diagnosis.search.rules import IMITATES, LIKELY
@@ -23,12 +23,13 @@ def named_causes(search: OwnMinima, likeliest: Visited) -> tuple[Visited, tuple[
     """The set of what can be named, the most certain first: the weakest is taken away while one may be imitated."""
     here = likeliest
     while here.groups:
-        found = search.causes(here, search.left(here))
-        weakest = min(found, key=lambda g: found[g].log_odds)
-        if not _doubted(search, here, found[weakest]):
-            return here, tuple(sorted(found.values(), key=lambda c: -c.log_odds))
-        search.say(f"{found[weakest].candidates[0].label} may be a part of something else")
-        here = search.at(here.groups - {weakest}, here)
+        found = causes(search.posterior(here), search.left(here))
+        weakest = found[-1]
+        if not _doubted(search, here, weakest):
+            return here, found
+        search.say(f"{weakest.candidates[0].label} may be a part of something else")
+        (group,) = (g for g in here.groups if search.candidates_of(g)[0] == weakest.candidates[0])
+        here = search.at(here.groups - {group}, here)
     return here, ()
 
 

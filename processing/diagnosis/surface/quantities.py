@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict
 
 from processing.arrays import Array
 from processing.diagnosis.search.space import Space
-from processing.diagnosis.surface.problem import SurfaceProblem
+from processing.diagnosis.surface.problem import Pixels, SurfaceProblem
 from processing.polarization.cloude import xi0_and_dominant
 from processing.polarization.image_difference import linear_diattenuation, magnitude, orientation_difference, rmsd
 
@@ -36,11 +36,7 @@ class Quantities(BaseModel):
 def quantities(problem: SurfaceProblem, k: int, space: Space, values: Array) -> tuple[Quantities, Array]:
     """What the model with these values says of a capture, and xi0 of its pixels (P,)."""
     here, data = problem.pixels(k, space, values), problem.captures[k]
-    total = here.alpha_0 + here.alpha_id
-    with np.errstate(divide="ignore", invalid="ignore"):
-        xi0 = (here.alpha_0 + here.alpha_id / 4) / total
-        # Where the model modulates little, xi0 is noise.
-        xi0[here.strength * total < LEAST_SIGNAL] = np.nan
+    xi0 = _xi0(here)
     good = xi0[np.isfinite(xi0)]
     ideal = data.y - here.residual * problem.sigma[k]
     drawn = np.random.default_rng(0).normal(ideal, problem.sigma[k])
@@ -54,6 +50,20 @@ def quantities(problem: SurfaceProblem, k: int, space: Space, values: Array) -> 
         unphysical=float(np.mean((good < 0.25) | (good > 1))) if good.size else float("nan"),
     )
     return said, xi0
+
+
+def xi0_of(problem: SurfaceProblem, k: int, space: Space, values: Array) -> Array:
+    """xi0 (P,) of the pixels of a capture by the model with these values; NaN where it is noise."""
+    return _xi0(problem.pixels(k, space, values))
+
+
+def _xi0(here: Pixels) -> Array:
+    total = here.alpha_0 + here.alpha_id
+    with np.errstate(divide="ignore", invalid="ignore"):
+        xi0 = (here.alpha_0 + here.alpha_id / 4) / total
+        # Where the model modulates little, xi0 is noise.
+        xi0[here.strength * total < LEAST_SIGNAL] = np.nan
+    return np.asarray(xi0, dtype=float)
 
 
 def dominant_errors(

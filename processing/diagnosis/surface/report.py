@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.search.space import Space
-from processing.diagnosis.surface.judge import SurfaceJudged
+from processing.diagnosis.surface.diagnose import SurfaceJudged
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.diagnosis.surface.quantities import dominant_errors, quantities
 from processing.reports.colours import SIGNED

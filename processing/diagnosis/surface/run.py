@@ -9,7 +9,7 @@ from typing import Any
 from processing.computing.blas import one_blas_thread
 from processing.diagnosis.search.posterior import Say
 from processing.diagnosis.surface.data import SurfaceData, read_surface
-from processing.diagnosis.surface.judge import SurfaceJudged, diagnose_surface
+from processing.diagnosis.surface.diagnose import SurfaceJudged, diagnose_surface
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel

@@ -8,12 +8,11 @@ from typing import Any
 from pydantic import BaseModel
 
 from processing.diagnosis.instrument_file import WriteError, file_head
-from processing.diagnosis.search.result import FoundEffect
-from processing.diagnosis.surface.judge import SurfaceDiagnosis
+from processing.diagnosis.surface.diagnose import SurfaceDiagnosis
 from processing.doors import require_new
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.applied_effects import instrument_effects
-from processing.instrument.model import AppliedEffect, InstrumentModel
+from processing.instrument.model import InstrumentModel
 from processing.reflectance import first_surface, polarized_diffuse
 from processing.reflectance.effects.base import GeometryEffect, MaterialEffect, reflectance_effects
 from processing.whole_file import write_new_text
@@ -37,7 +36,7 @@ def corrected_material(
 
 def corrected_geometry(view: ViewingGeometry, diagnosis: SurfaceDiagnosis) -> ViewingGeometry:
     """The geometry with the sphere and the arm's zero where they were found."""
-    for effect in diagnosis.effects:
+    for effect in diagnosis.applied():
         values = {name: float(p.value) for name, p in effect.parameters.items() if not isinstance(p.value, tuple)}
         known = reflectance_effects().get(effect.kind)
         if isinstance(known, GeometryEffect):
@@ -48,20 +47,6 @@ def corrected_geometry(view: ViewingGeometry, diagnosis: SurfaceDiagnosis) -> Vi
 def targets(path: Path) -> tuple[Path, Path, Path]:
     """Files for the material, the geometry and the instrument."""
     return path, path.with_suffix(".geometry.yaml"), path.with_suffix(".instrument.yaml")
-
-
-def _applied(effect: FoundEffect, diagnosis: SurfaceDiagnosis) -> AppliedEffect:
-    """An effect of the instrument as its file stores it."""
-    return AppliedEffect(
-        kind=effect.kind,
-        element=effect.element,
-        parameters=effect.parameters,
-        evidence=effect.evidence,
-        captures=tuple(c.name for c in diagnosis.captures) if effect.capture is None else (effect.capture,),
-        scope=effect.scope,
-        wavelength_nm=diagnosis.wavelengths_nm[0],
-        indistinguishable_from=effect.indistinguishable_from,
-    )
 
 
 def write_surface(
@@ -81,12 +66,14 @@ def write_surface(
 
     Raises
     ------
-    WriteError : nothing was found that a file could hold.
+    WriteError : nothing was found that a file could hold, or the correction is refused.
     ProcessError : one of the files exists.
     """
-    kinds = {e.kind for e in diagnosis.effects}
+    if diagnosis.correction is not None and diagnosis.correction.refused is not None:
+        raise WriteError(f"{path} was not written: {diagnosis.correction.refused}.")
+    kinds = {e.kind for e in diagnosis.applied()}
     of_surface = [effect for kind, effect in reflectance_effects().items() if kind in kinds]
-    of_instrument = tuple(_applied(e, diagnosis) for e in diagnosis.effects if e.kind in instrument_effects())
+    of_instrument = tuple(e for e in diagnosis.applied() if e.kind in instrument_effects())
     models: list[tuple[Path, BaseModel]] = []
     for_material, for_geometry, for_instrument = targets(path)
     if any(isinstance(e, MaterialEffect) for e in of_surface):

@@ -8,7 +8,7 @@ from rule_decisions import QUIET, Asked, Patch, cause, decides
 from processing.diagnosis.search import own_minima
 from processing.diagnosis.search.sets import State
 from processing.diagnosis.surface import data as surface_data
-from processing.diagnosis.surface import judge as surface_judge
+from processing.diagnosis.surface import diagnose
 
 
 def own(**known: object) -> own_minima.OwnMinima:
@@ -40,21 +40,20 @@ def test_explains(m: Patch) -> bool:
 
 @decides
 def test_left_over(m: Patch) -> bool:
-    return [surface_judge._explains([], [{"a": 1000.0}], [{"a": y}]) for y in (28.0, 32.0)] == [True, False]
+    return [diagnose._explains([], [{"a": 1000.0}], [{"a": y}]) for y in (28.0, 32.0)] == [True, False]
 
 
 @decides
 def test_most_effects(m: Patch) -> bool:
     nothing = [{"a": 0.0}]
-    said = [surface_judge._verdict([cause()] * n, nothing, nothing) for n in (3, 4)]
-    return said == ["explained", "unexplained"]
+    return [diagnose._explained_by_few([cause()] * n, nothing, nothing) for n in (3, 4)] == [True, False]
 
 
 @decides
 def test_as_likely(m: Patch) -> bool:
     problem = Some(captures=[0], rows=lambda k, changes: np.eye(4, 16), changes=lambda *a: (None, None))
     before = [Some(excess=1.0, freedom=1.0, rms=rms) for rms in (0.020, 0.0225)]
-    return [surface_judge._degeneracy_in_doubt(problem, Some(before=b, base=None)) for b in before] == [True, False]
+    return [diagnose._degeneracy_in_doubt(problem, Some(before=b, base=None)) for b in before] == [True, False]
 
 
 @decides

@@ -5,7 +5,8 @@ from types import SimpleNamespace as Some
 import numpy as np
 from rule_decisions import Patch, decides, made
 
-from processing.diagnosis.instrument import evidence, recommend, telling
+from processing.diagnosis.instrument import recommend, telling
+from processing.diagnosis.search import evidence
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.sets import Group, Quadratic
 from processing.diagnosis.search.space import Space

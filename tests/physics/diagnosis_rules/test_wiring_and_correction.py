@@ -9,6 +9,7 @@ from processing.diagnosis.instrument import cautious, empirical, guard, whole_be
 from processing.diagnosis.instrument.doubts import PART_OF_LEFT, WAVE, WAVE_AS_WELL
 from processing.diagnosis.instrument.names import Names, unfit
 from processing.diagnosis.search import causes
+from processing.diagnosis.search import guard as search_guard
 from processing.diagnosis.search.result import Empirical
 from processing.diagnosis.search.sets import Quadratic
 from processing.diagnosis.search.space import Space
@@ -67,21 +68,23 @@ def test_shares(m: Patch) -> bool:
     return takes_part(m, [0.5, 0.009, 0.011], cause()) == ["0", "2"]
 
 
-def guarded(m: Patch, rms: float, condition: float) -> bool:
-    solved = Some(before=Some(rms=1.0), after=Some(rms=rms), base=None, before_fit=None, space="new", fit=None)
-    m.setattr(guard, "_stretch", lambda problem, solved: 1.0)
-    m.setattr(guard, "_of_rows", lambda problem, k, space, fit: (16, condition if space == "new" else 1.0))
-    return all(c.holds for c in guard.checks(Some(captures=[Some(name="a")]), solved))
+def guarded(rms: float, condition: float) -> bool:
+    solved = Some(before=Some(rms=1.0), after=Some(rms=rms))
+    figures = (
+        search_guard.held_out_check(solved),
+        *search_guard.rows_checks("a", np.eye(2), np.diag([1, 1 / condition])),
+    )
+    return search_guard.refusal(figures) is None
 
 
 @decides
 def test_worse(m: Patch) -> bool:
-    return guarded(m, 1.0019, 1.0) and not guarded(m, 1.0021, 1.0)
+    return guarded(1.0019, 1.0) and not guarded(1.0021, 1.0)
 
 
 def determined(size: float) -> bool:
-    change = guard.PredictedChange(before=0.005, after=0.001, size=size, expected=size, stderr=0.001)
-    return guard.refusal(guard.chances(change, change, lasting=True, each={})) is None
+    change = search_guard.PredictedChange(before=0.005, after=0.001, size=size, expected=size, stderr=0.001)
+    return search_guard.refusal(guard.chances(change, change, lasting=True, each={})) is None
 
 
 @decides
@@ -91,7 +94,9 @@ def test_chance_worse(m: Patch) -> bool:
 
 @decides
 def test_least_change(m: Patch) -> bool:
-    small = [guard.PredictedChange(1e-4, 1e-4, size=size, expected=size, stderr=1e-4) for size in (1.9e-5, 2.1e-5)]
+    small = [
+        search_guard.PredictedChange(1e-4, 1e-4, size=size, expected=size, stderr=1e-4) for size in (1.9e-5, 2.1e-5)
+    ]
     return [change.chance_worse > 0.4 for change in small] == [False, True]
 
 
@@ -104,7 +109,7 @@ def test_as_good_as(m: Patch) -> bool:
 
 @decides
 def test_worse_condition(m: Patch) -> bool:
-    return guarded(m, 1.0, 1.4) and not guarded(m, 1.0, 1.6)
+    return guarded(1.0, 1.4) and not guarded(1.0, 1.6)
 
 
 def without_name(m: Patch, *left: float) -> Empirical | None:

@@ -10,27 +10,31 @@ import numpy as np
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause
+from processing.diagnosis.search.evidence import wanted_for_evidence, would_be_seen
+from processing.diagnosis.search.judge import Judgement, beyond_chance
 from processing.diagnosis.search.own_minima import OwnMinima, Visited
 from processing.diagnosis.search.posterior import Say
 from processing.diagnosis.search.result import (
     CaptureReport,
+    Correction,
     Diagnosis,
     Error,
     FoundEffect,
     Ranked,
     Unexplained,
-    Verdict,
 )
 from processing.diagnosis.search.rules import AS_LIKELY, LEFT_OVER, LIMIT, MOST_EFFECTS, SEEN
 from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.search.stored import parameters_of
+from processing.diagnosis.surface.guard import chances, checks
 from processing.diagnosis.surface.naming import named_causes, roughness, solution
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.diagnosis.surface.quantities import Quantities, quantities
 from processing.diagnosis.surface.recommend import recommended
 from processing.diagnosis.surface.standard_errors import standard_errors
 from processing.diagnosis.surface.structure import structure
+from processing.instrument.model import AppliedEffect
 from processing.polarization.image_difference import rmsd
 
 CONFIRM = (
@@ -62,59 +66,103 @@ class SurfaceJudged:
 def diagnose_surface(problem: SurfaceProblem, material: str, say: Say) -> SurfaceJudged:
     """Search, test what is left, and judge."""
     search = OwnMinima(problem, say)
-    captures = range(len(problem.captures))
     likeliest, nothing = search.run(), search.at(frozenset())
     say("testing what is left over")
-    before, at_best = ([structure(problem, k, v.space, v.fit.values) for k in captures] for v in (nothing, likeliest))
+    before, at_best = (_tests(problem, v.space, v.fit.values) for v in (nothing, likeliest))
     here, named = nothing, tuple[Cause, ...]()
     if _explains(likeliest.space.candidates, before, at_best):
         here, named = named_causes(search, likeliest)
     solved = solution(problem, search, here)
-    after = [structure(problem, k, solved.space, solved.fit.values) for k in captures]
-    verdict = _verdict(named, before, after)
-    ranking = _ranking(search)
-    tried: tuple[str, ...] = ()
-    if verdict == "unexplained":
-        tried = tuple(c.label for c in likeliest.space.candidates) or tuple(r.candidate for r in ranking[:5])
-        named, after = (), before
-        solved = Solution(solved.base, solved.before_fit, solved.before, solved.base, solved.before_fit, solved.before)
-    rivals = [c for cause in named if cause.alternatives for c in (*cause.candidates, *cause.alternatives)]
-    lines = tuple(
-        f"{problem.captures[k].name}: {name}, {value:.0f} standard deviations above noise"
-        for k in captures
-        for name, value in after[k].items()
-        if value > LIMIT
+    after = _tests(problem, solved.space, solved.fit.values)
+    if not _explained_by_few(named, before, after):
+        here, named, solved, after = nothing, (), solved.undone, before
+    judgement = Judgement(
+        named=bool(named),
+        sure=bool(named),
+        structure=any(beyond_chance(tests) for tests in after),
+        seen=bool(would_be_seen(search.posterior(nothing))),
+        figures=checks(problem, solved),
+        chances=chances(problem, solved, here.covariance),
     )
+    kept = judgement.kept(solved, bool(named))
+    return _told(problem, material, search, judgement, _Found(likeliest, here, named, solved, kept), before)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """The likeliest set, the one that is named and its causes; its correction, and what of it is applied."""
+
+    likeliest: Visited
+    here: Visited
+    named: tuple[Cause, ...]
+    solved: Solution
+    kept: Solution
+
+
+def _told(
+    problem: SurfaceProblem,
+    material: str,
+    search: OwnMinima,
+    judgement: Judgement,
+    found: _Found,
+    before: Sequence[dict[str, float]],
+) -> SurfaceJudged:
+    kept, verdict, captures = found.kept, judgement.verdict, range(len(problem.captures))
+    after, named = _tests(problem, kept.space, kept.fit.values), found.named
+    ranking = _ranking(search)
+    rivals = [c for cause in named if cause.alternatives for c in (*cause.candidates, *cause.alternatives)]
     first, last = (
         [quantities(problem, k, space, fit.values) for k in captures]
-        for space, fit in ((solved.base, solved.before_fit), (solved.space, solved.fit))
+        for space, fit in ((kept.base, kept.before_fit), (kept.space, kept.fit))
     )
-    in_doubt = _degeneracy_in_doubt(problem, solved)
+    in_doubt = _degeneracy_in_doubt(problem, found.solved)
+    effects = _effects(problem, found, in_doubt)
     diagnosis = SurfaceDiagnosis(
         verdict=verdict,
-        error_before=_error(problem, solved.before.rms, solved.before.chi2_reduced),
-        error_after=_error(problem, solved.after.rms, solved.after.chi2_reduced),
+        error_before=_error(problem, kept.before.rms, kept.before.chi2_reduced),
+        error_after=_error(problem, kept.after.rms, kept.after.chi2_reduced),
         noise_floor_percent=100 * noise_floor(problem),
-        effects=_effects(problem, solved, named, here.state.unit, in_doubt),
-        unobservable=_unobservable(search, here),
-        recommendation=recommended(problem, solved.space, solved.fit, rivals, verdict, before)
+        effects=effects,
+        unobservable=_unobservable(search, found.here),
+        recommendation=wanted_for_evidence(problem)
+        if verdict == "undetermined"
+        else recommended(problem, kept.space, kept.fit, rivals, verdict, before)
         + (CONFIRM if named and in_doubt else ""),
-        unexplained=None
-        if verdict in ("consistent", "explained")
-        else Unexplained(description=lines, tried=tried, empirical=None),
+        unexplained=_unexplained(problem, found.likeliest, after, ranking)
+        if verdict in ("unexplained", "partly_explained")
+        else None,
         calibrated={},
         ranking=ranking,
         captures=tuple(_capture(problem, k, before[k], after[k]) for k in captures),
         instrument=problem.model.name,
         wavelengths_nm=(problem.captures[0].wavelength_nm,),
         simulated=any(c.simulated for c in problem.captures),
+        correction=Correction(
+            effects=tuple(_applied(problem, e) for e in effects), checks=judgement.checks, refused=judgement.refused
+        ),
         material=material,
-        constants=constants(problem, solved.space, solved.fit.values),
+        constants=constants(problem, kept.space, kept.fit.values),
         quantities_before=tuple(q for q, _ in first),
         quantities_after=tuple(q for q, _ in last),
         xi0_change=tuple(rmsd(b[np.isfinite(b)]) for b in (y - x for (_, x), (_, y) in zip(first, last, strict=True))),
     )
-    return SurfaceJudged(diagnosis, solved)
+    return SurfaceJudged(diagnosis, kept)
+
+
+def _tests(problem: SurfaceProblem, space: Space, values: Array) -> list[dict[str, float]]:
+    return [structure(problem, k, space, values) for k in range(len(problem.captures))]
+
+
+def _unexplained(
+    problem: SurfaceProblem, likeliest: Visited, after: Sequence[dict[str, float]], ranking: Sequence[Ranked]
+) -> Unexplained:
+    lines = tuple(
+        f"{data.name}: {name}, {value:.0f} standard deviations above noise"
+        for data, tests in zip(problem.captures, after, strict=True)
+        for name, value in beyond_chance(tests).items()
+    )
+    tried = tuple(c.label for c in likeliest.space.candidates) or tuple(r.candidate for r in ranking[:5])
+    return Unexplained(description=lines, tried=tried, empirical=None)
 
 
 def constants(problem: SurfaceProblem, space: Space, values: Array) -> dict[str, float]:
@@ -131,13 +179,10 @@ def noise_floor(problem: SurfaceProblem) -> float:
     return float(np.sqrt(np.mean(parts)))
 
 
-def _verdict(named: Sequence[Cause], before: Sequence[dict[str, float]], after: Sequence[dict[str, float]]) -> Verdict:
-    left = any(value > LIMIT for tests in after for value in tests.values())
-    if not named:
-        return "unexplained" if left else "consistent"
-    if len(named) > MOST_EFFECTS or not _explains([c for cause in named for c in cause.candidates], before, after):
-        return "unexplained"
-    return "partly_explained" if left else "explained"
+def _explained_by_few(
+    named: Sequence[Cause], before: Sequence[dict[str, float]], after: Sequence[dict[str, float]]
+) -> bool:
+    return len(named) <= MOST_EFFECTS and _explains([c for one in named for c in one.candidates], before, after)
 
 
 def _explains(
@@ -164,10 +209,9 @@ def _error(problem: SurfaceProblem, rms: float, chi2: float) -> Error:
     return Error(rms_percent=100 * rms, chi2_reduced=chi2, held_out=problem.held_out)
 
 
-def _effects(
-    problem: SurfaceProblem, solved: Solution, named: Sequence[Cause], unit: float, in_doubt: bool
-) -> tuple[FoundEffect, ...]:
-    error = standard_errors(problem, solved.space, solved.fit, unit)
+def _effects(problem: SurfaceProblem, found: _Found, in_doubt: bool) -> tuple[FoundEffect, ...]:
+    solved = found.solved
+    error = standard_errors(problem, solved.space, solved.fit, found.here.state.unit)
     part = dict(zip(solved.space.candidates, solved.space.slices, strict=True))
     doubt = (DEGENERACY,) if in_doubt else ()
     return tuple(
@@ -183,8 +227,23 @@ def _effects(
             probability=cause.probability,
             answer="one of" if doubt else cause.answer,
         )
-        for cause in named
+        for cause in found.named
         for candidate in cause.candidates
+    )
+
+
+def _applied(problem: SurfaceProblem, effect: FoundEffect) -> AppliedEffect:
+    """An effect as a file stores it."""
+    return AppliedEffect(
+        kind=effect.kind,
+        element=effect.element,
+        parameters=effect.parameters,
+        evidence=effect.evidence,
+        captures=tuple(c.name for c in problem.captures),
+        scope=effect.scope,
+        wavelength_nm=problem.captures[0].wavelength_nm,
+        indistinguishable_from=effect.indistinguishable_from,
+        probability=effect.probability,
     )
 
 
@@ -208,7 +267,7 @@ def _unobservable(search: OwnMinima, here: Visited) -> tuple[str, ...]:
         candidate.short
         for g, (curvature, _) in told.items()
         if g not in here.groups and np.all(np.diag(curvature) * state.unit < SEEN)
-        for candidate in search.members[g]
+        for candidate in search.candidates_of(g)
     )
 
 

@@ -7,14 +7,12 @@ from dataclasses import dataclass
 
 from processing.diagnosis.instrument.cautious import cautious
 from processing.diagnosis.instrument.empirical import empirical
-from processing.diagnosis.instrument.evidence import wanted_for_evidence, would_be_seen
 from processing.diagnosis.instrument.guard import (
     chances,
     checks,
     lasts,
     predicted_change_of_each,
     predicted_changes,
-    refusal,
 )
 from processing.diagnosis.instrument.names import Names, names_of, unfit
 from processing.diagnosis.instrument.outcome import Outcome, left_of, outcome_of
@@ -37,8 +35,11 @@ from processing.diagnosis.instrument.telling import (
 )
 from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.instrument.wiring import Wiring, miswired, miswired_train
+from processing.diagnosis.search.evidence import wanted_for_evidence, would_be_seen
+from processing.diagnosis.search.guard import PredictedChange
+from processing.diagnosis.search.judge import Judgement
 from processing.diagnosis.search.posterior import Say
-from processing.diagnosis.search.result import Check, Diagnosis, FoundEffect, Unexplained, Verdict
+from processing.diagnosis.search.result import Diagnosis, FoundEffect, Unexplained
 from processing.diagnosis.search.solution import Solution
 from processing.instrument.model import InstrumentModel
 
@@ -53,23 +54,6 @@ class Judged:
     after: tuple[Residual, ...]
 
 
-@dataclass(frozen=True)
-class Guarded:
-    """Whether a correction may be written.
-
-    Attributes
-    ----------
-    figures : before and after it; refused : why it may not.
-    lasting : whether what belongs to the instrument serves later captures.
-    holds : whether the residual and W are none the worse, whatever the chances are.
-    """
-
-    figures: tuple[Check, ...]
-    refused: str | None
-    lasting: bool
-    holds: bool
-
-
 def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | None = None) -> Judged:
     """Find the posterior, test what is left, guard the correction, and name causes.
 
@@ -81,9 +65,7 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
     first = outcome_of(bench, found)
     names = names_of(first)
     used = _carefully(first, names)
-    switched = told_switches(used.asked, used.solved)
-    guard = _guarded(used, names, wiring)
-    return _told(used, names, switched, guard, wiring)
+    return _told(used, names, told_switches(used.asked, used.solved), wiring)
 
 
 def _wired(problem: InstrumentProblem, say: Say, declared: InstrumentModel | None) -> tuple[Wiring | None, WholeBench]:
@@ -111,30 +93,35 @@ def _carefully(first: Outcome, names: Names) -> Outcome:
     return used if careful is None else used.corrected_by(careful, without)
 
 
-def _guarded(used: Outcome, names: Names, wiring: Wiring | None) -> Guarded:
+def _changes(used: Outcome, names: Names) -> tuple[PredictedChange, PredictedChange, dict[str, PredictedChange]]:
+    """What the correction does to M here, in later captures, and in each of several."""
     asked, solved = used.asked, used.solved
     here, later = predicted_changes(asked, used.found, solved)
     each = predicted_change_of_each(asked, used.found, solved)
-    if not names.sure:
-        left = sum(left_of(asked, r) for r in used.after)
-        explained = solved.before.excess - solved.after.excess
-        here, later = (c.beside(left, explained) for c in (here, later))
-        each = {name: c.beside(left, explained) for name, c in each.items()}
-    lasting = lasts(later, names.doubt.values())
-    # Where there is nothing to apply, nothing is said of what it would do.
-    figures, chance = checks(asked, solved), chances(here, later, lasting, each) if solved.effects else ()
-    refused = f"change this first: {wiring.told}" if wiring is not None else refusal((*figures, *chance))
-    return Guarded((*figures, *chance), refused, lasting, refusal(figures) is None)
+    if names.sure:
+        return here, later, each
+    left = sum(left_of(asked, r) for r in used.after)
+    explained = solved.before.excess - solved.after.excess
+    here, later = (c.beside(left, explained) for c in (here, later))
+    return here, later, {name: c.beside(left, explained) for name, c in each.items()}
 
 
-def _told(
-    used: Outcome, names: Names, switched: Sequence[FoundEffect], guard: Guarded, wiring: Wiring | None
-) -> Judged:
+def _told(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring: Wiring | None) -> Judged:
     problem, asked, found, solved = used.bench.problem, used.asked, used.found, used.solved
-    any_cause = bool(names.named or names.untold or switched)
-    corrects = guard.refused is None and (any_cause or bool(solved.base.size))
-    kept = solved if corrects else _nothing(solved)
-    verdict = _verdict_of(used, names, switched, guard, wiring)
+    here, later, each = _changes(used, names)
+    lasting = lasts(later, names.doubt.values())
+    judgement = Judgement(
+        named=bool(names.named or switched),
+        sure=bool(names.sure or switched),
+        structure=used.structure or bool(names.untold),
+        seen=bool(would_be_seen(found)),
+        figures=checks(asked, solved),
+        # Where there is nothing to apply, nothing is said of what it would do.
+        chances=chances(here, later, lasting, each) if solved.effects else (),
+        first=None if wiring is None else wiring.told,
+    )
+    any_cause = judgement.named or bool(names.untold)
+    kept, verdict = judgement.kept(solved, any_cause), judgement.verdict
     unseen = unobservable(used.bench.whole, found)
     diagnosis = Diagnosis(
         verdict=verdict,
@@ -159,25 +146,12 @@ def _told(
         instrument=problem.model.name,
         wavelengths_nm=tuple(sorted(set(problem.wavelengths_nm))),
         simulated=any(c.simulated for c in problem.captures),
-        correction=correction(problem, found, solved, any_cause, guard.figures, guard.refused, guard.lasting, kept),
-        wiring=None if wiring is None else wiring.told,
+        correction=correction(problem, found, solved, any_cause, judgement, lasting, kept),
+        wiring=judgement.first,
         left_out=not_measured(problem),
         noise=noise_report(problem),
     )
-    return Judged(diagnosis, kept, used.before, used.after if corrects else used.before)
-
-
-def _verdict_of(
-    used: Outcome, names: Names, switched: Sequence[FoundEffect], guard: Guarded, wiring: Wiring | None
-) -> Verdict:
-    if wiring is not None or (names.named and not guard.holds):
-        return "unexplained"
-    structure, sure = used.structure or bool(names.untold), [*names.sure, *switched]
-    if structure:
-        return "partly_explained" if sure else "unexplained"
-    if names.named or switched:
-        return "explained" if sure else "partly_explained"
-    return "consistent" if would_be_seen(used.found) else "undetermined"
+    return Judged(diagnosis, kept, used.before, used.before if kept is not solved else used.after)
 
 
 def _unexplained(used: Outcome, names: Names) -> Unexplained:
@@ -187,7 +161,3 @@ def _unexplained(used: Outcome, names: Names) -> Unexplained:
         tried=tried or tuple(r.candidate for r in ranking(used.found, used.solved.before)[:5]),
         empirical=empirical(used.found, used.solved),
     )
-
-
-def _nothing(solved: Solution) -> Solution:
-    return Solution(solved.base, solved.before_fit, solved.before, solved.base, solved.before_fit, solved.before)

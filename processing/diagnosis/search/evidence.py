@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
-from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.posterior import Posterior
+from processing.diagnosis.search.problem import Problem
 from processing.diagnosis.search.rules import NOMINAL_TAU, VISIBLE_FAULT
 from processing.instrument.effects.base import CountsEffect, FieldEffect, Switch, ValuePerState
 
@@ -39,7 +39,7 @@ def would_be_seen(found: Posterior) -> tuple[Candidate, ...]:
     )
 
 
-def wanted_for_evidence(problem: InstrumentProblem) -> str:
+def wanted_for_evidence(problem: Problem) -> str:
     """What would make a statement possible where nothing of typical size would have been seen."""
     needed = "More light, more pixels, or states that differ more."
     if problem.noise_known:

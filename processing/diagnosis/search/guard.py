@@ -1,0 +1,121 @@
+"""Nothing is written that makes a measurement worse: figures before and after a correction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import ndtr
+
+from processing.arrays import Array
+from processing.diagnosis.search.result import Check
+from processing.diagnosis.search.rules import CHANCE_WORSE, LEAST_CHANGE, WORSE, WORSE_CONDITION
+from processing.diagnosis.search.solution import Solution
+
+#: Singular values below this, relative to the largest, are none.
+RANK = 1e-6
+
+
+def held_out_check(solved: Solution, stretch: float = 1.0) -> Check:
+    """The residual on held-out data, percent; `stretch` is by how much a correction of the counts widens them."""
+    before, after = 100 * solved.before.rms, 100 * solved.after.rms / stretch
+    return Check(
+        name="rms on held-out data, percent of the mean signal",
+        before=before,
+        after=after,
+        holds=bool(after <= WORSE * before),
+    )
+
+
+def rows_checks(name: str, before: Array, after: Array) -> tuple[Check, Check]:
+    """Rank and condition of a measurement matrix W (L, 16) without and with a correction."""
+    (rank, condition), (new_rank, new_condition) = (_rank_and_condition(w) for w in (before, after))
+    where = f"of the measurement matrix of {name}"
+    return (
+        Check(name=f"rank {where}", before=rank, after=new_rank, holds=new_rank >= rank),
+        Check(
+            name=f"condition {where}",
+            before=condition,
+            after=new_condition,
+            holds=bool(new_condition <= WORSE_CONDITION * condition),
+        ),
+    )
+
+
+def _rank_and_condition(w: Array) -> tuple[int, float]:
+    size = np.linalg.svd(w, compute_uv=False)
+    size = size[size > RANK * size[0]]
+    return size.size, float(size[0] / size[-1])
+
+
+@dataclass(frozen=True)
+class PredictedChange:
+    """What a correction does to what the user reads (M/m00, xi0), as the posterior expects it; all rms over pixels.
+
+    Attributes
+    ----------
+    before, after : error without and with the correction.
+    size : of the change; expected, stderr : how far the true one goes along it, and the standard error of that.
+    """
+
+    before: float
+    after: float
+    size: float
+    expected: float
+    stderr: float
+
+    @property
+    def chance_worse(self) -> float:
+        """Chance that the error grows: that the true change goes less than half as far along this one."""
+        if self.size <= LEAST_CHANGE:
+            return 0.0
+        beyond = self.expected - self.size / 2
+        return float(ndtr(-beyond / self.stderr)) if self.stderr > 0 else float(beyond < 0)
+
+    @property
+    def told(self) -> float:
+        """The chance that it grows, with no more digits than a calibration can show."""
+        return round(self.chance_worse, 4)
+
+    def beside(self, left: float, explained: float) -> PredictedChange:
+        """Where no cause is beyond doubt and structure is left: as wrong, along itself, as that is to what it explains.
+
+        `left` and `explained` are chi-squares, of which the roots are amounts.
+        """
+        wrong = np.sqrt(left / explained) if explained > 0 else 1.0
+        return replace(self, stderr=float(np.hypot(self.stderr, wrong * self.size)))
+
+
+NOTHING = PredictedChange(0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def predicted_change(given: Array, mean: Array, covariance: Array, products: Array) -> PredictedChange:
+    """Of values `given` (K,), where the true ones have a mean (K,) and a covariance (K, K).
+
+    `products` (K, K) of the slopes of what the user reads, averaged.
+    """
+    left = max(float(np.sum(products * covariance)), 0.0)
+    along, missed = products @ given, mean - given
+    size = float(np.sqrt(max(float(given @ along), 0.0)))
+    stderr = float(np.sqrt(max(float(along @ covariance @ along), 0.0))) / max(size, 1e-300)
+    before, after = (np.sqrt(left + max(float(v @ products @ v), 0.0)) for v in (mean, missed))
+    return PredictedChange(float(before), float(after), size, float(mean @ along) / max(size, 1e-300), stderr)
+
+
+def chance_checks(quantity: str, change: PredictedChange) -> tuple[Check, Check]:
+    """Error of a quantity as the posterior expects it, and the chance that it grows, which decides."""
+    return (
+        Check(name=f"predicted error of {quantity}, rms", before=change.before, after=change.after, holds=True),
+        Check(
+            name=f"chance that the error of {quantity} grows",
+            before=0.0,
+            after=change.told,
+            holds=change.chance_worse <= CHANCE_WORSE,
+        ),
+    )
+
+
+def refusal(found: tuple[Check, ...]) -> str | None:
+    """Why a correction is not written, in words; None if every figure holds."""
+    worse = [f"{c.name}: {c.before:.4g} to {c.after:.4g}" for c in found if not c.holds]
+    return "it would make worse: " + "; ".join(worse) if worse else None

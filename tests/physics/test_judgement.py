@@ -1,0 +1,54 @@
+"""One judge for instrument and surface: the verdict of names and structure, and what is applied."""
+
+import numpy as np
+import pytest
+
+from processing.diagnosis.search.fit import Fit
+from processing.diagnosis.search.judge import Judgement
+from processing.diagnosis.search.result import Check
+from processing.diagnosis.search.solution import Solution
+from processing.diagnosis.search.space import Space, Sums
+
+GROWS = (Check(name="rms", before=1.0, after=2.0, holds=False),)
+FALLS = (Check(name="rms", before=2.0, after=1.0, holds=True),)
+
+
+@pytest.mark.parametrize(
+    ("named", "sure", "structure", "seen", "verdict"),
+    [
+        (False, False, False, True, "consistent"),
+        (False, False, False, False, "undetermined"),
+        (False, False, True, True, "unexplained"),
+        (True, False, True, True, "unexplained"),
+        (True, True, True, True, "partly_explained"),
+        (True, False, False, True, "partly_explained"),
+        (True, True, False, False, "explained"),
+    ],
+)
+def test_verdict_of_names_and_what_is_left(named, sure, structure, seen, verdict) -> None:
+    assert Judgement(named, sure, structure, seen, FALLS).verdict == verdict
+
+
+def test_what_makes_the_residual_worse_explains_nothing() -> None:
+    assert Judgement(True, True, False, True, GROWS).verdict == "unexplained"
+    assert Judgement(False, False, False, True, GROWS).verdict == "consistent"
+
+
+def test_a_chance_that_the_reading_gets_worse_refuses_the_correction_not_the_name() -> None:
+    judged = Judgement(True, True, False, True, FALLS, chances=GROWS)
+    assert judged.verdict == "explained"
+    assert judged.refused == "it would make worse: rms: 1 to 2"
+
+
+def test_wiring_comes_first() -> None:
+    judged = Judgement(True, True, False, True, FALLS, first="swap the axes")
+    assert (judged.verdict, judged.refused) == ("unexplained", "change this first: swap the axes")
+
+
+def test_only_what_holds_and_has_a_cause_is_applied() -> None:
+    nothing = Fit(np.zeros(0), Sums.empty(1, 0), 0.0)
+    solved = Solution(Space(()), nothing, None, Space(()), nothing, None)
+    holds, refused = Judgement(True, True, False, True, FALLS), Judgement(True, True, False, True, GROWS)
+    assert holds.kept(solved, True) is solved
+    assert holds.kept(solved, False) is not solved
+    assert refused.kept(solved, True) is not solved
