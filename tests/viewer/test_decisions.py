@@ -165,6 +165,18 @@ def test_an_accepted_surface_is_a_new_material_and_a_new_geometry(lab, client, s
     assert "<option>print.geometry.yaml</option>" in page
 
 
+def test_a_surface_whose_correction_is_refused_is_not_written(lab, client, surface_diagnosed):
+    result = Diagnoses(Library(lab)).folder(surface_diagnosed) / "diagnosis.json"
+    found = json.loads(result.read_text())
+    found["correction"]["refused"] = "it would make worse: rms: 1 to 2"
+    result.write_text(json.dumps(found))
+    assert not Diagnoses(Library(lab)).story(surface_diagnosed).writes
+    asked = {"name": surface_diagnosed, "accept": "yes", "file": "print.yaml", "note": ""}
+    answer = client.post("/decide", json=asked, headers=ORIGIN)
+    assert (answer.status_code, "it would make worse" in answer.text) == (422, True)
+    assert not list(lab.glob("print*"))
+
+
 def test_nothing_of_an_accepted_surface_replaces_a_file(lab, client, surface_diagnosed):
     (lab / "print.geometry.yaml").write_text("mine")
     asked = {"name": surface_diagnosed, "accept": "yes", "file": "print.yaml", "note": ""}

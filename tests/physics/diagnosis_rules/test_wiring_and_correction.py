@@ -9,7 +9,7 @@ from processing.diagnosis.instrument import cautious, empirical, guard, whole_be
 from processing.diagnosis.instrument.doubts import PART_OF_LEFT, WAVE, WAVE_AS_WELL
 from processing.diagnosis.instrument.names import Names, unfit
 from processing.diagnosis.search import causes
-from processing.diagnosis.search import guard as search_guard
+from processing.diagnosis.search.guard import PredictedChange, held_out_check, refusal, rows_checks
 from processing.diagnosis.search.result import Empirical
 from processing.diagnosis.search.sets import Quadratic
 from processing.diagnosis.search.space import Space
@@ -71,10 +71,10 @@ def test_shares(m: Patch) -> bool:
 def guarded(rms: float, condition: float) -> bool:
     solved = Some(before=Some(rms=1.0), after=Some(rms=rms))
     figures = (
-        search_guard.held_out_check(solved),
-        *search_guard.rows_checks("a", np.eye(2), np.diag([1, 1 / condition])),
+        held_out_check(solved),
+        *rows_checks("a", np.eye(2), np.diag([1, 1 / condition])),
     )
-    return search_guard.refusal(figures) is None
+    return refusal(figures) is None
 
 
 @decides
@@ -83,8 +83,8 @@ def test_worse(m: Patch) -> bool:
 
 
 def determined(size: float) -> bool:
-    change = search_guard.PredictedChange(before=0.005, after=0.001, size=size, expected=size, stderr=0.001)
-    return search_guard.refusal(guard.chances(change, change, lasting=True, each={})) is None
+    change = PredictedChange(before=0.005, after=0.001, size=size, expected=size, stderr=0.001)
+    return refusal(guard.chances(change, change, lasting=True, each={})) is None
 
 
 @decides
@@ -94,9 +94,7 @@ def test_chance_worse(m: Patch) -> bool:
 
 @decides
 def test_least_change(m: Patch) -> bool:
-    small = [
-        search_guard.PredictedChange(1e-4, 1e-4, size=size, expected=size, stderr=1e-4) for size in (1.9e-5, 2.1e-5)
-    ]
+    small = [PredictedChange(1e-4, 1e-4, size=size, expected=size, stderr=1e-4) for size in (1.9e-5, 2.1e-5)]
     return [change.chance_worse > 0.4 for change in small] == [False, True]
 
 
