@@ -12,6 +12,7 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.descent import descend
 from processing.diagnosis.search.likely_set import likely_set
+from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import FEW_CAUSES, TAU, TAU_WEIGHT
 from processing.diagnosis.search.sampling import sample
 from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets, State
@@ -237,14 +238,7 @@ def test_the_state_that_a_slip_begins_at_is_one_of_those_that_the_data_leave_ope
     sets = Sets(form(design, np.array([0.0, 0.5, 0.0]), 30), groups(1, 1, 1), QUIET)
     state = likely_set(sets)
     samples = SimpleNamespace(best=state, any_of=lambda members: 1.0)
-    found = SimpleNamespace(
-        sets=sets,
-        samples=samples,
-        space=space,
-        members=((0,), (1,), (2,)),
-        label=lambda g: space.candidates[g],
-        others={},
-    )
+    found = Posterior(space, ((0,), (1,), (2,)), sets, samples, np.zeros(3), np.eye(3), {})
     (cause,) = causes(found, 0.0)
     told = {c.place for c in (*cause.candidates, *cause.alternatives)}
     assert cause.answer == "one of"
