@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from processing.diagnosis.search.result import Diagnosis
+from processing.diagnosis.search.rules import SAME_NM
 from processing.errors import ProcessError
 from processing.instrument.model import Dispersive, EffectParameter, InstrumentModel
 from processing.whole_file import write_new_text
@@ -45,7 +46,7 @@ def _merged(old: Dispersive, entry: EffectParameter, wavelengths_nm: tuple[float
     else:
         new = dict(zip(entry.wavelengths_nm or (), entry.value, strict=True))
     kept = {} if not isinstance(old, dict) else old
-    return {k: v for k, v in kept.items() if all(abs(k - w) >= 0.5 for w in new)} | new
+    return {k: v for k, v in kept.items() if all(abs(k - w) >= SAME_NM for w in new)} | new
 
 
 def file_head(first: str, note: str) -> str:

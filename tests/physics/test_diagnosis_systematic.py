@@ -5,9 +5,10 @@ from types import SimpleNamespace as Some
 import numpy as np
 import pytest
 
-from processing.diagnosis.instrument.systematic import MOST, _leading, _missed
+from processing.diagnosis.instrument.systematic import _leading, _missed
 from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.search.likely_set import likely_set
+from processing.diagnosis.search.rules import MOST_STORED
 from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets
 
 
@@ -16,7 +17,7 @@ def test_directions_hold_what_another_capture_will_have_too():
     size = 41
     covariance, lasts = np.diag([*np.full(40, 1.0), 0.01]), np.arange(size) == 40
     covariance[40, 0] = covariance[0, 40] = 0.05
-    stored = _leading(covariance, np.eye(size), lasts)[1][:, :MOST]
+    stored = _leading(covariance, np.eye(size), lasts)[1][:, :MOST_STORED]
     told = stored @ stored.T
     assert told[40, 40] == pytest.approx(0.01, rel=0.05)
     # What they share with it belongs to it.

@@ -47,7 +47,7 @@ def test_single_precision_in_strips_is_what_double_says(capture, monkeypatch, th
     _, double = excess(*capture)
     monkeypatch.setenv("UMOV_THREADS", threads)
     monkeypatch.setattr(pixel_sums, "MANY_PX", 0)
-    monkeypatch.setattr(pixel_sums, "LEAST_NOISE", 0.0)
+    monkeypatch.setattr(pixel_sums, "NOISE_OF_SINGLE", 0.0)
     monkeypatch.setattr(pixel_sums, "STRIP_PX", 20 * COLUMNS)
     _, single = excess(*capture)
     assert np.all(np.abs(double.excess) < 6 * np.sqrt(2 * double.freedom))
@@ -79,7 +79,7 @@ def test_squares_are_averaged_while_they_are_read(configs, tmp_path, monkeypatch
     counts[4, 8:9, 11:12] = 2**16 - 1
     text = (configs / "instruments/rgb950.yaml").read_text()
     write_capture(tmp_path / "c.h5", bench, counts, angles, Sample(kind="unknown"), text)
-    monkeypatch.setattr(read_frames, "MOST_VALUES", counts.size / (side - 0.5) ** 2)
+    monkeypatch.setattr(read_frames, "MOST_READ", counts.size / (side - 0.5) ** 2)
     with Capture(tmp_path / "c.h5") as capture:
         data = read_capture(capture, InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662))
     assert (data.binned, data.pitch) == (side, side)

@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 
 from processing.diagnosis.captured.capture_data import CaptureData, SharedNoise
 from processing.diagnosis.captured.squares import means, side_for, squares
-
-#: Values of a capture that are fitted; more are averaged over squares of pixels.
-MOST_FITTED = 5_000_000
+from processing.diagnosis.search.rules import MOST_FITTED
 
 
 def averaged_for_fits(data: CaptureData) -> CaptureData:

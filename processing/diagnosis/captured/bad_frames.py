@@ -14,12 +14,15 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
-from processing.diagnosis.search.rules import AGAINST_NEXT, LEAST_MISFIT, MOST_BAD_FRAMES, MOSTLY
-
-#: Singular values below this, relative to the largest, are none.
-RANK = 1e-8
-#: States with most left over, of which pairs are tried in each other's place.
-SUSPECTS = 12
+from processing.diagnosis.search.range_of import range_of
+from processing.diagnosis.search.rules import (
+    AGAINST_NEXT,
+    LEAST_MISFIT,
+    MOST_BAD_FRAMES,
+    MOSTLY,
+    SUSPECTS_OF_EXCHANGE,
+    UNPREDICTED,
+)
 
 
 @dataclass(frozen=True)
@@ -72,8 +75,7 @@ class _Moments:
         return (np.asarray(states)[:, None] * self._channels + np.arange(self._channels)).reshape(-1)
 
     def _outside(self, rows: NDArray[np.int64]) -> Array:
-        u, size, _ = np.linalg.svd(self._a[rows], full_matrices=False)
-        q = u[:, size > RANK * size[0]]
+        q = range_of(self._a[rows])
         return np.asarray(np.eye(len(rows)) - q @ q.T)
 
     def _fitted(self, states: Sequence[int]) -> tuple[Array, Array]:
@@ -96,7 +98,7 @@ class _Moments:
             mine = slice(j * c, (j + 1) * c)
             free = p[mine, mine]
             # A residual, over what is free of the state, is its difference from the prediction by the others.
-            if np.linalg.cond(free) > 1e4:
+            if np.linalg.cond(free) > UNPREDICTED:
                 continue
             back = np.linalg.inv(free)
             misfit = float(np.sqrt(max(np.trace(back @ beyond[mine, mine] @ back.T), 0.0) / c))
@@ -109,7 +111,7 @@ class _Moments:
         p, beyond = self._fitted(states)
         least, pair = (1 - MOSTLY) * self.left(states), None
         where = np.arange(len(p)).reshape(len(states), self._channels)
-        worst = np.argsort(-np.diag(p @ beyond @ p).reshape(where.shape).sum(axis=1))[:SUSPECTS]
+        worst = np.argsort(-np.diag(p @ beyond @ p).reshape(where.shape).sum(axis=1))[:SUSPECTS_OF_EXCHANGE]
         for i, j in combinations(sorted(worst.tolist()), 2):
             order = where.copy()
             order[[i, j]] = order[[j, i]]

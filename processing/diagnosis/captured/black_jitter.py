@@ -8,12 +8,11 @@ from numpy.typing import NDArray
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.common_rest import NORMAL_MAD
-from processing.diagnosis.search.rules import DIM, FEWEST_DIM, NOISE_SURE
+from processing.diagnosis.search.range_of import inside_and_outside
+from processing.diagnosis.search.rules import DIM, FEWEST_DIM, LIT, NOISE_SURE
 
-#: Variance of a median over that of a mean.
+#: [1, fixed] Variance of a median over that of a mean.
 MEDIAN = np.pi / 2
-#: Singular values below this, relative to the largest, are none.
-RANK = 1e-8
 
 
 def black_jitter(data: CaptureData, a: Array) -> tuple[Array, float] | None:
@@ -28,10 +27,9 @@ def black_jitter(data: CaptureData, a: Array) -> tuple[Array, float] | None:
     lit = data.usable & ~data.clipped
     if not lit.any():
         return None
-    lit &= mean > np.median(mean[lit]) / 2
+    lit &= mean > LIT * np.median(mean[lit])
     dim = np.any(y != 0, axis=0) & (mean < DIM * mean[lit].mean())
-    u, size, _ = np.linalg.svd(a[rows], full_matrices=True)
-    outside = u[:, int(np.sum(size > RANK * size[0])) :]
+    _, outside = inside_and_outside(a[rows])
     free = outside.shape[1]
     if dim.sum() < FEWEST_DIM or not free:
         return None

@@ -15,7 +15,7 @@ from processing.reduction.move_image import shifted_back
 
 #: Corrected counts of signals (N, channels, rows, columns), and their slope over the old ones.
 Correct = Callable[[Array], tuple[Array, Array]]
-#: Rows of an image that are worked on together.
+#: [rows] Of an image that are worked on together.
 STRIP_ROWS = 16
 
 

@@ -13,14 +13,24 @@ from processing.diagnosis.captured.detector_noise import DetectorNoise, detector
 from processing.diagnosis.search.rules import (
     AS_GOOD,
     DARK_NOISE_OFF,
+    LEAST_DARK,
+    LEAST_LIT,
     NOISE_ALIKE,
     NOISE_OFF,
     NOISE_OFF_MIXED,
     NOISE_SURE,
 )
 
-#: Least part without light of noise that was estimated.
-LEAST_DARK = 0.05
+#: [1] Largest factor on the gain that is tried, and one over the least.
+MOST_GAIN = 10.0
+#: [factors] On the gain that are tried: steps of a percent.
+GAINS = 400
+#: [1] Least factor on the variance without light that is tried.
+LEAST_DARK_FACTOR = 0.01
+#: [1] Largest factor on the variance without light that is tried.
+MOST_DARK_FACTOR = 400.0
+#: [factors] On the variance without light that are tried: steps of a percent.
+DARKS = 800
 
 
 def checked_noise(data: CaptureData, a: Array) -> CaptureData:
@@ -106,9 +116,10 @@ def noise_factors(found: DetectorNoise, shown: float, estimated: bool) -> tuple[
     if _against(both, usual, inverse) < NOISE_SURE**2 or not (far or _dark_is_off(found, shown)):
         return usual
     # As simple as the images allow: another gain, another read noise, both.
-    scales = np.geomspace(0.1, 10, 400)
+    scales = np.geomspace(1 / MOST_GAIN, MOST_GAIN, GAINS)
     gain = min(((s, s**2) for s in scales), key=lambda p: _against(both, p, inverse))
-    read = min(((1.0, d) for d in np.geomspace(0.01, 400, 800)), key=lambda p: _against(both, p, inverse))
+    darks = np.geomspace(LEAST_DARK_FACTOR, MOST_DARK_FACTOR, DARKS)
+    read = min(((1.0, d) for d in darks), key=lambda p: _against(both, p, inverse))
     simple = min(gain, read, key=lambda p: _against(both, p, inverse))
     if _against(both, simple, inverse) < AS_GOOD**2:
         return float(simple[0]), float(simple[1])
@@ -129,7 +140,7 @@ def _dark_is_off(found: DetectorNoise, shown: float) -> bool:
 def _balanced(found: DetectorNoise, white: float, dark: float) -> tuple[float, float]:
     """Both factors with the whole as found, which is known best."""
     light = found.light_share
-    shot = (white - dark * (1 - light)) / light if light > LEAST_DARK else 1.0
+    shot = (white - dark * (1 - light)) / light if light > LEAST_LIT else 1.0
     return (shot, dark) if shot > 0 else (white, white)
 
 

@@ -9,14 +9,15 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
-from processing.diagnosis.search.rules import BEYOND_NOISE
+from processing.diagnosis.search.range_of import inside_and_outside
+from processing.diagnosis.search.rules import BEYOND_NOISE, CUT_BACK
 
-#: Robust standard deviations at which a residual is cut off before structure is looked for.
-CUT = 4.0
-#: Median of absolute values of normal ones, in standard deviations.
+#: [standard deviations, fixed] Median of absolute values of normal ones.
 NORMAL_MAD = 0.6745
-#: Pixels that tell a standard deviation to half a percent.
+#: [pixels] That tell a standard deviation to half a percent.
 PIXELS_OF_SCALE = 50_000
+#: [of the largest] Least variance of a row in whose units it is: that of none is zero.
+LEAST_LEVEL = 1e-3
 
 
 @dataclass(frozen=True)
@@ -43,19 +44,17 @@ class Whitened:
         y = data.signal.reshape(rows, -1)[np.ix_(keep, good.reshape(-1))]
         variance = data.variance_of(good).reshape(rows, -1)[keep].astype(np.float32)
         mean = np.mean(variance, axis=1, dtype=float)
-        level = np.sqrt(np.maximum(mean, 1e-3 * mean.max()))
-        u, power, _ = np.linalg.svd(a[keep] / level[:, None], full_matrices=True)
-        rank = int(np.sum(power > 1e-8 * power[0]))
+        level = np.sqrt(np.maximum(mean, LEAST_LEVEL * mean.max()))
         y /= level[:, None].astype(np.float32)
         variance /= (level[:, None] ** 2).astype(np.float32)
-        return cls(y, variance, level, u[:, :rank], u[:, rank:])
+        return cls(y, variance, level, *inside_and_outside(a[keep] / level[:, None]))
 
     def rest(self, clean: NDArray[np.bool_]) -> Array:
         """Projection (L, L) on what neither the model reaches nor the residual of the `clean` pixels has in common."""
         outside = self.outside.astype(np.float32)
         r = outside @ (outside.T @ (self.y if clean.all() else self.y[:, clean]))
         scale = robust_scale(r).astype(np.float32)
-        inner = (outside.T @ np.clip(r, -CUT * scale, CUT * scale, out=r)).astype(float)
+        inner = (outside.T @ np.clip(r, -CUT_BACK * scale, CUT_BACK * scale, out=r)).astype(float)
         value, vector = np.linalg.eigh(inner @ inner.T / inner.shape[1])
         # Largest eigenvalue of noise over the median one (Marchenko and Pastur).
         edge = BEYOND_NOISE * (1 + np.sqrt(len(value) / inner.shape[1])) ** 2

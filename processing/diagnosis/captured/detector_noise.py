@@ -14,16 +14,14 @@ import numpy as np
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.common_rest import Whitened
+from processing.diagnosis.search.rules import FEWEST_FREE_FOR_NOISE, LINES_APART, NARROWEST, NOT_ALIKE_PX
 
-#: Values of the image that are looked at: enough for a part in a thousand of the noise.
+#: [intensities] Of the image that are looked at: enough for a part in a thousand of the noise.
 MOST_VALUES = 4_000_000
-#: Fewer rows, columns, or directions over the states than these tell nothing about noise.
-FEWEST_PIXELS, FEWEST_DIRECTIONS = 12, 4
-#: Distances in pixels over which noise is no longer alike, and the image has hardly changed.
-FAR = (3, 4)
-#: Distance of rows, or columns, whose means are compared.
-APART = 2
-#: Weight of the belief that both parts of the noise are as declared, where the images do not tell them apart.
+#: [of what is declared] Least part of the variance that weights are made of.
+LEAST_PART = 0.01
+#: [unit of chi-square] Weight of the belief that both parts of the noise are as declared, where the images do not tell
+#: them apart.
 WEAK = 1e-3
 
 
@@ -62,16 +60,16 @@ class DetectorNoise:
 def detector_noise(data: CaptureData, a: Array) -> DetectorNoise | None:
     """Noise of a capture against rows a (L, K) of its model; None where its images do not show it."""
     height, width = data.usable.shape
-    if min(height, width) < FEWEST_PIXELS:
+    if min(height, width) < NARROWEST:
         return None
-    rows = min(height, max(FEWEST_PIXELS, MOST_VALUES // (width * data.values_per_pixel)))
+    rows = min(height, max(NARROWEST, MOST_VALUES // (width * data.values_per_pixel)))
     part = slice((height - rows) // 2, (height - rows) // 2 + rows)
     looked_at = np.zeros(data.usable.shape, dtype=bool)
     looked_at[part] = (data.usable & ~data.clipped)[part]
-    if looked_at.sum() < FEWEST_PIXELS**2:
+    if looked_at.sum() < NARROWEST**2:
         return None
     white = Whitened.of(data, a, looked_at)
-    if white.outside.shape[1] < FEWEST_DIRECTIONS:
+    if white.outside.shape[1] < FEWEST_FREE_FOR_NOISE:
         return None
     rest = white.rest(np.ones(white.y.shape[1], dtype=bool))
     floor = np.repeat(data.floor, data.signal.shape[1])[data.row_counts] / white.level**2
@@ -94,22 +92,23 @@ def _of_a_bend(white: Whitened) -> float:
 
 def _compared(r: Array, light: Array, dark: Array, free: float) -> DetectorNoise:
     expected = light + dark
-    across = {lag: _half_square(r, expected, lag, 2) for lag in (1, *FAR)}
-    down = {lag: _half_square(r, expected, lag, 1) for lag in (1, *FAR)}
+    far = (NOT_ALIKE_PX, NOT_ALIKE_PX + 1)
+    across = {lag: _half_square(r, expected, lag, 2) for lag in (1, *far)}
+    down = {lag: _half_square(r, expected, lag, 1) for lag in (1, *far)}
     count = np.isfinite(r).sum() * free
-    white = float(np.mean([across[lag] for lag in FAR]))
+    white = float(np.mean([across[lag] for lag in far]))
     error = white * float(np.sqrt(3 / count))
     rows = _common(r, expected, 2) - white * _within(r, 2, 1 - across[1] / white)
     columns = _common(r, expected, 1) - white * _within(r, 1, 1 - down[1] / white)
     number = free * r.shape[0] * np.array(r.shape[1:])
     # Means of a row scatter by the noise of a pixel over the number of its pixels.
     rows_error = float(white / r.shape[2] * np.sqrt(3 / number[0]))
-    far_down = float(np.mean([down[lag] for lag in FAR]))
+    far_down = float(np.mean([down[lag] for lag in far]))
     shot, floor, covariance = _levels(r, light, dark, free)
     return DetectorNoise(
         white=white,
         white_error=error,
-        each=float(np.mean([_of_each(r, expected, lag) for lag in FAR])),
+        each=float(np.mean([_of_each(r, expected, lag) for lag in far])),
         shot=shot,
         dark=floor,
         covariance=covariance,
@@ -148,8 +147,8 @@ def _common(r: Array, expected: Array, axis: int) -> float:
     """The same of means over an axis, in units of the variance of a pixel."""
     counts = np.isfinite(r).sum(axis=axis)
     mean = np.nansum(r, axis=axis) / np.maximum(counts, 1)
-    first, second = _pairs(np.where(counts > 0, mean, np.nan), APART, 1)
-    one, other = _pairs(np.nansum(expected, axis=axis) / np.maximum(counts, 1), APART, 1)
+    first, second = _pairs(np.where(counts > 0, mean, np.nan), LINES_APART, 1)
+    one, other = _pairs(np.nansum(expected, axis=axis) / np.maximum(counts, 1), LINES_APART, 1)
     used = np.isfinite(first - second)
     return float(np.sum((first - second)[used] ** 2) / np.sum((one + other)[used]))
 
@@ -162,13 +161,13 @@ def _within(r: Array, axis: int, alike: float) -> float:
 
 def _levels(r: Array, light: Array, dark: Array, free: float) -> tuple[float, float, Array]:
     """Parts of the variance with and without light over what is declared, and their covariance."""
-    first, second = _pairs(r, FAR[0], 2)
+    first, second = _pairs(r, NOT_ALIKE_PX, 2)
     half = (first - second) ** 2 / 2
     used = np.isfinite(half)
-    design = np.stack([np.mean(_pairs(x, FAR[0], 2), axis=0)[used] for x in (light, dark)], axis=1)
+    design = np.stack([np.mean(_pairs(x, NOT_ALIKE_PX, 2), axis=0)[used] for x in (light, dark)], axis=1)
     found = np.ones(2)
     for _ in range(3):
-        weight = 1 / (design @ np.maximum(found, 0.01)) ** 2
+        weight = 1 / (design @ np.maximum(found, LEAST_PART)) ** 2
         normal = (design * weight[:, None]).T @ design + WEAK * np.eye(2)
         found = np.linalg.solve(normal, (design * weight[:, None]).T @ half[used] + WEAK)
     # A difference has the noise of two pixels, and each pixel is in two of them.

@@ -8,11 +8,13 @@ import numpy as np
 from scipy.optimize import nnls
 
 from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.search.rules import FEW_ROWS, LEAST_SCATTER
 
-#: Components of the states that count as signal: a Mueller matrix has 16 unknowns.
+#: [components, fixed] Of the states that count as signal: a Mueller matrix has 16 unknowns.
 COMPONENTS = 16
-#: Pixels that are looked at, and levels of the signal at which their scatter is told.
+#: [pixels] That are looked at.
 PIXELS = 20_000
+#: [levels] Of the signal at which their scatter is told.
 LEVELS = 24
 
 
@@ -33,7 +35,7 @@ def estimated_noise(data: CaptureData) -> CaptureData:
     rest = y - u[:, :keep] @ (u[:, :keep].T @ y)
     # A row that the components follow closely has less scatter left than its noise.
     share = 1 - np.sum(u[:, :keep] ** 2, axis=1)
-    good = share > 0.05 if rows > 4 else share > 0.0
+    good = share > LEAST_SCATTER if rows > FEW_ROWS else share > 0.0
     square = rest[good] ** 2 / share[good, None]
     signal = (y - rest)[good]
     edges = np.quantile(signal, np.linspace(0, 1, LEVELS + 1))

@@ -17,15 +17,22 @@ from scipy import ndimage
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.common_rest import Whitened, robust_scale
-from processing.diagnosis.search.rules import ALSO_BAD, BAD_DEVIATIONS, BAD_PIXEL, HIT, MOST_HITS, MOST_STRUCK
+from processing.diagnosis.search.rules import (
+    ALSO_BAD,
+    BAD_DEVIATIONS,
+    BAD_PIXEL,
+    BRIGHTEST,
+    DIMMEST,
+    FEWEST_FOR_HITS,
+    FEWEST_FREE_FOR_HITS,
+    HIT,
+    MOST_HITS,
+    MOST_STRUCK,
+    SIDE_AROUND,
+)
 
-#: Side of the square of pixels around.
-AROUND = 5
-#: Variance of a state over that of the usual one of its pixel, and of a dim pixel over that of all, as far as it is
-#: believed.
-BRIGHTEST, LEAST_VARIANCE = 4.0, 0.1
-#: Below so many pixels, or directions over the states that the model leaves over, nothing can stand out.
-FEWEST_PIXELS, FEWEST_DIRECTIONS = 100, 8
+#: [of the variance of a state] Least part that a fit leaves of it: that of none is zero.
+LEAST_FREE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -42,14 +49,14 @@ def outliers_of(data: CaptureData, a: Array) -> Outliers:
     good, keep = data.usable & ~data.clipped, data.row_counts
     hits, bad = np.zeros((rows, good.size), dtype=bool), np.zeros(good.shape, dtype=bool)
     found = Outliers(hits.reshape(data.signal.shape), bad)
-    if good.sum() < FEWEST_PIXELS:
+    if good.sum() < FEWEST_FOR_HITS:
         return found
     white = Whitened.of(data, a, good)
-    if white.outside.shape[1] < FEWEST_DIRECTIONS:
+    if white.outside.shape[1] < FEWEST_FREE_FOR_HITS:
         return found
     # What is struck tells a noise of its own: no state is believed to be far brighter than the usual one of its pixel.
-    usual = np.maximum(np.median(white.variance, axis=0), np.float32(LEAST_VARIANCE))
-    share = np.sqrt(np.clip(white.variance / usual, np.float32(LEAST_VARIANCE), np.float32(BRIGHTEST)))
+    usual = np.maximum(np.median(white.variance, axis=0), np.float32(DIMMEST))
+    share = np.sqrt(np.clip(white.variance / usual, np.float32(DIMMEST), np.float32(BRIGHTEST)))
     clean = np.ones(white.y.shape[1], dtype=bool)
     # Twice: what was struck is no structure of the image.
     for _ in range(2):
@@ -64,7 +71,7 @@ def outliers_of(data: CaptureData, a: Array) -> Outliers:
         t /= size.astype(np.float32) * scale
         struck, noisy = _hits(r, t, noise, rest)
         clean = (np.max(np.abs(t), axis=0) < HIT) & ~struck.any(axis=0)
-        if clean.all() or clean.sum() < FEWEST_PIXELS:
+        if clean.all() or clean.sum() < FEWEST_FOR_HITS:
             break
     hits[np.ix_(keep, good.reshape(-1))] = struck
     map_of = np.full(good.shape, float(np.median(noisy)))
@@ -89,7 +96,7 @@ def _hits(
         struck: list[int] = []
         found: tuple[list[int], float] = ([], float(noisy[p]))
         while len(struck) < MOST_STRUCK:
-            free = np.maximum(np.diag(q), 1e-6)
+            free = np.maximum(np.diag(q), LEAST_FREE)
             # One hit is strongest where it struck: so it goes with a projection, whatever the noise of each state.
             k = int(np.argmax(np.abs(left) / np.sqrt(free)))
             far = abs(left[k]) / np.sqrt(free[k]) / noise[k, p]
@@ -105,7 +112,7 @@ def _hits(
 
 def _noisier_than_around(noisy: Array, free: int) -> NDArray[np.bool_]:
     """Pixels (rows, columns) with far more noise than those around them, and than the image."""
-    around = ndimage.percentile_filter(noisy, 100 * (1 - ALSO_BAD), size=AROUND)
+    around = ndimage.percentile_filter(noisy, 100 * (1 - ALSO_BAD), size=SIDE_AROUND)
     least = max(BAD_PIXEL, 1 + BAD_DEVIATIONS * float(np.sqrt(2 / free)))
     return np.asarray(noisy > least * np.maximum(around, np.median(noisy)))
 

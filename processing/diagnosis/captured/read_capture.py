@@ -13,7 +13,7 @@ from processing.calibration.known_sample import known_mueller
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.noise_estimate import estimated_noise
 from processing.diagnosis.captured.read_frames import read_frames
-from processing.diagnosis.search.rules import DARK_RIM, FAINTEST
+from processing.diagnosis.search.rules import DARK_RIM, FAINTEST, FEWEST_FOR_SCATTER, MOST_CUT_OFF
 from processing.instrument.changes import Conditions, elapsed
 from processing.instrument.model import InstrumentModel
 from processing.reduction.black import Black
@@ -23,10 +23,10 @@ from processing.reduction.noise import NoiseModel
 from processing.reduction.sample_states import sample_states
 from processing.storage.capture import Capture, CaptureError
 
-#: A state is left out if more than this share of its pixels is cut off.
-MOST_CUT_OFF = 0.01
-#: Below this number of pixels their scatter says nothing about the noise.
-FEWEST_PIXELS = 30
+#: [of the mean signal] Noise that counts are weighted with where it is not known; what it is does not matter.
+SOME_NOISE = 1e-3
+#: [of the noise of the dark frames] Least part that a fit leaves of it in a state: that of none is zero.
+LEAST_OUTSIDE = 1e-9
 
 
 def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
@@ -58,7 +58,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
         exposure=exposure,
         sample=None if kind == "unknown" else known_mueller(capture.header.sample).reshape(16),
         slope=np.zeros(len(states)),
-        floor=np.full(len(states), (1e-3 * float(np.mean(raw)) / top) ** 2),
+        floor=np.full(len(states), (SOME_NOISE * float(np.mean(raw)) / top) ** 2),
         noise_known=False,
         noise_source="not known: too few pixels and no detector constants; the residual itself is the measure",
         clipped=frames.clipped,
@@ -84,7 +84,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
         data = replace(
             data, slope=np.zeros(len(states)), floor=floor, noise_known=True, noise_source="stated per state"
         )
-    if not data.noise_known and data.usable.sum() >= FEWEST_PIXELS:
+    if not data.noise_known and data.usable.sum() >= FEWEST_FOR_SCATTER:
         data = estimated_noise(data)
     return without_dark_pixels(data) if data.noise_known else data
 
@@ -103,7 +103,7 @@ def _of_black(
     channels, a = rows.shape[1], rows.reshape(-1, rows.shape[2])
     outside = np.eye(len(a)) - a @ np.linalg.pinv(a)
     left = outside @ np.repeat(black.weights(capture.column("exposure_s")[states]), channels, axis=0)
-    variance = left**2 @ black.mean_variance(noise) / np.maximum(np.diag(outside), 1e-9)
+    variance = left**2 @ black.mean_variance(noise) / np.maximum(np.diag(outside), LEAST_OUTSIDE)
     return np.asarray(variance.reshape(-1, channels).mean(axis=1))
 
 

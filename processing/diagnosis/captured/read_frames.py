@@ -11,15 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.diagnosis.captured.squares import means, side_for, squares
-from processing.diagnosis.search.rules import CUT_OFF
+from processing.diagnosis.search.rules import BELOW_WELL, CUT_OFF, FEW_PIXELS, MANY_VALUES, MOST_READ
 from processing.instrument.model import InstrumentModel
 from processing.reduction.counts_to_signal import Correction
 from processing.storage.capture import Capture
-
-#: Values of a capture that are read; a larger one is averaged over squares of pixels.
-MOST_VALUES = 20_000_000
-#: Values of a pixel beyond which few pixels are kept: the second moments of the states would be larger than the pixels.
-MANY_VALUES, FEW_PIXELS = 160, 64
 
 
 @dataclass(frozen=True)
@@ -105,7 +100,7 @@ class _Split:
 
 def _side(values: int, height: int, width: int) -> int:
     """Side of the squares of pixels that are averaged, of images with so many values in each pixel."""
-    side = side_for(values * height * width, MOST_VALUES)
+    side = side_for(values * height * width, MOST_READ)
     if values > MANY_VALUES:
         side = max(side, int(np.ceil(np.sqrt(height * width / FEW_PIXELS))))
     return side
@@ -123,6 +118,6 @@ def _clip_level(capture: Capture, correction: Correction) -> float | None:
     detector, level = capture.header.detector, correction.saturation
     if detector.full_well_e is not None and detector.gain_e_per_count is not None:
         well = detector.black_level_counts + detector.full_well_e / detector.gain_e_per_count
-        spread = 4 * (detector.read_noise_e or 0.0) / detector.gain_e_per_count
+        spread = BELOW_WELL * (detector.read_noise_e or 0.0) / detector.gain_e_per_count
         level = well - spread if level is None else min(level, well - spread)
     return level

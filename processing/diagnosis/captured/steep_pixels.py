@@ -15,11 +15,9 @@ from scipy import ndimage
 
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
-from processing.diagnosis.search.rules import LOST_BY_MOVING, MOST_STEEP
+from processing.diagnosis.search.rules import LOST_BY_MOVING, MOST_STEEP, TRIED_PX
 from processing.reduction.move_image import taps
 
-#: [pixels of the sensor] By which frames are moved, and back again.
-TRIED_PX = 0.5
 #: [pixels, or squares of them] From which on nothing of an edge is felt.
 FELT_PX = 8
 

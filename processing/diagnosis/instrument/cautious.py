@@ -17,7 +17,7 @@ from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import AS_GOOD_AS, CHANCE_WORSE
 from processing.diagnosis.search.solution import Solution
 
-#: Weights of the change of M that are tried.
+#: [1] Weights of the change of M that are tried.
 WEIGHTS = 10.0 ** np.arange(2, 16, 0.25)
 
 

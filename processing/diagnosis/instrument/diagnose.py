@@ -40,6 +40,7 @@ from processing.diagnosis.search.guard import PredictedChange
 from processing.diagnosis.search.judge import Judgement
 from processing.diagnosis.search.posterior import Say
 from processing.diagnosis.search.result import Diagnosis, FoundEffect, Unexplained
+from processing.diagnosis.search.rules import MOST_TRIED
 from processing.diagnosis.search.solution import Solution
 from processing.instrument.model import InstrumentModel
 
@@ -158,6 +159,6 @@ def _unexplained(used: Outcome, names: Names) -> Unexplained:
     tried = tuple(c.candidates[0].label for c in names.named)
     return Unexplained(
         description=descriptions([c.name for c in used.asked.captures], used.after),
-        tried=tried or tuple(r.candidate for r in ranking(used.found, used.solved.before)[:5]),
+        tried=tried or tuple(r.candidate for r in ranking(used.found, used.solved.before)[:MOST_TRIED]),
         empirical=empirical(used.found, used.solved),
     )

@@ -16,13 +16,10 @@ from processing.arrays import Array
 from processing.diagnosis.instrument.features import inside
 from processing.diagnosis.instrument.pixel_sums import Pixels
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.projection import RANK
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.rules import LIMIT
+from processing.diagnosis.search.range_of import range_of
+from processing.diagnosis.search.rules import FEWEST_AT_EDGES, LIMIT
 from processing.diagnosis.search.space import Space
-
-#: Pixels at edges from which on they are asked.
-FEWEST = 10
 
 
 @dataclass(frozen=True)
@@ -76,7 +73,7 @@ def _of_capture(
     if data.steep is None:
         return None
     edge = data.steep & inside(*data.steep.shape) & ~data.clipped
-    if edge.sum() < FEWEST:
+    if edge.sum() < FEWEST_AT_EDGES:
         return None
     here = [[c for c in group if c.acts(k, data.wavelength_nm)] for group in shifts]
     without = _without(space, values, [c for group in here for c in group])
@@ -84,8 +81,7 @@ def _of_capture(
     rest_px = changes.shift_px / data.pitch
     rows, sigma, use = data.values_per_pixel, moments.sigma.astype(np.float32)[:, None, None], moments.counts
     images = data.moved_back(rest_px + problem.own_px[k]).signal.reshape(rows, *edge.shape) / sigma
-    u, size, _ = np.linalg.svd(problem.columns(k, changes) * use[:, None], full_matrices=False)
-    q = u[:, size > RANK * size[0]].astype(np.float32)
+    q = range_of(problem.columns(k, changes) * use[:, None]).astype(np.float32)
     fitted = (q @ (q.T @ images.reshape(rows, -1))).reshape(images.shape)
     pixels = Pixels(data)
     scale, free = np.sqrt(pixels.scale[edge]), 1 - np.sum(q * q, axis=1)

@@ -9,7 +9,7 @@ from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.result import Empirical
-from processing.diagnosis.search.rules import ALSO, EMPIRICAL_SHARE, TAU
+from processing.diagnosis.search.rules import ALSO, ALSO_FITS, EMPIRICAL_SHARE, TAU
 from processing.diagnosis.search.solution import Solution
 from processing.instrument.effects.base import GeneralEffect
 
@@ -38,7 +38,7 @@ def empirical(found: Posterior, solved: Solution) -> Empirical | None:
         rms_percent_in_sample=100 * solved.before.rms * float(np.sqrt(share)),
         values=tuple(values.tolist()),
         unit=best.parameters[0].unit,
-        would_also_fit=tuple(dict.fromkeys(c.short for e, c, _ in fits if e <= left + 1.5 * freedom)),
+        would_also_fit=tuple(dict.fromkeys(c.short for e, c, _ in fits if e <= left + ALSO_FITS * freedom)),
     )
 
 

@@ -21,23 +21,29 @@ FEATURES = (
     *("counts", "one", "square", "cube", "fourth", "log", "log_square", "log_cube"),
     *("dx", "dy", "dxx", "dxy", "dyy"),
 )
-#: The last of them are derivatives of the image by position.
+#: [features, fixed] The last of them are derivatives of the image by position.
 DERIVATIVES = 5
-#: Signals below this have the logarithm of this.
+#: [of full scale] Signals below this have the logarithm of this.
 TINY = 1e-6
 NOTHING_SHARED = SharedNoise()
-#: Savitzky-Golay filters of seven points: value (third order), first and second derivative (fourth and fifth order).
+#: [1, fixed] Savitzky-Golay filters of seven points: value (third order), first and second derivative (fourth and fifth
+#: order).
 VALUE = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21
 FIRST = np.array([22.0, -67.0, -58.0, 0.0, 58.0, 67.0, -22.0]) / 252
 SECOND = np.array([-13.0, 67.0, -19.0, -70.0, -19.0, 67.0, -13.0]) / 132
 FILTERS = (VALUE, FIRST, SECOND)
-#: Pixels at the rim that the filters do not reach.
-MARGIN = 3
-#: Order of each derivative down and across the image, as they stand in FEATURES.
+#: [pixels, fixed] At the rim that the filters do not reach.
+MARGIN = VALUE.size // 2
+#: [1, fixed] Order of each derivative down and across the image, as they stand in FEATURES.
 ORDERS = ((0, 1), (1, 0), (0, 2), (1, 1), (2, 0))
-#: Filters down and across the image of a pixel itself and of its derivatives.
+#: [1, fixed] The filter that leaves a pixel as it is.
 POINT = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+#: [1, fixed] Filters down and across the image of a pixel itself and of its derivatives.
 PATTERNS = ((POINT, POINT), *((FILTERS[down], FILTERS[across]) for down, across in ORDERS))
+
+
+#: [answers] That are kept of what frames have of their noise in common.
+KEPT = 1024
 
 
 def features(u: NDArray[np.floating[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -91,7 +97,7 @@ def derivatives_of_part(u: NDArray[np.floating], rows: slice, columns: slice) ->
 
 
 # Frames that did not move, or moved together, share one answer.
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=KEPT)
 def shared_noise(x_px: float, y_px: float, mixed: SharedNoise = NOTHING_SHARED) -> Array:
     """Covariance (6, 6) of the noise of a pixel and its derivatives in a frame that was moved back by so many pixels.
 

@@ -9,6 +9,7 @@ The expected noise of every product is kept beside it, so that an excess over th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -19,16 +20,18 @@ from processing.arrays import Array, BoolArray
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.features import FEATURES
 from processing.diagnosis.instrument.pixel_sums import Pixels, Precision, features_of_pixels, products_of_pixels
+from processing.diagnosis.search.rules import (
+    FEWEST_PIXELS_FOR_TILES,
+    FEWEST_TILES,
+    FOLDS_OF_STATES,
+    FOLDS_OF_TILES,
+    MOST_ROWS_FOR_TILES,
+    MOST_TILES,
+    TILE_PX,
+)
 
-#: Parts that are held out in turn: of the image, or of the states (of which there are few, so each part is smaller).
-FOLDS_OF_TILES = 2
-FOLDS_OF_STATES = 5
-#: Tiles along each side of the image, for effects and structure that vary over it; of a small image, so many that each
-#: has four pixels a side.
-TILES, FEWEST_TILES, TILE_PX = 16, 8, 4
-#: Captures with more rows, or fewer pixels, than these hold out states, others hold out tiles of the image.
-MOST_ROWS_FOR_TILES = 100
-FEWEST_PIXELS_FOR_TILES = 64
+#: [of the largest] Eigenvalues of second moments below this are none.
+LEAST_MOMENT = 1e-15
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,11 @@ def holds_out_states(data: CaptureData) -> bool:
     return data.values_per_pixel > MOST_ROWS_FOR_TILES or int(data.usable.sum()) < FEWEST_PIXELS_FOR_TILES
 
 
+def folds_of(captures: Sequence[CaptureData]) -> int:
+    """How many parts of the captures are held out in turn."""
+    return FOLDS_OF_STATES if any(holds_out_states(c) for c in captures) else FOLDS_OF_TILES
+
+
 def moments_of(data: CaptureData, folds: int) -> Moments:
     """Build the moments of a capture, to be held out in so many parts."""
     pixels, channels = Pixels(data), data.signal.shape[1]
@@ -172,7 +180,7 @@ class _Grid:
     @classmethod
     def of(cls, height: int, width: int) -> _Grid:
         small = min(height, width)
-        side = min(TILES, max(small // TILE_PX, FEWEST_TILES), small)
+        side = min(MOST_TILES, max(small // TILE_PX, FEWEST_TILES), small)
         r, rows, y = _divided(height, side)
         c, columns, x = _divided(width, side)
         boxes = tuple((here, there) for here in rows for there in columns)
@@ -248,5 +256,5 @@ def _blocks_of(
 
 def _square_root(s: Array) -> Array:
     value, vector = np.linalg.eigh(s)
-    keep = value > 1e-15 * value[-1]
+    keep = value > LEAST_MOMENT * value[-1]
     return np.asarray(vector[:, keep] * np.sqrt(value[keep]))

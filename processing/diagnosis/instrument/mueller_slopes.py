@@ -8,7 +8,7 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.projection import RANK
+from processing.diagnosis.search.range_of import RANK
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import Changes
 

@@ -25,7 +25,7 @@ from processing.diagnosis.search.sets import Group, Sets, State
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import InstrumentEffect
 
-#: Chi-square that has odds of 99 to 1.
+#: [chi-square, fixed] That has odds of 99 to 1.
 STANDS_OUT = 2 * float(np.log(SURE / (1 - SURE)))
 
 

@@ -14,13 +14,32 @@ from collections.abc import Sequence
 import numpy as np
 
 from processing.arrays import Array
+from processing.diagnosis.search.rules import LEAST_TURN_DEG
 from processing.effect import Parameter
 from processing.instrument.changes import Changes, Conditions
 from processing.instrument.effects.base import LevelEffect, OfOneCapture, OpticsEffect, moving_axes
 from processing.instrument.model import InstrumentModel, Retarder
 
-#: Periods a turn that no effect of the list has, of what a turning plate does.
+#: [periods a turn, fixed] That no effect of the list has, of what a turning plate does.
 PERIODS = {"retardance": (2, 3, 4), "azimuth": (3, 4), "transmission": (3, 4)}
+
+
+#: [degree] Size of such a wave of a retardance or an azimuth; what it explains does not depend on this.
+WAVE_DEG = 0.5
+#: [1] Size of such a wave of a transmission; what it explains does not depend on this.
+WAVE_SHARE = 0.01
+#: [degree] Size of the turn of a sample; what it explains does not depend on this.
+TURN_DEG = 0.5
+#: [1] Size of a lag; what it explains does not depend on this.
+LAG_SHARE = 0.005
+#: [1] Size of a jump; what it explains does not depend on this.
+JUMP_SHARE = 0.01
+#: [sizes] To either side that all of them may have; nothing is fitted that far.
+REACH = 20.0
+
+
+def _about_zero(name: str, unit: str, size: float) -> Parameter:
+    return Parameter(name, unit, -REACH * size, REACH * size, size)
 
 
 class WaveOfAPlate(OpticsEffect):
@@ -34,12 +53,12 @@ class WaveOfAPlate(OpticsEffect):
         """Retarders that turn by more than half a turn: over less a wave is hardly anything but a slope."""
         axes = moving_axes(model, conditions)
         plates = (e for e in model.elements() if isinstance(e, Retarder) and e.axis in axes)
-        return tuple(e.name for e in plates if np.ptp(e.ratio * conditions.angles_deg[e.axis or ""]) > 180)
+        return tuple(e.name for e in plates if np.ptp(e.ratio * conditions.angles_deg[e.axis or ""]) > LEAST_TURN_DEG)
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         """Cosine and sine."""
-        unit, size = ("1", 0.01) if self.what == "transmission" else ("degree", 0.5)
-        return tuple(Parameter(n, unit, -20 * size, 20 * size, size) for n in ("cos", "sin"))
+        unit, size = ("1", WAVE_SHARE) if self.what == "transmission" else ("degree", WAVE_DEG)
+        return tuple(_about_zero(n, unit, size) for n in ("cos", "sin"))
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         """Add the wave to what the plate does."""
@@ -64,7 +83,7 @@ class TurningSample(OpticsEffect, OfOneCapture):
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         """From the first state to the last."""
-        return (Parameter("turn", "degree", -10.0, 10.0, 0.5),)
+        return (_about_zero("turn", "degree", TURN_DEG),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         """Turn every element."""
@@ -84,7 +103,7 @@ class ImageLag(OpticsEffect):
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         """The share."""
-        return (Parameter("share", "1", -0.1, 0.1, 0.005),)
+        return (_about_zero("share", "1", LAG_SHARE),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         """Read it with the next one."""
@@ -102,7 +121,7 @@ class JumpOfTheSource(LevelEffect, OfOneCapture):
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         """The share."""
-        return (Parameter("share", "1", -0.5, 0.5, 0.01),)
+        return (_about_zero("share", "1", JUMP_SHARE),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         """Another level from that state on."""

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from processing.arrays import Array, BoolArray
 from processing.diagnosis.captured.capture_data import CaptureData, Correct, for_strips
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.projection import RANK, add_response
+from processing.diagnosis.instrument.projection import add_response
 from processing.diagnosis.instrument.undone import undoing
 from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.range_of import range_of
 from processing.diagnosis.search.rules import NOISE_LEVEL
 from processing.diagnosis.search.space import Space
 
@@ -78,8 +79,7 @@ def _rest(problem: InstrumentProblem, k: int, space: Space, values: Array) -> tu
     a = problem.columns(k, changes) * problem.moments[k].counts[:, None]
     counts = data.signal.reshape(data.values_per_pixel, *data.signal.shape[2:])
     y = add_response(counts, problem.coefficients(k, changes), a)
-    u, size, _ = np.linalg.svd(a, full_matrices=False)
-    q = u[:, size > RANK * size[0]]
+    q = range_of(a)
     outside = (np.eye(len(a)) - q @ q.T) * level[:, None] / level
     rest = outside.astype(np.float32) @ y.reshape(len(a), -1)
     return rest.reshape(y.shape), 1 - np.sum(q * q, axis=1)

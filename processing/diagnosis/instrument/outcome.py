@@ -91,7 +91,7 @@ def left_of(problem: InstrumentProblem, r: Residual) -> float:
 def white(r: Residual) -> bool:
     """Whether the mean residual of a state tells nothing of that of the next one."""
     mean = r.mean[np.isfinite(r.mean)]
-    if mean.size < 8 or not np.any(mean):
+    if mean.size <= WHITE**2 or not np.any(mean):
         return True
     centred = mean - mean.mean()
     lag = float(centred[1:] @ centred[:-1] / (centred @ centred))

@@ -26,13 +26,17 @@ from processing.diagnosis.instrument.features import (
 )
 
 Precision = type[np.float32] | type[np.float64]
-#: Pixels of a strip, and rows that it has at least: derivatives need three more on either side.
-STRIP_PX, STRIP_ROWS = 16384, 16
-#: Pixels that are multiplied together: their features stay in the cache.
+#: [pixels] Of a strip.
+STRIP_PX = 16384
+#: [rows] That a strip has at least: derivatives need three more on either side.
+STRIP_ROWS = 16
+#: [pixels] That are multiplied together: their features stay in the cache.
 TOGETHER = 2048
-#: Pixels from which on single precision is worth it, and least noise over mean signal for which it is enough.
-MANY_PX, LEAST_NOISE = 50_000, 1e-4
-#: Pixels that tell the directions over the rows in which most of the light is.
+#: [pixels] From which on single precision is worth it.
+MANY_PX = 50_000
+#: [of the mean signal] Least noise for which single precision is enough.
+NOISE_OF_SINGLE = 1e-4
+#: [pixels] That tell the directions over the rows in which most of the light is.
 PIXELS_OF_BASIS = 5000
 
 
@@ -92,7 +96,7 @@ class Pixels:
 
     def precision(self, noise_floor: float) -> Precision:
         """Single precision where there are many pixels, and their noise over the mean signal is far above it."""
-        return np.float32 if self.good.sum() > MANY_PX and noise_floor > LEAST_NOISE else np.float64
+        return np.float32 if self.good.sum() > MANY_PX and noise_floor > NOISE_OF_SINGLE else np.float64
 
     @cached_property
     def basis(self) -> Array:

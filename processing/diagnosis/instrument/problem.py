@@ -19,20 +19,20 @@ from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
 from processing.diagnosis.instrument.moments import (
-    FOLDS_OF_STATES,
-    FOLDS_OF_TILES,
     Moments,
-    holds_out_states,
+    folds_of,
     moments_of,
 )
 from processing.diagnosis.instrument.noise_level import with_noise_of_light
-from processing.diagnosis.instrument.projection import RANK, add_block, noise_information
+from processing.diagnosis.instrument.projection import add_block, noise_information
 from processing.diagnosis.instrument.slopes import Columns, slopes_of_counts, slopes_of_rows
 from processing.diagnosis.instrument.tile_rows import tile_columns
 from processing.diagnosis.instrument.tile_slopes import slopes_of_tiles
 from processing.diagnosis.instrument.tile_sums import add_tiles
 from processing.diagnosis.instrument.undone import distance, exactly_undone, movable, undoing
 from processing.diagnosis.search.candidate import Candidate, nominal_values, pool
+from processing.diagnosis.search.range_of import range_of
+from processing.diagnosis.search.rules import ENOUGH_SOUND, EXACT
 from processing.diagnosis.search.space import Space, Sums
 from processing.instrument.applied_effects import apply_to, changes_of
 from processing.instrument.changes import Changes
@@ -44,11 +44,9 @@ from processing.instrument.effects.base import (
 )
 from processing.instrument.model import InstrumentModel
 
-#: Distance, in typical sizes, from the point of expansion up to which a correction of counts is exact enough.
-EXACT = 0.3
-#: Points of expansion that are kept besides the first: each has counts of its own.
+#: [points] Of expansion that are kept besides the first: each has counts of its own.
 MOST_POINTS = 3
-#: Element matrices that are kept for use in another evaluation.
+#: [matrices] Of elements that are kept for use in another evaluation.
 MOST_BUILT = 64
 
 
@@ -82,7 +80,7 @@ class InstrumentProblem:
         own = (changes_of(m, c.conditions, c.name).shift_px / c.pitch for m, c in pairs)
         self.own_px = tuple(s if movable(s) else np.zeros_like(s) for s in own)
         self.captures = self.still if moved_back else _moved_back(self.still, self.own_px)
-        self.folds = folds or (FOLDS_OF_STATES if any(holds_out_states(c) for c in self.captures) else FOLDS_OF_TILES)
+        self.folds = folds or folds_of(self.captures)
         self.moments: tuple[Moments, ...] = tuple(moments_of(c, self.folds) for c in self.captures)
         self._built: list[dict[tuple[str, bytes], Array]] = [{} for _ in self.captures]
         #: What a chi-square of each capture counts; less where structure is left in it.
@@ -111,8 +109,7 @@ class InstrumentProblem:
         for k, moments in enumerate(self.moments):
             use = moments.counts
             a = self.columns(k, self.changes(k, empty, np.zeros(0)))[use]
-            u, size, _ = np.linalg.svd(a, full_matrices=False)
-            q = u[:, size > RANK * size[0]]
+            q = range_of(a)
             z = np.concatenate(
                 [b.counts for b in moments.blocks[:: self.folds if moments.tiles is None else 1]], axis=1
             )
@@ -327,7 +324,7 @@ class InstrumentProblem:
         for block in self.moments[k].blocks:
             if block.clipped and changes.drop_clipped:
                 # What is left of a clipped pixel is its states without any clipping, if they are enough.
-                if block.sound.size < 1.5 * a.shape[1]:
+                if block.sound.size < ENOUGH_SOUND * a.shape[1]:
                     continue
                 block = replace(block, rows=block.sound)
             if block.rows.size:

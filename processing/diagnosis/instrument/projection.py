@@ -14,10 +14,8 @@ from processing.diagnosis.captured.capture_data import for_strips
 from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES, derivatives_of_part, features
 from processing.diagnosis.instrument.moments import Block, Moments
 from processing.diagnosis.instrument.noise_of_parts import NoiseOfParts, fitted
+from processing.diagnosis.search.range_of import RANK, range_of
 from processing.diagnosis.search.space import Sums
-
-#: Singular values below this, relative to the largest, are none.
-RANK = 1e-8
 
 
 def add_response(counts: NDArray[Any], coefficients: Array, a: Array) -> NDArray[Any]:
@@ -31,8 +29,7 @@ def add_response(counts: NDArray[Any], coefficients: Array, a: Array) -> NDArray
     plain, around = coefficients[:-DERIVATIVES], coefficients[-DERIVATIVES:]
     fitted = None
     if np.any(around):
-        u, size, _ = np.linalg.svd(a, full_matrices=False)
-        q = u[:, size > RANK * size[0]].astype(counts.dtype)
+        q = range_of(a).astype(counts.dtype)
         fitted = (q @ (q.T @ counts.reshape(counts.shape[0], -1))).reshape(counts.shape)
 
     def strip(rows: slice) -> None:
@@ -176,8 +173,7 @@ def noise_information(block: Block, a: Array, dc: Array, moments: Moments) -> Ar
     moving = np.flatnonzero(np.any(dc[:, -DERIVATIVES:, rows], axis=(1, 2)))
     if not moving.size:
         return out
-    u, size, _ = np.linalg.svd(a[rows], full_matrices=False)
-    q = u[:, size > RANK * size[0]]
+    q = range_of(a[rows])
     hat = q @ q.T
     noise = block.noise[rows, -DERIVATIVES:, -DERIVATIVES:] / moments.sigma[rows, None, None] ** 2
     # P diag(dc) Q Q^T for each value and derivative.

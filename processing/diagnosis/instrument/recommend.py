@@ -11,11 +11,14 @@ from processing.arrays import Array
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit
-from processing.diagnosis.search.rules import APART, VISIBLE
+from processing.diagnosis.search.range_of import LEAST_OF_SIGNATURE, range_of
+from processing.diagnosis.search.rules import APART, CLEARLY_MORE, VISIBLE
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import CountsEffect, InstrumentEffect, ValuePerState
 from processing.polarization import mueller
 
+#: [typical sizes] Step of a difference of signals.
+STEP = 1e-3
 #: Samples that a lab has at hand, in the order of the trouble they make.
 SAMPLES: dict[str, NDArray[np.float64]] = {
     "air (Omega = 180 degrees, nothing at the centre)": np.eye(4),
@@ -49,7 +52,7 @@ def _capture(
             continue
         value = _power(problem, space, fit, sample, rows_side, unseen)
         # A simpler sample is preferred unless another one tells clearly more.
-        if value > power + 0.15:
+        if value > power + CLEARLY_MORE:
             best, power = name, value
     if any(isinstance(c.effect, CountsEffect) for c in rivals):
         return (
@@ -106,8 +109,8 @@ def _signature(problem: InstrumentProblem, space: Space, fit: Fit, sample: Array
     columns = []
     for j in range(candidate.size):
         moved = zero.copy()
-        moved[part.start + j] += 1e-3 * candidate.typical[j]
-        d = (signal(moved) - start) / 1e-3
+        moved[part.start + j] += STEP * candidate.typical[j]
+        d = (signal(moved) - start) / STEP
         columns.append(d - start * (start @ d) / scale**2)
     return np.stack(columns, axis=1) / scale
 
@@ -119,7 +122,6 @@ def _sine(first: Array, second: Array) -> float:
         norm = np.linalg.norm(a)
         if norm < VISIBLE:
             return 0.0
-        u, size, _ = np.linalg.svd(b, full_matrices=False)
-        u = u[:, size > 1e-9 * max(size[0], 1e-300)]
+        u = range_of(b, LEAST_OF_SIGNATURE)
         out = min(out, float(np.linalg.norm(a - u @ (u.T @ a)) / norm))
     return out

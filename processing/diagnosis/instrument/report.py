@@ -11,8 +11,10 @@ from processing.arrays import Array
 from processing.diagnosis.instrument.diagnose import Judged
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import add_response
-from processing.diagnosis.instrument.structure import HARMONICS, Residual
+from processing.diagnosis.instrument.structure import Residual
 from processing.diagnosis.search.fit import Fit
+from processing.diagnosis.search.range_of import rank_of
+from processing.diagnosis.search.rules import HARMONICS
 from processing.diagnosis.search.space import Space
 from processing.polarization.cloude import xi0_and_dominant
 from processing.reports.colours import SIGNED
@@ -164,7 +166,7 @@ def _mueller(problem: InstrumentProblem, k: int, space: Space, fit: Fit) -> Arra
     data = problem.captures[k]
     changes = problem.changes(k, space, values)
     w = problem.models[k].rows(data.conditions.angles_deg, changes).reshape(-1, 16) * data.row_exposure[:, None]
-    if np.linalg.matrix_rank(w, rtol=1e-8) < 16:
+    if rank_of(w) < 16:
         return None
     rows, shape = w.shape[0], data.signal.shape[2:]
     y = data.signal.reshape(rows, *shape).astype(float)

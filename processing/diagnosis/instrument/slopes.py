@@ -24,7 +24,7 @@ from processing.instrument.model import InstrumentModel
 Columns = Callable[[Changes], Array]
 #: Makes the changes of a capture of the values (K,) of a space.
 ChangesOf = Callable[[Array], Changes]
-#: Step of a derivative, in typical sizes.
+#: [typical sizes] Step of a derivative.
 STEP = 1e-4
 
 

@@ -15,13 +15,18 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause
 from processing.diagnosis.search.posterior import Posterior
+from processing.diagnosis.search.range_of import range_of
 from processing.diagnosis.search.rules import ONE_WAVE, SURE
 from processing.instrument.effects.base import SourceEffect, ValuePerState
 
-#: Frequencies of a wave over n states, for each state; and between two of them, where a wave is looked at closely.
-FREQUENCIES, CLOSELY = 8, 9
-#: Values of the largest pattern, beside a drift: a wave, or a jump and a bend.
+#: [frequencies] Of a wave over n states, for each state.
+FREQUENCIES = 8
+#: [frequencies] Between two of them, where a wave is looked at closely.
+CLOSELY = 9
+#: [values, fixed] Of the largest pattern, beside a drift: a wave, or a jump and a bend.
 VALUES = 2
+#: [of the largest] Singular values of a pattern beside a drift below which it is a drift itself.
+BESIDE_DRIFT = 1e-6
 
 
 def waves(cycles: Array, n: int) -> Array:
@@ -157,8 +162,7 @@ def patterned(values: Array, information: Array, covariance: Array) -> Patterned
     for pattern in (*waves(_cycles(n)[0], n), *jumps(n)):
         beside = root @ pattern
         beside -= np.outer(drift, drift @ beside)
-        u, size, _ = np.linalg.svd(beside, full_matrices=False)
-        along = u[:, size > 1e-6 * size[0]].T @ seen
+        along = range_of(beside, BESIDE_DRIFT).T @ seen
         held = max(held, float(along @ along))
     # One direction is that of the mean, one that of the drift.
     directions = float(power.clip(0).sum() ** 2 / np.sum(power.clip(0) ** 2)) - 2

@@ -11,15 +11,12 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate, NominalValue
 from processing.diagnosis.search.fit import Fit, minimize
 from processing.diagnosis.search.posterior import Say
-from processing.diagnosis.search.rules import FAR_OFF, NEAR_ENOUGH
+from processing.diagnosis.search.rules import FAR_DEG, FAR_OFF, LESS_FROM_AFAR, NEAR_DEG, NEAR_ENOUGH, STARTS
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import ChannelLevels, SourceEffect, ValuePerState
 
-#: Places from which nominal values are fitted.
-STARTS = 24
-#: Half widths of the starts of nominal values, in degrees: azimuths, which come round again; retardances of plates of a
-#: known order, and of elements of which no more than "some retardance" is known.
-ANY_AZIMUTH, NEAR, FAR = 90.0, 20.0, 120.0
+#: [degree, fixed] Half width of the starts of azimuths, which come round again after half a turn.
+ANY_AZIMUTH = 90.0
 
 Values = dict[Candidate, Array]
 
@@ -52,7 +49,7 @@ def _searched(problem: InstrumentProblem, base: Space, pool: Sequence[Candidate]
     ]
     wide = Space((*base.candidates, *free))
     values = np.concatenate([fit.values, np.zeros(wide.size - base.size)])
-    return _by_candidate(wide, _best_start(problem, wide, values, fit.excess))
+    return _by_candidate(wide, _best_start(problem, wide, values, fit.excess, STARTS))
 
 
 def best_of_starts(problem: InstrumentProblem, space: Space, starts: int, begin: Array | None = None) -> Fit:
@@ -70,7 +67,7 @@ def _best_start(
     space: Space,
     values: Array,
     best: float,
-    starts: int = STARTS,
+    starts: int,
     enough: float = 0.0,
     free: BoolArray | None = None,
 ) -> Array:
@@ -80,7 +77,7 @@ def _best_start(
     """
     random, start = np.random.default_rng(0), values
     for k in range(starts + 1):
-        width = _widths(space, NEAR if k % 2 else FAR)
+        width = _widths(space, NEAR_DEG if k % 2 else FAR_DEG)
         here = random.uniform(-1, 1, space.size) * width if k else start
         tried = minimize(problem, space, here, expansions=0, free=free)
         if tried.excess < best:
@@ -101,11 +98,11 @@ def _widths(space: Space, retardance: float) -> Array:
 
 def _anywhere(candidate: Candidate) -> bool:
     """A nominal value that may be far off: no window, no diattenuation."""
-    return isinstance(candidate.effect, NominalValue) and candidate.parameters[0].typical >= NEAR
+    return isinstance(candidate.effect, NominalValue) and candidate.parameters[0].typical >= NEAR_DEG
 
 
 def _far(problem: InstrumentProblem, pool: Sequence[Candidate], fit: Fit) -> Values:
-    best, out = 0.5 * fit.excess, {}
+    best, out = LESS_FROM_AFAR * fit.excess, {}
     for candidate in pool:
         for start in candidate.starts:
             tried = minimize(problem, Space((candidate,)), start)
@@ -153,7 +150,7 @@ class _AtOne:
         fit = minimize(self.problem, self.space, np.zeros(self.space.size), free=self._large)
         values = fit.values
         if fit.rms > NEAR_ENOUGH:
-            values = _best_start(self.problem, self.space, values, fit.excess, enough=NEAR_ENOUGH, free=self._large)
+            values = _best_start(self.problem, self.space, values, fit.excess, STARTS, NEAR_ENOUGH, self._large)
         return _by_candidate(self.space, values)
 
     def beside(self, start: Mapping[str, Array]) -> Values:

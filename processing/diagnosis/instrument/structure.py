@@ -18,15 +18,15 @@ from processing.diagnosis.instrument.tile_rows import tile_columns
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.judge import beyond_chance
 from processing.diagnosis.search.linearized import deviation_of
+from processing.diagnosis.search.range_of import range_of
+from processing.diagnosis.search.rules import FEWEST_FOR_PATTERNS, FEWEST_PAIRS, HARMONICS, PATCHES
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import FIELD_TERMS, Changes, field_terms
 from processing.instrument.effects.base import ImageShift
 from processing.reduction.move_image import neighbour_noise
 
-#: Harmonics of a turn that are shown of a residual.
-HARMONICS = 4
-#: Pixels from which on tests by signal and by place are made.
-FEWEST_PIXELS = 30
+#: [of the largest] Eigenvalues of the light below this are none.
+LEAST_LIGHT = 1e-10
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     free = np.zeros((rows, height, width), dtype=np.float32)
     signal = np.zeros((rows, height, width), dtype=np.float32)
     for here, columns in _parts(problem, capture, changes, a):
-        q = _basis(columns / level[:, None] * moments.counts[:, None])
+        q = range_of(columns / level[:, None] * moments.counts[:, None])
         part = y[:, *here]
         onto = (q * level[:, None]).astype(np.float32) @ (q.T / level).astype(np.float32)
         signal[:, *here] = (onto @ part.reshape(rows, -1)).reshape(part.shape)
@@ -120,10 +120,7 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     n, channels = data.signal.shape[:2]
     mean = r[:, good].mean(axis=1) if good.any() else np.zeros(rows)
     states = mean.reshape(n, channels).mean(axis=1)
-    harmonics = {
-        axis: np.array([2 * abs(np.mean(states * np.exp(1j * h * np.deg2rad(v)))) for h in range(1, HARMONICS + 1)])
-        for axis, v in data.conditions.angles_deg.items()
-    }
+    harmonics = {axis: _harmonics(states, v) for axis, v in data.conditions.angles_deg.items()}
     flat = r[:, good]
     moment = flat @ flat.T / max(flat.shape[1], 1)
     value, vector = np.linalg.eigh(moment.astype(np.float64))
@@ -138,6 +135,12 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
         leading_share=float(value[-1] / max(value.sum(), 1e-300)),
         left=left,
     )
+
+
+def _harmonics(states: Array, angles_deg: Array) -> Array:
+    """Amplitudes (HARMONICS,) of values (N,) of the states in periods of a turn."""
+    turns = np.deg2rad(angles_deg)
+    return np.array([2 * abs(np.mean(states * np.exp(1j * h * turns))) for h in range(1, HARMONICS + 1)])
 
 
 def _alike(data: CaptureData) -> Array:
@@ -175,11 +178,6 @@ def _parts(
     return list(zip(tiles.boxes, columns, strict=True))
 
 
-def _basis(a: Array) -> Array:
-    u, size, _ = np.linalg.svd(a, full_matrices=False)
-    return np.asarray(u[:, size > 1e-8 * size[0]])
-
-
 def _tests(
     images: Images,
     shown: Array,
@@ -202,13 +200,13 @@ def _tests(
     freedom = shown @ wanted.sum(axis=1, dtype=float)
     # Name to chi-square beyond noise, and its standard deviation with nothing but noise.
     found = {"sum of squares": (_square(flat) - freedom, deviation_of(max(freedom, 1e-300), spread))}
-    if count < FEWEST_PIXELS:
+    if count < FEWEST_FOR_PATTERNS:
         # What goes with the signal, or with the place, needs an image.
         return _in_deviations(found)
     # Linear in the signal: every pixel's residual against the leading components of the fitted signal near by.
     s = images.around[:, good]
     _, size, vt = np.linalg.svd((s @ s.T).astype(float))
-    keep = min(columns, int(np.sum(size > 1e-10 * size[0])))
+    keep = min(columns, int(np.sum(size > LEAST_LIGHT * size[0])))
     turned = vt[:keep] / np.sqrt(np.maximum(size[:keep], 1e-300))[:, None]
     weights = turned.astype(np.float32) @ s
     linear = flat @ weights.T
@@ -231,7 +229,7 @@ def _tests(
             both = good[first[1:]] & good[second[1:]]
             product = r[first] * r[second]
             product[:, ~both] = 0.0
-            if both.sum() * len(r) > 100:
+            if both.sum() * len(r) > FEWEST_PAIRS:
                 null = alike[:, k] @ np.sum(expected[first], axis=(1, 2), where=both, dtype=float)
                 # The residuals of the rows of one pixel go together: a pair of pixels counts as one.
                 pairs = product.sum(axis=0, dtype=float)
@@ -252,7 +250,7 @@ def _in_deviations(found: dict[str, tuple[float, float]]) -> tuple[dict[str, flo
 
 
 def _patches(r: NDArray[np.float32], expected: NDArray[np.float32], spread: float) -> tuple[float, float]:
-    side = max(r.shape[1] // 8, 1)
+    side = max(r.shape[1] // PATCHES, 1)
     h, w = r.shape[1] // side * side, r.shape[2] // side * side
     shape = (r.shape[0], h // side, side, w // side, side)
     total = np.nansum(r[:, :h, :w].reshape(shape), axis=(2, 4), dtype=np.float64)
@@ -263,7 +261,7 @@ def _patches(r: NDArray[np.float32], expected: NDArray[np.float32], spread: floa
 
 
 def _correlates(r: NDArray[np.float32], signal: NDArray[np.float32], good: NDArray[np.bool_]) -> dict[str, float]:
-    if good.sum() < 30 or min(r.shape[1:]) < 3:
+    if good.sum() < FEWEST_FOR_PATTERNS or min(r.shape[1:]) < 3:
         return {}
     loud = np.sqrt(np.mean(np.nan_to_num(r) ** 2, axis=0))
     mean = signal.mean(axis=0)

@@ -15,19 +15,16 @@ from processing.arrays import Array
 from processing.diagnosis.instrument.mueller_slopes import mueller_slopes
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.odds import MOST_ODDS
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import TAKES_PART, UNSEEN
+from processing.diagnosis.search.rules import MOST_STORED, SMALL_PART, STORED_SHARE, TAKES_PART, UNSEEN
 from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.search.stored import by_wavelength, parameters_of, scope_of
 from processing.instrument.effects.base import FieldEffect, Switch
 from processing.instrument.model import AppliedEffect, EffectParameter, SystematicError
 
-#: Share of the squared error of M that the stored directions hold, and how many they are at most.
-SHARE, MOST = 0.995, 20
-#: Part of the largest effect in a direction below which another one in it is left out.
-SMALL = 0.03
-#: Elements of M/m00 that can be wrong.
+#: [elements, fixed] Of M/m00 that can be wrong.
 ELEMENTS = 15
 
 
@@ -66,12 +63,12 @@ def systematic_error(problem: InstrumentProblem, found: Posterior, used: Solutio
     products = products.sum(axis=0)
     lasts = np.array([c.capture is None for c in space.candidates for _ in c.parameters])
     size, directions = _leading(covariance, products, lasts)
-    enough = int(np.searchsorted(np.cumsum(size), SHARE * size.sum())) + 1
+    enough = int(np.searchsorted(np.cumsum(size), STORED_SHARE * size.sum())) + 1
     names = tuple(c.name for c in problem.captures)
     told = []
-    for direction in directions.T[: min(enough, MOST)]:
+    for direction in directions.T[: min(enough, MOST_STORED)]:
         weight = np.abs(direction) * np.sqrt(np.maximum(np.diag(products), 0.0))
-        told.append(_as_effects(space, direction, weight > SMALL * weight.max(), names))
+        told.append(_as_effects(space, direction, weight > SMALL_PART * weight.max(), names))
     error = SystematicError(
         directions=tuple(told),
         rms_over_m00=float(np.sqrt(of_elements.sum() / light / ELEMENTS)),
@@ -120,7 +117,7 @@ def _unseen(found: Posterior) -> Array:
         own = np.linalg.inv(s + np.eye(q.size))
         # Evidence for the group at its typical size, against none.
         gain = 0.5 * float(q @ own @ q - np.linalg.slogdet(np.eye(q.size) + s)[1])
-        chance = 1 / (1 + (1 - UNSEEN) / UNSEEN * np.exp(-np.clip(gain, -50, 50)))
+        chance = 1 / (1 + (1 - UNSEEN) / UNSEEN * np.exp(-np.clip(gain, -MOST_ODDS, MOST_ODDS)))
         scale = typical[group.index]
         out[np.ix_(group.index, group.index)] += chance * own * np.outer(scale, scale)
     return out

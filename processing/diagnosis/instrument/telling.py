@@ -26,7 +26,7 @@ from processing.diagnosis.search.result import (
     NotMeasured,
     Ranked,
 )
-from processing.diagnosis.search.rules import DECISIVE, DOUBTED, LIKELY, NOISE_ERROR, SEEN, SURE
+from processing.diagnosis.search.rules import DECISIVE, DOUBTED, LIKELY, MOST_RANKED, NOISE_ERROR, SEEN, SURE
 from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.search.stored import by_wavelength, parameters_of, scope_of
@@ -226,7 +226,7 @@ def ranking(found: Posterior, before: HeldOut) -> tuple[Ranked, ...]:
             evidence=round(gain, 1),
             rms_percent=100 * before.rms * float(np.sqrt(max(1 - gain / total, 0.0))),
         )
-        for gain, k in sorted(alone, reverse=True)[:10]
+        for gain, k in sorted(alone, reverse=True)[:MOST_RANKED]
     )
 
 

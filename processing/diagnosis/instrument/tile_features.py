@@ -13,7 +13,7 @@ from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.moments import Moments, Tiles
 from processing.diagnosis.instrument.pixel_sums import STRIP_PX, Part, Pixels
 
-#: The counts alone, of all features.
+#: [features, fixed] The counts alone, of all features.
 PLAIN = (0,)
 
 

@@ -17,8 +17,10 @@ from processing.instrument.changes import Changes
 from processing.instrument.model import InstrumentModel
 from processing.reduction.effects_of_capture import extra_retardance, with_extra
 
-#: Frequencies of what is linear, and of what is quadratic, in the rows.
-LINEAR, QUADRATIC = 1, 2
+#: [1, fixed] Frequency of what is linear in the rows.
+LINEAR = 1
+#: [1, fixed] Frequency of what is quadratic in the rows.
+QUADRATIC = 2
 
 
 def tile_columns(model: InstrumentModel, data: CaptureData, moments: Moments, changes: Changes) -> Array:

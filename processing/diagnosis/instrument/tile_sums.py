@@ -19,7 +19,7 @@ from processing.diagnosis.instrument.tile_slope_sums import add_slopes
 from processing.diagnosis.instrument.tile_slopes import TileSlopes
 from processing.diagnosis.search.space import Sums
 
-#: Tiles that are reckoned with together: what is made of them stays small.
+#: [tiles] That are reckoned with together: what is made of them stays small.
 TOGETHER = 32
 
 

@@ -9,16 +9,18 @@ import numpy as np
 from processing.arrays import Array
 from processing.diagnosis.instrument.features import MARGIN
 from processing.diagnosis.instrument.noise_of_light import scatter_prefers
-from processing.diagnosis.instrument.problem import EXACT, InstrumentProblem
+from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.starts import best_of_starts, first_values
 from processing.diagnosis.instrument.undone import exactly_undone
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
+from processing.diagnosis.search.descent import LEAST_WIDTH
 from processing.diagnosis.search.fit import Fit, held_out, minimize, prior, score
 from processing.diagnosis.search.likely_set import everything
 from processing.diagnosis.search.posterior import Posterior, Say, first_look, posterior, resampled
 from processing.diagnosis.search.rules import (
     DECISIVE,
+    EXACT,
     FAR_OFF,
     GROWTH,
     LIKELY,
@@ -40,7 +42,7 @@ from processing.instrument.effects.base import (
 )
 from processing.storage.capture import CaptureError
 
-#: Times that the noise is taken from a first look at the counts before anything is weighed.
+#: [times] That the noise is taken from a first look at the counts before anything is weighed.
 FIRST_LOOKS = 4
 
 
@@ -329,7 +331,7 @@ def solution(bench: WholeBench, found: Posterior, unfit: Sequence[Candidate] = (
     typical = space.joined("typical")
     part = dict(zip(found.space.candidates, found.space.slices, strict=True))
     spread = np.concatenate([np.zeros(0), *(np.diag(found.covariance)[part[c]] for c in space.candidates)])
-    weak = found.samples.best.unit / np.maximum(np.sqrt(spread + values**2), 1e-3 * typical) ** 2
+    weak = found.samples.best.unit / np.maximum(np.sqrt(spread + values**2), LEAST_WIDTH * typical) ** 2
     return Solution(bench.base, base_fit, before, space, fit, held_out(asked, space, fit, weak), weak)
 
 

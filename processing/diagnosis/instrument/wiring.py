@@ -17,14 +17,12 @@ from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.starts import best_of_starts
-from processing.diagnosis.search.rules import DECISIVE, WIRING
+from processing.diagnosis.search.rules import DECISIVE, FEW_STARTS, WIRING, WIRING_SCATTER
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
 
-#: Ratios of two gears that are taken for one another in rotating-retarder polarimeters.
+#: [1, fixed] Ratios of two gears that are taken for one another in rotating-retarder polarimeters.
 GEARS = {"5 instead of 4.91": 5 / 4.91, "4.91 instead of 5": 4.91 / 5}
-#: Places from which nominal values are fitted for each mistake.
-FEW_STARTS = 5
 
 
 @dataclass(frozen=True)
@@ -77,7 +75,7 @@ def _left(problem: InstrumentProblem, space: Space, values: Array) -> float:
     excess, freedom = float(sums.excess.sum()), float(sums.freedom.sum())
     if not problem.noise_known:
         return excess + freedom
-    return max(excess, 0.0) + 4 * float(np.sqrt(2 * max(freedom, 1.0) * problem.spread))
+    return max(excess, 0.0) + WIRING_SCATTER * float(np.sqrt(2 * max(freedom, 1.0) * problem.spread))
 
 
 def _mistakes(problem: InstrumentProblem) -> Iterator[Wiring]:

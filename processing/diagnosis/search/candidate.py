@@ -10,6 +10,7 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.search.dispersion import Curve, curve
+from processing.diagnosis.search.rules import NOMINAL_DEG, NOMINAL_EXTINCTION, NOMINAL_SHARE, WINDOW_DEG
 from processing.effect import Effect, Parameter
 from processing.errors import ProcessError
 from processing.instrument.applied_effects import instrument_effects
@@ -104,18 +105,38 @@ class Candidate:
         return np.array([p.upper for p in self.parameters])
 
 
+#: [degree] How far an azimuth may be from its nominal value: no valley ends there.
+AZIMUTH_DEG = 400.0
+#: [degree] The same of a retardance.
+RETARDANCE_DEG = 200.0
+#: [degree] The same of a window.
+WINDOW_REACH_DEG = 40.0
+#: [1] The same below zero of an extinction or a depolarization: noise may take it there.
+BELOW_ZERO = 0.02
+
+
+def _nominal(field: str, window: bool) -> Parameter:
+    """A nominal value; what has no retardance is a window, and close to that."""
+    if field == "azimuth_deg":
+        return Parameter("azimuth", "degree", -AZIMUTH_DEG, AZIMUTH_DEG, NOMINAL_DEG)
+    if field == "retardance_deg":
+        reach, size = (WINDOW_REACH_DEG, WINDOW_DEG) if window else (RETARDANCE_DEG, NOMINAL_DEG)
+        return Parameter("retardance", "degree", -reach, reach, size)
+    if field == "diattenuation":
+        return Parameter(field, "1", -1.0, 1.0, NOMINAL_SHARE)
+    return Parameter(field, "1", -BELOW_ZERO, 1.0, NOMINAL_EXTINCTION if field == "extinction" else NOMINAL_SHARE)
+
+
 class NominalValue(InstrumentEffect):
     """A value of the train that the instrument file gives as only nominal (`calibrate`)."""
 
-    FIELDS: ClassVar[dict[str, Parameter]] = {
-        "azimuth_deg": Parameter("azimuth", "degree", -400, 400, 30.0),
-        "retardance_deg": Parameter("retardance", "degree", -200, 200, 30.0),
-        "extinction": Parameter("extinction", "1", -0.02, 1.0, 0.1),
-        "diattenuation": Parameter("diattenuation", "1", -1.0, 1.0, 0.01),
-        "depolarization": Parameter("depolarization", "1", -0.02, 1.0, 0.01),
-    }
-    #: What has no retardance is a window, and close to that.
-    WINDOW: ClassVar[Parameter] = Parameter("retardance", "degree", -40, 40, 1.0)
+    FIELDS: ClassVar[tuple[str, ...]] = (
+        "azimuth_deg",
+        "retardance_deg",
+        "extinction",
+        "diattenuation",
+        "depolarization",
+    )
     #: A mount is the same at every wavelength; retardances and diattenuations follow a curve.
     BELONGS: ClassVar[dict[str, Belongs]] = {
         "azimuth_deg": "mechanics",
@@ -140,7 +161,7 @@ class NominalValue(InstrumentEffect):
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         nominal = next(getattr(e, self.field) for e in model.elements() if e.name == self.element)
-        return (self.WINDOW if self.field == "retardance_deg" and nominal == 0 else self.FIELDS[self.field],)
+        return (_nominal(self.field, nominal == 0),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         value = values[0]

@@ -13,8 +13,9 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.odds import probability_at
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import ALIKE, ALTERNATIVE, LIKELY, SURE
+from processing.diagnosis.search.rules import ALIKE, ALTERNATIVE, LIKELY, SHOWN, SURE
 
 Answer = Literal["sure", "likely", "one of", "unknown"]
 
@@ -76,7 +77,7 @@ def causes(found: Posterior, left: float) -> tuple[Cause, ...]:
                 candidates=tuple(found.space.candidates[m] for m in found.members[k]),
                 values=tuple(values[p] for p in parts),
                 covariance=tuple(covariance[p, p] for p in parts),
-                probability=min(found.samples.any_of(members), float(1 / (1 + np.exp(-np.clip(total, -50, 50))))),
+                probability=min(found.samples.any_of(members), float(probability_at(total))),
                 log_odds=float(odds[k]),
                 alternatives=tuple(found.space.candidates[found.members[j][0]] for j in others),
             )
@@ -87,7 +88,7 @@ def causes(found: Posterior, left: float) -> tuple[Cause, ...]:
 def shown(values: Array, covariance: Array) -> float:
     """Chi-square of values (N,) over that from which on so many are not zero: three standard deviations."""
     n = values.size
-    return float(values @ np.linalg.lstsq(covariance, values)[0]) / max(9.0, n + 3 * float(np.sqrt(2 * n)))
+    return float(values @ np.linalg.lstsq(covariance, values)[0]) / max(SHOWN**2, n + SHOWN * float(np.sqrt(2 * n)))
 
 
 def least_odds(odds: float, left: float) -> float:

@@ -15,12 +15,22 @@ from processing.diagnosis.search.sampling import Samples, sample
 from processing.diagnosis.search.sets import Group, Noise, Sets, State
 from processing.diagnosis.search.space import Space, Sums
 
-#: Steps of a descent.
+#: [steps] Of a descent.
 STEPS = 6
-#: Times that everything is linearized anew before groups are chosen.
+#: [times] That everything is linearized anew before groups are chosen.
 EXPANSIONS = 8
-#: The descent ends when a step gains less than this in chi-square, or this fraction of it.
-LEAST_GAIN, LEAST_RELATIVE = 0.05, 1e-7
+#: [chi-square] The descent ends when a step gains less than this.
+LEAST_GAIN = 0.05
+#: [of the chi-square] The same.
+LEAST_RELATIVE = 1e-7
+#: [typical sizes] Least width of a prior of values that are fitted.
+LEAST_WIDTH = 1e-3
+#: [steps] One after the other that may be refused.
+REFUSED = 8
+#: [1] By which a step that is refused is damped more, and one that is taken less.
+STIFFER = 10.0
+#: [of the curvature] Damping of a step that was refused without any.
+FIRST_DAMPING = 1e-3
 
 
 def all_at_once(
@@ -74,7 +84,7 @@ def improved(
     part, positions = _part_of(space, [g for g, p in zip(groups, samples.probability, strict=True) if p > TAKES_PART])
     typical = space.joined("typical")[positions]
     width = np.sqrt(np.diag(samples.covariance) + samples.mean**2)[positions] * typical
-    weak = samples.best.unit / np.maximum(width, 1e-3 * typical) ** 2
+    weak = samples.best.unit / np.maximum(width, LEAST_WIDTH * typical) ** 2
     out = np.where(space.fixed, starts[0], 0.0)
     if positions.size:
         places = [x[positions] for x in starts]
@@ -126,18 +136,18 @@ def descend(problem: Problem, space: Space, x: Array, weak: Array, steps: int = 
         freedom = max(float(sums.freedom.sum()), 1e-300)
         g = sums.gradient.sum(axis=0) - sums.excess.sum() / freedom * sums.stretch.sum(axis=0) + weak * x
         h = sums.curvature.sum(axis=0) + np.diag(weak)
-        for _ in range(8):
+        for _ in range(REFUSED):
             move = np.linalg.solve(h + damping * np.diag(np.diag(h)), g)
             tried = np.where(space.fixed, x, np.clip(x - move, lower, upper))
             # Derivatives are most of the work; a step that is refused needs none.
             now = _penalized(problem.sums(space, tried, derivatives=False), weak, tried, reference)
             if now <= least:
                 break
-            damping = max(10 * damping, 1e-3)
+            damping = max(STIFFER * damping, FIRST_DAMPING)
         # Also where the sum is no number: so far away that the model has no intensities.
         if not now <= least:
             break
-        gain, x, least, damping = least - now, tried, now, damping / 10
+        gain, x, least, damping = least - now, tried, now, damping / STIFFER
         if gain < LEAST_GAIN + LEAST_RELATIVE * abs(least):
             break
     return x

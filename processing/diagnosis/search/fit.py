@@ -10,20 +10,36 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array, BoolArray
 from processing.diagnosis.search.problem import Problem
+from processing.diagnosis.search.rules import LEAST_FREEDOM
 from processing.diagnosis.search.space import Space, Sums
 from processing.instrument.effects.base import ValuePerState
 
-#: The prior that keeps unseen parameters still is this many times wider than a typical size.
+#: [typical sizes] Width of the prior that keeps unseen parameters still.
 PRIOR_WIDTH = 10.0
-#: Steps of a fit.
+#: [steps] Of a fit.
 STEPS = 15
-#: What is held out is predicted to this fraction of the excess: a fit that ends earlier would still know it.
-MANY_STEPS, HELD_OUT_RELATIVE = 30, 1e-4
-#: Times that corrections of counts are expanded anew in one fit.
+#: [steps] Of a fit that what is held out is predicted by.
+MANY_STEPS = 30
+#: [of the excess] To which what is held out is predicted: a fit that ends earlier would still know it.
+HELD_OUT_RELATIVE = 1e-4
+#: [steps] Of such a fit where the model is far from linear.
+FEW_STEPS = 6
+#: [times] That corrections of counts are expanded anew in one fit.
 EXPANSIONS = 2
-#: The fit ends when a step promises less than this in chi-square, or this fraction of the excess.
+#: [chi-square] The fit ends when a step promises less than this.
 LEAST_GAIN = 0.01
+#: [of the excess] The same.
 LEAST_RELATIVE = 1e-7
+#: [1] By which a step that is refused is damped more, and one that is taken less.
+STIFFER = 10.0
+#: [of the curvature] Damping of the first step.
+FIRST_DAMPING = 1e-6
+#: [of the curvature] Least damping of a step that is taken.
+LEAST_DAMPING = 1e-9
+#: [of the curvature] Least damping of a step that was refused.
+REFUSED_DAMPING = 1e-4
+#: [of the curvature] Damping beyond which there is no step.
+MOST_DAMPING = 1e6
 
 
 @dataclass(frozen=True)
@@ -89,7 +105,7 @@ def _descend(
     x = np.clip(start, lower, upper)
     sums = problem.sums(space, x)
     cost = sums.excess[use].sum() + weak @ x**2
-    damping = 1e-6
+    damping = FIRST_DAMPING
     for _ in range(steps):
         g = sums.gradient[use].sum(axis=0) + weak * x
         h = sums.curvature[use].sum(axis=0) + np.diag(weak)
@@ -97,7 +113,7 @@ def _descend(
         if not move.any():
             break
         gm, hm = g[move], h[np.ix_(move, move)]
-        if damping <= 1e-6 and _promise(gm, hm) < least_gain + LEAST_RELATIVE * abs(cost):
+        if damping <= FIRST_DAMPING and _promise(gm, hm) < least_gain + LEAST_RELATIVE * abs(cost):
             break
         while True:
             step = np.zeros_like(x)
@@ -105,14 +121,14 @@ def _descend(
             tried = np.clip(x + step, lower, upper)
             # Derivatives are most of the work; a step that is refused needs none.
             new_cost = problem.sums(space, tried, derivatives=False).excess[use].sum() + weak @ tried**2
-            if new_cost <= cost or damping > 1e6:
+            if new_cost <= cost or damping > MOST_DAMPING:
                 break
-            damping = max(damping * 10, 1e-4)
+            damping = max(damping * STIFFER, REFUSED_DAMPING)
         if not new_cost <= cost:
             break
         gain = cost - new_cost
         x, sums, cost = tried, problem.sums(space, tried), new_cost
-        damping = max(damping / 10, 1e-9)
+        damping = max(damping / STIFFER, LEAST_DAMPING)
         if gain < least_gain + LEAST_RELATIVE * abs(cost):
             break
     return Fit(x, sums, float(sums.excess[use].sum()))
@@ -192,7 +208,7 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
     for fold in range(problem.folds):
         others = [f for f in range(problem.folds) if f != fold]
         if problem.far_from_linear:
-            values = minimize(problem, space, full.values, others, steps=6).values
+            values = minimize(problem, space, full.values, others, steps=FEW_STEPS).values
         else:
             values = _one_step(full, space, others, weak)
             if _worse(problem, space, full, values, others, weak):
@@ -239,7 +255,7 @@ def _in_sample(space: Space, full: Fit, weak: Array) -> HeldOut:
     h = full.sums.curvature.sum(axis=0)
     fitted = float(np.trace(np.linalg.solve(h + np.diag(weak), h))) if space.size else 0.0
     freedom = float(full.sums.freedom.sum())
-    share = max(1 - fitted / max(freedom, 1e-300), 0.2)
+    share = max(1 - fitted / max(freedom, 1e-300), LEAST_FREEDOM)
     square, count = float(full.sums.square.sum()), float(full.sums.count.sum())
     shares = full.sums.shares.sum(axis=2) * [1.0, share]
     excess = float(full.sums.excess.sum())

@@ -9,11 +9,8 @@ from scipy.special import ndtr
 
 from processing.arrays import Array
 from processing.diagnosis.search.result import Check
-from processing.diagnosis.search.rules import CHANCE_WORSE, LEAST_CHANGE, WORSE, WORSE_CONDITION
+from processing.diagnosis.search.rules import CHANCE_WORSE, LEAST_CHANGE, MEASURED, WORSE, WORSE_CONDITION
 from processing.diagnosis.search.solution import Solution
-
-#: Singular values below this, relative to the largest, are none.
-RANK = 1e-6
 
 
 def held_out_check(solved: Solution, stretch: float = 1.0) -> Check:
@@ -44,7 +41,7 @@ def rows_checks(name: str, before: Array, after: Array) -> tuple[Check, Check]:
 
 def _rank_and_condition(w: Array) -> tuple[int, float]:
     size = np.linalg.svd(w, compute_uv=False)
-    size = size[size > RANK * size[0]]
+    size = size[size > MEASURED * size[0]]
     return size.size, float(size[0] / size[-1])
 
 

@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 from processing.diagnosis.search.rules import HOPE, NEEDED, PATIENCE
 from processing.diagnosis.search.sets import NEVER, Sets, State
 
-#: Changes of a set in one climb.
+#: [changes] Of a set in one climb.
 STEPS = 60
+#: [1] One in so many of the groups that nothing speaks for are taken away at once.
+AT_ONCE = 6
 
 
 def likely_set(sets: Sets) -> State:
@@ -68,7 +70,7 @@ def thinned(sets: Sets) -> State:
         if odds.min(initial=np.inf) > NEEDED:
             return kept
         # Of those that may be there alone one after the other: the last is not impossible any more.
-        at_once = 1 if odds.min() < NEVER / 2 else max(1, int(np.sum(odds < 0)) // 6)
+        at_once = 1 if odds.min() < NEVER / 2 else max(1, int(np.sum(odds < 0)) // AT_ONCE)
         worst = np.argsort(odds)[:at_once]
         state.tau[worst] = 0.0
         retune(sets, state)

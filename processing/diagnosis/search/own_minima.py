@@ -19,13 +19,10 @@ from processing.diagnosis.search.likely_set import retune
 from processing.diagnosis.search.linearized import grouped, noise_of, quadratic
 from processing.diagnosis.search.posterior import Posterior, Say
 from processing.diagnosis.search.problem import Problem
-from processing.diagnosis.search.rules import BOUND, EXPLAINS, HOPE, IMITATES, LEADERS
+from processing.diagnosis.search.rules import BOUND, ENOUGH, EXPLAINS, HOPE, IMITATES, LEADERS
 from processing.diagnosis.search.sampling import Samples
 from processing.diagnosis.search.sets import Group, Sets, State
 from processing.diagnosis.search.space import Space
-
-#: A fit of a set ends when a step gains less than this, in the unit of chi-square.
-ENOUGH = 0.05
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,7 @@ from processing.diagnosis.search.rules import (
     ALTERNATIVE,
     BENT,
     CHANGES,
+    FEWER_ROUNDS,
     GROWTH,
     HOPE,
     ROUNDS,
@@ -38,9 +39,6 @@ from processing.instrument.effects.base import PointwiseEffect
 
 #: Called with a line that says what is being done.
 Say = Callable[[str], None]
-
-#: Rounds where the noise is not known: every one makes what is left smaller, which is then taken for the noise.
-FEWER_ROUNDS = 4
 
 
 @dataclass(frozen=True)

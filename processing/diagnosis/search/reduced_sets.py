@@ -12,11 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
-from processing.diagnosis.search.rules import SHARES
+from processing.diagnosis.search.rules import CERTAIN, SHARES
 from processing.diagnosis.search.sets import Group, Quadratic, Sets, State
-
-#: Log odds against its absence, and over any other group in its place, from which on a group is certain.
-CERTAIN = 25.0
 
 
 class ReducedSets:

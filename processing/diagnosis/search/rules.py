@@ -24,6 +24,14 @@ MANY = 9
 FEW_CAUSES = 0.5
 #: [typical sizes] Standard deviation of a nominal value of the train (30 degrees): the weakest prior that keeps it.
 NOMINAL_TAU = 10.0
+#: [degree] Typical size of a nominal azimuth or retardance: what is read off a mount or a label is no better.
+NOMINAL_DEG = 30.0
+#: [degree] The same of the retardance of what has none: a window is close to that.
+WINDOW_DEG = 1.0
+#: [1] The same of an extinction: what is only nominal may be a film.
+NOMINAL_EXTINCTION = 0.1
+#: [1] The same of a diattenuation, or of a depolarization.
+NOMINAL_SHARE = 0.01
 #: [of a factor e in wavelength] Length over which values of optics stay alike from one wavelength to another: an
 #: achromatic plate bends once over an octave, a coating a few times.
 SMOOTH = 0.3
@@ -45,6 +53,13 @@ LEAST_NOISE = 1e-4
 #: dropped: 1 to 160 000.
 REFUTED = 12.0
 
+#: [pixels] Below which their scatter says nothing about the noise.
+FEWEST_FOR_SCATTER = 30
+#: [of its noise] That a row has to have beside the components of a capture, if its scatter is to tell noise.
+LEAST_SCATTER = 0.05
+#: [intensities of a pixel] Up to which every row tells noise that has any: there are no others.
+FEW_ROWS = 4
+
 # ---- what is left out of a capture ---------------------------------------------------------------------------------
 #: [standard deviations of one intensity] Mean signal below which a pixel is dark: logarithms and powers of such counts
 #: do not scatter in proportion to the noise, and they say nothing about polarization.
@@ -53,6 +68,12 @@ FAINTEST = 5.0
 DARK_RIM = 4
 #: [standard deviations of the read-out] Below black, from which on counts of zero are cut off, not noise.
 CUT_OFF = 6.0
+#: [of its pixels] That are cut off, from which on a state is left out.
+MOST_CUT_OFF = 0.01
+#: [standard deviations of the read-out] Below the full well, from which on a pixel is clipped: noise takes it there.
+BELOW_WELL = 4.0
+#: [pixels of the sensor] By which frames are moved, and back again, to see what is lost: half of one loses most.
+TRIED_PX = 0.5
 #: [standard deviations of one intensity] By which a pixel is another one after the image was moved by half a pixel and
 #: back, from which on it is at an edge: what an image that moves does there cannot be undone.
 LOST_BY_MOVING = 0.5
@@ -60,6 +81,14 @@ LOST_BY_MOVING = 0.5
 MOST_STEEP = 0.75
 #: [robust standard deviations] From which on an intensity is a hit: the largest of 10^9 normal ones is 6.1.
 HIT = 8.0
+#: [of the variance of the usual state of a pixel] Up to which the noise of a state is believed: a hit tells its own.
+BRIGHTEST = 4.0
+#: [of the mean variance] The same of a dim pixel, at least.
+DIMMEST = 0.1
+#: [pixels] Below which nothing can stand out.
+FEWEST_FOR_HITS = 100
+#: [directions] Over the states that the model leaves over, below which nothing can stand out.
+FEWEST_FREE_FOR_HITS = 8
 #: [states] Of one pixel that are hits; with more of them it is a bad pixel.
 MOST_STRUCK = 4
 #: [of the pixels of a state] Beyond which what stands out is no hit: the frame itself moved, or belongs to nothing.
@@ -68,6 +97,8 @@ MOST_HITS = 0.02
 BAD_PIXEL = 4.0
 #: [standard deviations] By which its variance has to stand out as well, where there are few states.
 BAD_DEVIATIONS = 10.0
+#: [pixels] Side of the square of pixels around: an image that moves makes more of them noisy, a bad pixel is alone.
+SIDE_AROUND = 5
 #: [of the 25 pixels around] That may be as bad: at an edge that moves more of them are.
 ALSO_BAD = 0.2
 #: [of the signal] Rms by which a bad frame differs from what all others predict: a source or an axis that is merely
@@ -79,10 +110,26 @@ AGAINST_NEXT = 8.0
 MOSTLY = 0.5
 #: [of the states] That may be bad.
 MOST_BAD_FRAMES = 0.1
+#: [condition] Of what a state leaves free, from which on the others do not predict it.
+UNPREDICTED = 1e4
+#: [states] With most left over, of which pairs are tried in each other's place.
+SUSPECTS_OF_EXCHANGE = 12
+#: [intensities for each unknown] That a pixel has to have without its clipped states: fewer leave next to nothing over.
+ENOUGH_SOUND = 1.5
 
 # ---- the detector's noise, as its images show it ------------------------------------------------------------------
 #: [of the largest eigenvalue of noise] From which on a direction over the states is structure, which all pixels share.
 BEYOND_NOISE = 1.15
+#: [robust standard deviations] At which a residual is cut back before structure is looked for: a hit is none.
+CUT_BACK = 4.0
+#: [pixels] Along a side of an image, below which it tells nothing about noise.
+NARROWEST = 12
+#: [directions] Over the states that the model leaves over, below which they tell nothing about noise.
+FEWEST_FREE_FOR_NOISE = 4
+#: [pixels] Distance over which noise is no longer alike, and the image has hardly changed; and one more.
+NOT_ALIKE_PX = 3
+#: [rows, or columns] Distance of those whose means are compared: next to each other they may share noise.
+LINES_APART = 2
 #: [standard deviations] From which on a deviation from what is declared of the noise is there.
 NOISE_SURE = 6.0
 #: [1] Deviation of the variance of a pixel from what is declared that is told: photon transfer curves of a lab are as
@@ -92,6 +139,10 @@ NOISE_OFF = 0.06
 NOISE_OFF_MIXED = 0.15
 #: [1] The same of the part of the variance without light: darks of a lab are as good.
 DARK_NOISE_OFF = 0.5
+#: [of what is estimated] Least part of the noise without light where the noise was estimated: no camera has none.
+LEAST_DARK = 0.05
+#: [of the variance] That goes with the light, from which on images tell the gain.
+LEAST_LIT = 0.05
 #: [1] Deviation of the variance from what is declared where a bend of the response is undone, beyond which that bend
 #: does not go with how the counts scatter: two standard deviations of what labs know of a gain.
 GAIN_OFF = 0.03
@@ -99,6 +150,8 @@ GAIN_OFF = 0.03
 NOISE_ALIKE = 0.05
 #: [standard deviations] Up to which another gain alone, or another read noise alone, is as good as both.
 AS_GOOD = 3.0
+#: [of the median] Brightness from which on a pixel is lit.
+LIT = 0.5
 #: [of the mean of lit pixels] Brightness below which a pixel is dim: what happens to the light is twenty times weaker
 #: there, an offset is not.
 DIM = 0.05
@@ -110,6 +163,12 @@ FEWEST_DIM = 30
 FAR_OFF = 0.05
 #: [of the signal] Residual below which no better start is looked for.
 NEAR_ENOUGH = 0.01
+#: [of what is left over] Less than which a far start has to leave to be taken.
+LESS_FROM_AFAR = 0.5
+#: [degree] Half width of the starts of retardances of plates of a known order; and size from which on values have any.
+NEAR_DEG = 20.0
+#: [degree] The same of elements of which no more than "some retardance" is known.
+FAR_DEG = 120.0
 #: [unit of chi-square] After the first choice of groups, from which on the first linearization is not believed.
 BENT = 2.0
 #: [typical sizes] Standard deviation of every group where all begin at once and each intensity counts in full: among
@@ -128,10 +187,18 @@ DECISIVE = 25.0
 #: [1] Growth of the unit of chi-square, by what the tests of the residual find, from which on the sets are visited
 #: again; and at values beyond what a straight line to them promised, from which on it is not believed.
 GROWTH = 1.05
+#: [typical sizes] From where a correction of counts was made exactly, up to which it is exact enough.
+EXACT = 0.3
+#: [log odds] Against its absence, and over any other group in its place, from which on a group is not asked any more.
+CERTAIN = 25.0
+#: [unit of chi-square] A fit of a set ends when a step gains less, and a far start is taken that gains more.
+ENOUGH = 0.05
 
 # ---- wiring --------------------------------------------------------------------------------------------------------
 #: [1] Factor by which less must be left over without a mistake of wiring: no small change of a value does that.
 WIRING = 5.0
+#: [standard deviations] Of what is left over by chance, that count as left over too: less is no reason for a mistake.
+WIRING_SCATTER = 4.0
 
 # ---- correction ----------------------------------------------------------------------------------------------------
 #: [probability] From which on a group takes part in the correction that is written. What is less likely moves the mean
@@ -147,6 +214,10 @@ WORSE = 1.002
 #: [probability] That the error of M grows by a correction, up to which it is written: what is changed has to be 4.65
 #: standard errors of the change, for the error grows where the truth goes less than half as far.
 CHANCE_WORSE = 0.01
+#: [of the largest] Singular value of W from which on a direction is measured.
+MEASURED = 1e-6
+#: [nm] Difference below which two wavelengths are the same in a file that is written.
+SAME_NM = 0.5
 #: [of m00] Least change of M/m00 that is asked for its error: less is the rounding of counts.
 LEAST_CHANGE = 2e-5
 #: [standard deviations] From the mean of the posterior, up to which another correction is as good: one that changes M
@@ -158,6 +229,16 @@ WORSE_CONDITION = 1.5
 EMPIRICAL_SHARE = 0.1
 #: [of what the best takes] By which another such correction may do worse and still be one that would also fit.
 ALSO = 0.02
+#: [of what is allowed so] By which it may do worse at most.
+ALSO_FITS = 1.5
+#: [of the degrees of freedom] That fitted values leave at least, where nothing is held out.
+LEAST_FREEDOM = 0.2
+#: [of the squared error of M] That the directions hold which are stored of what stays uncertain.
+STORED_SHARE = 0.995
+#: [directions] That are stored at most.
+MOST_STORED = 20
+#: [of the largest effect in a direction] Below which another one in it is left out.
+SMALL_PART = 0.03
 
 # ---- structure -----------------------------------------------------------------------------------------------------
 #: [standard deviations] Beyond which a test of the residual says "structure".
@@ -166,6 +247,30 @@ LIMIT = 5.0
 LIMIT_OF_TWO = 3.5
 #: [standard deviations] Autocorrelation over the states from which on the residual of few pixels is not white.
 WHITE = 4.0
+#: [pixels] From which on structure is looked for that goes with the signal, or with the place.
+FEWEST_FOR_PATTERNS = 30
+#: [pairs of intensities] Beyond which neighbours are compared.
+FEWEST_PAIRS = 100
+#: [patches] Along the height of an image, whose means are tested.
+PATCHES = 8
+#: [harmonics] Of a turn that are shown of a residual: an element that turns makes four.
+HARMONICS = 4
+
+# ---- what is held out, and parts of an image ------------------------------------------------------------------------
+#: [intensities of a pixel] Beyond which states are held out, not tiles of the image.
+MOST_ROWS_FOR_TILES = 100
+#: [pixels] Below which states are held out.
+FEWEST_PIXELS_FOR_TILES = 64
+#: [parts] That are held out in turn, of the tiles of an image.
+FOLDS_OF_TILES = 2
+#: [parts] The same of the states, of which there are few.
+FOLDS_OF_STATES = 5
+#: [tiles] Along each side of an image, for effects and structure that vary over it.
+MOST_TILES = 16
+#: [tiles] The same of a small image, at least.
+FEWEST_TILES = 8
+#: [pixels] Along a side of a tile, between these two.
+TILE_PX = 4
 
 # ---- names ---------------------------------------------------------------------------------------------------------
 #: [probability] From which on a cause is called sure.
@@ -178,6 +283,12 @@ DOUBTED = 0.95
 ALTERNATIVE = 7.0
 #: [of what the cause explains] The same: no effect's model is exact.
 ALIKE = 1e-3
+#: [standard deviations] From which on a value is not zero; of several as many beyond what chance gives all of them.
+SHOWN = 3.0
+#: [causes] That are told with what each would explain alone.
+MOST_RANKED = 10
+#: [causes] That are told as tried where nothing is named.
+MOST_TRIED = 5
 
 # ---- why a name is doubted -----------------------------------------------------------------------------------------
 #: [of the range] How close to the end of a parameter's range a value stands at its bound.
@@ -195,6 +306,10 @@ CHANCE_OF_PATTERN = 0.01
 #: to move. Where it does they show 0.5 to 1.1 of it, and it explains 0.5 to 0.7 of what they do; of light that is
 #: added, or a spot that fades, one of the two is 0 to 0.4.
 EDGES = 0.43
+#: [pixels] At edges, from which on they are asked.
+FEWEST_AT_EDGES = 10
+#: [degree] Turn of a plate from which on a wave of its turns is asked in a cause's place: over less it is a slope.
+LEAST_TURN_DEG = 180.0
 #: [standard deviations] By which the size of an effect of source, optics or mechanics may differ over the image.
 UNEVEN = 6.0
 #: [of what it explains] The same, for a large effect.
@@ -223,6 +338,8 @@ VISIBLE_FAULT = 4.0
 NOISE_ERROR = 0.05
 #: [sine] Of the angle between two signatures, from which on a capture tells them apart.
 APART = 0.3
+#: [sine] By which another sample has to do better than a simpler one to be asked for.
+CLEARLY_MORE = 0.15
 #: [of the signal] Signature of a typical size below which a capture does not see an effect.
 VISIBLE = 1e-4
 
@@ -243,10 +360,34 @@ AS_LIKELY = 0.015
 DARK = 0.1
 #: [of the noise of a pixel] Modulated light of a tile from which on its pixels have a say in the dominant process.
 LEAST_MODULATION = 1.0
+#: [pixels] Below which an object tells nothing.
+FEWEST_OF_OBJECT = 100
+#: [pixels] Of an object that are used at most, evenly spread.
+MOST_OF_OBJECT = 4000
+#: [of its radius] Rim of an object that is left out: one off its place would mix object and background there.
+RIM_OF_OBJECT = 0.06
+#: [pixels of the camera] The same, at least: the interpolation of a mosaic mixes as many.
+RIM_PX = 6
+#: [tiles] Along each side of an object, half of which are held out in turn.
+TILES_OF_OBJECT = 8
+#: [degree] Half angle in which the middle of an object sees its support.
+SUPPORT_DEG = 35.0
+#: [half widths of the object] From its middle down to the support.
+SUPPORT_DEPTH = 2.0
+#: [typical sizes] Along a bent valley, from where a deeper minimum is looked for.
+ALONG_VALLEY = 1.0
+#: [standard errors] From a minimum, where the excess is looked at if the valley is bent.
+ERRORS_AWAY = 3.0
+#: [doublings] By which an error may grow at most as a bent valley asks.
+MOST_DOUBLINGS = 5
+#: [of its noise] Polarized light of a pixel from which on its xi0 is shown.
+SHOWS_XI0 = 20.0
 
 # ---- effort: what a search may cost --------------------------------------------------------------------------------
 #: [rounds] Times that the problem is linearized anew about its solution.
 ROUNDS = 7
+#: [rounds] The same where the noise is not known: each makes what is left smaller, which is then taken for the noise.
+FEWER_ROUNDS = 4
 #: [standard deviations] A move of the solution below which no new linearization is needed.
 SETTLED = 0.3
 #: [changes] Of a chain in the last round.
@@ -259,3 +400,15 @@ SAMPLES_BEFORE = 80
 PATIENCE = 8
 #: [groups] That are fitted beside a set of effects of a surface: what one step promises says little there.
 LEADERS = 12
+#: [places] From which nominal values are fitted.
+STARTS = 24
+#: [places] The same for each mistake of wiring.
+FEW_STARTS = 5
+#: [intensities] Of a capture that are read; a larger one is averaged over squares of pixels.
+MOST_READ = 20_000_000
+#: [intensities] Of a capture that are fitted; more are averaged over squares of pixels.
+MOST_FITTED = 5_000_000
+#: [intensities of a pixel] Beyond which few pixels are kept: second moments of the states would be larger than those.
+MANY_VALUES = 160
+#: [pixels] That are kept then.
+FEW_PIXELS = 64

@@ -15,14 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
+from processing.diagnosis.search.odds import probability_at
 from processing.diagnosis.search.rules import ALTERNATIVE
 from processing.diagnosis.search.sets import Conditional, Sets, State
 
-#: Weight of a set below which it changes no mean.
+#: [probability] Weight of a set below which it changes no mean.
 LEAST_WEIGHT = 1e-6
-#: How often a group is asked at least, relative to one that is there half of the time.
+#: [of its probability] How often a group is asked at least, relative to one that is there half of the time.
 LEAST_INTEREST = 0.04
-#: Groups that are tried in the place of one.
+#: [groups] That are tried in the place of one.
 MOST_RIVALS = 8
 
 
@@ -110,7 +111,7 @@ def sample(sets: Sets, state: State, visits: int, seed: int = 0) -> Samples:
 
 def chance_of(sets: Sets, c: Conditional) -> Array:
     """Probability (G,) of each group given the others."""
-    return np.where(sets.free, 1 / (1 + np.exp(-np.clip(c.log_odds, -50, 50))), 1.0)
+    return np.where(sets.free, probability_at(c.log_odds), 1.0)
 
 
 def swapped(sets: Sets, state: State) -> Iterator[State]:

@@ -20,9 +20,12 @@ from scipy.special import betaln
 from processing.arrays import Array
 from processing.diagnosis.search.rules import FEW_CAUSES, MANY, TAU, TAU_WEIGHT, TAU_WEIGHT_OF_MANY
 
-#: Probability of what cannot be, for its logarithm; and log odds of it, beyond what any data speak for.
+#: [probability] Of what cannot be, for its logarithm.
 LEAST_WEIGHT = 1e-300
+#: [log odds] Of what cannot be, beyond what any data speak for.
 NEVER = -1e9
+#: [groups] That are not there, at least, in the odds of one more.
+FEWEST_ABSENT = 0.1
 
 
 @dataclass(frozen=True)
@@ -187,7 +190,7 @@ class Sets:
     def prior_odds(self, there: NDArray[np.bool_]) -> Array:
         """Log odds (G,) of each group to be there, of the prior, given the others of a set."""
         others = self.beside + there.sum() - there
-        rest = np.maximum((1 + FEW_CAUSES) * self.count - others - 1, 0.1)
+        rest = np.maximum((1 + FEW_CAUSES) * self.count - others - 1, FEWEST_ABSENT)
         beside = np.where(self.alone, (there & self.alone).sum() - (there & self.alone), 0.0)
         return np.asarray(np.log((1 + others) / rest / self.share)) + NEVER * beside
 

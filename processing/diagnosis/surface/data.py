@@ -11,7 +11,15 @@ from scipy import ndimage
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.read_capture import read_capture
-from processing.diagnosis.search.rules import DARK, LEAST_MODULATION
+from processing.diagnosis.search.rules import (
+    DARK,
+    FEWEST_OF_OBJECT,
+    LEAST_MODULATION,
+    MOST_OF_OBJECT,
+    RIM_OF_OBJECT,
+    RIM_PX,
+    TILES_OF_OBJECT,
+)
 from processing.diagnosis.surface.view import SurfaceView
 from processing.errors import ProcessError
 from processing.geometry.pinhole import PinholeCamera
@@ -24,15 +32,7 @@ from processing.reduction.sample_states import sample_states
 from processing.reflectance.base import ReflectanceModel
 from processing.storage.capture import Capture
 
-#: Pixels of a capture that are used, evenly spread.
-MOST_PIXELS = 4000
-#: Below so many an object tells nothing.
-FEWEST_PIXELS = 100
-#: Rim that is left out, as part of the object's radius and in pixels of the camera: an object off its place, and
-#: interpolation of a mosaic, would mix object and background there.
-RIM, RIM_PX = 0.06, 6
-#: Tiles along each side of the object, half of them held out in turn.
-TILES = 8
+#: [parts, fixed] Of the object that are held out in turn, as a chessboard has them.
 FOLDS = 2
 
 
@@ -117,10 +117,10 @@ def read_surface(
     camera = _grid(view.camera.resized(rows, columns), cell * data.binned, height, width)
     picked = _pick(data, signal, view.model_copy(update={"camera": camera}), omega, cell)
     where = np.argwhere(picked)
-    if len(where) < FEWEST_PIXELS:
+    if len(where) < FEWEST_OF_OBJECT:
         raise ProcessError(
             f"{capture.path}: {len(where)} pixels see the lit object well within its outline; "
-            f"{FEWEST_PIXELS} are needed. Check the geometry file and the arm angle ({omega:g} degrees)."
+            f"{FEWEST_OF_OBJECT} are needed. Check the geometry file and the arm angle ({omega:g} degrees)."
         )
     states = signal[:, :, picked].astype(np.float64)
     exposure, conditions, state_slope, state_floor = data.exposure, data.conditions, data.slope, data.floor
@@ -138,8 +138,7 @@ def read_surface(
     channels = signal.shape[1]
     share = np.tile(share, conditions.states)
     slope, floor = np.repeat(state_slope, channels) * share, np.repeat(state_floor, channels) * share
-    low = where.min(axis=0)
-    tiles = (where - low) * TILES // (where.max(axis=0) - low + 1)
+    tile, fold = _tiles(where)
     return SurfaceData(
         name=data.name,
         view=SurfaceView(view, camera, picked, omega, material, data.wavelength_nm),
@@ -149,8 +148,8 @@ def read_surface(
         floor=floor,
         exposure=np.repeat(exposure, channels),
         conditions=conditions,
-        fold=tiles.sum(axis=1) % FOLDS,
-        tile=tiles[:, 0] * TILES + tiles[:, 1],
+        fold=fold,
+        tile=tile,
         where=where,
         shape=(height, width),
         noise=data.noise_source,
@@ -159,6 +158,13 @@ def read_surface(
         omega_deg=omega,
         clipped_fraction=float(np.mean(data.clipped)),
     )
+
+
+def _tiles(where: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Tile of each pixel (P, 2), and the part of a chessboard in which it is, each (P,)."""
+    low = where.min(axis=0)
+    tiles = (where - low) * TILES_OF_OBJECT // (where.max(axis=0) - low + 1)
+    return tiles[:, 0] * TILES_OF_OBJECT + tiles[:, 1], tiles.sum(axis=1) % FOLDS
 
 
 def _black_variance(capture: Capture) -> float:
@@ -177,11 +183,11 @@ def _pick(
         raise ProcessError(f"{data.name}: no pixel sees a lit point of the object at Omega {omega:g} degrees.")
     mean = signal.mean(axis=(0, 1), dtype=np.float64)
     lit = mean > DARK * np.median(mean[mask])
-    rim = int(np.ceil(max(RIM * np.sqrt(mask.sum() / np.pi), RIM_PX / (cell * data.binned))))
+    rim = int(np.ceil(max(RIM_OF_OBJECT * np.sqrt(mask.sum() / np.pi), RIM_PX / (cell * data.binned))))
     inside = ndimage.binary_erosion(mask & lit, iterations=rim)
     good = inside & data.usable & ~ndimage.binary_dilation(data.clipped, iterations=1)
     # Neighbours of an interpolated mosaic share pixels; every second one does not.
-    step = max(int(np.ceil(np.sqrt(good.sum() / MOST_PIXELS))), 2 if cell > 1 else 1)
+    step = max(int(np.ceil(np.sqrt(good.sum() / MOST_OF_OBJECT))), 2 if cell > 1 else 1)
     grid = np.zeros_like(good)
     grid[::step, ::step] = True
     return np.asarray(good & grid)

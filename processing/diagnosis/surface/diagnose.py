@@ -14,6 +14,7 @@ from processing.diagnosis.search.evidence import wanted_for_evidence, would_be_s
 from processing.diagnosis.search.judge import Judgement, beyond_chance
 from processing.diagnosis.search.own_minima import OwnMinima, Visited
 from processing.diagnosis.search.posterior import Say
+from processing.diagnosis.search.range_of import rank_of
 from processing.diagnosis.search.result import (
     CaptureReport,
     Correction,
@@ -23,7 +24,7 @@ from processing.diagnosis.search.result import (
     Ranked,
     Unexplained,
 )
-from processing.diagnosis.search.rules import AS_LIKELY, LEFT_OVER, LIMIT, MOST_EFFECTS, SEEN
+from processing.diagnosis.search.rules import AS_LIKELY, LEFT_OVER, LIMIT, MOST_EFFECTS, MOST_RANKED, MOST_TRIED, SEEN
 from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.search.stored import parameters_of
@@ -161,7 +162,7 @@ def _unexplained(
         for data, tests in zip(problem.captures, after, strict=True)
         for name, value in beyond_chance(tests).items()
     )
-    tried = tuple(c.label for c in likeliest.space.candidates) or tuple(r.candidate for r in ranking[:5])
+    tried = tuple(c.label for c in likeliest.space.candidates) or tuple(r.candidate for r in ranking[:MOST_TRIED])
     return Unexplained(description=lines, tried=tried, empirical=None)
 
 
@@ -198,7 +199,7 @@ def _explains(
 
 def _degeneracy_in_doubt(problem: SurfaceProblem, solved: Solution) -> bool:
     full = (
-        np.linalg.matrix_rank(problem.rows(k, problem.changes(k, solved.base, np.zeros(0))[0]), rtol=1e-8) == 16
+        rank_of(problem.rows(k, problem.changes(k, solved.base, np.zeros(0))[0])) == 16
         for k in range(len(problem.captures))
     )
     excess = solved.before.excess / max(solved.before.excess + solved.before.freedom, 1e-300)
@@ -255,7 +256,7 @@ def _ranking(search: OwnMinima) -> tuple[Ranked, ...]:
     alone = [(v.score_at(unit) - start, v) for v in search.visited.values() if len(v.groups) == 1]
     return tuple(
         Ranked(candidate=v.space.candidates[0].label, evidence=round(2 * odds, 1), rms_percent=100 * v.fit.rms)
-        for odds, v in sorted(alone, key=lambda item: -item[0])[:10]
+        for odds, v in sorted(alone, key=lambda item: -item[0])[:MOST_RANKED]
     )
 
 

@@ -8,15 +8,15 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause, causes
 from processing.diagnosis.search.fit import LEAST_GAIN, Fit, held_out, minimize
 from processing.diagnosis.search.own_minima import OwnMinima, Visited
-from processing.diagnosis.search.rules import IMITATES, LIKELY
+from processing.diagnosis.search.rules import ALONG_VALLEY, IMITATES, LIKELY
 from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.diagnosis.surface.standard_errors import bent
 from processing.reflectance.effects.base import ReflectanceEffect
 
-#: Steps, in typical sizes, from which a minimum in a bent valley is looked for once more.
-NEAR = 1.0
+#: [steps] Of a fit that looks for a deeper minimum in a bent valley.
+STEPS = 8
 
 
 def named_causes(search: OwnMinima, likeliest: Visited) -> tuple[Visited, tuple[Cause, ...]]:
@@ -64,9 +64,9 @@ def _deepest(problem: SurfaceProblem, space: Space, fit: Fit) -> Fit:
     """A deeper minimum near by, if a valley is bent."""
     typical, best = space.joined("typical"), fit
     for k in np.flatnonzero(bent(space)):
-        for sign in (NEAR, -NEAR):
+        for sign in (ALONG_VALLEY, -ALONG_VALLEY):
             start = fit.values.copy()
             start[k] += sign * typical[k]
-            tried = minimize(problem, space, start, steps=8)
+            tried = minimize(problem, space, start, steps=STEPS)
             best = tried if tried.excess < best.excess - LEAST_GAIN else best
     return best

@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.range_of import rank_of
+from processing.diagnosis.search.rules import FEWEST_OF_OBJECT
 from processing.diagnosis.search.space import Space, Sums
-from processing.diagnosis.surface.data import FEWEST_PIXELS, FOLDS, SurfaceData
+from processing.diagnosis.surface.data import FOLDS, SurfaceData
 from processing.effect import Parameter
 from processing.errors import ProcessError
 from processing.instrument.applied_effects import apply_to, instrument_effects
@@ -26,12 +28,12 @@ from processing.instrument.model import InstrumentModel
 from processing.reflectance.changes import ReflectanceChanges
 from processing.reflectance.effects.base import MaterialEffect, ReflectanceEffect, reflectance_effects
 
-#: Step of a derivative, in typical sizes.
+#: [typical sizes] Step of a derivative.
 STEP = 1e-4
-#: Smooth patterns over an object that a misfit can have: up to second order in the position.
+#: [patterns, fixed] Smooth ones over an object that a misfit can have: up to second order in the position.
 PATTERNS = 6
-#: Part of the modelled light that has to be polarized before it counts as a second column.
-LEAST_MODULATION = 1e-6
+#: [of the modelled light] Part of it that has to be polarized before it counts as a second column.
+LEAST_POLARIZED = 1e-6
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ class SurfaceProblem:
         for k, data in enumerate(self.captures):
             w = self.rows(k, self.changes(k, Space(()), np.zeros(0))[0])
             here = data.kept(data.polarized(w[:, 0]))
-            if len(here.y) >= FEWEST_PIXELS:
+            if len(here.y) >= FEWEST_OF_OBJECT:
                 out.append(here)
         if not out:
             raise ProcessError(
@@ -129,7 +131,7 @@ class SurfaceProblem:
         out = []
         for k in range(len(self.captures)):
             w = self.rows(k, self.changes(k, Space(()), np.zeros(0))[0])
-            out.append((max(int(np.linalg.matrix_rank(w, rtol=1e-8)) - 2, 1), np.ones(PATTERNS)))
+            out.append((max(rank_of(w) - 2, 1), np.ones(PATTERNS)))
         return out
 
     def changes(self, capture: int, space: Space, values: Array) -> tuple[Changes, ReflectanceChanges]:
@@ -175,7 +177,7 @@ class SurfaceProblem:
         e = flat / length[:, None]
         f = columns - e * np.sum(e * columns, axis=1, keepdims=True)
         strength = np.sqrt(np.sum(f**2, axis=1))
-        modulates = strength > LEAST_MODULATION * np.sqrt(np.sum(columns**2, axis=1))
+        modulates = strength > LEAST_POLARIZED * np.sqrt(np.sum(columns**2, axis=1))
         f = np.where(modulates[:, None], f / np.maximum(strength, 1e-300)[:, None], 0.0)
         level, modulation = np.sum(e * y, axis=1), np.sum(f * y, axis=1)
         # Mean of q over each tile, from the same weighted squares.

@@ -6,13 +6,12 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from processing.arrays import Array
+from processing.diagnosis.search.range_of import rank_of
+from processing.diagnosis.search.rules import SHOWS_XI0
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.problem import Pixels, SurfaceProblem
 from processing.polarization.cloude import xi0_and_dominant
 from processing.polarization.image_difference import linear_diattenuation, magnitude, orientation_difference, rmsd
-
-#: Signal of the polarized light over its noise from which on a pixel's xi0 is shown.
-LEAST_SIGNAL = 20.0
 
 
 class Quantities(BaseModel):
@@ -62,7 +61,7 @@ def _xi0(here: Pixels) -> Array:
     with np.errstate(divide="ignore", invalid="ignore"):
         xi0 = (here.alpha_0 + here.alpha_id / 4) / total
         # Where the model modulates little, xi0 is noise.
-        xi0[here.strength * total < LEAST_SIGNAL] = np.nan
+        xi0[here.strength * total < SHOWS_XI0] = np.nan
     return np.asarray(xi0, dtype=float)
 
 
@@ -72,7 +71,7 @@ def dominant_errors(
     """Modelled less measured psi (degrees) and |D| (percent) of each pixel (P,); None if W has not rank 16."""
     optics, surface = problem.changes(k, space, values)
     w = problem.rows(k, optics)
-    if np.linalg.matrix_rank(w, rtol=1e-8) < 16:
+    if rank_of(w) < 16:
         return None
     _, m0 = xi0_and_dominant((y @ np.linalg.pinv(w).T).reshape(-1, 4, 4))
     measured, modelled = (linear_diattenuation(m) for m in (m0, problem.captures[k].view.dominant(surface)))

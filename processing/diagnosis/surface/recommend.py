@@ -9,7 +9,8 @@ import numpy as np
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit
-from processing.diagnosis.search.rules import APART
+from processing.diagnosis.search.range_of import LEAST_OF_SIGNATURE, range_of, rank_of
+from processing.diagnosis.search.rules import APART, LIMIT
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.reflectance.effects.base import ReflectanceEffect
@@ -26,7 +27,7 @@ def recommended(
     """One sentence."""
     own = "smooth over the object, of the instrument"
     if verdict == "unexplained":
-        if any(tests.get(own, 0.0) > 5.0 for tests in before):
+        if any(tests.get(own, 0.0) > LIMIT for tests in before):
             return (
                 "No Mueller matrix at all explains these intensities: diagnose the instrument first, without "
                 "--reflectance and best on air, then come back with the instrument file that it writes."
@@ -42,7 +43,7 @@ def recommended(
             return candidate.effect.advice
     if len(rivals) > 1 and _apart(problem, space, fit, rivals) >= APART:
         return "Their signatures differ: repeat the capture with more light or more frames."
-    if np.linalg.matrix_rank(problem.rows(0, problem.changes(0, space, fit.values)[0]), rtol=1e-8) < 16:
+    if rank_of(problem.rows(0, problem.changes(0, space, fit.values)[0])) < 16:
         return "Take a full Mueller capture of the same object: one angle of polarization at each pixel is too little."
     return "Take captures at two more arm angles, at least 30 degrees apart, and diagnose them together."
 
@@ -65,7 +66,6 @@ def _apart(problem: SurfaceProblem, space: Space, fit: Fit, rivals: Sequence[Can
 
 
 def _sine(a: Array, b: Array) -> float:
-    u, size, _ = np.linalg.svd(b, full_matrices=False)
-    u = u[:, size > 1e-9 * max(size[0], 1e-300)]
+    u = range_of(b, LEAST_OF_SIGNATURE)
     norm = float(np.linalg.norm(a))
     return float(np.linalg.norm(a - u @ (u.T @ a)) / norm) if norm else 0.0

@@ -7,12 +7,15 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.search.fit import Fit, minimize, prior
+from processing.diagnosis.search.rules import ERRORS_AWAY, MOST_DOUBLINGS
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.reflectance.effects.base import BentValley
 
-#: The excess is looked at this many errors from the minimum; errors grow at most by the factor.
-AT, WIDEST = 3.0, 32.0
+#: [typical sizes] From its bound up to which a value stands at it.
+AT_BOUND = 1e-6
+#: [steps] Of a fit of all other values.
+STEPS = 5
 
 
 def standard_errors(problem: SurfaceProblem, space: Space, fit: Fit, spread: float) -> Array:
@@ -28,7 +31,7 @@ def standard_errors(problem: SurfaceProblem, space: Space, fit: Fit, spread: flo
     error = np.sqrt(np.maximum(np.diag(both), 0.0))
     wide = np.ones(space.size)
     for j in np.flatnonzero(bent(space)):
-        step = AT * error[j]
+        step = ERRORS_AWAY * error[j]
         wide[j] = _wide(problem, space, fit, int(j), step, step**2 / max(bread[j, j], 1e-300))
     return np.asarray(error * wide * np.sqrt(spread))
 
@@ -57,7 +60,7 @@ def _wide(problem: SurfaceProblem, space: Space, fit: Fit, j: int, step: float, 
     others = np.arange(space.size) != j
     # A value that stands at its bound may not want to leave it by itself.
     edges = np.minimum(fit.values - space.joined("lower"), space.joined("upper") - fit.values)
-    inner = np.where(edges > 1e-6 * space.joined("typical"), fit.values, 0.0)
+    inner = np.where(edges > AT_BOUND * space.joined("typical"), fit.values, 0.0)
     last, wide = 0.0, 1.0
     while True:
         ends = [x for x in fit.values[j] + wide * step * np.array([1.0, -1.0]) if lower <= x <= upper]
@@ -67,9 +70,9 @@ def _wide(problem: SurfaceProblem, space: Space, fit: Fit, j: int, step: float, 
         for end in ends:
             start = inner.copy()
             start[j] = end
-            lowest = min(lowest, minimize(problem, space, start, free=others, steps=5).excess)
+            lowest = min(lowest, minimize(problem, space, start, free=others, steps=STEPS).excess)
         rise = lowest - fit.excess
-        if rise >= promised or wide >= WIDEST:
+        if rise >= promised or wide >= 2**MOST_DOUBLINGS:
             low = wide / 2 if wide > 1 else 0.0
             part = (promised - last) / max(rise - last, promised - last, 1e-300)
             return max(1.0, low + (wide - low) * part)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from processing.arrays import Array
+from processing.diagnosis.search.range_of import range_of
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.problem import SurfaceProblem
 
@@ -19,8 +20,7 @@ def structure(problem: SurfaceProblem, k: int, space: Space, values: Array) -> d
     r, noise = here.residual, problem.noise[k] * here.free
     out = {"sum of squares": float((np.sum(r**2) - noise.sum()) / np.sqrt(2 * noise.sum()))}
     w = problem.rows(k, problem.changes(k, space, values)[0]) / np.mean(problem.sigma[k], axis=0)[:, None]
-    u, size, _ = np.linalg.svd(w, full_matrices=False)
-    basis = u[:, size > 1e-8 * size[0]]
+    basis = range_of(w)
     rows, rank = basis.shape
     tiles = np.unique(data.tile)
     totals = np.stack([r[data.tile == t].sum(axis=0) for t in tiles])

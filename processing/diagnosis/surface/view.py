@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Delaunay
 
 from processing.arrays import Array
+from processing.diagnosis.search.rules import SUPPORT_DEG, SUPPORT_DEPTH
 from processing.errors import ProcessError
 from processing.geometry.frames import ScatteringGeometry, dot, unit
 from processing.geometry.pinhole import PinholeCamera
@@ -22,14 +23,17 @@ from processing.reflectance import first_surface, polarized_diffuse
 from processing.reflectance.base import ReflectanceModel, constants_at
 from processing.reflectance.changes import ReflectanceChanges
 
-#: The support: a level disc, cut into parts, that the object's middle sees in this half angle, this many times the
-#: object's half width below it.
-SUPPORT_PARTS, SUPPORT_DEG, SUPPORT_DEPTH = 16, 35.0, 2.0
-#: It is computed at one in so many pixels of a sphere.
+#: [parts] Of the support, a level disc.
+SUPPORT_PARTS = 16
+#: [pixels] Of a sphere, at one in so many of which the light of the support is computed.
 EVERY = 13
-#: Answers that are kept of each kind; a fit changes one value at a time.
+#: [of a triangle] By which a pixel may be outside of it and still be in it.
+ON_EDGE = 1e-6
+#: [rad, fixed] Turn from one part of a disc to the next that spreads them evenly.
+GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
+#: [answers] That are kept of each kind; a fit changes one value at a time.
 KEPT = 8
-#: Steps of theta_h in which the polarized light of a surface is learnt from its own pixels.
+#: [steps] Of theta_h in which the polarized light of a surface is learnt from its own pixels.
 BINS = 16
 
 Kept = TypeVar("Kept")
@@ -155,10 +159,9 @@ class SurfaceView:
         shape = self.view.shape
         middle = np.asarray(shape.centre_mm) if isinstance(shape, Sphere) else self.points.mean(axis=0)
         half_width = shape.radius_mm if isinstance(shape, Sphere) else float(np.ptp(self.points[:, 0])) / 2
-        depth = SUPPORT_DEPTH * half_width * np.exp(changes.support_log_depth)
+        depth, disc = _support(half_width, changes)
         columns = np.zeros((2, SUPPORT_PARTS, len(points), 4))
-        radius = depth * np.tan(np.deg2rad(SUPPORT_DEG) + changes.support_rad)
-        ways = [part - points for part in middle + _disc(depth, radius)]
+        ways = [part - points for part in middle + disc]
         parts = _once(
             self._parts,
             (changes.support_rad, changes.support_log_depth),
@@ -195,7 +198,7 @@ class Between:
     def __init__(self, where: Array) -> None:
         self.nodes = np.union1d(np.arange(0, len(where), EVERY), ConvexHull(where).vertices)
         grid = Delaunay(where[self.nodes])
-        inside = np.maximum(grid.find_simplex(where, tol=1e-6), 0)
+        inside = np.maximum(grid.find_simplex(where, tol=ON_EDGE), 0)
         first = np.einsum("pij,pj->pi", grid.transform[inside, :2], where - grid.transform[inside, 2])
         self._weights = np.column_stack([first, 1 - first.sum(axis=1)])
         self._corners = grid.simplices[inside]
@@ -205,10 +208,16 @@ class Between:
         return np.asarray(np.einsum("pi,pi...->p...", self._weights, values[self._corners]))
 
 
+def _support(half_width_mm: float, changes: ReflectanceChanges) -> tuple[float, Array]:
+    """Depth of the support below the middle of an object, and the middles (SUPPORT_PARTS, 3) of its parts, in mm."""
+    depth = SUPPORT_DEPTH * half_width_mm * np.exp(changes.support_log_depth)
+    return depth, _disc(depth, depth * np.tan(np.deg2rad(SUPPORT_DEG) + changes.support_rad))
+
+
 def _disc(depth_mm: float, radius_mm: float) -> Array:
     """Middles (SUPPORT_PARTS, 3) of equal parts of a level disc below the origin."""
     k = np.arange(SUPPORT_PARTS) + 0.5
-    turn, ring = np.pi * (3 - np.sqrt(5)) * k, radius_mm * np.sqrt(k / SUPPORT_PARTS)
+    turn, ring = GOLDEN_ANGLE * k, radius_mm * np.sqrt(k / SUPPORT_PARTS)
     return np.stack([ring * np.cos(turn), np.full_like(k, -depth_mm), ring * np.sin(turn)], axis=1)
 
 

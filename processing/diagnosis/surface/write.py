@@ -8,6 +8,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from processing.diagnosis.instrument_file import WriteError, file_head
+from processing.diagnosis.search.rules import SAME_NM
 from processing.diagnosis.surface.diagnose import SurfaceDiagnosis
 from processing.doors import require_new
 from processing.geometry.viewing import ViewingGeometry
@@ -27,7 +28,7 @@ def corrected_material(
     for nm, c in material.constants.items():
         a, b = (c.a, c.b) if isinstance(c, polarized_diffuse.Constants) else (0.0, 2.0)
         known[nm] = polarized_diffuse.Constants(n=c.n, k=c.k, a=a, b=b)
-    key = next((nm for nm in known if abs(nm - diagnosis.wavelengths_nm[0]) < 0.5), diagnosis.wavelengths_nm[0])
+    key = next((nm for nm in known if abs(nm - diagnosis.wavelengths_nm[0]) < SAME_NM), diagnosis.wavelengths_nm[0])
     known[key] = polarized_diffuse.Constants(**diagnosis.constants)
     names = ", ".join(c.name for c in diagnosis.captures)
     source = f"diagnose, {diagnosis.wavelengths_nm[0]:g} nm, from {names}"

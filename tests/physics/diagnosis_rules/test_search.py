@@ -24,7 +24,9 @@ def test_far_off(m: Patch) -> bool:
     return said == [{}, "far"]
 
 
-def rounds(m: Patch, unit: float = 1.0, moves: float = 9.0, known: bool = True) -> tuple[list[int], bool]:
+def rounds(
+    m: Patch, unit: float = 1.0, moves: float = 9.0, known: bool = True, told: bool = True
+) -> tuple[list[int], bool]:
     """Sets visited in each round of `posterior` of a value that moves by so many deviations, and whether all began."""
     visits: list[int] = []
     all_first = False
@@ -50,7 +52,7 @@ def rounds(m: Patch, unit: float = 1.0, moves: float = 9.0, known: bool = True) 
     m.setattr(descent, "improved", lambda *of: np.full(1, moves * len(visits)))
     m.setattr(posterior, "_posterior_of", lambda *a: None)
     m.setattr(posterior, "down_to_noise", lambda *a: None)
-    problem = Some(noise_known=True, relinearize=lambda *a: False, sums=lambda *a: Sums.empty(1, 1))
+    problem = Some(noise_known=told, relinearize=lambda *a: False, sums=lambda *a: Sums.empty(1, 1))
     posterior.posterior(problem, Space((made(),)), (), np.zeros(1), lambda line: None)
     return visits, all_first
 

@@ -1,0 +1,30 @@
+"""Directions that the columns of a matrix reach, and how many of them there are."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from processing.arrays import Array
+
+#: [of the largest] Singular values below this are none.
+RANK = 1e-8
+#: [of the largest] The same of a signature, which is made of the finest differences.
+LEAST_OF_SIGNATURE = 1e-9
+
+
+def range_of(a: Array, least: float = RANK) -> Array:
+    """Orthonormal directions (L, rank) that the columns of a (L, K) reach."""
+    u, size, _ = np.linalg.svd(a, full_matrices=False)
+    return np.asarray(u[:, size > least * size[0]])
+
+
+def inside_and_outside(a: Array) -> tuple[Array, Array]:
+    """Orthonormal directions (L, rank) and (L, L - rank) that the columns of a (L, K) reach, and do not reach."""
+    u, size, _ = np.linalg.svd(a, full_matrices=True)
+    rank = int(np.sum(size > RANK * size[0]))
+    return u[:, :rank], u[:, rank:]
+
+
+def rank_of(a: Array) -> int:
+    """How many directions the columns of a (L, K) reach."""
+    return int(np.linalg.matrix_rank(a, rtol=RANK))
