@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -107,8 +107,7 @@ def doubts(
         if cause not in out and isinstance(first.effect, SourceEffect) and first.capture in patterned:
             out[cause] = BESIDE_PATTERN
     # What follows a pattern is no effect of the list: what it took away is left over as well.
-    other = (*ELSE, *AS_WELL)
-    left += sum(2 * cause.log_odds * found.samples.best.unit for cause, why in out.items() if why in other)
+    left += sum(2 * cause.log_odds * found.samples.best.unit for cause in something_else(out, (*ELSE, *AS_WELL)))
     for rank, cause in enumerate(causes, 1):
         if problem.noise_known:
             weak = 2 * cause.log_odds * found.samples.best.unit < TIMES * rank**2 * left
@@ -122,6 +121,11 @@ def doubts(
         if cause not in out and cause.log_odds < uneven:
             out[cause] = "it may be a part of what is uneven over the image"
     return out
+
+
+def something_else(doubt: Mapping[Cause, str], reasons: Collection[str] = ELSE) -> list[Cause]:
+    """Causes that are something else for one of these reasons, and stand out: what hardly does may be chance."""
+    return [cause for cause, why in doubt.items() if why in reasons and 2 * cause.log_odds > STANDS_OUT]
 
 
 def _in_its_place(gains: Mapping[type[InstrumentEffect], float], cause: Cause) -> str | None:

@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from processing.diagnosis.instrument.doubts import AS_WELL, BESIDE_PATTERN, ELSE, acts_on_unknown, doubts, testable
+from processing.diagnosis.instrument.doubts import (
+    AS_WELL,
+    BESIDE_PATTERN,
+    ELSE,
+    acts_on_unknown,
+    doubts,
+    something_else,
+    testable,
+)
 from processing.diagnosis.instrument.outcome import Outcome
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
@@ -60,7 +68,7 @@ def unfit(problem: InstrumentProblem, solved: Solution, names: Names) -> list[Ca
     # Values that are not random, or as many as the data have; and those of a source that were found beside them.
     reasons = (*ELSE, *AS_WELL, BESIDE_PATTERN)
     found = _candidates([*names.untold, *(cause for cause, reason in names.doubt.items() if reason in reasons)])
-    if names.untold or any(reason in ELSE for reason in names.doubt.values()):
+    if names.untold or something_else(names.doubt):
         # Something is there that is not in the list: only what has a name of its own is no part of it.
         own = set(_candidates([cause for cause in names.named if cause not in names.doubt]))
         found += [

@@ -6,7 +6,7 @@ import numpy as np
 from rule_decisions import Patch, cause, decides, made
 
 from processing.diagnosis.instrument import cautious, empirical, guard, whole_bench, wiring
-from processing.diagnosis.instrument.doubts import PART_OF_LEFT, WAVE, WAVE_AS_WELL
+from processing.diagnosis.instrument.doubts import PART_OF_LEFT, WAVE, WAVE_AS_WELL, something_else
 from processing.diagnosis.instrument.names import Names, unfit
 from processing.diagnosis.search import causes
 from processing.diagnosis.search.guard import PredictedChange, held_out_check, refusal, rows_checks
@@ -134,7 +134,7 @@ def test_also(m: Patch) -> bool:
 def test_beside_what_is_in_no_list_only_what_has_a_name_of_its_own_is_used() -> None:
     waved, named, likely, nameless = (made(kind=kind) for kind in ("waved", "named", "likely", "nameless"))
     field = made(FieldEffect)
-    told = tuple(cause(candidate=c) for c in (waved, named, likely))
+    told = tuple(cause(odds=50.0, candidate=c) for c in (waved, named, likely))
     problem = Some(captures=[Some(sample=None, wavelength_nm=662.0)])
     solved = Some(effects=(waved, named, likely, nameless, field))
     doubt = {told[0]: WAVE, told[2]: PART_OF_LEFT}
@@ -146,3 +146,10 @@ def test_beside_what_is_in_no_list_only_what_has_a_name_of_its_own_is_used() -> 
     # A sample that is known takes up nothing.
     problem.captures[0].sample = "air"
     assert unfit(problem, solved, Names(told, (), doubt)) == []
+
+
+def test_what_hardly_stands_out_takes_no_stronger_name_with_it() -> None:
+    """A cause of 8 in chi-square that was something else had the names of nine others, of up to 1300, doubted."""
+    weak, strong = cause(odds=4.0), cause(odds=10.0)
+    assert something_else({weak: WAVE, strong: WAVE}) == [strong]
+    assert something_else({weak: WAVE, strong: PART_OF_LEFT}) == []
