@@ -112,6 +112,7 @@ def test_a_lamp_that_jumps_is_no_source_that_drifts(configs, tmp_path, bench):
     ("named", "odds", "wave", "turn", "lag", "told", "reason"),
     [
         (100.0, 5.0, 120.0, 0.0, 0.0, "one", WAVE),
+        (100.0, 5.0, 105.0, 0.0, 0.0, "one", WAVE_AS_WELL),
         (100.0, 5.0, 99.0, 0.0, 0.0, "one", WAVE_AS_WELL),
         (100.0, 5.0, 93.0, 0.0, 0.0, "one", WAVE_AS_WELL),
         (100.0, 5.0, 90.0, 0.0, 0.0, "one", None),

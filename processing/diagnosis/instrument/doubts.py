@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -58,9 +58,9 @@ LAG_AS_WELL = "a part of each frame that is read with the next one explains as m
 JUMP = "a source that jumps once explains more than it does"
 JUMP_AS_WELL = "a source that jumps once explains as much as it does"
 #: For each, the gain in chi-square from which on it explains more, and the reasons. That the sample turned, of which
-#: all else may be a part, has to be sure.
+#: all else may be a part, has to be sure; so has a wave of a plate, of which there are as many as plates and harmonics.
 IN_ITS_PLACE = {
-    WaveOfAPlate: (0.0, WAVE, WAVE_AS_WELL),
+    WaveOfAPlate: (STANDS_OUT, WAVE, WAVE_AS_WELL),
     TurningSample: (STANDS_OUT, TURN, TURN_AS_WELL),
     ImageLag: (0.0, LAG, LAG_AS_WELL),
     JumpOfTheSource: (0.0, JUMP, JUMP_AS_WELL),
@@ -107,7 +107,7 @@ def doubts(
         if cause not in out and isinstance(first.effect, SourceEffect) and first.capture in patterned:
             out[cause] = BESIDE_PATTERN
     # What follows a pattern is no effect of the list: what it took away is left over as well.
-    left += sum(2 * cause.log_odds * found.samples.best.unit for cause in something_else(out, (*ELSE, *AS_WELL)))
+    left += sum(2 * cause.log_odds * found.samples.best.unit for cause in something_else(out))
     for rank, cause in enumerate(causes, 1):
         if problem.noise_known:
             weak = 2 * cause.log_odds * found.samples.best.unit < TIMES * rank**2 * left
@@ -123,9 +123,9 @@ def doubts(
     return out
 
 
-def something_else(doubt: Mapping[Cause, str], reasons: Collection[str] = ELSE) -> list[Cause]:
-    """Causes that are something else for one of these reasons, and stand out: what hardly does may be chance."""
-    return [cause for cause, why in doubt.items() if why in reasons and 2 * cause.log_odds > STANDS_OUT]
+def something_else(doubt: Mapping[Cause, str]) -> list[Cause]:
+    """Causes that are something else and stand out: what hardly does may be chance, and what does as well is told."""
+    return [cause for cause, why in doubt.items() if why in ELSE and 2 * cause.log_odds > STANDS_OUT]
 
 
 def _in_its_place(gains: Mapping[type[InstrumentEffect], float], cause: Cause) -> str | None:
