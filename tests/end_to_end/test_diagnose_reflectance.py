@@ -78,7 +78,9 @@ def test_first_surface_lacks_polarized_diffuse(name, configs, scene, tmp_path, c
     assert effect.kind == "polarized_diffuse"
     assert effect.evidence > 1000
     assert d.constants == pytest.approx({"n": 1.30, "k": 0.08, "a": 0.17, "b": 2.0}, abs=0.05)
-    assert "<img" in (tmp_path / "d.html").read_text()
+    report = (tmp_path / "d.html").read_text()
+    assert "<img" in report
+    assert "chance that the error of xi0 grows" in report
 
     # xi0 of the Stokes camera: only the new material is right.
     found = []

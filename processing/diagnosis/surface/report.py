@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.search.space import Space
-from processing.diagnosis.surface.diagnose import SurfaceJudged
+from processing.diagnosis.surface.diagnose import SurfaceDiagnosis, SurfaceJudged
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.diagnosis.surface.quantities import dominant_errors, quantities
 from processing.reports.colours import SIGNED
@@ -43,8 +43,12 @@ def write_surface_report(path: Path, judged: SurfaceJudged, problem: SurfaceProb
         Section(
             "Diagnosis",
             summary,
-            tables=[("Effects", rows), ("Candidates of the first round", ranking)],
-            warnings=d.unexplained.description if d.unexplained else (),
+            tables=[
+                ("Effects", rows),
+                ("What the correction does", _checks(d)),
+                ("Candidates of the first round", ranking),
+            ],
+            warnings=[*_refusal(d), *(d.unexplained.description if d.unexplained else ())],
         )
     ]
     for k, capture in enumerate(d.captures):
@@ -69,6 +73,19 @@ def write_surface_report(path: Path, judged: SurfaceJudged, problem: SurfaceProb
         sections.append(Section(capture.name, facts, figures))
     title = f"diagnose: {d.material} with {d.instrument}"
     write_new_text(path, render(title, d.simulated, f"{d.wavelengths_nm[0]:g} nm", sections))
+
+
+def _checks(d: SurfaceDiagnosis) -> list[list[str]]:
+    rows = [["figure", "before", "after", ""]]
+    for check in () if d.correction is None else d.correction.checks:
+        word = "holds" if check.holds else "gets worse"
+        rows.append([check.name, f"{check.before:.4g}", f"{check.after:.4g}", word])
+    return rows
+
+
+def _refusal(d: SurfaceDiagnosis) -> list[str]:
+    refused = None if d.correction is None else d.correction.refused
+    return [] if refused is None else [f"The correction is refused: {refused}"]
 
 
 def residual_figure(judged: SurfaceJudged, problem: SurfaceProblem, k: int) -> Any:
