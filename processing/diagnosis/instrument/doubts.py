@@ -123,9 +123,12 @@ def doubts(
     return out
 
 
-def something_else(doubt: Mapping[Cause, str]) -> list[Cause]:
-    """Causes that are something else and stand out: what hardly does may be chance, and what does as well is told."""
-    return [cause for cause, why in doubt.items() if why in ELSE and 2 * cause.log_odds > STANDS_OUT]
+def something_else(doubt: Mapping[Cause, str], least: float = STANDS_OUT) -> list[Cause]:
+    """Causes that are something else and explain more than `least` of chi-square.
+
+    What hardly stands out may be chance, and what does as well in a cause's place is told.
+    """
+    return [cause for cause, why in doubt.items() if why in ELSE and 2 * cause.log_odds > least]
 
 
 def _in_its_place(gains: Mapping[type[InstrumentEffect], float], cause: Cause) -> str | None:

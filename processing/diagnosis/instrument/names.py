@@ -18,7 +18,7 @@ from processing.diagnosis.instrument.outcome import Outcome
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause, causes
-from processing.diagnosis.search.rules import LIKELY
+from processing.diagnosis.search.rules import DECISIVE, LIKELY
 from processing.diagnosis.search.solution import Solution
 from processing.instrument.effects.base import FieldEffect, ValuePerState
 
@@ -68,7 +68,7 @@ def unfit(problem: InstrumentProblem, solved: Solution, names: Names) -> list[Ca
     # Values that are not random, or as many as the data have; and those of a source that were found beside them.
     reasons = (*ELSE, *AS_WELL, BESIDE_PATTERN)
     found = _candidates([*names.untold, *(cause for cause, reason in names.doubt.items() if reason in reasons)])
-    if names.untold or something_else(names.doubt):
+    if names.untold or something_else(names.doubt, DECISIVE):
         # Something is there that is not in the list: only what has a name of its own is no part of it.
         own = set(_candidates([cause for cause in names.named if cause not in names.doubt]))
         found += [
