@@ -1,4 +1,4 @@
-"""A capture of one channel whose noise is the same everywhere and known."""
+"""A capture of one channel whose noise is known."""
 
 import numpy as np
 
@@ -6,16 +6,19 @@ from processing.diagnosis.captured.capture_data import CaptureData
 from processing.instrument.changes import Conditions
 
 
-def steady_capture(signal, sigma):
-    """Data of intensities (N, H, W) with a standard deviation `sigma`, of an unknown sample."""
+def steady_capture(signal, sigma, slope=0.0, sample=None):
+    """Data of intensities (N, H, W) with a standard deviation `sigma` without light, and a variance of `slope` with it.
+
+    `sample` (16,) is None where it is unknown.
+    """
     states, *shape = signal.shape
     return CaptureData(
         name="steady",
         signal=signal[:, None].astype(np.float32),
         conditions=Conditions({}, states, ("all",), np.arange(states) / states, 4095.0),
         exposure=np.ones(states),
-        sample=None,
-        slope=np.zeros(states),
+        sample=sample,
+        slope=np.full(states, slope),
         floor=np.full(states, sigma**2),
         noise_known=True,
         noise_source="",

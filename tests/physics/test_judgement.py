@@ -1,13 +1,19 @@
 """One judge for instrument and surface: the verdict of names and structure, and what is applied."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.judge import Judgement
 from processing.diagnosis.search.result import Check
 from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space, Sums
+from processing.diagnosis.surface import guard
+from processing.effect import Parameter
+from processing.instrument.effects.psg_retardance import PsgRetardance
 
 GROWS = (Check(name="rms", before=1.0, after=2.0, holds=False),)
 FALLS = (Check(name="rms", before=2.0, after=1.0, holds=True),)
@@ -52,3 +58,16 @@ def test_only_what_holds_and_has_a_cause_is_applied() -> None:
     assert holds.kept(solved, True) is solved
     assert holds.kept(solved, False) is not solved
     assert refused.kept(solved, True) is not solved
+
+
+def test_where_no_pixel_shows_xi0_nothing_is_said_of_it(monkeypatch) -> None:
+    """The mean over no pixel is no number, and by that every correction of a dim object was refused."""
+    candidate = Candidate(PsgRetardance(), "", (Parameter("x", "1", -1.0, 1.0, 1.0),))
+    fit = Fit(np.ones(1), Sums.empty(1, 1), 0.0)
+    solved = Solution(Space(()), fit, None, Space((candidate,)), fit, None)
+    problem = SimpleNamespace(captures=[None])
+    monkeypatch.setattr(guard, "xi0_of", lambda *of: np.full(5, np.nan))
+    assert guard.chances(problem, solved, np.eye(1)) == ()
+    monkeypatch.setattr(guard, "xi0_of", lambda problem, k, space, values: np.append(0.1 * values, np.nan))
+    told = guard.change_of_xi0(problem, solved, 0.01 * np.eye(1))
+    assert (told.size, told.stderr) == pytest.approx((0.1, 0.0071), abs=1e-4)

@@ -152,7 +152,7 @@ def _told(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring: 
         left_out=not_measured(problem),
         noise=noise_report(problem),
     )
-    return Judged(diagnosis, kept, used.before, used.before if kept is not solved else used.after)
+    return Judged(diagnosis, kept, used.before, used.after if kept is solved else used.before)
 
 
 def _unexplained(used: Outcome, names: Names) -> Unexplained:

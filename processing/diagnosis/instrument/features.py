@@ -40,8 +40,6 @@ ORDERS = ((0, 1), (1, 0), (0, 2), (1, 1), (2, 0))
 POINT = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 #: [1, fixed] Filters down and across the image of a pixel itself and of its derivatives.
 PATTERNS = ((POINT, POINT), *((FILTERS[down], FILTERS[across]) for down, across in ORDERS))
-
-
 #: [answers] That are kept of what frames have of their noise in common.
 KEPT = 1024
 

@@ -163,7 +163,7 @@ def chances(
     return (
         predicted,
         grows,
-        Check(name=f"{grows.name} in later captures{alone}", before=0.0, after=later.told, holds=True),
+        Check(name=f"{grows.name} in later captures{alone}", before=0.0, after=later.rounded_chance, holds=True),
         *(
             Check(
                 name=f"predicted error of M/m00 of {name}, rms (it grows with a chance of {_in_words(change)})",
@@ -177,7 +177,7 @@ def chances(
 
 
 def _in_words(change: PredictedChange) -> str:
-    return f"{change.told:.2g}" if change.told > 0 else "less than 0.0001"
+    return f"{change.rounded_chance:.2g}" if change.rounded_chance > 0 else "less than 0.0001"
 
 
 def lasts(later: PredictedChange, reasons: Collection[str] = ()) -> bool:

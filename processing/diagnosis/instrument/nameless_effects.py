@@ -22,8 +22,6 @@ from processing.instrument.model import InstrumentModel, Retarder
 
 #: [periods a turn, fixed] That no effect of the list has, of what a turning plate does.
 PERIODS = {"retardance": (2, 3, 4), "azimuth": (3, 4), "transmission": (3, 4)}
-
-
 #: [degree] Size of such a wave of a retardance or an azimuth; what it explains does not depend on this.
 WAVE_DEG = 0.5
 #: [1] Size of such a wave of a transmission; what it explains does not depend on this.

@@ -11,7 +11,7 @@ from processing.arrays import Array
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit
-from processing.diagnosis.search.range_of import LEAST_OF_SIGNATURE, range_of
+from processing.diagnosis.search.range_of import part_outside
 from processing.diagnosis.search.rules import APART, CLEARLY_MORE, VISIBLE
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import CountsEffect, InstrumentEffect, ValuePerState
@@ -117,11 +117,6 @@ def _signature(problem: InstrumentProblem, space: Space, fit: Fit, sample: Array
 
 def _sine(first: Array, second: Array) -> float:
     """Part of the smaller signature that the other cannot mimic; 0 if either is not seen."""
-    out = 1.0
-    for a, b in ((first, second), (second, first)):
-        norm = np.linalg.norm(a)
-        if norm < VISIBLE:
-            return 0.0
-        u = range_of(b, LEAST_OF_SIGNATURE)
-        out = min(out, float(np.linalg.norm(a - u @ (u.T @ a)) / norm))
-    return out
+    if min(np.linalg.norm(first), np.linalg.norm(second)) < VISIBLE:
+        return 0.0
+    return min(part_outside(first, second), part_outside(second, first))

@@ -26,7 +26,7 @@ def information(found: Posterior) -> tuple[Array, NDArray[np.int64]]:
 
 
 def would_be_seen(found: Posterior) -> tuple[Candidate, ...]:
-    """Effects of the optics or the source that at a typical size would stand out of the noise, or of what is left."""
+    """Effects of optics, source or surface that at a typical size would stand out of the noise, or of what is left."""
     told, always = information(found)
     told /= found.samples.best.unit
     return tuple(

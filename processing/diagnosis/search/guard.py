@@ -70,8 +70,8 @@ class PredictedChange:
         return float(ndtr(-beyond / self.stderr)) if self.stderr > 0 else float(beyond < 0)
 
     @property
-    def told(self) -> float:
-        """The chance that it grows, with no more digits than a calibration can show."""
+    def rounded_chance(self) -> float:
+        """The same with no more digits than a calibration can show."""
         return round(self.chance_worse, 4)
 
     def beside(self, left: float, explained: float) -> PredictedChange:
@@ -106,7 +106,7 @@ def chance_checks(quantity: str, change: PredictedChange) -> tuple[Check, Check]
         Check(
             name=f"chance that the error of {quantity} grows",
             before=0.0,
-            after=change.told,
+            after=change.rounded_chance,
             holds=change.chance_worse <= CHANCE_WORSE,
         ),
     )

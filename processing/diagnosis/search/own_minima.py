@@ -73,7 +73,6 @@ class OwnMinima:
         self.problem, self.say = problem, say
         self.whole = Space(problem.pool())
         self.members, self.groups = grouped(self.whole, ())
-        self._part = dict(zip(self.whole.candidates, self.whole.slices, strict=True))
         nothing = Space(())
         self.noise = noise_of(problem, problem.sums(nothing, np.zeros(0), derivatives=False))
         self.visited: dict[frozenset[int], Visited] = {}
@@ -109,9 +108,7 @@ class OwnMinima:
     def _visit(self, groups: frozenset[int], space: Space, fit: Fit) -> Visited:
         part = dict(zip(space.candidates, space.slices, strict=True))
         here = [
-            Group(
-                np.concatenate([np.r_[part[self.whole.candidates[m]]] for m in self.members[g]]), self.groups[g].share
-            )
+            Group(np.concatenate([np.r_[part[c]] for c in self.candidates_of(g)]), self.groups[g].share)
             for g in sorted(groups)
         ]
         # At a bound, or where a valley is too flat to follow, slopes are left; nothing can be gained by them.
@@ -194,7 +191,8 @@ class OwnMinima:
         weight = np.exp([min(v.score_at(unit) - here.score_at(unit), 0.0) for v in visited])
         weight /= weight.sum()
         there = np.array([[g in v.groups for g in range(len(self.groups))] for v in visited])
-        index = np.concatenate([np.zeros(0, dtype=int), *(np.r_[self._part[c]] for c in here.space.candidates)])
+        part = dict(zip(self.whole.candidates, self.whole.slices, strict=True))
+        index = np.concatenate([np.zeros(0, dtype=int), *(np.r_[part[c]] for c in here.space.candidates)])
         values, covariance = np.zeros(typical.size), np.zeros((typical.size, typical.size))
         values[index] = here.fit.values
         covariance[np.ix_(index, index)] = here.covariance

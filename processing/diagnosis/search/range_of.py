@@ -25,6 +25,12 @@ def inside_and_outside(a: Array) -> tuple[Array, Array]:
     return u[:, :rank], u[:, rank:]
 
 
+def part_outside(a: Array, b: Array) -> float:
+    """Part of a signature a (L, K) that another one, b (L, M), does not reach: the sine of their angle."""
+    u, norm = range_of(b, LEAST_OF_SIGNATURE), float(np.linalg.norm(a))
+    return float(np.linalg.norm(a - u @ (u.T @ a)) / norm) if norm else 0.0
+
+
 def rank_of(a: Array) -> int:
     """How many directions the columns of a (L, K) reach."""
     return int(np.linalg.matrix_rank(a, rtol=RANK))

@@ -49,6 +49,7 @@ DEGENERACY = "not_triply_degenerate"
 class SurfaceDiagnosis(Diagnosis):
     """Result of `diagnose --reflectance`."""
 
+    correction: Correction
     material: str
     constants: dict[str, float]
     quantities_before: tuple[Quantities, ...]
@@ -86,18 +87,24 @@ def diagnose_surface(problem: SurfaceProblem, material: str, say: Say) -> Surfac
         chances=chances(problem, solved, here.covariance),
     )
     kept = judgement.kept(solved, bool(named))
-    return _told(problem, material, search, judgement, _Found(likeliest, here, named, solved, kept), before)
+    found = _Found(likeliest, here, named, solved, kept, before, after)
+    return _told(problem, material, search, judgement, found)
 
 
 @dataclass(frozen=True)
 class _Found:
-    """The likeliest set, the one that is named and its causes; its correction, and what of it is applied."""
+    """The likeliest set, the one that is named and its causes; its correction, and what of it is applied.
+
+    `before`, `after` : tests of each capture without and with the correction, whether or not it is applied.
+    """
 
     likeliest: Visited
     here: Visited
     named: tuple[Cause, ...]
     solved: Solution
     kept: Solution
+    before: Sequence[dict[str, float]]
+    after: Sequence[dict[str, float]]
 
 
 def _told(
@@ -106,10 +113,8 @@ def _told(
     search: OwnMinima,
     judgement: Judgement,
     found: _Found,
-    before: Sequence[dict[str, float]],
 ) -> SurfaceJudged:
-    kept, verdict, captures = found.kept, judgement.verdict, range(len(problem.captures))
-    after, named = _tests(problem, kept.space, kept.fit.values), found.named
+    kept, named, verdict, captures = found.kept, found.named, judgement.verdict, range(len(problem.captures))
     ranking = _ranking(search)
     rivals = [c for cause in named if cause.alternatives for c in (*cause.candidates, *cause.alternatives)]
     first, last = (
@@ -127,14 +132,14 @@ def _told(
         unobservable=_unobservable(search, found.here),
         recommendation=wanted_for_evidence(problem)
         if verdict == "undetermined"
-        else recommended(problem, kept.space, kept.fit, rivals, verdict, before)
+        else recommended(problem, kept.space, kept.fit, rivals, verdict, found.before)
         + (CONFIRM if named and in_doubt else ""),
-        unexplained=_unexplained(problem, found.likeliest, after, ranking)
+        unexplained=_unexplained(problem, found.likeliest, found.after, ranking)
         if verdict in ("unexplained", "partly_explained")
         else None,
         calibrated={},
         ranking=ranking,
-        captures=tuple(_capture(problem, k, before[k], after[k]) for k in captures),
+        captures=tuple(_capture(problem, k, found.before[k], found.after[k]) for k in captures),
         instrument=problem.model.name,
         wavelengths_nm=(problem.captures[0].wavelength_nm,),
         simulated=any(c.simulated for c in problem.captures),

@@ -28,11 +28,14 @@ def checks(problem: SurfaceProblem, solved: Solution) -> tuple[Check, ...]:
 
 
 def chances(problem: SurfaceProblem, solved: Solution, covariance: Array) -> tuple[Check, ...]:
-    """What the correction does to xi0, where its values have a covariance (K, K)."""
-    return chance_checks("xi0", predicted_change(problem, solved, covariance)) if solved.effects else ()
+    """What the correction does to xi0, where its values have a covariance (K, K); none where no pixel shows xi0."""
+    if not solved.effects:
+        return ()
+    change = change_of_xi0(problem, solved, covariance)
+    return () if change is None else chance_checks("xi0", change)
 
 
-def predicted_change(problem: SurfaceProblem, solved: Solution, covariance: Array) -> PredictedChange:
+def change_of_xi0(problem: SurfaceProblem, solved: Solution, covariance: Array) -> PredictedChange | None:
     """The change of xi0 and its error, which is that at both ends of every principal axis of the values.
 
     Slopes at what was found do not tell it: the model is far from linear, and values have bounds.
@@ -40,14 +43,16 @@ def predicted_change(problem: SurfaceProblem, solved: Solution, covariance: Arra
     space, values = solved.space, solved.fit.values
     found = _xi0(problem, space, values)
     change = found - _xi0(problem, space, np.zeros(space.size))
-    size = _rms(change)
+    if not np.isfinite(change).any():
+        return None
+    size = float(np.sqrt(_mean(change**2)))
     along, whole = 0.0, 0.0
     lower, upper = space.joined("lower"), space.joined("upper")
     variance, axes = np.linalg.eigh(covariance)
     for one in (np.sqrt(np.maximum(variance, 0.0)) * axes).T:
         ends = [_xi0(problem, space, np.clip(values + sign * one, lower, upper)) - found for sign in (1, -1)]
-        whole += sum(_rms(end) ** 2 for end in ends) / 2
-        along += sum(float(np.nanmean(end * change)) ** 2 for end in ends) / 2 / max(size, 1e-300) ** 2
+        whole += sum(_mean(end**2) for end in ends) / 2
+        along += sum(_mean(end * change) ** 2 for end in ends) / 2 / max(size, 1e-300) ** 2
     return PredictedChange(float(np.hypot(size, np.sqrt(whole))), float(np.sqrt(whole)), size, size, float(along**0.5))
 
 
@@ -55,5 +60,7 @@ def _xi0(problem: SurfaceProblem, space: Space, values: Array) -> Array:
     return np.concatenate([xi0_of(problem, k, space, values) for k in range(len(problem.captures))])
 
 
-def _rms(x: Array) -> float:
-    return float(np.sqrt(np.nanmean(x**2)))
+def _mean(x: Array) -> float:
+    """Over the pixels that show xi0."""
+    shown = x[np.isfinite(x)]
+    return float(shown.mean()) if shown.size else 0.0

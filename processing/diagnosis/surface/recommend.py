@@ -6,10 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit
-from processing.diagnosis.search.range_of import LEAST_OF_SIGNATURE, range_of, rank_of
+from processing.diagnosis.search.range_of import part_outside, rank_of
 from processing.diagnosis.search.rules import APART, LIMIT
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.problem import SurfaceProblem
@@ -61,11 +60,5 @@ def _apart(problem: SurfaceProblem, space: Space, fit: Fit, rivals: Sequence[Can
     smallest = 1.0
     for i, first in enumerate(signatures):
         for second in signatures[i + 1 :]:
-            smallest = min(smallest, _sine(first, second), _sine(second, first))
+            smallest = min(smallest, part_outside(first, second), part_outside(second, first))
     return smallest
-
-
-def _sine(a: Array, b: Array) -> float:
-    u = range_of(b, LEAST_OF_SIGNATURE)
-    norm = float(np.linalg.norm(a))
-    return float(np.linalg.norm(a - u @ (u.T @ a)) / norm) if norm else 0.0

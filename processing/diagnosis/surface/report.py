@@ -77,14 +77,14 @@ def write_surface_report(path: Path, judged: SurfaceJudged, problem: SurfaceProb
 
 def _checks(d: SurfaceDiagnosis) -> list[list[str]]:
     rows = [["figure", "before", "after", ""]]
-    for check in () if d.correction is None else d.correction.checks:
+    for check in d.correction.checks:
         word = "holds" if check.holds else "gets worse"
         rows.append([check.name, f"{check.before:.4g}", f"{check.after:.4g}", word])
     return rows
 
 
 def _refusal(d: SurfaceDiagnosis) -> list[str]:
-    refused = None if d.correction is None else d.correction.refused
+    refused = d.correction.refused
     return [] if refused is None else [f"The correction is refused: {refused}"]
 
 

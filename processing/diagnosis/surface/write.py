@@ -70,7 +70,7 @@ def write_surface(
     WriteError : nothing was found that a file could hold, or the correction is refused.
     ProcessError : one of the files exists.
     """
-    if diagnosis.correction is not None and diagnosis.correction.refused is not None:
+    if diagnosis.correction.refused is not None:
         raise WriteError(f"{path} was not written: {diagnosis.correction.refused}.")
     kinds = {e.kind for e in diagnosis.applied()}
     of_surface = [effect for kind, effect in reflectance_effects().items() if kind in kinds]

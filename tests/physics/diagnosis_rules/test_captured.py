@@ -5,6 +5,7 @@ from types import SimpleNamespace as Some
 import numpy as np
 from rule_decisions import Patch, decides
 from scipy.linalg import hadamard
+from steady_capture import steady_capture
 
 from processing.arrays import Array
 from processing.diagnosis.captured import bad_frames, black_jitter, checked_noise, outliers, read_capture, read_frames
@@ -12,7 +13,6 @@ from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.common_rest import Whitened
 from processing.diagnosis.captured.steep_pixels import without_steep_pixels
 from processing.diagnosis.instrument import noise_level
-from processing.instrument.changes import Conditions
 
 STATES = 40
 
@@ -57,23 +57,7 @@ def test_fewest_dim(m: Patch) -> bool:
 
 def images(signal: np.ndarray, noise: float) -> CaptureData:
     """Two equal states of an image (rows, columns), of so much noise."""
-    shape = signal.shape
-    return CaptureData(
-        name="a",
-        signal=np.broadcast_to(signal, (2, 1, *shape)).astype(np.float32),
-        conditions=Conditions({}, 2, ("camera",), np.zeros(2), 1000.0),
-        exposure=np.ones(2),
-        sample=None,
-        slope=np.zeros(2),
-        floor=np.full(2, noise**2),
-        noise_known=True,
-        noise_source="stated",
-        clipped=np.zeros(shape, dtype=bool),
-        clipped_states=np.zeros(2, dtype=bool),
-        usable=np.ones(shape, dtype=bool),
-        simulated=True,
-        wavelength_nm=550.0,
-    )
+    return steady_capture(np.broadcast_to(signal, (2, *signal.shape)), noise)
 
 
 def dark(level: float) -> int:

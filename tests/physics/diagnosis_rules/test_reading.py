@@ -7,6 +7,7 @@ from types import SimpleNamespace as Some
 import numpy as np
 from rule_decisions import Patch, decides
 from scipy.linalg import hadamard
+from steady_capture import steady_capture
 from test_captured import steep
 
 from processing.arrays import Array
@@ -23,7 +24,6 @@ from processing.diagnosis.captured import (
 )
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.common_rest import Whitened
-from processing.instrument.changes import Conditions
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture import Capture
 from processing.storage.capture_schema import Sample
@@ -35,23 +35,7 @@ FILE = Path(__file__).parents[3] / "configs/instruments/rgb950.yaml"
 
 def signals(signal: Array, slope: float = 0.0, floor: float = 0.0, sample: Array | None = None) -> CaptureData:
     """A capture of one channel with signals (N, rows, columns) and such a noise."""
-    states, *shape = signal.shape
-    return CaptureData(
-        name="a",
-        signal=signal[:, None].astype(np.float32),
-        conditions=Conditions({}, states, ("camera",), np.zeros(states), 1000.0),
-        exposure=np.ones(states),
-        sample=sample,
-        slope=np.full(states, slope),
-        floor=np.full(states, floor),
-        noise_known=True,
-        noise_source="stated",
-        clipped=np.zeros(shape, dtype=bool),
-        clipped_states=np.zeros(states, dtype=bool),
-        usable=np.ones(shape, dtype=bool),
-        simulated=True,
-        wavelength_nm=550.0,
-    )
+    return steady_capture(signal, np.sqrt(floor), slope, sample)
 
 
 def read(counts: Array, **declared: object) -> CaptureData:
