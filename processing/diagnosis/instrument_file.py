@@ -26,8 +26,8 @@ def extended(model: InstrumentModel, diagnosis: Diagnosis) -> InstrumentModel:
     values: dict[str, dict[str, Dispersive]] = {}
     for name, entry in diagnosis.calibrated.items() if diagnosis.corrects else ():
         element, _, field = name.rpartition(".")
-        old: Dispersive = next(getattr(e, field) for e in model.elements() if e.name == element)
-        values.setdefault(element, {})[field] = _merged(old, entry, diagnosis.wavelengths_nm)
+        old = model.value_of(name)
+        values.setdefault(element, {})[field] = _merged(old or 0.0, entry, diagnosis.wavelengths_nm)
     systematic = diagnosis.systematic()
     told = [s.wavelength_nm for s in systematic]
     update = {

@@ -12,6 +12,7 @@ from processing.effect import EffectError, Parameter, found_in
 from processing.instrument.changes import Changes, Conditions
 from processing.instrument.effects.base import InstrumentEffect, ValuePerState
 from processing.instrument.model import AppliedEffect, InstrumentModel
+from processing.instrument.nominal import KIND, shift_nominal
 
 #: Entry points of packages outside that add effects.
 ENTRY_POINTS = "umov.effects"
@@ -30,6 +31,12 @@ def apply_to(changes: Changes, model: InstrumentModel, applied: AppliedEffect) -
     ------
     EffectError : no such kind, place or parameter.
     """
+    if applied.kind == KIND:
+        (value,) = applied.parameters.values()
+        if model.value_of(applied.element or "") is None:
+            raise EffectError(f"{KIND}: {applied.element!r} is no value of instrument {model.name!r}")
+        shift_nominal(changes, model, applied.element or "", float(np.asarray(value.value)))
+        return
     effects = instrument_effects()
     if applied.kind not in effects:
         raise EffectError(f"effect {applied.kind!r} does not exist; there are: {', '.join(sorted(effects))}")

@@ -44,7 +44,7 @@ class Element(Part):
 
     def azimuth_rad(self, angles_deg: Mapping[str, ArrayLike], states: int) -> Array:
         """Azimuth (states,) in radians; angles_deg holds the angle of each axis for each state."""
-        azimuth = np.full(states, _number(self.azimuth_deg))
+        azimuth = np.full(states, number(self.azimuth_deg))
         if self.axis is not None:
             if self.axis not in angles_deg:
                 known = ", ".join(sorted(angles_deg)) or "none"
@@ -64,7 +64,7 @@ class Polarizer(Element):
     extinction: Dispersive = 0.0
 
     def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
-        extinction = _number(self.extinction) + (changes.extinction[self.name] if changes else 0.0)
+        extinction = number(self.extinction) + (changes.extinction[self.name] if changes else 0.0)
         return mueller.polarizer(azimuth_rad, extinction)
 
 
@@ -81,10 +81,10 @@ class Retarder(Element):
     depolarization: Dispersive = 0.0
 
     def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
-        retardance = np.deg2rad(_number(self.retardance_deg)) + (changes.retardance_rad[self.name] if changes else 0.0)
-        lost = _number(self.depolarization) + (changes.depolarization[self.name] if changes else 0.0)
+        retardance = np.deg2rad(number(self.retardance_deg)) + (changes.retardance_rad[self.name] if changes else 0.0)
+        lost = number(self.depolarization) + (changes.depolarization[self.name] if changes else 0.0)
         plain = mueller.retarder(azimuth_rad, retardance, lost)
-        d = _number(self.diattenuation) + (changes.diattenuation[self.name] if changes else 0.0)
+        d = number(self.diattenuation) + (changes.diattenuation[self.name] if changes else 0.0)
         if np.all(d == 0.0):
             return plain
         return mueller.diattenuator(azimuth_rad, 1 + d, 1 - d) @ plain
@@ -98,13 +98,14 @@ class Diattenuator(Element):
     t_min: Dispersive
 
     def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
-        return mueller.diattenuator(azimuth_rad, _number(self.t_max), _number(self.t_min))
+        return mueller.diattenuator(azimuth_rad, number(self.t_max), number(self.t_min))
 
 
 AnyElement = Annotated[Polarizer | Retarder | Diattenuator, Field(discriminator="kind")]
 
 
-def _number(value: Dispersive) -> float:
+def number(value: Dispersive) -> float:
+    """The value, once a wavelength is chosen; WavelengthError before."""
     if isinstance(value, dict):
         raise WavelengthError("the instrument model has values for several wavelengths: choose one with .at()")
     return float(value)

@@ -17,7 +17,7 @@ from pydantic import Field, field_serializer, field_validator, model_validator
 from processing.arrays import Array
 from processing.instrument import direction_text
 from processing.instrument.changes import Changes
-from processing.instrument.elements import AnyElement, Part
+from processing.instrument.elements import AnyElement, Part, number
 from processing.instrument.elements import Dispersive as Dispersive
 from processing.instrument.elements import Element as Element
 from processing.instrument.elements import Polarizer as Polarizer
@@ -36,7 +36,14 @@ class Channel(Part):
 
     name: str
     elements: tuple[AnyElement, ...] = ()
-    gain: float = Field(default=1.0, gt=0)
+    gain: Dispersive = 1.0
+
+    @field_validator("gain")
+    @classmethod
+    def _is_positive(cls, gain: Dispersive) -> Dispersive:
+        if min(gain.values() if isinstance(gain, dict) else [gain]) <= 0:
+            raise ValueError("the gain of a channel must be above 0")
+        return gain
 
 
 class AppliedEffect(Part):
@@ -116,7 +123,8 @@ class InstrumentModel(Part):
     `mosaic`, for a division-of-focal-plane sensor, lays out the channel names over the super-pixel, row by
     row from the top left, e.g. (("90", "45"), ("135", "0")).
     `beams` names the channels whose images lie side by side on one detector, in equal parts of its columns.
-    `calibrate` names values ("element.field") that are only nominal: `diagnose` fits them to captures of known samples.
+    `calibrate` names values ("element.field", "channel.gain") that are only nominal: `diagnose` fits them to captures
+    of known samples.
     An effect of scope "capture" holds for the captures that it names and for no other.
     `belongs_to` says of such values, and of kinds of effects, what they belong to where that is not the rule: a
     spectrograph sees one run of the axes at all wavelengths (`rotation_slip: mechanics`), the axis of an achromatic
@@ -212,20 +220,31 @@ class InstrumentModel(Part):
         values: dict[str, dict[str, Dispersive]] = {}
         for name in self.calibrate:
             element, _, field = name.rpartition(".")
-            given = next((getattr(e, field, None) for e in self.elements() if e.name == element), None)
+            given = self.value_of(name)
             if isinstance(given, dict) and not _listed(wavelength_nm, tuple(given)):
                 known = sorted(given)
                 near = float(np.interp(wavelength_nm, known, [given[k] for k in known]))
                 values.setdefault(element, {})[field] = {**given, wavelength_nm: near}
         return self.with_values(values).at(wavelength_nm)
 
+    def value_of(self, name: str) -> Dispersive | None:
+        """The value "element.field", or "channel.gain"; None where this instrument has none of that name."""
+        place, _, field = name.rpartition(".")
+        parts = self.channels if field == "gain" else self.elements()
+        return next((getattr(p, field, None) for p in parts if p.name == place), None)
+
     def with_values(self, values: Mapping[str, Mapping[str, Any]]) -> InstrumentModel:
-        """The model with other values of its elements: element to field to value."""
+        """The model with other values of its elements and channels: name to field to value."""
+
+        def new(name: str, *, gain: bool) -> dict[str, Any]:
+            return {field: value for field, value in values.get(name, {}).items() if (field == "gain") == gain}
 
         def swap(elements: tuple[AnyElement, ...]) -> tuple[AnyElement, ...]:
-            return tuple(e.model_copy(update=dict(values.get(e.name, {}))) for e in elements)
+            return tuple(e.model_copy(update=new(e.name, gain=False)) for e in elements)
 
-        channels = tuple(c.model_copy(update={"elements": swap(c.elements)}) for c in self.channels)
+        channels = tuple(
+            c.model_copy(update={"elements": swap(c.elements)} | new(c.name, gain=True)) for c in self.channels
+        )
         update = {"generator": swap(self.generator), "analyzer": swap(self.analyzer), "channels": channels}
         return self.model_copy(update=update)
 
@@ -246,7 +265,7 @@ class InstrumentModel(Part):
         for k, channel in enumerate(self.channels):
             own = [_matrices(e, angles_deg, n, changes) for e in channel.elements]
             row = np.zeros((n, 4))
-            row[:, 0] = channel.gain
+            row[:, 0] = number(channel.gain)
             for matrix in reversed(common + own):
                 row = np.einsum("ni,nij->nj", row, matrix)
             out[:, k] = row

@@ -55,9 +55,15 @@ Progress = Callable[[int, int], None]
 BLOCK_PIXELS = 1 << 18
 
 CHI_SQUARE = Plane((), "", "squared residual over what the noise model expects; 1 if the model is complete")
-SYSTEMATIC = Plane(
-    (4, 4), "count", "systematic standard errors of mueller (of M/m00, times m00): what the diagnosis leaves uncertain"
-)
+_LEFT = "what the diagnosis leaves uncertain"
+SYSTEMATIC = {
+    "mueller_systematic": Plane(
+        (4, 4), "count", f"systematic standard errors of mueller (of M/m00, times m00): {_LEFT}"
+    )
+}
+SENT_SYSTEMATIC = {
+    "stokes_systematic": Plane((4,), "count", f"systematic standard errors of stokes (of S/S0, times S0): {_LEFT}")
+}
 COVARIANCE = Plane(
     (ELEMENTS * (ELEMENTS + 1) // 2,),
     "count2",
@@ -225,7 +231,7 @@ def reduce_mueller(
     planes |= SENT_PLANES if sent is not None else {}
     systematic = _systematic(capture, model, states, inversion)
     if systematic is not None:
-        planes["mueller_systematic"] = SYSTEMATIC
+        planes |= SYSTEMATIC if sent is None else SENT_SYSTEMATIC
     with ProductWriter(out, "mueller", capture.header, capture.frame_shape, planes, steps, overwrite) as product:
         product.array("measurement_matrix", w, "", "W (state, channel, 16): intensity = W . vec(M), row-major")
         _store_noise(product, noise, solver)
@@ -281,7 +287,7 @@ def _store_noise(product: ProductWriter, noise: NoiseModel | None, solver: Solve
 def _systematic(
     capture: Capture, model: InstrumentModel, states: NDArray[np.int64], inversion: Inversion
 ) -> Systematic | None:
-    if not model.systematic or inversion.rank < ELEMENTS:
+    if not model.systematic:
         return None
 
     def matrix(other: InstrumentModel) -> NDArray[np.float64]:
@@ -290,7 +296,7 @@ def _systematic(
     def counts(other: InstrumentModel) -> CountsCorrection | None:
         return counts_correction(capture_changes(capture, other, states), other)
 
-    return Systematic.of(model, matrix, counts, inversion.pinv)
+    return Systematic.of(model, matrix, counts, inversion.basis)
 
 
 def _block(
@@ -302,14 +308,17 @@ def _block(
     lost = (mask & np.uint8(Mask.NOT_FINITE | Mask.BAD | Mask.NOT_DETERMINED)) != 0
     if sent is not None:
         found |= sent.planes(found["mueller"], found["residual_rms"], solver)
+        if systematic is not None:
+            found["stokes_systematic"] = systematic.errors(found["mueller"], sent.rows)
+            found["stokes_systematic"][~sent.seen] = np.nan
+    elif systematic is not None:
+        found["mueller_systematic"] = systematic.errors(found["mueller"])
     unseen = ~determined_elements(solver.inversion.basis)
     if unseen.any():
-        found["mueller"][unseen] = np.nan
-        found["mueller_errors"][unseen] = np.nan
+        for name in {"mueller", "mueller_errors", "mueller_systematic"} & set(found):
+            found[name][unseen] = np.nan
         if "mueller_covariance" in found:
             found["mueller_covariance"][(unseen[:, None] | unseen)[np.tril_indices(ELEMENTS)]] = np.nan
-    if systematic is not None:
-        found["mueller_systematic"] = systematic.errors(found["mueller"])
     for name, values in found.items():
         if lost.any() and name != "pixel_flags":
             values[..., lost] = np.nan

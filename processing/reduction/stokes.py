@@ -14,7 +14,7 @@ from processing.instrument.changes import Changes
 from processing.instrument.model import InstrumentModel
 from processing.reduction.counts_to_signal import Correction
 from processing.reduction.cut_off import without_cut_off
-from processing.reduction.effects_of_capture import capture_changes, counts_correction
+from processing.reduction.effects_of_capture import CountsCorrection, capture_changes, counts_correction
 from processing.reduction.facts import in_words
 from processing.reduction.instrument_of_capture import require_one_colour
 from processing.reduction.left_out import LeftOut
@@ -26,6 +26,7 @@ from processing.reduction.mosaic.pixel_response import corrected_frame
 from processing.reduction.mueller import Progress
 from processing.reduction.noise import NoiseModel
 from processing.reduction.sample_states import sample_states
+from processing.reduction.systematic import Systematic
 from processing.storage.capture import Capture, CaptureError
 from processing.storage.pixel_mask import Mask
 from processing.storage.product import LIT_ERRORS, Plane, ProductWriter, Step
@@ -51,10 +52,18 @@ PLANES = {
     "pixel_flags": Plane((), "", f"0 = good; bits: {Mask.meaning()}", np.uint8),
 }
 
+_LEFT = "what the diagnosis leaves uncertain"
+SYSTEMATIC = {
+    "s1_systematic": Plane((), "count", f"systematic standard errors of s1 (of S1/S0, times S0): {_LEFT}"),
+    "s2_systematic": Plane((), "count", f"systematic standard errors of s2 (of S2/S0, times S0): {_LEFT}"),
+    "dolp_systematic": Plane((), "", f"systematic standard errors of dolp: {_LEFT}"),
+    "aolp_deg_systematic": Plane((), "degree", f"systematic standard errors of aolp_deg: {_LEFT}"),
+}
+
 #: A degree of polarization has an error bar, and so an angle, above this many of its errors.
 SEEN = 3.0
 #: Without light there is no degree and no angle of polarization; S itself is a measurement all the same.
-RATIOS = ("dolp", "dolp_errors", "aolp_deg", "aolp_deg_errors")
+RATIOS = ("dolp", "dolp_errors", "aolp_deg", "aolp_deg_errors", "dolp_systematic", "aolp_deg_systematic")
 
 
 def channel_rows(
@@ -122,6 +131,7 @@ def reduce_stokes(
     cut_off = [*left_out.warnings, *cut_off]
     changes = capture_changes(capture, model, states)
     model_rows, analyzers = channel_rows(capture, model, states, changes)
+    systematic = _systematic(capture, model, states)
     correction = correction or Correction.of(capture)
     noise = noise or NoiseModel.of(capture.header.detector, integer=capture.integer_counts)
     merged = merge(capture, states, correction, noise, counts_correction(changes, model), progress)
@@ -130,6 +140,10 @@ def reduce_stokes(
         frame = corrected_frame(frame, response, layout, analyzers)
     channels = demosaic(frame, layout, method)
     found = stokes(channels, analyzers, layout, method, merged, frame)
+    planes = PLANES
+    if systematic is not None:
+        planes = PLANES | SYSTEMATIC
+        found |= systematic_errors(systematic, found)
     found["pixel_flags"] = _spread(merged.mask, channels.shape[1:])
     lost = (found["pixel_flags"] & ~np.uint8(Mask.SATURATED)) != 0
     dark = ~(found["s0"] > 0)
@@ -139,7 +153,7 @@ def reduce_stokes(
     rows, columns = channels.shape[1:]
     facts = _facts(found, analyzers, noise, correction, method, len(states))
     facts["warnings"] += cut_off
-    with ProductWriter(out, "stokes", capture.header, (rows, columns), PLANES, steps, overwrite) as product:
+    with ProductWriter(out, "stokes", capture.header, (rows, columns), planes, steps, overwrite) as product:
         product.array("measurement_matrix", model_rows, "", "W (channel, 16): intensity = W . vec(M), row-major")
         correlation = neighbour_correlation(layout, method, tuple(map(tuple, np.linalg.pinv(analyzers).tolist())))
         product.array(
@@ -206,6 +220,28 @@ def stokes(
     found |= {"stokes_covariance": covariance, "dolp": dolp, "dolp_errors": dolp_errors, "closure": closure}
     found |= {"aolp_deg": np.rad2deg(aolp), "aolp_deg_errors": np.rad2deg(aolp_errors)}
     return {name: np.asarray(values, dtype=np.float32) for name, values in found.items()}
+
+
+def _systematic(capture: Capture, model: InstrumentModel, states: NDArray[np.int64]) -> Systematic | None:
+    def rows(other: InstrumentModel) -> NDArray[np.float64]:
+        return channel_rows(capture, other, states, capture_changes(capture, other, states))[1][None]
+
+    def counts(other: InstrumentModel) -> CountsCorrection | None:
+        return counts_correction(capture_changes(capture, other, states), other)
+
+    return Systematic.of(model, rows, counts, np.eye(LINEAR))
+
+
+def systematic_errors(systematic: Systematic, found: dict[str, NDArray[Any]]) -> dict[str, NDArray[np.float32]]:
+    """Planes `SYSTEMATIC` of an image of s0, s1 and s2."""
+    s = np.stack([found[name] for name in ("s0", "s1", "s2")])
+    moved = np.stack(list(systematic.moves(s.reshape(LINEAR, -1)))).reshape(-1, *s.shape)[:, 1:]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        linear = np.hypot(s[1], s[2])
+        u, v = s[1:] / linear
+        along, across = u * moved[:, 0] + v * moved[:, 1], u * moved[:, 1] - v * moved[:, 0]
+        each = (moved[:, 0], moved[:, 1], along / s[0], np.rad2deg(across / linear / 2))
+    return {name: np.sqrt(np.sum(e**2, axis=0), dtype=np.float32) for name, e in zip(SYSTEMATIC, each, strict=True)}
 
 
 def _by_channel(raw: NDArray[np.float32], layout: MosaicLayout, channels: NDArray[np.float32]) -> NDArray[np.float32]:

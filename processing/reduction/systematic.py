@@ -1,8 +1,8 @@
-"""Systematic standard errors of a Mueller image, from what the instrument's diagnosis left uncertain."""
+"""Systematic standard errors of a Mueller or Stokes image, from what the instrument's diagnosis left uncertain."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +14,14 @@ from processing.reduction.effects_of_capture import CountsCorrection
 
 
 @dataclass(frozen=True)
-class _Direction:
-    """One independent direction: M moves by `turn` (16, 16) times M, and by what a correction of the counts adds."""
+class Direction:
+    """One independent direction of one standard deviation.
+
+    Attributes
+    ----------
+    turn : (K, K); the unknowns of a pixel move by `turn` times themselves.
+    counts : a correction of the counts that moves them further; None without.
+    """
 
     turn: Array
     counts: CountsCorrection | None
@@ -23,15 +29,15 @@ class _Direction:
 
 @dataclass(frozen=True)
 class Systematic:
-    """All directions of one capture.
+    """All directions of one capture, for K unknowns of a pixel: 16 of a Mueller matrix, 3 of a linear Stokes vector.
 
     Attributes
     ----------
-    w, inverse : (L, 16) measurement matrix and (16, L) its inverse.
-    channels : rows of W for each state.
+    w, inverse : (L, K) measurement matrix and (K, L) its inverse in what the instrument determines.
+    channels : rows of `w` for each state.
     """
 
-    directions: tuple[_Direction, ...]
+    directions: tuple[Direction, ...]
     w: Array
     inverse: Array
     channels: int
@@ -42,32 +48,40 @@ class Systematic:
         model: InstrumentModel,
         matrix: Callable[[InstrumentModel], Array],
         counts: Callable[[InstrumentModel], CountsCorrection | None],
-        inverse: Array,
+        basis: Array,
     ) -> Systematic | None:
         """Directions of a model; None where it has none.
 
         Parameters
         ----------
-        matrix : makes (states, channels, 16), the measurement matrix of the capture, of a model and its effects.
+        matrix : makes (states, channels, K), the measurement matrix of the capture, of a model and its effects.
         counts : makes of them what is corrected in the counts.
-        inverse : (16, L) of the measurement matrix.
+        basis : (K, R) what the instrument determines of the unknowns; they move inside of that alone.
         """
-        w, out = matrix(model), []
-        flat = w.reshape(-1, 16)
+
+        def inverse(w: Array) -> Array:
+            return np.asarray(basis @ np.linalg.pinv(w.reshape(-1, len(basis)) @ basis))
+
+        w = matrix(model)
+        flat, out = w.reshape(-1, len(basis)), []
         for error in model.systematic:
             for effects in error.directions:
                 moved = matrix(model.model_copy(update={"effects": (*model.effects, *effects)}))
                 bent = counts(model.model_copy(update={"effects": effects}))
-                turn = np.linalg.pinv(moved.reshape(-1, 16)) @ flat - np.eye(16)
-                out.append(_Direction(turn, bent if bent is not None and bent.response else None))
-        return cls(tuple(out), flat, inverse, w.shape[1]) if out else None
+                turn = inverse(moved) @ flat - basis @ basis.T
+                out.append(Direction(turn, bent if bent is not None and bent.response else None))
+        return cls(tuple(out), flat, inverse(w), w.shape[1]) if out else None
 
-    def errors(self, mueller: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Standard errors (4, 4, pixels) in counts; those of M/m00 times m00, so that of m00 itself is zero."""
-        m = mueller.reshape(16, -1).astype(np.float64)
-        variance = np.zeros_like(m)
+    def moves(self, values: NDArray[np.floating], rows: Array | None = None) -> Iterator[Array]:
+        """What each direction does to `rows` (J, K) times the unknowns (K, pixels), their first held: (J, pixels).
+
+        Only ratios to the first (m00, S0) are measured; `rows` are by default the unknowns themselves.
+        """
+        m = values.astype(np.float64)
+        rows = np.eye(len(m)) if rows is None else rows
+        shown = rows @ m
         with np.errstate(divide="ignore", invalid="ignore"):
-            relative = m / m[0]
+            relative = shown / shown[0]
         for direction in self.directions:
             moved = direction.turn @ m
             if direction.counts is not None:
@@ -75,6 +89,10 @@ class Systematic:
                 bent = signal.copy()
                 direction.counts.apply(bent)
                 moved += self.inverse @ (bent - signal).reshape(-1, m.shape[1])
-            moved -= relative * moved[0]
-            variance += moved**2
-        return np.sqrt(variance).astype(np.float32).reshape(4, 4, -1)
+            moved = rows @ moved
+            yield moved - relative * moved[0]
+
+    def errors(self, values: NDArray[np.floating], rows: Array | None = None) -> NDArray[np.float32]:
+        """Standard errors (J, pixels) of what `moves` moves, in the unit of the values; that of the first is zero."""
+        variance = sum(moved**2 for moved in self.moves(values, rows))
+        return np.asarray(np.sqrt(variance), dtype=np.float32)

@@ -7,8 +7,10 @@ from bench_capture import bench_capture
 
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel, SystematicError
 from processing.reduction.mueller import reduce_mueller
+from processing.reduction.stokes import reduce_stokes
 from processing.storage.capture import Capture
 from processing.storage.product import Step
+from processing.yaml_file import dump_yaml
 from simulators.blind.undeclared_captures import Bench
 
 
@@ -58,3 +60,71 @@ def test_two_directions_add_in_squares_and_other_wavelengths_have_none(air, conf
     )
     assert both == pytest.approx(np.hypot(one, two), rel=1e-4, abs=1e-3)
     assert model.model_copy(update={"systematic": (first,)}).at(451).systematic == ()
+
+
+#: An instrument, angles of its axes, and a value of its train that is uncertain by so much.
+PARTIAL = {
+    "rotating_retarder_stokes": ({"psa": 22.5 * np.arange(16)}, ("psa_retarder.azimuth_deg", 0.4), "mueller"),
+    "rotating_analyzer": ({"psa": 30.0 * np.arange(6)}, ("analyzer.azimuth_deg", 0.5), "mueller"),
+    "linear_mueller": (
+        {"psg": np.repeat([0.0, 60, 120, 20], 4), "psa": np.tile([0.0, 60, 120, 100], 4)},
+        ("analyzer.azimuth_deg", 0.5),
+        "mueller",
+    ),
+    "mosaic_polarimeter": ({"psg": 22.5 * np.arange(8)}, ("psg_retarder.azimuth_deg", 0.5), "mueller"),
+    "linear_stokes": ({}, ("micropolarizer_45.azimuth_deg", 0.5), "stokes"),
+}
+SAMPLE = np.array([[1, 0.2, -0.1, 0.05], [0.15, 0.6, 0.1, -0.2], [-0.3, 0.05, 0.5, 0.1], [0.2, 0.1, -0.15, 0.4]])
+
+
+def product_of(synthetic_capture, tmp_path, signal, angles, model, name):
+    """Every dataset of the product of a capture without noise, of signals (states, channels)."""
+    states = len(signal)
+    mosaic = None
+    if model.mosaic is not None:
+        where = {channel: (r, c) for r, line in enumerate(model.mosaic) for c, channel in enumerate(line)}
+        frames = np.zeros((states, 1, 8, 8), np.float32)
+        for k, channel in enumerate(c.name for c in model.channels):
+            r, c = where[channel]
+            frames[:, 0, r::2, c::2] = signal[:, k, None, None]
+        mosaic = model.mosaic
+    else:
+        frames = np.broadcast_to(signal[..., None, None], (*signal.shape, 4, 4)).astype(np.float32)
+    path = synthetic_capture(frames, angles, title=name, mosaic=mosaic, instrument_yaml=dump_yaml(model))
+    out = tmp_path / f"{name}.h5"
+    with Capture(path, by_super_pixel=bool(angles)) as capture:
+        reduce = reduce_mueller if angles or mosaic is None else reduce_stokes
+        reduce(capture, model, out, (Step("reduce", {}),))
+    found = {}
+    with h5py.File(out) as h5:
+        h5.visititems(lambda key, node: found.__setitem__(key.rpartition("/")[2], node))
+        return {key: node[...] for key, node in found.items() if isinstance(node, h5py.Dataset)}
+
+
+@pytest.mark.parametrize("instrument", PARTIAL)
+def test_a_nominal_value_that_is_open_shows_in_whatever_the_instrument_determines(
+    instrument, configs, synthetic_capture, tmp_path
+):
+    """One standard deviation of a value that `calibrate` lists moves the product by one systematic standard error."""
+    angles, (value, error), kind = PARTIAL[instrument]
+    model = InstrumentModel.load(configs / f"instruments/{instrument}.yaml").at(662)
+    off = model.with_values({value.split(".")[0]: {value.split(".")[1]: model.value_of(value) + error}})
+    states = max([np.size(v) for v in angles.values()], default=1)
+    signal = off.rows(angles or {"": np.zeros(states)}) @ SAMPLE.reshape(16) * 1000
+    open_end = model.model_copy(update={"systematic": (uncertain("calibrate", value, value=error),)})
+    found = product_of(synthetic_capture, tmp_path, signal, angles, open_end, "nominal")
+    exact = product_of(synthetic_capture, tmp_path, signal, angles, off, "exact")
+    if kind == "stokes":
+        for name in ("s1", "s2"):
+            moved = np.abs(found[name] / found["s0"] - exact[name] / exact["s0"]).mean()
+            assert (found[f"{name}_systematic"] / found["s0"]).mean() == pytest.approx(moved, abs=3e-4)
+        for name, unit in (("dolp", 1.0), ("aolp_deg", 60.0)):
+            moved = np.abs(found[name] - exact[name]).mean()
+            assert found[f"{name}_systematic"].mean() == pytest.approx(moved, abs=3e-4 * unit, rel=0.03)
+        return
+    seen = np.isfinite(found["mueller"]).all(axis=(2, 3))
+    assert np.array_equal(np.isfinite(found["mueller_systematic"]).all(axis=(2, 3)), seen)
+    moved = np.abs(found["mueller"] / found["mueller"][0, 0] - exact["mueller"] / exact["mueller"][0, 0])[seen]
+    told = (found["mueller_systematic"] / found["mueller"][0, 0])[seen]
+    assert moved.max() > 0.003
+    assert told == pytest.approx(moved, abs=3e-4)

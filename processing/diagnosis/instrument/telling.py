@@ -192,12 +192,11 @@ def calibrated(problem: InstrumentProblem, found: Posterior, solved: Solution) -
     part = dict(zip(found.space.candidates, found.space.slices, strict=True))
     values: dict[str, dict[float, tuple[float, float]]] = {}
     for candidate, where in zip(solved.base.candidates, solved.base.slices, strict=True):
-        element, _, field = candidate.place.rpartition(".")
         covariance = found.covariance[part[candidate], part[candidate]]
         for one, (fitted,), ((variance,),) in by_wavelength(candidate, solved.fit.values[where], covariance):
             for model, wavelength in zip(problem.models, problem.wavelengths_nm, strict=True):
                 if one.wavelength_nm in (None, wavelength):
-                    start = float(next(getattr(e, field) for e in model.elements() if e.name == element))
+                    start = float(model.value_of(candidate.place))  # type: ignore[arg-type]
                     value = start + float(fitted), float(np.sqrt(max(variance, 0.0)))
                     values.setdefault(candidate.place, {})[wavelength] = value
     unit = {c.place: c.parameters[0].unit for c in solved.base.candidates}

@@ -10,13 +10,14 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.search.dispersion import Curve, curve
-from processing.diagnosis.search.rules import NOMINAL_DEG, NOMINAL_EXTINCTION, NOMINAL_SHARE, WINDOW_DEG
+from processing.diagnosis.search.rules import NOMINAL_DEG, NOMINAL_EXTINCTION, NOMINAL_GAIN, NOMINAL_SHARE, WINDOW_DEG
 from processing.effect import Effect, Parameter
 from processing.errors import ProcessError
 from processing.instrument.applied_effects import instrument_effects
 from processing.instrument.changes import Changes, Conditions
 from processing.instrument.effects.base import FromAState, FromFileOnly, InstrumentEffect
 from processing.instrument.model import Belongs, InstrumentModel
+from processing.instrument.nominal import FIELDS, KIND, shift_nominal
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,8 @@ RETARDANCE_DEG = 200.0
 WINDOW_REACH_DEG = 40.0
 #: [1] The same below zero of an extinction or a depolarization: noise may take it there.
 BELOW_ZERO = 0.02
+#: [1] How far below its nominal value a gain of a channel may be.
+MOST_LOST = 0.95
 
 
 def _nominal(field: str, window: bool) -> Parameter:
@@ -124,49 +127,41 @@ def _nominal(field: str, window: bool) -> Parameter:
         return Parameter("retardance", "degree", -reach, reach, size)
     if field == "diattenuation":
         return Parameter(field, "1", -1.0, 1.0, NOMINAL_SHARE)
+    if field == "gain":
+        return Parameter(field, "1", -MOST_LOST, np.inf, NOMINAL_GAIN)
     return Parameter(field, "1", -BELOW_ZERO, 1.0, NOMINAL_EXTINCTION if field == "extinction" else NOMINAL_SHARE)
 
 
 class NominalValue(InstrumentEffect):
     """A value of the train that the instrument file gives as only nominal (`calibrate`)."""
 
-    FIELDS: ClassVar[tuple[str, ...]] = (
-        "azimuth_deg",
-        "retardance_deg",
-        "extinction",
-        "diattenuation",
-        "depolarization",
-    )
     #: A mount is the same at every wavelength; retardances and diattenuations follow a curve.
     BELONGS: ClassVar[dict[str, Belongs]] = {
         "azimuth_deg": "mechanics",
         "retardance_deg": "dispersion",
         "diattenuation": "dispersion",
         "depolarization": "dispersion",
+        "gain": "detector",
     }
 
     def __init__(self, name: str, model: InstrumentModel) -> None:
-        self.kind = "calibrate"
+        self.kind = KIND
         self.name = name
-        self.element, _, self.field = name.rpartition(".")
-        known = {e.name for e in model.elements()}
-        if self.element not in known or self.field not in self.FIELDS:
+        self.field = name.rpartition(".")[2]
+        if self.field not in FIELDS or model.value_of(name) is None:
             raise ProcessError(
                 f"instrument {model.name!r}: calibrate: {name!r} is not ELEMENT.FIELD with an element of this "
-                f"instrument and a field of {', '.join(self.FIELDS)}"
+                f"instrument and a field of {', '.join(FIELDS[:-1])}, nor CHANNEL.gain"
             )
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
-        return (f"{self.element}.{self.field}",)
+        return (self.name,)
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        nominal = next(getattr(e, self.field) for e in model.elements() if e.name == self.element)
-        return (_nominal(self.field, nominal == 0),)
+        return (_nominal(self.field, model.value_of(self.name) == 0),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
-        value = values[0]
-        target = getattr(changes, self.field.replace("_deg", "_rad"))
-        target[self.element] = target[self.element] + (np.deg2rad(value) if self.field.endswith("_deg") else value)
+        shift_nominal(changes, model, place, values[0])
 
 
 def nominal_values(

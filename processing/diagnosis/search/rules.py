@@ -32,6 +32,8 @@ WINDOW_DEG = 1.0
 NOMINAL_EXTINCTION = 0.1
 #: [1] The same of a diattenuation, or of a depolarization.
 NOMINAL_SHARE = 0.01
+#: [1] The same of the gain of a channel: coatings and two cameras differ by this much.
+NOMINAL_GAIN = 0.1
 #: [of a factor e in wavelength] Length over which values of optics stay alike from one wavelength to another: an
 #: achromatic plate bends once over an octave, a coating a few times.
 SMOOTH = 0.3

@@ -22,5 +22,8 @@ class ChannelGain(ChannelEffect, ChannelLevels):
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         return tuple(Parameter(f"channel_{c.name}", "1", -0.5, 0.5, 0.02) for c in model.channels[1:])
 
+    def shifts(self, model: InstrumentModel, place: str) -> tuple[str, ...]:
+        return tuple(f"{c.name}.gain" for c in model.channels[1:])
+
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         changes.gain = changes.gain * np.concatenate([[1.0], 1 + values])[None, :]

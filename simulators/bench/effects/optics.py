@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from processing.arrays import Image
+from processing.instrument.elements import number
 from processing.instrument.model import InstrumentModel, Retarder
 from simulators.bench.effects.base import BenchEffect, Shot, with_element
 
@@ -124,6 +125,7 @@ class ChannelError(BenchEffect):
         if self.channel not in {c.name for c in model.channels}:
             raise KeyError(f"instrument {model.name!r} has no channel {self.channel!r}")
         channels = tuple(
-            c.model_copy(update={"gain": c.gain * self.gain}) if c.name == self.channel else c for c in model.channels
+            c.model_copy(update={"gain": number(c.gain) * self.gain}) if c.name == self.channel else c
+            for c in model.channels
         )
         return model.model_copy(update={"channels": channels})

@@ -36,8 +36,9 @@ MODEL = InstrumentModel.load(Path(__file__).parents[3] / "configs/instruments/rg
 def nominal(field: str, value: float = 1.0) -> Candidate:
     """A nominal value of an element that has another one in the instrument file."""
     element = Some(name="e", **{field: value})
-    effect = NominalValue(f"e.{field}", Some(elements=lambda: [element], name=""))
-    return Candidate(effect, f"e.{field}", effect.parameters(Some(elements=lambda: [element]), None, ""))
+    model = Some(value_of=lambda name: getattr(element, name.rpartition(".")[2]), name="")
+    effect = NominalValue(f"e.{field}", model)
+    return Candidate(effect, f"e.{field}", effect.parameters(model, None, ""))
 
 
 def typical(field: str, value: float = 1.0) -> float:
@@ -62,6 +63,11 @@ def test_nominal_extinction(m: Patch) -> bool:
 @decides
 def test_nominal_share(m: Patch) -> bool:
     return typical("diattenuation") == typical("depolarization") == 0.01
+
+
+@decides
+def test_nominal_gain(m: Patch) -> bool:
+    return typical("gain") == 0.1
 
 
 def begun(m: Patch, space: Space) -> list[np.ndarray]:
