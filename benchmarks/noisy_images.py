@@ -79,27 +79,40 @@ def five_samples() -> dict[str, np.ndarray]:
     }
 
 
-def noisy_image(matrices: np.ndarray, electrons: float, seed: int, w: np.ndarray | None = None) -> MuellerImage:
+def noisy_image(
+    matrices: np.ndarray,
+    electrons: float,
+    seed: int,
+    w: np.ndarray | None = None,
+    darks: int = 0,
+    read_noise_e: float = READ_NOISE_E,
+) -> MuellerImage:
     """Image (1, pixels) reduced from a capture of each matrix (pixels, 4, 4) with m00 = 1.
 
     Parameters
     ----------
     electrons : mean over the states of what an ideal depolarizer with m00 = 1 gives; one electron is one count.
+    darks : dark frames whose mean is subtracted; 0: the black is known.
     """
     w = rgb950() if w is None else w
     rng = np.random.default_rng(seed)
     scale = electrons / w[:, 0].mean()
     expected = scale * matrices.reshape(-1, 16) @ w.T
-    counts = rng.poisson(np.maximum(expected, 0)) + rng.normal(0, READ_NOISE_E, expected.shape)
+    counts = rng.poisson(np.maximum(expected, 0)) + rng.normal(0, read_noise_e, expected.shape)
     inverse = np.linalg.pinv(w)
+    dark = np.zeros((16, 0))
+    if darks:
+        error = read_noise_e / np.sqrt(darks)
+        counts -= rng.normal(0, error, (len(counts), 1))
+        dark = inverse.sum(axis=1, keepdims=True) * error
     m = inverse @ counts.T
-    floor = np.full(len(w), READ_NOISE_E**2)
+    floor = np.full(len(w), read_noise_e**2)
     variance = np.maximum(w @ m + floor[:, None], 0.5 * floor[:, None])
     shape = (1, len(expected))
     residual = counts.T - w @ m
     return MuellerImage(
         values=m.reshape(4, 4, *shape).astype(np.float32),
-        errors=np.sqrt(inverse**2 @ variance).reshape(4, 4, *shape).astype(np.float32),
+        errors=np.sqrt(inverse**2 @ variance + dark.sum(axis=1, keepdims=True) ** 2).reshape(4, 4, *shape).astype("f4"),
         mask=np.zeros(shape, np.uint8),
         residual_rms=np.sqrt(np.mean(residual**2, axis=0)).reshape(shape).astype(np.float32),
         w=w,
@@ -109,4 +122,5 @@ def noisy_image(matrices: np.ndarray, electrons: float, seed: int, w: np.ndarray
         steps=(),
         simulated=True,
         facts={"weighted": False},
+        dark=dark,
     )

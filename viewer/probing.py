@@ -162,6 +162,7 @@ class PixelReducer:
                 "determined": determined_words(self._inversion),
                 "pixels": count,
             },
+            dark=solver.dark_errors / np.sqrt(count),
         )
         return image, intensities
 

@@ -49,7 +49,13 @@ def sent_back_block(product: Product, rows: slice, planes: dict[str, Plane]) -> 
     values[:, 0], value_errors[:, 0] = stokes, errors
     determined = ", ".join(f"m{k}0" for k in np.flatnonzero(seen))
     column = replace(
-        image, values=values, errors=value_errors, w=w, sent=None, facts=image.facts | {"determined": determined}
+        image,
+        values=values,
+        errors=value_errors,
+        w=w,
+        sent=None,
+        facts=image.facts | {"determined": determined},
+        dark=np.linalg.pinv(w) @ (image.w @ image.dark),
     )
     wanted = [name for name, (own, _) in _NAMES.items() if own in planes]
     found = partial_block(column, wanted, {})

@@ -282,6 +282,10 @@ def _store_noise(product: ProductWriter, noise: NoiseModel | None, solver: Solve
     product.array("noise_slope", slope, "count", "shot noise: variance a signal count, for each row of W")
     floor = solver.intensity_floor if noise else nothing
     product.array("noise_floor", floor, "count2", "variance without light, for each row of W")
+    dark = solver.dark_errors
+    if dark.any():
+        text = "errors (element, mean of darks) of mueller that one standard error of each mean of dark frames makes"
+        product.array("dark_errors", dark, "count", text)
 
 
 def _systematic(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
@@ -58,6 +58,7 @@ class MuellerImage:
     header, steps, simulated, facts
         As in the product.
     sent : (4, rows, columns), Stokes vector that the sample sends back, where no element is determined alone.
+    dark : (16, K), counts, errors of the elements that one standard error of each mean of dark frames makes.
     """
 
     values: NDArray[np.float32]
@@ -72,6 +73,7 @@ class MuellerImage:
     simulated: bool
     facts: dict[str, Any]
     sent: NDArray[np.float32] | None = None
+    dark: NDArray[np.float64] = field(default_factory=lambda: np.zeros((16, 0)))
 
     @classmethod
     def load(cls, path: Path | str, rows: slice = slice(None)) -> Self:
@@ -96,6 +98,7 @@ class MuellerImage:
             simulated=product.simulated,
             facts=product.facts,
             sent=product.get("stokes", rows) if "stokes" in product.names else None,
+            dark=product.array("dark_errors") if product.has_array("dark_errors") else np.zeros((16, 0)),
         )
 
     @property
@@ -151,7 +154,7 @@ class MuellerImage:
         """Covariance (rows, columns, 16, 16) of the elements, counts^2, row-major order m00, m01, ... m33.
 
         Rebuilt from W, the noise model and the fitted intensities, then scaled so that its diagonal is `errors`
-        squared (which also holds what the dark frames and left-out states add).
+        squared (which also holds what flats and left-out states add).
         """
         return self._covariance
 
@@ -164,6 +167,7 @@ class MuellerImage:
             full = np.linalg.inv(normal) if whole else np.linalg.pinv(normal, rcond=SMALLEST**2, hermitian=True)
         else:
             full = np.einsum("np,in,jn->pij", variance, inverse, inverse, optimize=True)
+        full = full + self.dark @ self.dark.T
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = self.errors.reshape(16, -1).T / np.sqrt(np.einsum("pii->pi", full))
         scale[:, ~self.seen] = 0.0
@@ -195,9 +199,23 @@ class MuellerImage:
         if self.facts["weighted"]:
             full = self._covariance.reshape(-1, 16, 16)
             return np.asarray(np.einsum("pi,pi->p", (full @ g[:, :, None])[..., 0], g).reshape(self.mask.shape))
-        seen = self._inverse.T.astype(np.float32) @ g.T.astype(np.float32)
-        found = np.einsum("np,np,np->p", seen, seen, self.intensity_variance)
+        drive, variance = self._sources
+        seen = drive.T @ g.T.astype(np.float32)
+        found = np.einsum("np,np,np->p", seen, seen, variance)
         return np.asarray((found * self._told).reshape(self.mask.shape))
+
+    def moments_of(self, elements: Sequence[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Traces (rows, columns) of C and of C^2, C being the covariance of these elements, row-major; counts^2, ^4."""
+        if self.facts["weighted"]:
+            part = self._covariance.reshape(-1, 16, 16)[:, elements][:, :, elements]
+            found = np.einsum("pii->p", part), np.einsum("pij,pij->p", part, part)
+        else:
+            drive, variance = self._sources
+            gram = drive[list(elements)].T @ drive[list(elements)]
+            told = self._told
+            square = np.einsum("np,np->p", (gram * gram) @ variance, variance)
+            found = np.diag(gram) @ variance * told, square * told**2
+        return found[0].reshape(self.mask.shape).astype(float), found[1].reshape(self.mask.shape).astype(float)
 
     def product_of(self, form: NDArray[np.float64], gradient: NDArray[np.floating]) -> NDArray[np.float64]:
         """Sum over elements a, b, k of covariance[a, b] form[a, b, k] gradient[k]: (rows, columns).
@@ -211,8 +229,9 @@ class MuellerImage:
         if self.facts["weighted"]:
             full = self._covariance.reshape(-1, 256) @ form.reshape(256, 16)
             return np.asarray(np.einsum("pk,pk->p", full, g).reshape(self.mask.shape))
-        each = np.einsum("an,bn,abk->nk", self._inverse, self._inverse, form, optimize=True)
-        found = np.einsum("np,np->p", each.astype(np.float32) @ g.T.astype(np.float32), self.intensity_variance)
+        drive, variance = self._sources
+        each = np.einsum("an,bn,abk->nk", drive, drive, form, optimize=True)
+        found = np.einsum("np,np->p", each.astype(np.float32) @ g.T.astype(np.float32), variance)
         return np.asarray((found * self._told).reshape(self.mask.shape))
 
     def drawn_noise(self, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -220,23 +239,36 @@ class MuellerImage:
         if self.facts["weighted"]:
             factor = np.linalg.cholesky(np.nan_to_num(self._covariance.reshape(-1, 16, 16)) + 1e-12 * np.eye(16))
             return np.asarray(np.einsum("pij,jp->ip", factor, rng.normal(size=(16, len(factor)))))
-        variance = self.intensity_variance
-        noise = self._inverse @ (np.sqrt(variance) * rng.normal(size=variance.shape))
+        drive, variance = self._sources
+        noise = drive @ (np.sqrt(variance) * rng.normal(size=variance.shape))
         return np.asarray(noise * np.sqrt(self._told))
 
     @property
     def told_variance(self) -> NDArray[np.float64]:
         """`intensity_variance` (N, pixels) with what dark frames and left-out states add, as the errors hold it."""
-        return np.asarray(self.intensity_variance * self._told)
+        common = np.square(self.w @ self.dark).sum(axis=1)[:, None]
+        return np.asarray((self.intensity_variance + common) * self._told)
 
     @cached_property
     def _told(self) -> NDArray[np.float64]:
-        # Flats, dark frames and left-out states change all errors of a pixel much alike.
+        # Flats and left-out states change all errors of a pixel much alike.
         seen = self.seen
         if not seen.any():
             return np.ones(self.mask.size)
-        plain = np.square(self._inverse[seen]).sum(axis=0).astype(np.float32) @ self.intensity_variance
+        drive, variance = self._sources
+        plain = np.square(drive[seen]).sum(axis=0) @ variance
         return np.asarray(np.square(self.errors.reshape(16, -1)[seen]).sum(axis=0) / plain)
+
+    @cached_property
+    def _sources(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """What independent errors do to the elements (16, N + K), and their variances (N + K, pixels).
+
+        They are those of the intensities and of the means of dark frames.
+        """
+        drive = np.concatenate([self._inverse, self.dark], axis=1).astype(np.float32)
+        ones = np.ones((self.dark.shape[1], self.mask.size), np.float32)
+        variance = np.concatenate([self.intensity_variance, ones]) if len(ones) else self.intensity_variance
+        return drive, variance
 
     @cached_property
     def _inverse(self) -> NDArray[np.float64]:

@@ -132,12 +132,16 @@ def test_errors_are_those_of_the_noise(case: str, rgb950: InstrumentModel, synth
         assert "residual" in image.facts["noise"]
 
 
-def test_covariance_is_that_of_repeated_captures(rgb950: InstrumentModel, synthetic_capture) -> None:
+@pytest.mark.parametrize("darks", [0, 1])
+def test_covariance_is_that_of_repeated_captures(darks: int, rgb950: InstrumentModel, synthetic_capture) -> None:
     rng = np.random.default_rng(3)
     shape = (60, 100)
-    m = np.broadcast_to(scene(rng, (1, 1)), (4, 4, *shape))
-    frames = noisy(rng, signals(rgb950, table(), m))
-    image = reduced(synthetic_capture(frames, table(), detector=detector()), rgb950)
+    # So little light that one dark frame is most of the error of m00.
+    m = np.broadcast_to(scene(rng, (1, 1), level=20.0 if darks else 2000.0), (4, 4, *shape))
+    frames = noisy(rng, np.concatenate([np.zeros((darks, 1, *shape)), signals(rgb950, table(), m)]))
+    angles = {axis: np.concatenate([np.full(darks, np.nan), values]) for axis, values in table().items()}
+    role = ("dark",) * darks + ("sample",) * 40
+    image = reduced(synthetic_capture(frames, angles, detector=detector(bits=16), role=role), rgb950)
     deviation = (image.values - m).reshape(16, -1)
     found = np.cov(deviation)
     told = image.covariance().reshape(-1, 16, 16).mean(axis=0)

@@ -52,6 +52,7 @@ class FieldSolver:
     def __init__(self, plain: MuellerSolver, field: Field) -> None:
         self.plain, self.reader, self.inversion = plain, plain.reader, plain.inversion
         self.noise, self.repeats, self.intensity_floor = plain.noise, plain.repeats, plain.intensity_floor
+        self.dark_errors = plain.dark_errors
         self.field = field
         what = "the instrument's field_retardance changes W"
         self._pinv = FieldMatrix.of(lambda y, x: np.asarray(np.linalg.pinv(self._w_at(y, x)), dtype=float), what)

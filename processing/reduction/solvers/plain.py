@@ -46,7 +46,10 @@ class MuellerSolver:
         # The black is the same in all states of one exposure of a channel, so its error is common to them.
         self.black_variance = black.mean_variance(noise)
         seen = np.concatenate([inversion.pinv, inversion.null]).reshape(-1, len(reader.repeats), channels)
-        drive = np.einsum("knc,nd->kcd", seen, reader.black_weights) ** 2 @ self.black_variance
+        pushed = np.einsum("knc,nd->kcd", seen, reader.black_weights) * np.sqrt(self.black_variance)
+        #: Errors (16, means of darks) of the elements, counts, that one standard error of each mean of darks makes.
+        self.dark_errors = pushed[:16].reshape(16, -1)
+        drive = np.square(pushed).sum(axis=2)
         self.black = np.concatenate([drive[:16], drive[16:].sum(axis=0, keepdims=True)]).astype(np.float32)
         self.unit_sigma = np.sqrt(np.diag(inversion.unit_covariance)).astype(np.float32)
 

@@ -57,6 +57,7 @@ class WeightedSolver:
         self._solved_w, self._wt = w, np.ascontiguousarray(w.T)
         self._pairs = np.ascontiguousarray((w[:, PACKED_ROW] * w[:, PACKED_COLUMN]).T)
         self.intensity_floor = plain.intensity_floor
+        self.dark_errors = plain.dark_errors
         self._floor = self.intensity_floor.astype(np.float32)[:, None]
         self._slope = (self.noise.slope / self.repeats).astype(np.float32)[:, None]
 
