@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from processing.commands.batch import Made, files_of, place_for, run_batch, written_if_changed
 from processing.commands.product_options import Overwrite, ProductFile
 
 
@@ -17,32 +18,58 @@ def register(app: typer.Typer) -> None:
 
 
 def from_axostep_command(
-    source: Annotated[
-        Path, typer.Argument(help="File .cmmi or .bmmi. Raw .rmmd files go to `process import --stack`.")
+    sources: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Files .cmmi or .bmmi, or folders of them. Raw .rmmd files go to `process import --stack`."
+        ),
     ],
     wavelength_nm: Annotated[float | None, typer.Option(help="Where the file does not say.")] = None,
     omega_deg: Annotated[float | None, typer.Option(help="Angle of the source arm.")] = None,
     out: ProductFile = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Make a Mueller product out of a calibrated AxoStep image. It has no standard errors: the file holds none."""
+    """Make Mueller products out of calibrated AxoStep images. They have no standard errors: the files hold none."""
     from processing.storage.axostep_product import product_of_axostep
 
-    target = out or source.with_suffix(".mueller.h5")
-    told = product_of_axostep(source, target, wavelength_nm, omega_deg, overwrite)
-    for line in told:
-        typer.echo(line)
-    typer.echo(str(target))
+    inputs = files_of(sources, lambda path: True, "AxoStep images", (".cmmi", ".bmmi"))
+    place = place_for(inputs, out)
+
+    def make(source: Path, _: object) -> Made:
+        target = place(source.with_suffix(".mueller.h5"))
+        facts, is_unchanged = product_of_axostep(source, target, wavelength_nm, omega_deg, overwrite)
+        return Made((target,), is_unchanged, "".join(f"  {fact}" for fact in facts))
+
+    run_batch("reading", "files", inputs, make, lambda made: typer.echo(f"{made.facts.strip()}\n{made.paths[0]}"))
 
 
 def to_axostep_command(
-    source: Annotated[Path, typer.Argument(help="Mueller product of `process reduce`.")],
-    out: Annotated[Path | None, typer.Option(help="File .cmmi or .bmmi; default: .bmmi beside the source.")] = None,
+    sources: Annotated[list[Path], typer.Argument(help="Mueller products of `process reduce`, or folders of them.")],
+    out: Annotated[
+        Path | None, typer.Option(help="File .cmmi or .bmmi, or a folder; default: .bmmi beside the source.")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file of that name.")] = False,
 ) -> None:
-    """Write a Mueller product in AxoStep's format, for the lab's own tools."""
+    """Write Mueller products in AxoStep's format, for the lab's own tools."""
     from processing.storage.axostep_product import axostep_of_product
+    from processing.storage.product import Product, is_product
 
-    target = out or source.with_suffix("").with_suffix(".bmmi")
-    axostep_of_product(source, target, overwrite)
-    typer.echo(str(target))
+    def is_mueller(path: Path) -> bool:
+        if not is_product(path):
+            return False
+        with Product(path) as product:
+            return product.kind == "mueller"
+
+    inputs = files_of(sources, is_mueller, "Mueller products")
+    place = place_for(inputs, out)
+
+    def make(source: Path, _: object) -> Made:
+        target = place(source.with_suffix("").with_suffix(".bmmi"))
+
+        def write(name: Path) -> list[Path]:
+            axostep_of_product(source, name, overwrite)
+            return [name]
+
+        return written_if_changed(target, overwrite, write)
+
+    run_batch("writing", "files", inputs, make)

@@ -32,12 +32,13 @@ FigureFile = Annotated[
 NoFigure = Annotated[bool, typer.Option("--no-figure", help="Draw no figure.")]
 
 
-def draw(product: Path, figure: Path | None, no_figure: bool) -> None:
-    """Draw a product and say where; nothing with `no_figure`."""
+def draw(product: Path, figure: Path | None, no_figure: bool, silent: bool = False) -> None:
+    """Draw a product and print where, unless `silent`; nothing with `no_figure`."""
     if no_figure:
         return
     from processing.reports.figures import draw_product
 
     figure = figure or product.with_suffix(".png")
     draw_product(product, figure)
-    typer.echo(f"figure: {figure}")
+    if not silent:
+        typer.echo(f"figure: {figure}")

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from processing.commands.batch import Made, files_of, place_for, run_batch, written_if_changed
+
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
@@ -14,14 +16,27 @@ def register(app: typer.Typer) -> None:
 
 
 def export_command(
-    source: Annotated[Path, typer.Argument(help="Capture, product, or table of `process table`.")],
+    sources: Annotated[
+        list[Path], typer.Argument(help="Captures, products, tables of `process table`, or folders of the last two.")
+    ],
     to: Annotated[str, typer.Option(help="tiff, csv, fits, mat, png or pdf.")],
     plane: Annotated[list[str] | None, typer.Option(help="Plane, may be repeated; default: all.")] = None,
-    out: Annotated[Path | None, typer.Option(help="File, without or with its ending; default: by the source.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="File, without or with its ending, or a folder; default: by the source.")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files of that name.")] = False,
 ) -> None:
-    """Write a capture or product as TIFF stacks, CSV, FITS, MATLAB or as a figure for a paper; a table as CSV."""
+    """Write captures or products as TIFF stacks, CSV, FITS, MATLAB or as figures for a paper; tables as CSV."""
     from processing.export import export
+    from processing.export.figure import FIGURES
+    from processing.reflectance.tables import is_table
+    from processing.storage.product import is_product
 
-    for path in export(source, to, out or source.with_suffix(""), plane or (), overwrite):
-        typer.echo(str(path))
+    inputs = files_of(sources, lambda path: is_product(path) or (to not in FIGURES and is_table(path)), "products")
+    place = place_for(inputs, out)
+
+    def make(source: Path, _: object) -> Made:
+        target = place(source.with_suffix(""))
+        return written_if_changed(target, overwrite, lambda name: export(source, to, name, plane or ()))
+
+    run_batch("exporting", "files", inputs, make)

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from processing.commands.batch import Made, files_of, run_batch
+
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
@@ -71,11 +73,25 @@ def import_command(
 
 
 def colours_command(
-    capture: Annotated[Path, typer.Argument(help="Capture of a sensor with a colour filter.")],
+    captures: Annotated[
+        list[Path], typer.Argument(help="Captures of a sensor with a colour filter, or folders of them.")
+    ],
     out: Annotated[Path | None, typer.Option(help="Folder for the captures; default: that of the capture.")] = None,
 ) -> None:
-    """Split a capture of a colour sensor into one for each colour: red, green_a, green_b, blue."""
+    """Split each capture of a colour sensor into one for each colour: red, green_a, green_b, blue."""
+    from processing.storage.capture import Capture, made_of_captures
     from processing.storage.colour_split import split_colours
 
-    for path in split_colours(capture, out or capture.parent):
-        typer.echo(path)
+    def has_colours(path: Path) -> bool:
+        if made_of_captures(path):
+            return False
+        with Capture(path) as capture:
+            return capture.header.colours is not None
+
+    inputs = files_of(captures, has_colours, "captures of a colour sensor")
+
+    def make(capture: Path, _: object) -> Made:
+        paths, is_unchanged = split_colours(capture, out or capture.parent)
+        return Made(tuple(paths), is_unchanged)
+
+    run_batch("splitting", "captures", inputs, make)

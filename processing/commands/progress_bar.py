@@ -4,17 +4,62 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import typer
 
 from processing.computing import compile_watch
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+
+class BatchBar:
+    """The bar over the inputs of one command, and lines that appear above it."""
+
+    def __init__(self, bar: Progress, inputs: int) -> None:
+        self._bar, self._task, self._done = bar, bar.add_task("", total=inputs), 0
+
+    def tick(self, done: int, total: int) -> None:
+        """Part of the input that is being processed."""
+        self._bar.update(self._task, completed=self._done + done / max(total, 1))
+
+    def finish(self, line: str, failed: bool = False) -> None:
+        """Print the line of an input: on stdout, or on stderr for one that failed."""
+        self._done += 1
+        self._bar.update(self._task, completed=self._done)
+        # Bar and lines share a terminal, but stdout may also be a file: the bar makes room for each line.
+        self._bar.stop()
+        typer.echo(line, err=failed)
+        if not self._bar.disable:
+            self._bar.start()
 
 
 @contextmanager
 def progress_bar(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
     """A bar on stderr, gone at the end; yields a function of (done, in all). Nothing is drawn off a terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import MofNCompleteColumn, TextColumn
 
-    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TextColumn(unit), TimeRemainingColumn())
+    with _bar(what, MofNCompleteColumn(), TextColumn(unit)) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+@contextmanager
+def batch_bar(what: str, inputs: int) -> Iterator[BatchBar]:
+    """A bar over `inputs` files, as `progress_bar`."""
+    from rich.progress import TextColumn
+
+    with _bar(what, TextColumn("{task.completed:.0f}/{task.total:.0f} files")) as bar:
+        yield BatchBar(bar, inputs)
+
+
+@contextmanager
+def _bar(what: str, *counts: object) -> Iterator[Progress]:
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn(what), BarColumn(), *counts, TimeRemainingColumn())
     console = Console(stderr=True)
 
     def compiling() -> None:
@@ -24,8 +69,8 @@ def progress_bar(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
 
     compile_watch.watchers.append(compiling)
     try:
-        with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-            task = progress.add_task(what, total=None)
-            yield lambda done, total: progress.update(task, completed=done, total=total)
+        off = not console.is_terminal
+        with Progress(*columns, console=console, transient=True, disable=off, redirect_stdout=False) as bar:  # type: ignore[arg-type]
+            yield bar
     finally:
         compile_watch.watchers.clear()

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from processing.commands.drawing import FigureFile, NoFigure, draw
+from processing.commands.batch import captures_and, files_of, make_products
+from processing.commands.drawing import FigureFile, NoFigure
 from processing.commands.product_options import Overwrite, ProductFile
-from processing.commands.progress_bar import progress_bar
-from processing.commands.reduce import reduced_source
-from processing.commands.summary import summary
 
 if TYPE_CHECKING:
     from processing.polarization.quantities import NamedStokes
+    from processing.steps.file_step import FileStep, Found, Progress
 
 
 def register(app: typer.Typer) -> None:
@@ -23,7 +22,9 @@ def register(app: typer.Typer) -> None:
 
 
 def quantities_command(
-    source: Annotated[Path, typer.Argument(help="Mueller product of `process reduce`, or a capture.")],
+    sources: Annotated[
+        list[Path], typer.Argument(help="Captures or Mueller products of `process reduce`, or folders of them.")
+    ],
     also: Annotated[list[str] | None, typer.Option(help="More decompositions: symmetric, differential.")] = None,
     pair: Annotated[
         list[str] | None,
@@ -41,15 +42,20 @@ def quantities_command(
     from processing.maps.quantities import require_decompositions
     from processing.polarization.quantities import PAPER_PAIRS
     from processing.steps.maps import Quantities
+    from processing.steps.reduction import reduced
 
     pairs = {**PAPER_PAIRS, **dict(_pair(text) for text in pair or ())}
     # Before a capture is reduced for nothing.
     require_decompositions(also or ())
-    step = Quantities(reduced_source(source, instrument), tuple(also or ()), pairs)
-    with progress_bar("quantities", "rows") as tick:
-        product = step.make(out, overwrite, tick)
-    summary(product)
-    draw(product, figure, no_figure)
+
+    def step_of(source: Path, tick: Progress) -> tuple[FileStep, Found | None]:
+        image = reduced(source, instrument, tick)
+        return Quantities(image.path, tuple(also or ()), pairs), image if image.path != source else None
+
+    inputs = files_of(sources, captures_and(("mueller", "extrapolated")), "Mueller captures")
+    make_products(
+        "quantities", "rows", inputs, step_of, out=out, overwrite=overwrite, figure=figure, no_figure=no_figure
+    )
 
 
 def _pair(text: str) -> tuple[str, tuple[NamedStokes, NamedStokes]]:

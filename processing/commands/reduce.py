@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from processing.commands.drawing import FigureFile, NoFigure, draw
+from processing.commands.batch import files_of, make_products
+from processing.commands.drawing import FigureFile, NoFigure
 from processing.commands.product_options import Overwrite, ProductFile
-from processing.commands.progress_bar import progress_bar
-from processing.commands.summary import summary
+
+if TYPE_CHECKING:
+    from processing.steps.file_step import FileStep, Progress
 
 
 def register(app: typer.Typer) -> None:
@@ -19,7 +21,7 @@ def register(app: typer.Typer) -> None:
 
 
 def reduce_command(
-    capture: Annotated[Path, typer.Argument(help="Capture file (HDF5).")],
+    captures: Annotated[list[Path], typer.Argument(help="Captures (HDF5), or folders of them.")],
     instrument: Annotated[
         Path | None, typer.Option(help="Instrument file to use instead of the one in the capture.")
     ] = None,
@@ -51,32 +53,21 @@ def reduce_command(
 ) -> None:
     """Invert W per pixel: Mueller image, or Stokes image of a polarization mosaic, with standard errors."""
     from processing.steps.reduction import Reduction
+    from processing.storage.capture import made_of_captures
 
-    step = Reduction(
-        capture,
-        instrument,
-        weighted,
-        covariance,
-        physical,
-        camera,
-        dark,
-        tuple(flat or ()),
-        leave_out,
-        demosaic,
-        analyzers,
+    def step_of(capture: Path, tick: Progress) -> tuple[FileStep, None]:
+        flats = tuple(flat or ())
+        options = (instrument, weighted, covariance, physical, camera, dark, flats, leave_out, demosaic, analyzers)
+        return Reduction(capture, *options), None
+
+    inputs = files_of(captures, lambda path: not made_of_captures(path), "captures")
+    make_products(
+        "reducing",
+        "parts",
+        inputs,
+        step_of,
+        out=out,
+        overwrite=overwrite,
+        figure=figure,
+        no_figure=no_figure,
     )
-    with progress_bar("reducing", "rows" if step.kind == "mueller" else "states") as tick:
-        product = step.make(out, overwrite, tick)
-    summary(product)
-    draw(product, figure, no_figure)
-
-
-def reduced_source(source: Path, instrument: Path | None = None) -> Path:
-    """A product as it is; a capture's plain product, found or made with a progress bar, and said."""
-    from processing.steps.reduction import reduced
-
-    with progress_bar("reducing", "parts") as tick:
-        product, was_there = reduced(source, instrument, tick)
-    if product != source:
-        typer.echo(f"using {product}") if was_there else summary(product)
-    return product

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from processing.commands.drawing import FigureFile, NoFigure, draw
+from processing.commands.batch import captures_and, files_of, make_products
+from processing.commands.drawing import FigureFile, NoFigure
 from processing.commands.product_options import Overwrite, ProductFile
-from processing.commands.reduce import reduced_source
-from processing.commands.summary import summary
 from processing.whole_file import whole_file
+
+if TYPE_CHECKING:
+    from processing.steps.file_step import FileStep, Found, Progress
 
 
 def register(app: typer.Typer) -> None:
@@ -91,7 +93,9 @@ def fit_material_command(
 
 
 def extrapolate_command(
-    source: Annotated[Path, typer.Argument(help="Stokes capture, or its product of `process reduce`.")],
+    sources: Annotated[
+        list[Path], typer.Argument(help="Stokes captures or products of `process reduce`, or folders of them.")
+    ],
     geometry: Annotated[Path, typer.Option(help="Geometry file: camera, source, shape.")],
     material: Annotated[Path, typer.Option(help="Material file: the dominant process.")],
     out: ProductFile = None,
@@ -101,7 +105,13 @@ def extrapolate_command(
 ) -> None:
     """A full Mueller image from a linear Stokes capture: TD model with the estimated xi0 and M00."""
     from processing.steps.maps import Extrapolation
+    from processing.steps.reduction import reduced
 
-    product = Extrapolation(reduced_source(source), geometry, material).make(out, overwrite)
-    summary(product)
-    draw(product, figure, no_figure)
+    def step_of(source: Path, tick: Progress) -> tuple[FileStep, Found | None]:
+        image = reduced(source, progress=tick)
+        return Extrapolation(image.path, geometry, material), image if image.path != source else None
+
+    inputs = files_of(sources, captures_and(("stokes",)), "Stokes captures")
+    make_products(
+        "extrapolating", "parts", inputs, step_of, out=out, overwrite=overwrite, figure=figure, no_figure=no_figure
+    )

@@ -24,9 +24,28 @@ def summary(product: Path) -> None:
     for name, value in facts.items():
         if name not in ("warnings", "masked") and not name.endswith(ERRORS):
             typer.echo(f"  {name.replace('_', ' ')}: {fact_words(value)}{_with_error(name, facts)}")
-    for warning in facts["warnings"]:
-        typer.echo(f"warning: {warning}", err=True)
+    print_warnings(product)
     typer.echo(str(product))
+
+
+def print_warnings(product: Path, head: str = "") -> None:
+    """Print the warnings of a product on stderr, each after `head`."""
+    from processing.storage.product import Product
+
+    with Product(product) as opened:
+        for warning in opened.facts["warnings"]:
+            typer.echo(f"warning: {head}{warning}", err=True)
+
+
+def one_line(product: Path) -> str:
+    """What a batch prints after the name of a product: whether it is simulated, and its first median."""
+    from processing.storage.product import Product
+
+    with Product(product) as opened:
+        facts, simulated = opened.facts, opened.simulated
+    medians = (name for name in facts if name.startswith("median") and not name.endswith(ERRORS))
+    shown = [f"{name.replace('_', ' ')} {fact_words(facts[name])}" for name in list(medians)[:1]]
+    return "".join(f"  {text}" for text in ["SIMULATED"] * simulated + shown)
 
 
 def _with_error(name: str, facts: dict[str, Any]) -> str:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from processing.commands.drawing import FigureFile, NoFigure, draw
+from processing.commands.batch import captures_and, files_of, make_products
+from processing.commands.drawing import FigureFile, NoFigure
 from processing.commands.product_options import Overwrite, ProductFile
-from processing.commands.progress_bar import progress_bar
-from processing.commands.reduce import reduced_source
-from processing.commands.summary import summary
+
+if TYPE_CHECKING:
+    from processing.steps.file_step import FileStep, Found, Progress
 
 
 def register(app: typer.Typer) -> None:
@@ -20,7 +21,9 @@ def register(app: typer.Typer) -> None:
 
 
 def xi0_command(
-    source: Annotated[Path, typer.Argument(help="Capture, or a product of `process reduce`.")],
+    sources: Annotated[
+        list[Path], typer.Argument(help="Captures or products of `process reduce`, or folders of them.")
+    ],
     geometry: Annotated[
         Path | None, typer.Option(help="Geometry file: camera, source, shape (for less than whole matrices).")
     ] = None,
@@ -35,16 +38,18 @@ def xi0_command(
 ) -> None:
     """xi0 from a Mueller capture (coherency eigenvalues), or from less with a model (two coefficients)."""
     from processing.steps.maps import Xi0
+    from processing.steps.reduction import reduced
     from processing.storage.images import seen_elements
     from processing.storage.product import Product
 
-    image = reduced_source(source, instrument)
-    with Product(image) as product:
-        if product.kind == "mueller" and seen_elements(product.facts).all() and (geometry or material):
-            told = "holds whole Mueller matrices: --geometry and --material are not looked at"
-            typer.echo(f"warning: {image} {told}", err=True)
-    step = Xi0(image, geometry, material)
-    with progress_bar("xi0", "rows") as tick:
-        made = step.make(out, overwrite, tick)
-    summary(made)
-    draw(made, figure, no_figure)
+    def step_of(source: Path, tick: Progress) -> tuple[FileStep, Found | None]:
+        image = reduced(source, instrument, tick)
+        with Product(image.path) as product:
+            if product.kind == "mueller" and seen_elements(product.facts).all() and (geometry or material):
+                told = "holds whole Mueller matrices: --geometry and --material are not looked at"
+                typer.echo(f"warning: {image.path} {told}", err=True)
+        return Xi0(image.path, geometry, material), image if image.path != source else None
+
+    # Without a model of the dominant process, Stokes images have no xi0.
+    inputs = files_of(sources, captures_and(("mueller", "stokes") if material else ("mueller",)), "captures for xi0")
+    make_products("xi0", "rows", inputs, step_of, out=out, overwrite=overwrite, figure=figure, no_figure=no_figure)

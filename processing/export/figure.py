@@ -49,7 +49,8 @@ def write_figure(source: Path, path: Path, planes: Sequence[str]) -> None:
                     panels.append((f"{name.replace('_', ' ')}{' ' + place if place else ''}{unit}", shown, limits))
             figure = grid_figure(panels, product.header.title, product.simulated)
     with whole_file(path) as new:
-        figure.savefig(new, dpi=FIGURE_DPI)
+        # Without a date the same product gives the same bytes: `process export` then skips the file.
+        figure.savefig(new, dpi=FIGURE_DPI, metadata={"CreationDate": None} if path.suffix == ".pdf" else None)
 
 
 def _known(product: Product) -> NDArray[np.bool_]:

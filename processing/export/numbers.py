@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 #: What a variable of MATLAB's version 5 files may have.
 MATLAB_BYTES = 2**31 - 1
 
+#: Text of 116 bytes at the beginning of such a file; MATLAB reads its first word.
+MATLAB_HEADER = b"MATLAB 5.0 MAT-file, written by umov".ljust(116)
+
 
 def _facts(dataset: xr.Dataset) -> dict[str, Any]:
     """Attributes of a file: what a person wants to know, without the whole header."""
@@ -132,6 +135,9 @@ def _to_matlab(dataset: xr.Dataset, names: list[str], out: Path, overwrite: bool
             oned_as="column",
             long_field_names=True,
         )
+        # SciPy puts the date there. The same product gives the same bytes, and `process export` then skips the file.
+        with new.open("r+b") as file:
+            file.write(MATLAB_HEADER)
     return [path]
 
 

@@ -69,6 +69,18 @@ class FileStep(OfFiles, ABC):
         self._write(out, self.record(), overwrite, progress)
         return out
 
+    def kept_or_made(
+        self, out: Path | str | None = None, overwrite: bool = False, progress: Progress | None = None
+    ) -> Found:
+        """The product at `out` (default: the usual path): kept if it is exactly this one, else made as by `make`.
+
+        `overwrite` makes it in any case. Raises ProcessError as `make` does.
+        """
+        out = Path(out) if out else self.usual_path
+        if not overwrite and out.is_file() and made_of(out) == self.record().made_of:
+            return Found(out, True)
+        return Found(self.make(out, overwrite, progress), False)
+
     @one_blas_thread()
     def found_or_made(self, path: Path | str | None = None, progress: Progress | None = None) -> Found:
         """The product, made now unless `path` (default: the usual one) holds exactly it.

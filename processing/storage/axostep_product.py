@@ -15,12 +15,15 @@ from processing.storage.images import require_all_elements
 from processing.storage.mueller_planes import MUELLER_PLANES
 from processing.storage.pixel_mask import Mask
 from processing.storage.product import Product, ProductWriter, Step, file_identity
+from processing.storage.provenance import made_of
 
 
 def product_of_axostep(
     source: Path, out: Path, wavelength_nm: float | None, omega_deg: float | None, overwrite: bool
-) -> list[str]:
-    """Write a Mueller product with the image of a .cmmi or .bmmi file; returns lines that say what was found.
+) -> tuple[list[str], bool]:
+    """Write a Mueller product with the image of a .cmmi or .bmmi file, unless `out` is exactly that product.
+
+    Returns what was found in the file, in words, and whether the product existed.
 
     Raises
     ------
@@ -49,6 +52,13 @@ def product_of_axostep(
         },
         (file_identity(source, "source"),),
     )
+    date = f", {image.date:%Y-%m-%d %H:%M} GMT" if image.date else ""
+    told = [
+        f"{columns} x {rows} pixels, {nm:g} nm{date}, {len(image.reduced)} reduced parameters (not taken over)",
+        f"header of {image.header_words} words" + (" as the lab's reader expects" if image.header_words == 5 else ""),
+    ]
+    if not overwrite and out.is_file() and made_of(out) == step.made_of:
+        return told, True
     nothing = np.full((rows, columns), np.nan, np.float32)
     finite = np.isfinite(image.mueller).all(axis=(0, 1))
     facts: dict[str, Any] = {
@@ -69,11 +79,7 @@ def product_of_axostep(
             pixel_flags=np.where(finite, 0, np.uint8(Mask.NOT_FINITE)).astype(np.uint8),
         )
         writer.seal(facts)
-    date = f", {image.date:%Y-%m-%d %H:%M} GMT" if image.date else ""
-    return [
-        f"{columns} x {rows} pixels, {nm:g} nm{date}, {len(image.reduced)} reduced parameters (not taken over)",
-        f"header of {image.header_words} words" + (" as the lab's reader expects" if image.header_words == 5 else ""),
-    ]
+    return told, False
 
 
 def axostep_of_product(source: Path, out: Path, overwrite: bool) -> None:

@@ -16,19 +16,22 @@ import numpy as np
 
 from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture
+from processing.storage.capture import Capture, CaptureError
 from processing.storage.capture_schema import STATE_COLUMNS, create_layout, write_closing
+from processing.storage.provenance import content_of, file_identity
 from processing.yaml_file import dump_yaml, parse_yaml
 
 Colours = tuple[tuple[str, ...], ...]
 
 
-def split_colours(path: Path, folder: Path) -> list[Path]:
-    """Write a capture for each colour, the two greens apart; returns their paths.
+def split_colours(path: Path, folder: Path) -> tuple[list[Path], bool]:
+    """Write a capture for each colour, the two greens apart.
+
+    Returns their paths, and whether all of them existed, made of the same capture by the same version.
 
     Raises
     ------
-    ProcessError : the capture has no colour filter, the frames are too small, or a file exists already.
+    ProcessError : the capture has no colour filter, the frames are too small, or another file has one of the names.
     """
     with Capture(path) as capture:
         colours = capture.header.colours
@@ -37,13 +40,27 @@ def split_colours(path: Path, folder: Path) -> list[Path]:
         cell = len(colours) // 2
         parts = _parts(colours, cell, capture.frame_shape)
         out = {name: folder / f"{path.stem}.{name}.h5" for name in parts}
+        content = content_of(file_identity(path))
+        if all(_is_part(file, content) for file in out.values()):
+            return list(out.values()), True
         there = [str(file) for file in out.values() if file.exists()]
         if there:
             raise ProcessError(f"{', '.join(there)} exists. Give another --out.")
         folder.mkdir(parents=True, exist_ok=True)
         for name, (rows, columns) in parts.items():
-            _write(capture, name, out[name], rows, columns)
-    return list(out.values())
+            _write(capture, name, out[name], rows, columns, content)
+    return list(out.values()), False
+
+
+def _is_part(path: Path, content: str | None) -> bool:
+    """Whether a file is a part of the capture with this content, written by this version."""
+    if not path.is_file():
+        return False
+    try:
+        with Capture(path) as part:
+            return part.closing.get("of_content") == content and part.header.versions.get("umov") == version("umov")
+    except CaptureError:
+        return False
 
 
 def _parts(colours: Colours, cell: int, shape: tuple[int, int]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -71,7 +88,7 @@ def _start(lines: Sequence[str], cell: int) -> int:
     return next((k for k in range(1, cell) if lines[k] != lines[k - 1]), 0)
 
 
-def _write(capture: Capture, name: str, out: Path, rows: np.ndarray, columns: np.ndarray) -> None:
+def _write(capture: Capture, name: str, out: Path, rows: np.ndarray, columns: np.ndarray, content: str | None) -> None:
     header, done = capture.header, capture.done
     mosaic = header.mosaic
     if mosaic is not None:
@@ -101,4 +118,4 @@ def _write(capture: Capture, name: str, out: Path, rows: np.ndarray, columns: np
         for column in STATE_COLUMNS.keys() - {"done", "crc32", "segment"}:
             h5[f"entry/states/{column}"][...] = capture.column(column)
         h5["entry/states/done"][...] = 1
-        write_closing(h5, "complete", {"colour": name, "of": str(capture.path)})
+        write_closing(h5, "complete", {"colour": name, "of": str(capture.path), "of_content": content})

@@ -321,7 +321,7 @@ def test_figures_are_written_and_nothing_is_replaced(exported, product, tmp_path
     path = exported("product", "--to", "pdf", "--plane", "mueller_errors")[0]
     assert path.read_bytes().startswith(b"%PDF")
     for options, told in (
-        (["--to", "pdf"], "exists"),
+        (["--to", "pdf", "--plane", "mueller"], "exists"),
         (["--to", "doc"], "unknown format"),
         (["--to", "csv", "--plane", "nothing"], "has no 'nothing'"),
     ):

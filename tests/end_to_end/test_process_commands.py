@@ -82,10 +82,13 @@ def test_import_reduce_figure(suffix: str, tmp_path: Path, instrument: Path, pro
     image = MuellerImage.load(tmp_path / "states.mueller.h5")
     assert np.max(np.abs(image.values.reshape(16, 8, 12) - data.m)) < 5  # counts, from rounding of the frames
     assert np.isfinite(image.errors).all()
+    written = (tmp_path / "states.mueller.h5").stat().st_mtime_ns
     code, out, err = process("reduce", tmp_path / "states.h5")
-    assert code == 2
-    assert "exists" in err
-    assert process("reduce", tmp_path / "states.h5", "--overwrite")[0] == 0
+    assert (code, out.splitlines()[-1].startswith("unchanged")) == (0, True)
+    assert (tmp_path / "states.mueller.h5").stat().st_mtime_ns == written
+    code, out, err = process("reduce", tmp_path / "states.h5", "--weighted")
+    assert (code, "states.mueller.h5 exists" in err) == (2, True)
+    assert process("reduce", tmp_path / "states.h5", "--weighted", "--overwrite")[0] == 0
 
 
 @pytest.mark.parametrize("kind", ["npy", "h5", "h5 named"])

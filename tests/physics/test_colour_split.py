@@ -38,7 +38,7 @@ def test_each_colour_has_its_four_analyzers(synthetic_capture, tmp_path: Path, t
         colours=rolled(COLOURS.repeat(2, 0).repeat(2, 1), top, left),
         channels=("mosaic",),
     )
-    parts = split_colours(path, tmp_path / "parts")
+    parts, _ = split_colours(path, tmp_path / "parts")
     assert {p.suffixes[0][1:] for p in parts} == {
         "red",
         "green_a",
@@ -59,7 +59,7 @@ def test_a_plain_bayer_sensor_is_split_pixel_by_pixel(synthetic_capture, tmp_pat
     r, c = np.mgrid[1:9, 0:10]
     frame = np.vectorize(LEVEL.get)(COLOURS[r % 2, c % 2])
     path = synthetic_capture(frame.astype(np.uint16)[None, None], {"psg": np.zeros(1)}, colours=rolled(COLOURS, 1, 0))
-    for part in split_colours(path, tmp_path / "parts"):
+    for part in split_colours(path, tmp_path / "parts")[0]:
         with Capture(part) as capture:
             assert set(capture.frames(0).ravel()) == {LEVEL[part.suffixes[0][1:].partition("_")[0]]}
 
