@@ -37,7 +37,7 @@ def identify(
             bits=bits,
             shift=config.shift,
             polarized=fmt.polarized,
-            colour=fmt.colour,
+            colours=fmt.colours,
             library=f"Aravis {aravis._version}",
             analyzers=ANGLES_LAYOUT if fmt.angles else None,
         )

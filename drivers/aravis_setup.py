@@ -12,30 +12,19 @@ from drivers.acquisition_status import AcquisitionStatus
 from drivers.aravis_library import interface_of
 from drivers.camera import CameraSettings
 from drivers.errors import CameraError, SettingRefused
+from drivers.exposure_and_gain import RATE_CONTROL, ExposureAndGain
 from drivers.genicam import Features
+from drivers.neutral_features import NeutralFeatures
 from drivers.pixel_formats import PixelFormat, pixel_format, pixel_format_of
 
 log = logging.getLogger(__name__)
 
 # Fits every Ethernet; jumbo frames have to be asked for, because a switch in between may drop them.
 _DEFAULT_PACKET_BYTES = 1500
-# Differences on read-back that are rounding on cameras that state no step: a sensor row, a tenth of a decibel, a count.
-_EXPOSURE_FLOOR_US = 20.0
-_GAIN_FLOOR_DB = 0.1
+# A difference on read-back that is rounding on cameras that state no step.
 _BLACK_LEVEL_FLOOR = 1.0
 # How near to a whole number the sensor's size over that of a frame is where pixels are binned or left out.
 _WHOLE = 0.02
-# What makes counts non-linear in light or changes between frames.
-# A frame rate limits the exposure, and triggered frames have none.
-_SWITCHED_OFF = (
-    "ExposureAuto",
-    "GainAuto",
-    "BlackLevelAuto",
-    "GammaEnable",
-    "LUTEnable",
-    "ChunkModeActive",
-    "AcquisitionFrameRateEnable",
-)
 # What a capture sets after the features, whatever they say.
 _SET_BY_CAPTURES = {
     **dict.fromkeys(genicam.EXPOSURE_US, "give exposure_s in the plan"),
@@ -76,6 +65,13 @@ class Config(BaseModel):
     bits: int | None = Field(default=None, ge=8, le=16, description="real bits, where the format has room for more")
     shift: int = Field(default=0, ge=0, le=8, description="empty low bits, where the camera left-aligns")
     gain_raw_per_db: float | None = Field(default=None, gt=0, description="for cameras that only have GainRaw")
+    gain_unit: Literal["dB", "factor"] | None = Field(
+        default=None, description="unit of Gain, where the camera's description gives none"
+    )
+    user_set: str | None = Field(
+        default="Default",
+        description="set of the camera's own settings that is loaded before any other; null leaves those of before",
+    )
     trigger_line: str = Field(default="Line0", description="input of the hardware trigger")
     trigger_edge: Literal["RisingEdge", "FallingEdge"] = "RisingEdge"
     trigger_timeout_s: float = Field(default=10.0, gt=0, description="longest wait for a hardware trigger")
@@ -144,6 +140,19 @@ class Setup:
         self.size = (0, 0)
         self.hardware = False
         self.status = AcquisitionStatus(None)
+        self.light = ExposureAndGain(name, features, config.gain_unit, config.gain_raw_per_db)
+        self._neutral = NeutralFeatures(name, features, config.user_set, config.features)
+        self._delay_s = 0.0
+        self.converter_bits: int | None = None
+
+    @property
+    def light_s(self) -> float:
+        """Time from a trigger to the end of its exposure."""
+        return self._delay_s + self.exposure_s
+
+    def warnings(self) -> list[str]:
+        """Settings that could not be brought to a known state, in words."""
+        return list(self._neutral.remarks)
 
     def release(self) -> None:
         """Drop the reference to the camera."""
@@ -177,15 +186,12 @@ class Setup:
         for setting, names in _BEHIND.items():
             if getattr(settings, setting) is not None:
                 self._require_free(setting, *names)
-        for name in _SWITCHED_OFF:
-            if name not in self._config.features:
-                features.switch_off(name)
-        if (
-            not {"Gamma", "GammaEnable"} & self._config.features.keys()
-            and features.find(("GammaEnable",)) is None
-            and features.find(("Gamma",)) is not None
-        ):
-            features.set_number(("Gamma",), 1.0, floor=1e-3)
+        # First, because it may set anything; chunks change the payload and are switched on where they are wanted.
+        self._neutral.establish()
+        if "ChunkModeActive" not in self._config.features:
+            features.switch_off("ChunkModeActive")
+        if not {*RATE_CONTROL} & self._config.features.keys():
+            self.light.free_rate()
         if settings.pixel_format is not None:
             self._set_pixel_format(settings.pixel_format)
         self._clear_offsets()
@@ -201,7 +207,11 @@ class Setup:
         elif settings.packet_size is not None:
             raise self._refused(f"packet_size {settings.packet_size}", "this camera is not on Ethernet")
         self._set_trigger(settings.trigger)
+        if "GainSelector" not in self._config.features:
+            self.light.select_gain()
         fmt = self.pixel_format()
+        if not {*genicam.CONVERTER_BITS} & self._config.features.keys():
+            self.light.set_converter(fmt)
         if self._config.bits is not None and self._config.bits > fmt.bits - self._config.shift:
             raise self._refused(
                 f"bits {self._config.bits} and shift {self._config.shift} in the rig file",
@@ -316,26 +326,26 @@ class Setup:
         features.set_choice("TriggerMode", "On")
         self.status = AcquisitionStatus(features)
 
-    def set_light(self, settings: CameraSettings) -> None:
-        """Exposure, gain and black level: no exposure is under way when this is called."""
+    def set_light(self, settings: CameraSettings, *, stopped: bool) -> None:
+        """Exposure, gain and black level: no exposure is under way when this is called.
+
+        `stopped` is True while the acquisition is stopped: the frame rate can be changed then.
+        """
         features = self._features
         if settings.exposure_s is not None:
-            features.set_number(genicam.EXPOSURE_US, settings.exposure_s * 1e6, floor=_EXPOSURE_FLOOR_US)
+            self.light.set_exposure(settings.exposure_s, stopped=stopped)
         if settings.gain_db is not None:
             self._require_free("gain_db", *genicam.GAIN_DB, *genicam.GAIN_RAW)
-            per_db = self._config.gain_raw_per_db
-            if features.find(genicam.GAIN_DB) is not None:
-                features.set_number(genicam.GAIN_DB, settings.gain_db, floor=_GAIN_FLOOR_DB)
-            elif per_db is not None:
-                features.set_number(genicam.GAIN_RAW, settings.gain_db * per_db)
-            else:
-                raise self._refused(
-                    f"gain_db {settings.gain_db:g}",
-                    "this camera has no Gain in decibels; with GainRaw, `gain_raw_per_db` is needed in the rig file",
-                )
+            self.light.set_gain(settings.gain_db)
         if settings.black_level is not None:
             self._require_free("black_level", *genicam.BLACK_LEVEL)
             features.set_number(genicam.BLACK_LEVEL, settings.black_level, floor=_BLACK_LEVEL_FLOOR)
+
+    def require_known_state(self) -> None:
+        """Read once more what must do nothing, after everything is set. Raises SettingRefused where it does not."""
+        self._neutral.require()
+        self._delay_s = self.light.delay_s()
+        self.converter_bits = self.light.converter_bits()
 
     def _require_free(self, setting: str, *names: str) -> None:
         """One of two values for the same thing would be dropped in silence."""
@@ -346,12 +356,7 @@ class Setup:
     def read_back(self, frame_average: int | None) -> CameraSettings:
         """Every setting as the camera has it now."""
         features = self._features
-        exposure_us = features.number(genicam.EXPOSURE_US)
-        gain_db = features.number(genicam.GAIN_DB)
-        raw = features.number(genicam.GAIN_RAW)
-        if gain_db is None and raw is not None and self._config.gain_raw_per_db is not None:
-            gain_db = raw / self._config.gain_raw_per_db
-        self.exposure_s = (exposure_us or 0.0) * 1e-6
+        self.exposure_s = self.light.exposure_s() or 0.0
         binning, decimation = self._factor("Binning"), self._factor("Decimation")
         untold = self._untold_factor((binning or 1) * (decimation or 1))
         if untold > 1:
@@ -367,7 +372,7 @@ class Setup:
         self.size, fmt = (int(width), int(height)), self.pixel_format()
         return CameraSettings(
             exposure_s=self.exposure_s or None,
-            gain_db=gain_db,
+            gain_db=self.light.gain_db(),
             black_level=features.number(genicam.BLACK_LEVEL),
             pixel_format=fmt.name,
             width=fmt.scale * int(width),

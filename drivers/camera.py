@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from drivers.errors import CameraError, FrameLost
+from drivers.top_of_counts import TopOfCounts
 
 log = logging.getLogger(__name__)
 
@@ -105,8 +106,9 @@ class CameraIdentity:
 
     `packet_delay` is the pause between two packets in ticks of the camera's clock, `resend` whether lost packets are
     asked for again; both None off Ethernet. `pixel_format_code` is the code as the camera sends it; `shift` is how many
-    empty low bits were removed; `colour` is True for the raw mosaic of a colour filter. `analyzers` are the names that
-    the camera itself gives to the analyzers over the super-pixel of its frames; None where the pixel format tells none.
+    empty low bits were removed. `colours` are the filters over the first two pixels of the first row, such as "RG";
+    empty without a colour filter. `analyzers` are the names that the camera itself gives to the analyzers over the
+    super-pixel of its frames; None where the pixel format tells none.
     """
 
     kind: str
@@ -127,7 +129,7 @@ class CameraIdentity:
     bits: int
     shift: int
     polarized: bool
-    colour: bool
+    colours: str
     library: str
     analyzers: tuple[tuple[str, ...], ...] | None = None
 
@@ -168,7 +170,7 @@ class Exposure:
             The camera stopped answering.
         """
         self.wait_exposed()
-        frame = self._camera._do_frame()
+        frame = self._camera._next_frame()
         if self._earlier is None:
             return frame
         self._earlier.add(frame)
@@ -178,24 +180,25 @@ class Exposure:
 class _Average:
     """Mean of several frames; a pixel that was saturated once stays saturated, so that masks still see it."""
 
-    def __init__(self, full_scale: int) -> None:
-        self._full_scale = full_scale
+    def __init__(self, top: TopOfCounts) -> None:
+        self._top = top
         self._frames = 0
 
     def add(self, frame: Frame) -> None:
         if self._frames == 0:
             self._sum = frame.pixels.astype(np.uint32)
-            self._saturated = frame.pixels >= self._full_scale
+            # The largest of each pixel, because the top may be learnt from a later frame.
+            self._largest = frame.pixels.copy()
             self._host_time_s = frame.host_time_s
         else:
             self._sum += frame.pixels
-            self._saturated |= frame.pixels >= self._full_scale
+            np.maximum(self._largest, frame.pixels, out=self._largest)
         self._frames += 1
         self._last = frame
 
     def result(self) -> Frame:
         mean = ((self._sum + self._frames // 2) // self._frames).astype(np.uint16)
-        mean[self._saturated] = self._full_scale
+        mean[self._largest >= self._top.counts] = self._top.counts
         mean.flags.writeable = False
         return Frame(mean, self._last.frame_id, self._last.camera_time_ns, self._host_time_s)
 
@@ -217,6 +220,8 @@ class Camera(ABC):
         self._retakes = 0
         self._settings: CameraSettings | None = None
         self._closed = False
+        self._top: TopOfCounts | None = None
+        self._counts_are: tuple[object, ...] = ()
 
     # --- settings ----------------------------------------------------------------------------------------
 
@@ -247,8 +252,19 @@ class Camera(ABC):
 
     @property
     def full_scale(self) -> int:
-        """Largest count a pixel can have; a pixel there is saturated."""
-        return (1 << self.bits) - 1
+        """Largest count a pixel can have, as far as its frames have shown; a pixel there is saturated."""
+        return self.top_of_counts.counts
+
+    @property
+    def top_of_counts(self) -> TopOfCounts:
+        """What the frames since the last change of the pixel format have shown of the step and the end of counts."""
+        if self._top is None:
+            self._top = TopOfCounts(self.bits, self._converter_bits())
+        return self._top
+
+    def warnings(self) -> list[str]:
+        """What could not be brought to a known state, in words; empty for a kind that has no such settings."""
+        return []
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
         """Set the camera and return its settings as read back.
@@ -265,7 +281,11 @@ class Camera(ABC):
         """
         self._require_open()
         self._settings = None
+        before = self._counts_are
         self._settings = self._do_configure(settings)
+        self._counts_are = (self._settings.pixel_format, self._settings.binning, self.bits, self._converter_bits())
+        if before != self._counts_are:
+            self._top = None
         log.info("camera %s is set to %s", self.name, self._settings.model_dump(exclude_none=True))
         return self._settings
 
@@ -286,7 +306,7 @@ class Camera(ABC):
         """
         self._require_open()
         frames = self.settings.frame_average or 1
-        earlier = _Average(self.full_scale) if frames > 1 else None
+        earlier = _Average(self.top_of_counts) if frames > 1 else None
         if earlier is not None:
             for _ in range(frames - 1):
                 earlier.add(self._whole_frame(None))
@@ -307,18 +327,23 @@ class Camera(ABC):
         average = self.settings.frame_average or 1
         frames = []
         for _ in range(count):
-            mean = _Average(self.full_scale) if average > 1 else None
+            mean = _Average(self.top_of_counts) if average > 1 else None
             for _ in range(average):
                 frame = self._whole_frame(mean)
             frames.append(frame if mean is None else mean.result())
         return frames
+
+    def _next_frame(self) -> Frame:
+        frame = self._do_frame()
+        self.top_of_counts.look(frame.pixels)
+        return frame
 
     def _whole_frame(self, mean: _Average | None) -> Frame:
         for attempt in range(self._allowed_retakes + 1):
             self._do_trigger()
             try:
                 self._do_wait_exposed()
-                frame = self._do_frame()
+                frame = self._next_frame()
             except FrameLost as error:
                 lost = error
                 if attempt < self._allowed_retakes:
@@ -374,6 +399,10 @@ class Camera(ABC):
             raise CameraError(f"camera {self.name}", "it was closed", "Open it again")
 
     # --- hooks of a camera family ------------------------------------------------------------------------
+
+    def _converter_bits(self) -> int | None:
+        """Bits of the converter; None where the camera does not tell them."""
+        return None
 
     @abstractmethod
     def _do_configure(self, settings: CameraSettings) -> CameraSettings: ...

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from drivers.errors import CameraError, CameraLost, SettingRefused
 
@@ -16,6 +16,8 @@ from drivers.errors import CameraError, CameraLost, SettingRefused
 EXPOSURE_US = ("ExposureTime", "ExposureTimeAbs")
 GAIN_DB = ("Gain", "GainAbs")
 GAIN_RAW = ("GainRaw",)
+#: Bits of the converter behind the pixel format: FLIR, Lucid, Basler, Adimec.
+CONVERTER_BITS = ("AdcBitDepth", "ADCBitDepth", "BslSensorBitDepth", "SensorBitDepth")
 BLACK_LEVEL = ("BlackLevel", "BlackLevelAbs", "BlackLevelRaw")
 TEMPERATURE_C = ("DeviceTemperature", "TemperatureAbs")
 SENSOR_WIDTH = ("SensorWidth", "WidthMax")
@@ -24,7 +26,31 @@ PACKET_DELAY = ("GevSCPD",)
 SERIAL_NUMBER = ("DeviceSerialNumber", "DeviceID")
 FIRMWARE = ("DeviceFirmwareVersion", "DeviceVersion")
 
+_SECONDS = {
+    "ns": 1e-9,
+    "us": 1e-6,
+    "µs": 1e-6,
+    "μs": 1e-6,
+    "usec": 1e-6,
+    "ms": 1e-3,
+    "msec": 1e-3,
+    "s": 1.0,
+    "sec": 1.0,
+}
+_DECIBEL, _FACTOR = ("db", "decibel", "decibels"), ("x", "factor", "times", "ratio", "fold", "multiplier")
+
 T = TypeVar("T")
+
+
+def seconds_of(unit: str) -> float:
+    """Seconds of a feature's unit of time; microseconds, which the SFNC has, where it is not known here."""
+    return _SECONDS.get(unit.strip().lower(), 1e-6)
+
+
+def gain_unit(unit: str) -> Literal["dB", "factor"] | None:
+    """What the unit of a Gain feature means; None where its description does not say."""
+    word = unit.strip().strip("[]()").lower()
+    return "dB" if word in _DECIBEL else "factor" if word in _FACTOR else None
 
 
 class Features:
@@ -47,6 +73,7 @@ class Features:
         self._camera = camera
         self._device = camera.get_device()
         self._is_lost = False
+        self._selectors: dict[str, str] | None = None
 
     def release(self) -> None:
         """Drop the references to the camera."""
@@ -249,6 +276,80 @@ class Features:
         except self._glib_error as error:
             # One feature that cannot be read, such as a write-only one, must not cost the others.
             found[name] = f"not readable: {error.message}"
+
+    def names(self) -> list[str]:
+        """Names of every feature under the root category, commands included, in the order of the node map."""
+        return list(self._listed(self._device.get_genicam(), "Root"))
+
+    def _listed(self, nodes: Any, name: str) -> Iterator[str]:
+        node = nodes.get_node(name)
+        if isinstance(node, self._aravis.GcCategory):
+            for entry in node.get_features():
+                yield from self._listed(nodes, entry)
+        elif isinstance(node, self._aravis.GcFeatureNode):
+            yield name
+
+    def writable(self) -> list[str]:
+        """Names of the features that hold a value which can be set now, as far as the camera tells."""
+        kinds = self._aravis
+        return [
+            name
+            for name in self.names()
+            if self.kind(name) in ("flag", "choice", "number")
+            and self._device.get_feature(name).get_actual_access_mode() != kinds.GcAccessMode.RO
+            and self._camera.is_feature_available(name)
+        ]
+
+    def kind(self, name: str) -> Literal["flag", "choice", "number", "text", "other"]:
+        """What a feature holds."""
+        node, kinds = self._device.get_feature(name), self._aravis
+        if isinstance(node, kinds.GcBoolean):
+            return "flag"
+        # An enumeration is a number and a text to Aravis as well.
+        if isinstance(node, kinds.GcEnumeration):
+            return "choice"
+        if isinstance(node, kinds.GcCommand | kinds.GcCategory):
+            return "other"
+        if isinstance(node, kinds.GcInteger | kinds.GcFloat):
+            return "number"
+        return "text" if isinstance(node, kinds.GcString) else "other"
+
+    def value(self, name: str) -> bool | float | str | None:
+        """Read a feature of any kind; None where the camera has it not now."""
+        if self.find((name,)) is None:
+            return None
+        kind = self.kind(name)
+        if kind == "flag":
+            return self.flag(name)
+        return self.number((name,)) if kind == "number" else self.text((name,))
+
+    def limits(self, name: str) -> tuple[float, float]:
+        """Lowest and highest value of a number now."""
+        with self.asking(f"read the limits of {name}"):
+            is_float = self._is_float(name)
+            low, high = (self._camera.get_float_bounds if is_float else self._camera.get_integer_bounds)(name)
+        return float(low), float(high)
+
+    def unit(self, name: str) -> str:
+        """Unit of a number as the description gives it; empty where it gives none."""
+        node = self._device.get_feature(name)
+        if not isinstance(node, self._aravis.GcFloat | self._aravis.GcInteger):
+            return ""
+        with self.asking(f"read the unit of {name}"):
+            return str(node.get_unit() or "")
+
+    def selector_of(self, name: str) -> str | None:
+        """The feature that selects which of several values `name` is; None where the description names none."""
+        if self._selectors is None:
+            self._selectors = dict(self._all_selected())
+        return self._selectors.get(name)
+
+    def _all_selected(self) -> Iterator[tuple[str, str]]:
+        for name in self.names():
+            node = self._device.get_feature(name)
+            if isinstance(node, self._aravis.GcSelector) and node.is_selector():
+                for selected in node.get_selected_features():
+                    yield selected.get_name(), name
 
     def flag(self, name: str) -> bool:
         """Read a yes-or-no feature that the camera is known to have."""

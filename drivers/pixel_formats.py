@@ -7,6 +7,7 @@ occupies. A format that is not listed here is refused: the layout would be a gue
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -36,8 +37,9 @@ class PixelFormat:
         How pixels share bytes.
     polarized : bool
         True where the maker marks the format as that of a polarization sensor.
-    colour : bool
-        True for the raw mosaic of a colour filter, alone or over a polarization mosaic.
+    colours : str
+        Filters over the first two pixels of the first row, such as "GR"; the other two lie below them. Empty without
+        a colour filter. On a polarization sensor each colour covers a whole super-pixel.
     angles : bool
         True where each pixel is sent as four counts, those behind 0, 45, 90 and 135 degrees. `decode` lays them out as
         the super-pixel of the raw mosaic, so a frame has twice as many rows and columns.
@@ -48,7 +50,7 @@ class PixelFormat:
     bits: int
     layout: Layout = "plain"
     polarized: bool = False
-    colour: bool = False
+    colours: Literal["", "RG", "GR", "GB", "BG"] = ""
     angles: bool = False
 
     @property
@@ -209,6 +211,28 @@ def _encode(fmt: PixelFormat, flat: NDArray[np.uint16]) -> NDArray[np.uint8]:
     return triples.ravel()[:size]
 
 
+# PFNC codes of the four orders of the colour filters, in the order of their codes.
+_BAYER_CODES: dict[tuple[int, Layout], dict[Literal["RG", "GR", "GB", "BG"], int]] = {
+    (8, "plain"): {"GR": 0x01080008, "RG": 0x01080009, "GB": 0x0108000A, "BG": 0x0108000B},
+    (10, "plain"): {"GR": 0x0110000C, "RG": 0x0110000D, "GB": 0x0110000E, "BG": 0x0110000F},
+    (10, "packed"): {"GR": 0x010C0026, "RG": 0x010C0027, "GB": 0x010C0028, "BG": 0x010C0029},
+    (10, "p"): {"BG": 0x010A0052, "GB": 0x010A0054, "GR": 0x010A0056, "RG": 0x010A0058},
+    (12, "plain"): {"GR": 0x01100010, "RG": 0x01100011, "GB": 0x01100012, "BG": 0x01100013},
+    (12, "packed"): {"GR": 0x010C002A, "RG": 0x010C002B, "GB": 0x010C002C, "BG": 0x010C002D},
+    (12, "p"): {"BG": 0x010C0053, "GB": 0x010C0055, "GR": 0x010C0057, "RG": 0x010C0059},
+    (14, "plain"): {"GR": 0x01100109, "RG": 0x0110010A, "GB": 0x0110010B, "BG": 0x0110010C},
+    (14, "p"): {"GR": 0x010E0105, "RG": 0x010E0106, "GB": 0x010E0107, "BG": 0x010E0108},
+    (16, "plain"): {"GR": 0x0110002E, "RG": 0x0110002F, "GB": 0x01100030, "BG": 0x01100031},
+}
+_ENDINGS: dict[Layout, str] = {"plain": "", "packed": "Packed", "p": "p"}
+
+
+def _bayer() -> Iterator[PixelFormat]:
+    for (bits, layout), codes in _BAYER_CODES.items():
+        for order, code in codes.items():
+            yield PixelFormat(f"Bayer{order}{bits}{_ENDINGS[layout]}", code, bits, layout, colours=order)
+
+
 PIXEL_FORMATS: tuple[PixelFormat, ...] = (
     # PFNC and GigE Vision.
     PixelFormat("Mono8", 0x01080001, 8),
@@ -220,14 +244,8 @@ PIXEL_FORMATS: tuple[PixelFormat, ...] = (
     PixelFormat("Mono12p", 0x010C0047, 12, "p"),
     PixelFormat("Mono14", 0x01100025, 14),
     PixelFormat("Mono16", 0x01100007, 16),
-    PixelFormat("BayerRG8", 0x01080009, 8, colour=True),
-    PixelFormat("BayerRG10", 0x0110000D, 10, colour=True),
-    PixelFormat("BayerRG10Packed", 0x010C0027, 10, "packed", colour=True),
-    PixelFormat("BayerRG10p", 0x010A0058, 10, "p", colour=True),
-    PixelFormat("BayerRG12", 0x01100011, 12, colour=True),
-    PixelFormat("BayerRG12Packed", 0x010C002B, 12, "packed", colour=True),
-    PixelFormat("BayerRG12p", 0x010C0059, 12, "p", colour=True),
-    PixelFormat("BayerRG16", 0x0110002F, 16, colour=True),
+    PixelFormat("Mono14p", 0x010E0104, 14, "p"),
+    *_bayer(),
     # Lucid, from one public header that lists its codes; the layout is that of the Mono format of the same name
     # (unverified on hardware).
     PixelFormat("PolarizeMono8", 0x81080001, 8, polarized=True),
@@ -241,19 +259,19 @@ PIXEL_FORMATS: tuple[PixelFormat, ...] = (
     PixelFormat("PolarizedAngles_0d_45d_90d_135d_Mono12p", 0x8230001F, 12, "p", polarized=True, angles=True),
     PixelFormat("PolarizedAngles_0d_45d_90d_135d_Mono16", 0x8240002F, 16, polarized=True, angles=True),
     # The same of the colour sensor: each count has the colour of its super-pixel, which make a Bayer pattern.
-    PixelFormat("PolarizedAngles_0d_45d_90d_135d_BayerRG8", 0x8220020F, 8, polarized=True, colour=True, angles=True),
+    PixelFormat("PolarizedAngles_0d_45d_90d_135d_BayerRG8", 0x8220020F, 8, polarized=True, colours="RG", angles=True),
     PixelFormat(
-        "PolarizedAngles_0d_45d_90d_135d_BayerRG12p", 0x8230021F, 12, "p", polarized=True, colour=True, angles=True
+        "PolarizedAngles_0d_45d_90d_135d_BayerRG12p", 0x8230021F, 12, "p", polarized=True, colours="RG", angles=True
     ),
     # FLIR, named in Spinnaker's public interface without codes; layout by the rule of the names (unverified).
     PixelFormat("Polarized8", None, 8, polarized=True),
     PixelFormat("Polarized10p", None, 10, "p", polarized=True),
     PixelFormat("Polarized12p", None, 12, "p", polarized=True),
     PixelFormat("Polarized16", None, 16, polarized=True),
-    PixelFormat("BayerRGPolarized8", None, 8, polarized=True, colour=True),
-    PixelFormat("BayerRGPolarized10p", None, 10, "p", polarized=True, colour=True),
-    PixelFormat("BayerRGPolarized12p", None, 12, "p", polarized=True, colour=True),
-    PixelFormat("BayerRGPolarized16", None, 16, polarized=True, colour=True),
+    PixelFormat("BayerRGPolarized8", None, 8, polarized=True, colours="RG"),
+    PixelFormat("BayerRGPolarized10p", None, 10, "p", polarized=True, colours="RG"),
+    PixelFormat("BayerRGPolarized12p", None, 12, "p", polarized=True, colours="RG"),
+    PixelFormat("BayerRGPolarized16", None, 16, polarized=True, colours="RG"),
     # The Imaging Source, from its own public IC4 bindings and its Aravis example.
     PixelFormat("PolarizedMono8", 0x8108000A, 8, polarized=True),
     PixelFormat("PolarizedMono12p", 0x810C000B, 12, "p", polarized=True),

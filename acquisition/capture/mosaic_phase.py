@@ -6,6 +6,8 @@ from acquisition.errors import AcquisitionError
 from drivers.camera import Camera, CameraIdentity, CameraSettings
 from processing.instrument.model import InstrumentModel
 
+_COLOURS = {"R": "red", "G": "green", "B": "blue"}
+
 
 def seen_by_camera(instrument: InstrumentModel, camera: Camera) -> InstrumentModel:
     """The instrument with its mosaic as the camera's frames have it; the instrument file has that of the sensor.
@@ -24,7 +26,7 @@ def seen_by_camera(instrument: InstrumentModel, camera: Camera) -> InstrumentMod
             "as if its pixels saw through no polarizer. Lay the analyzers out as `mosaic` there (see "
             "mosaic_polarimeter.yaml), or use another camera for this mode"
         )
-    if instrument.mosaic is None and not who.colour:
+    if instrument.mosaic is None and not who.colours:
         return instrument
     wrong = _unknown(settings, camera.bins_like_with_like)
     if instrument.mosaic is not None:
@@ -47,12 +49,14 @@ def colours_of(instrument: InstrumentModel, camera: Camera) -> tuple[tuple[str, 
     On a polarization sensor each colour covers a whole super-pixel.
     """
     who, settings = camera.describe(), camera.settings
-    if not who.colour:
+    if not who.colours:
         return None
     each = 1 if instrument.mosaic is None else 2
     rows, columns = 2 * each, 2 * each
     top, left = settings.offset_y or 0, settings.offset_x or 0
-    sensor = (("red", "green"), ("green", "blue"))
+    # The second row holds green on the other diagonal, and the colour that is not in the first.
+    below = {"RG": "GB", "GR": "BG", "GB": "RG", "BG": "GR"}[who.colours]
+    sensor = [[_COLOURS[letter] for letter in line] for line in (who.colours, below)]
     return tuple(
         tuple(sensor[(top + r) % rows // each][(left + c) % columns // each] for c in range(columns))
         for r in range(rows)

@@ -25,6 +25,7 @@ def begin_record(job: Job, rig: Rig, number: int) -> dict[str, Any]:
         "by": f"{_user()} on {socket.gethostname()}, process {os.getpid()}",
         "identity": identity_of(job.plan, job.rig, job.instrument, rig).model_dump(),
         "camera_settings": rig.require_camera().settings.model_dump(exclude_none=True),
+        "camera_warnings": rig.require_camera().warnings(),
         "places": places(rig.describe()),
     }
 

@@ -114,7 +114,6 @@ class CaptureRunner:
         self._light: bool | None = None
         self._retakes: dict[int, int] = {}
         self._pending: deque[int] = deque()
-        self._full_scale = rig.require_camera().full_scale
         self._saturation_limit = saturation_limit
         lights = sum(role != "dark" for role in table.role)
         self._lit_darks = lit_darks or LitDarks(detector.black_level_counts, mosaic=mosaic, lights=lights)
@@ -187,6 +186,11 @@ class CaptureRunner:
         self.messages.add(text)
         for observer in self.observers:
             observer.warning(text)
+
+    @property
+    def _full_scale(self) -> int:
+        """Largest count that a pixel can have, as far as the frames so far have shown."""
+        return self.rig.require_camera().full_scale
 
     # --- one state ---------------------------------------------------------------------------------------
 
@@ -285,6 +289,7 @@ class CaptureRunner:
             "near_black_fraction": report.near_black_fraction,
             "monitor": report.monitor,
             "camera_temperature_c": exposed.temperature_c,
+            "full_scale_counts": self._full_scale,
         }
         with self.ledger.time("writing"):
             self._wait_for_disc()

@@ -163,6 +163,8 @@ def _run(
     if earlier is not None:
         _begin_segment(job, rig, runner, earlier)
     writer.on_failure = stop.fail
+    for text in rig.require_camera().warnings():
+        runner.warn(f"the camera is not in a known state: {text}")
     for observer in watchers:
         observer.run_started(title_of(job.plan), job.table, len(pending), job.instrument.mosaic)
     try:

@@ -158,7 +158,8 @@ def _camera(camera: Camera, config: RigConfig, frames: int) -> str:
         f"{who.sensor_width} x {who.sensor_height} {who.pixel_format} ({who.bits} bits), "
         f"{_packets(who)}{warm}; "
         f"{lost} of {frames} frames lost, {statistics.missing_packets} packets missing, "
-        f"{statistics.resent_packets} resent"
+        f"{statistics.resent_packets} resent; counts in steps of {camera.top_of_counts.step} up to {camera.full_scale}"
+        + "".join(f"; NOT IN A KNOWN STATE: {text}" for text in camera.warnings())
     )
     if lost:
         raise AcquisitionError(found + ". " + _against_loss(who))

@@ -122,6 +122,13 @@ class AravisCamera(Camera):
         with self._features.asking("read the node map"):
             return self._features.dump()
 
+    def warnings(self) -> list[str]:
+        """Settings that could not be brought to a known state, in words."""
+        return self._setup.warnings()
+
+    def _converter_bits(self) -> int | None:
+        return self._setup.converter_bits
+
     def _pixel_format(self) -> PixelFormat:
         return self._setup.pixel_format() if self._format is None else self._format
 
@@ -131,17 +138,20 @@ class AravisCamera(Camera):
         self._discard_outstanding()
         settings = self._config.settings.model_copy(update=settings.model_dump(exclude_none=True))
         structure = structure_of(settings)
-        if self._stream is None or structure != self._asked_structure:
+        exposure_s = settings.exposure_s
+        fits = exposure_s is None or exposure_s == self._setup.exposure_s or self._setup.light.fits(exposure_s)
+        if self._stream is None or structure != self._asked_structure or not fits:
             self._stop()
             self._asked_structure = None
             self._setup.set_structure(settings)
-            self._setup.set_light(settings)
+            self._setup.set_light(settings, stopped=True)
+            self._setup.require_known_state()
             self._format = self._setup.pixel_format()
             self._start()
             self._asked_structure = structure
         else:
             self._drain()
-            self._setup.set_light(settings)
+            self._setup.set_light(settings, stopped=False)
         return self._setup.read_back(settings.frame_average)
 
     # --- stream ------------------------------------------------------------------------------------------
@@ -218,12 +228,12 @@ class AravisCamera(Camera):
 
     def _wait_armed(self) -> None:
         """Wait until the camera heeds a trigger: one that comes too early is ignored."""
-        deadline_s = self._clock.now_s() + self._setup.exposure_s + self._transfer_s()
+        deadline_s = self._clock.now_s() + self._setup.light_s + self._transfer_s()
         while not self._setup.status.armed():
             if self._clock.now_s() > deadline_s:
                 self._restart()
                 raise self._frame_lost(
-                    f"not ready for a trigger within {self._setup.exposure_s + self._transfer_s():.2f} s",
+                    f"not ready for a trigger within {self._setup.light_s + self._transfer_s():.2f} s",
                     "Is it in continuous acquisition with TriggerMode On? Another trigger selector may hold it back",
                 )
             self._check_control("wait until the trigger is armed")
@@ -234,7 +244,7 @@ class AravisCamera(Camera):
         if self._setup.hardware:
             self._wait_for_hardware_trigger(stream)
             return
-        end_s = self._sent_s + self._setup.exposure_s
+        end_s = self._sent_s + self._setup.light_s
         self._sleep_until(end_s - max(_EARLY * self._setup.exposure_s, _EARLY_S))
         while (arrival := stream.take(0)) is not None:
             if self._is_ours(arrival):
@@ -256,7 +266,7 @@ class AravisCamera(Camera):
 
     def _wait_for_hardware_trigger(self, stream: FrameStream) -> None:
         # The end of the exposure is not visible, so it counts as ended when the frame is there.
-        deadline_s = self._sent_s + self._config.trigger_timeout_s + self._setup.exposure_s + self._transfer_s()
+        deadline_s = self._sent_s + self._config.trigger_timeout_s + self._setup.light_s + self._transfer_s()
         while not stream.has_arrival():
             if self._clock.now_s() > deadline_s:
                 self._restart()
@@ -269,7 +279,7 @@ class AravisCamera(Camera):
 
     def _do_frame(self) -> Frame:
         stream = self._live_stream()
-        deadline_s = self._sent_s + self._setup.exposure_s + self._transfer_s()
+        deadline_s = self._sent_s + self._setup.light_s + self._transfer_s()
         if self._setup.hardware:
             deadline_s += self._config.trigger_timeout_s
         while True:
@@ -296,8 +306,9 @@ class AravisCamera(Camera):
     def _is_ours(self, arrival: Arrival) -> bool:
         """True unless the frame left the camera before the exposure under way can have ended, or has an old number."""
         exposure_s = 0.0 if self._config.answers_early else self._setup.exposure_s
+        light_s = 0.0 if self._config.answers_early else self._setup.light_s
         came_s = self._camera_clock.came_s(arrival.camera_time_ns, arrival.first_packet_s, exposure_s)
-        ended_s = self._sent_unix_s + exposure_s - max(_EARLY * exposure_s, _EARLY_S)
+        ended_s = self._sent_unix_s + light_s - max(_EARLY * exposure_s, _EARLY_S)
         # Without its first packet a frame has no time; it is not whole either.
         return arrival.follows(self._last_id) and (arrival.first_packet_s <= 0 or came_s >= ended_s)
 
@@ -326,7 +337,7 @@ class AravisCamera(Camera):
             self._outstanding = False
             return
         stream = self._live_stream()
-        deadline_s = self._sent_s + self._setup.exposure_s + self._transfer_s()
+        deadline_s = self._sent_s + self._setup.light_s + self._transfer_s()
         while not self._setup.hardware and self._clock.now_s() < deadline_s:
             arrival = stream.take(_SLICE_S)
             if arrival is None:

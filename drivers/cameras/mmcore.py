@@ -47,7 +47,9 @@ class Config(BaseModel):
     properties: dict[str, str] = Field(default={}, description="any properties, set in this order and read back")
     bits: int | None = Field(default=None, ge=8, le=16, description="real bits, where the core does not know them")
     polarized: bool = Field(default=False, description="the pixels are those of a polarization mosaic")
-    colour: bool = Field(default=False, description="the pixels are those of a colour mosaic")
+    colours: Literal["", "RG", "GR", "GB", "BG"] = Field(
+        default="", description="filters over the first two pixels of the first row, where they are a colour mosaic"
+    )
     retakes: int = Field(default=3, ge=0, description="how often a lost frame is taken again")
     transfer_s: float = Field(default=5.0, gt=0, description="longest time from the end of an exposure to its frame")
 
@@ -120,7 +122,7 @@ class MMCoreCamera(Camera):
                 bits=bits,
                 shift=0,
                 polarized=self._config.polarized,
-                colour=self._config.colour,
+                colours=self._config.colours,
                 library=f"pymmcore-plus {version('pymmcore-plus')}, {self._core.getVersionInfo()}",
             )
 

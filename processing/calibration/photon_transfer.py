@@ -154,7 +154,8 @@ def _pairs(captures: Sequence[Capture], other: Black) -> Iterator[tuple[NDArray[
     """Signal and difference of pairs of repeated frames, scaled to single frames; clipped pixels are left out."""
     for capture in captures:
         bits = capture.header.detector.bits
-        ceiling = CLIPPING * (2**bits - 1) if bits and capture.integer_counts else np.inf
+        top = capture.full_scale_counts or (2**bits - 1 if bits else np.inf)
+        ceiling = CLIPPING * top if capture.integer_counts else np.inf
         averaged, exposure_s = capture.column("repeats"), capture.column("exposure_s").astype(float)
         darks = Black.of(capture) or other
         for group in repeats(capture):

@@ -111,7 +111,7 @@ def saturation(capture: Capture) -> float | None:
     detector = capture.header.detector
     if detector.bits is None or not capture.integer_counts:
         return None
-    top = float(2**detector.bits - 1)
+    top = capture.full_scale_counts or float(2**detector.bits - 1)
     if detector.full_well_e is None or detector.gain_e_per_count is None:
         return top
     well = detector.black_level_counts + detector.full_well_e / detector.gain_e_per_count

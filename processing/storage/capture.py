@@ -140,6 +140,15 @@ class Capture(OpenH5):
         return self.planned_column(name)[self.done]
 
     @property
+    def full_scale_counts(self) -> float | None:
+        """The largest count that the camera could send, as its frames have shown; None where nobody looked."""
+        if not self.has_column("full_scale_counts"):
+            return None
+        known = self.column("full_scale_counts")
+        # The end may have been found in a later state: it held for the earlier ones too.
+        return None if not np.isfinite(known).any() else float(np.nanmin(known))
+
+    @property
     def reduces_to(self) -> Literal["mueller", "stokes"]:
         """What a reduction makes of it: a Stokes image of a mosaic, if nothing turns between the states.
 
@@ -179,6 +188,10 @@ class Capture(OpenH5):
         with self._damage():
             nodes = parse_json(self._h5["entry/camera_nodes/data"][()], f"{self.path}: camera nodes", CaptureError)
             return dict(nodes)
+
+    def has_column(self, name: str) -> bool:
+        """False for a column that the file is too old for."""
+        return name in self._h5["entry/states"]
 
     def planned_column(self, name: str) -> NDArray[Any]:
         """A column of the state table for all planned states, done or not. Raises CaptureError for an unknown name."""

@@ -11,7 +11,7 @@ from processing.storage.h5_door import MOST_STATES, require_dataset
 
 STATUSES = ("running", "complete", "aborted", "failed")
 #: Columns that the first version of the format did not have.
-LATER_COLUMNS = ("segment", "crc32", "camera_temperature_c")
+LATER_COLUMNS = ("segment", "crc32", "camera_temperature_c", "full_scale_counts")
 ROLES = ("dark", "flat", "air", "sample")
 
 

@@ -53,6 +53,7 @@ STATE_COLUMNS: dict[str, Any] = {
     "near_black_fraction": np.float64,
     "monitor": np.float64,
     "camera_temperature_c": np.float64,
+    "full_scale_counts": np.float64,
 }
 #: Units of the columns; what is not named is a plain number.
 COLUMN_UNITS = {
@@ -61,6 +62,7 @@ COLUMN_UNITS = {
     "camera_time_ns": "ns",
     "monitor": "count/s",
     "camera_temperature_c": "degC",
+    "full_scale_counts": "count",
 }
 #: Units of what is known about the detector.
 DETECTOR_UNITS = {

@@ -116,6 +116,7 @@ def _write(capture: Capture, name: str, out: Path, rows: np.ndarray, columns: np
         for axis, angles in capture.angles_deg.items():
             h5[f"entry/instrument/{axis}/value"][...] = angles
         for column in STATE_COLUMNS.keys() - {"done", "crc32", "segment"}:
-            h5[f"entry/states/{column}"][...] = capture.column(column)
+            if capture.has_column(column):
+                h5[f"entry/states/{column}"][...] = capture.column(column)
         h5["entry/states/done"][...] = 1
         write_closing(h5, "complete", {"colour": name, "of": str(capture.path), "of_content": content})

@@ -69,7 +69,11 @@ def _write(capture: Capture, old: h5py.File, new: Path) -> None:
             for name in ("value", "raw_value"):
                 entry[f"instrument/{axis}/{name}"][...] = there[f"instrument/{axis}/{name}"][...]
         for name in STATE_COLUMNS:
-            entry[f"states/{name}"][...] = there[f"states/{name}"][...]
+            if name in there["states"]:
+                entry[f"states/{name}"][...] = there[f"states/{name}"][...]
+            else:
+                # An older file has not this column, and its checksums do not cover it.
+                del entry[f"states/{name}"]
         if "sigma" in there["states"]:
             there["states"].copy("sigma", entry["states"], without_attrs=True)
             entry["states/sigma"].attrs["units"] = "count"

@@ -64,10 +64,11 @@ def _number(name: str, register: str, low: int, high: int | str, step: int = 1) 
     )
 
 
-def _float(name: str, address: int, low: float, high: float, access: str = "RW") -> str:
+def _float(name: str, address: int, low: float, high: float, access: str = "RW", unit: str = "") -> str:
+    unit = f"<Unit>{unit}</Unit>" if unit else ""
     return (
         f'<Float Name="{name}" NameSpace="Standard"><pValue>{name}Register</pValue><Min>{low}</Min><Max>{high}</Max>'
-        f"</Float>{_register(name, address, 'FloatReg', access)}"
+        f"{unit}</Float>{_register(name, address, 'FloatReg', access)}"
     )
 
 
@@ -233,7 +234,7 @@ def _light(table: NodeMap) -> list[str]:
         if name.endswith("Raw"):
             features.append(_integer(name, raw, int(limits[0]), int(limits[1])))
         else:
-            features.append(_float(name, number, *limits))
+            features.append(_float(name, number, *limits, unit="dB" if name == "Gain" else ""))
     if table.gamma is not None:
         features.append(_float("Gamma", GAMMA, 0.25, 4.0))
     if table.gamma == "GammaEnable":

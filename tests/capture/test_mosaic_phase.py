@@ -11,10 +11,10 @@ from processing.instrument.model import InstrumentModel
 from tests.conftest import ROOT
 
 
-def colour_camera(**settings: object) -> SimpleNamespace:
+def colour_camera(order: str = "RG", **settings: object) -> SimpleNamespace:
     known = CameraSettings(offset_x=0, offset_y=0, width=20, height=16).model_copy(update=settings)
     return SimpleNamespace(
-        settings=known, bins_like_with_like=False, describe=lambda: SimpleNamespace(colour=True, polarized=False)
+        settings=known, bins_like_with_like=False, describe=lambda: SimpleNamespace(colours=order, polarized=False)
     )
 
 
@@ -30,6 +30,16 @@ def test_colours_follow_the_place_of_the_region(instrument, offset):
     assert seen_by_camera(instrument, camera) is instrument
     first = {(0, 0): "red", (1, 0): "green", (0, 1): "green", (1, 1): "blue"}[x % 2, y % 2]
     assert colours_of(instrument, camera)[0][0] == first
+
+
+@pytest.mark.parametrize("order", ["RG", "GR", "GB", "BG"])
+def test_the_format_says_in_which_order_the_colours_lie(instrument, order):
+    # PFNC: the two letters are the first row; red and blue lie on one diagonal, green on the other.
+    (a, b), (c, d) = (
+        tuple(colour[0].upper() for colour in row) for row in colours_of(instrument, colour_camera(order))
+    )
+    assert a + b == order
+    assert {a + d, b + c} in ({"RB", "GG"}, {"BR", "GG"})
 
 
 @pytest.mark.parametrize("setting", [{"reverse_x": True}, {"decimation": 2}, {"binning": 2}, {"offset_x": None}])
@@ -49,7 +59,7 @@ def test_what_hides_the_colour_of_a_pixel_is_refused(instrument, setting):
 )
 def test_analyzers_that_the_camera_names_are_those_of_the_instrument(told, declared, wrong):
     camera = colour_camera()
-    camera.describe = lambda: SimpleNamespace(colour=False, analyzers=told, pixel_format="by angle")
+    camera.describe = lambda: SimpleNamespace(colours="", analyzers=told, pixel_format="by angle")
     stokes = InstrumentModel.load(ROOT / "configs/instruments/linear_stokes.yaml").model_copy(
         update={"mosaic": declared}
     )

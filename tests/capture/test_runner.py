@@ -163,6 +163,7 @@ def test_what_is_noted_of_a_state(rig, runner_of):
         "near_black_fraction": 0.05,
         "monitor": pytest.approx(monitor),
         "camera_temperature_c": 31.5,
+        "full_scale_counts": 4095,
     }
     assert record.pixels is pixels
     assert (report.state, report.role, report.exposure_s) == (0, "sample", EXPOSURE_S)

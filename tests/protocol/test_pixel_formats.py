@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.aravis_library import load_aravis
 from drivers.errors import UnknownPixelFormat
 from drivers.pixel_formats import PIXEL_FORMATS, PixelFormat, pixel_format, pixel_format_of
 from simulators.camera.pixel_stamp import read_stamp, stamp
@@ -49,6 +50,16 @@ def test_an_image_survives_the_wire(fmt: PixelFormat, width: int, height: int, s
     memory = fmt.encode(pixels)
     assert memory.size == fmt.payload_bytes(width, height)
     assert np.array_equal(fmt.decode(memory, width, height), pixels)
+
+
+def test_codes_are_those_that_aravis_has() -> None:
+    aravis, _ = load_aravis()
+    names = [name for name in dir(aravis) if name.startswith("PIXEL_FORMAT_")]
+    told = {name.replace("_", ""): int(getattr(aravis, name)) & 0xFFFFFFFF for name in names}
+    theirs = {fmt.name: told.get(f"PIXELFORMAT{fmt.name.upper()}") for fmt in PIXEL_FORMATS}
+    known = {name: code for name, code in theirs.items() if code is not None}
+    assert {"Mono14", "BayerGR8", "BayerGB12p", "BayerBG10", "BayerBG16"} <= known.keys()
+    assert known == {fmt.name: fmt.code for fmt in PIXEL_FORMATS if fmt.name in known}
 
 
 def test_bits_in_memory_are_in_the_code() -> None:

@@ -1,0 +1,332 @@
+"""Settings that somebody may have left on a camera, and the value at which each of them does nothing.
+
+A GenICam description does not tell what a setting does or where it is neutral. The rules here go by the names of the
+GenICam Standard Features Naming Convention (SFNC 2.7) and by those that makers have in public feature lists (84 lists
+of the EPICS ADGenICam module: Allied Vision, Basler, FLIR, Point Grey, Adimec, Mikrotron, Teledyne, Tucsen, ViewWorks).
+A rule is a pattern, so a name that is not in those lists is found where it is formed alike.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+from drivers.errors import CameraError, CameraLost, SettingRefused
+from drivers.genicam import EXPOSURE_US, Features
+
+# What makers call an enumeration's entry that switches something off.
+_OFF_WORDS = ("Off", "None", "Disabled", "Disable", "False", "No", "Normal", "Standard", "Linear", "LiveVideo")
+_DEFAULT_SETS = ("Default", "Factory", "Standard", "FactoryDefault", "Default0", "DefaultSet")
+_LOADS = (
+    ("UserSetSelector", "UserSetLoad"),
+    ("ConfigFileIndex", "ConfigFileLoad"),
+    ("UserSetSelectorReg", "UserSetLoadReg"),
+)
+# Selectors of features whose description need not say so.
+_SELECTED_BY = {
+    "TriggerDelay": "TriggerSelector",
+    "TestPattern": "TestPatternGeneratorSelector",
+    "LUTEnable": "LUTSelector",
+    "BalanceRatio": "BalanceRatioSelector",
+    "CorrectionMode": "CorrectionSelector",
+    "ROIZoneMode": "ROIZoneSelector",
+}
+
+Neutral = Literal["off", "least", "one"] | tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """Features of a kind.
+
+    Attributes
+    ----------
+    names : str
+        Regular expression for the whole name.
+    neutral : {"off", "least", "one"} or tuple of str
+        Off: false, an entry that means off, or zero; least: the lower limit; one: 1; else the entries that will do.
+    harm : bool
+        True where the counts or the time of the exposure are wrong as long as it is set: no capture is taken then.
+    """
+
+    names: str
+    neutral: Neutral
+    harm: bool
+
+
+RULES = (
+    # The image is not that of the sensor, or holds more than it.
+    Rule(r"\w*Test(Pattern|Image|Mode)(Selector|Enable|Mode)?", "off", True),
+    Rule(r"\w*(ImageGenerator|VideoSource)(Selector|Enable)?", ("Off", "Sensor", "LiveVideo", "Normal"), True),
+    Rule(r"\w*(Overlay|Crosshair|ImageStamp|FrameStamp|Watermark|InfoField\w+)(Enable|Enabled|Mode)?", "off", True),
+    Rule(r"(Horizontal|Vertical|Image|X|Y)?Flip([XY]|Mode)?|BsliAtpEnab|Multishot(Enable|Mode)", "off", True),
+    Rule(r"GevSCPSBigEndian|\w*PixelBigEndian|ImageCompressionMode|\w*LossyCompression\w*Enable", "off", True),
+    # Settings change from frame to frame.
+    Rule(
+        r"\w*(Exposure|Gain|BlackLevel|White|WhiteBalance|Brightness|Contrast|Gamma|ExposureCompensation|BalanceRatio)Auto",
+        "off",
+        True,
+    ),
+    Rule(r"(Sequencer|Sequence|Bsl\w*Sequencer)(Configuration)?(Mode|Enable|Enabled)", "off", True),
+    Rule(r"\w*(HDR|Hdr|WDR|MultiExposure|MultiSlope|PieceWise\w*)_?(Mode|ModeEnabled?|Enabled?)?", "off", True),
+    Rule(r"\w*(Hue|Saturation|Sharpness|Sharpening|FrameRate|Iris|Focus|Defog|Flicker\w*)Auto", "off", False),
+    # The exposure does not begin with its trigger.
+    Rule(r"(\w*Trigger|Exposure(Start)?)Delay(Enable|Enabled)", "off", True),
+    Rule(r"(\w*Trigger|Trig|Exposure(Start)?)Delay(Abs|Raw|Time)?", "least", True),
+    Rule(r"TriggerOverlap", "off", False),
+    Rule(r"Trigger(Divider|Multiplier)|AcquisitionBurstFrameCount", "one", True),
+    Rule(r"EnableBurstAcquisition|BurstModeEnable|PtpAcquisitionGateTime|StreamHoldEnable", "off", True),
+    Rule(r"TransferControlMode", ("Automatic", "Basic"), True),
+    Rule(r"\w*(Averag(e|ing)\w*(Number|Count|Frames)\w*|FrameAverag\w*|FrameIntegration\w*Count)", "one", True),
+    Rule(r"\w*(Averag(e|ing)|FrameIntegration)(Mode|Enable)", "off", True),
+    # Counts are not linear in light, or not in the unit of the converter.
+    Rule(r"\w*(Gamma|LUT|Contrast|ToneMapping|Dehaze|Defog)(Enable|Enabled|CorrectionEnable)", "off", True),
+    Rule(r"Gamma(Abs)?", "one", True),
+    Rule(r"\w*ContrastMode", ("Linear", "Off", "ContrastMode_Off"), True),
+    Rule(r"Bsl(Brightness|Contrast)(Raw)?|BlackLevelOffsetDigital", "off", True),
+    Rule(r"DigitalShift", "off", True),
+    Rule(r"\w*DigitalGain\w*", "one", False),
+    # A pixel holds the light of its neighbours, which are other analyzers on a mosaic.
+    Rule(r"\w*(Sharpen(ing)?|Denois(e|ing)|MedianFilter)(Enable|Enabled|Mode)?", "off", True),
+    Rule(r"\w*(Sharpness|(?<!Pattern)NoiseReduction)(Enable|Enabled|Mode)", "off", True),
+    Rule(
+        r"\w*(EdgeFilter|EdgeEnhancement|Convolution|SmoothFilter|AdaptiveNoiseSuppression)(Mode|Enable)?", "off", True
+    ),
+    Rule(r"NirMode|DemosaicingMode|PgiMode|ProcessedRawEnable|OnBoardColorProcessEnabled", "off", False),
+    Rule(
+        r"\w*Defect\w*(Correct\w*|Mask)(Static|Dynamic|Row|Column|Pixel)?(Mode|Enable|Enabled)|DefectMask\w*Enable",
+        "off",
+        False,
+    ),
+    Rule(r"VendorDefectPixelCorr|BsliDPC[EH]|(HotPixel|\w*Defective\w*|FlatField)Correction", "off", False),
+    # A factor for each pixel or colour, the same for every frame.
+    Rule(
+        r"\w*(Ffc|FFC|FlatField|FlatFieldCorrection|Shading|LensShading|Vignetting)(Correction)?(Mode|Enable)",
+        "off",
+        False,
+    ),
+    Rule(r"BalanceRatio(Abs)?", "one", False),
+    Rule(r"LightSource(Selector|Preset)", "off", False),
+    Rule(r"\w*(ColorTransformation|ColorAdjustment|ColorCorrection|Saturation|Hue)(Mode|Enable|Enabled)", "off", False),
+    # Which pixels are read.
+    Rule(r"Center[XY]|\w*Multi(ple)?(ROI|Roi|Region)\w*Enable|StackedZoneImaging\w*Enable|ROIZoneMode", "off", True),
+    Rule(r"LegacyBinning(Horizontal|Vertical)|\w*Interlac\w*Enable", "off", True),
+    Rule(r"Scaling(Horizontal|Vertical)(Abs)?", "one", True),
+    Rule(r"DeviceScanType", ("Areascan", "AreaScan"), True),
+    # The clock of the exposure.
+    Rule(r"ExposureTimeMode|ExposureTimeSelector", ("Standard", "Common", "Timed"), True),
+    Rule(r"ShortExposureEnable|ExposureTimeBaseAbsEnable|GlobalResetReleaseModeEnable", "off", True),
+)
+_COMPILED = tuple((re.compile(rule.names), rule) for rule in RULES)
+
+# Writable features that say nothing of counts or times of frames: the link, lines that go out, what a program reads.
+_NO_MATTER = re.compile(
+    r"(Gev|Event|Chunk|File|User|Device|Line|Sync|Strobe|Counter|Timer|Action|Serial|Pt[pP]|Timestamp|Test|Expert|Payload"
+    r"|Auto|Lens|PIris|Iris|EFLens|U3V|TL|Bandwidth|Logic|Transfer|IEEE|Firmware|Software|Bsl(Light|Ptp|Periodic|Line)"
+    r"|Exposure(Auto|Time)|Gain(Auto|Raw|Abs)?$|Balance|Color|LUT|Defect|Sequence|Stream|Link|Cxp|Connection|DSP|PLC_"
+    r"|(Binning|Decimation|Reverse|Trigger|Acquisition|Width|Height|Offset[XY]|PixelFormat|BlackLevel)"
+    r")|\w*(Selector|SelectorIndex|Status|Reset|AccessKey)$"
+)
+
+
+def rule_for(name: str) -> Rule | None:
+    """The first rule whose pattern is that of a feature's name; None for a name that no rule knows."""
+    return next((rule for pattern, rule in _COMPILED if pattern.fullmatch(name)), None)
+
+
+class NeutralFeatures:
+    """Brings one camera to a known state: its own default first, then every feature that a rule knows.
+
+    Parameters
+    ----------
+    name : str
+        Name of the camera in messages.
+    features : Features
+        Those of the open camera; its acquisition is stopped.
+    user_set : str or None
+        The set that is loaded first; None loads none.
+    kept : collection of str
+        Features of the rig file: they are set on purpose, so no rule is applied to them.
+
+    Attributes
+    ----------
+    remarks : list of str
+        What could not be set, in words, for `acquire doctor` and the capture file.
+    """
+
+    def __init__(self, name: str, features: Features, user_set: str | None, kept: Collection[str]) -> None:
+        self._name, self._features, self._user_set, self._kept = name, features, user_set, frozenset(kept)
+        self._is_loaded = False
+        self._known: list[tuple[str, Rule]] | None = None
+        self.remarks: list[str] = []
+
+    def establish(self) -> None:
+        """Load the default once, and set every feature that a rule knows.
+
+        Raises
+        ------
+        CameraLost
+            The camera stopped answering.
+        """
+        if self._known is None:
+            names = self._features.names()
+            found = ((name, rule_for(name)) for name in names)
+            self._known = [(name, rule) for name, rule in found if rule is not None and name not in self._kept]
+        if not self._is_loaded:
+            self.remarks = list(self._load())
+            self._is_loaded = True
+        for name, rule in self._known:
+            for _ in self._entries_of_selector(name):
+                self._set(name, rule)
+
+    def require(self) -> None:
+        """Read every feature once more, after all settings are made.
+
+        Raises
+        ------
+        SettingRefused
+            One that spoils the frames is not neutral.
+        """
+        wrong = list(self._not_neutral())
+        if harmful := [text for text, rule in wrong if rule.harm]:
+            raise SettingRefused(
+                f"camera {self._name}, bring it to a known state",
+                "; ".join(harmful),
+                "Set it in the maker's program, or write it under `features` of the camera in the rig file if the "
+                "frames are right with it",
+            )
+        told = set(self.remarks)
+        self.remarks += [text for text, _ in wrong if text not in told]
+
+    def _load(self) -> Iterator[str]:
+        """Load the default user set; yields what is left unknown."""
+        if self._user_set is None:
+            yield from self._unknown("no user set is loaded (`user_set: null`)")
+            return
+        features = self._features
+        if features.find(("DefaultSetSelector",)) is not None and "Standard" in features.choices("DefaultSetSelector"):
+            self._try("DefaultSetSelector", "Standard")
+        for selector, load in _LOADS:
+            if features.find((selector,)) is None or features.find((load,)) is None:
+                continue
+            wanted = next((one for one in (self._user_set, *_DEFAULT_SETS) if one in features.choices(selector)), None)
+            if wanted is None:
+                break
+            probe = self._probe()
+            try:
+                features.set_choice(selector, wanted)
+                features.command(load)
+            except CameraLost:
+                raise
+            except CameraError as error:
+                yield from self._unknown(f"the default settings were not loaded ({error.came_back})")
+                return
+            if probe is not None and self._value(probe[0]) == probe[1]:
+                yield from self._unknown(f"{load} of {wanted} changed nothing, {probe[0]} stayed as it was")
+            return
+        yield from self._unknown("this camera has no default settings to load")
+
+    def _probe(self) -> tuple[str, float] | None:
+        """Set the exposure to a value that no default has, so that a load that does nothing is seen."""
+        name = self._features.find(EXPOSURE_US)
+        self._try("ExposureAuto", "Off")
+        now = None if name is None else self._value(name)
+        if name is None or not isinstance(now, float):
+            return None
+        for wanted in (1.37 * now, 0.73 * now):
+            if self._try(name, float(round(wanted))) and isinstance(back := self._value(name), float) and back != now:
+                return name, back
+        return None
+
+    def _unknown(self, why: str) -> Iterator[str]:
+        names = [
+            name
+            for name in self._features.writable()
+            if rule_for(name) is None and name not in self._kept and not _NO_MATTER.match(name)
+        ]
+        if names:
+            yield f"{why}: {', '.join(names)} may be as another program set them"
+
+    def _entries_of_selector(self, name: str) -> Iterator[None]:
+        """Choose each entry of a feature's selector in turn; once without one."""
+        features = self._features
+        selector = features.selector_of(name) or next(
+            (known for start, known in _SELECTED_BY.items() if re.fullmatch(start + "(Abs|Raw)?", name)), None
+        )
+        entries = features.choices(selector) if selector is not None else []
+        if selector is None or not entries:
+            yield
+            return
+        chosen = features.text((selector,))
+        for entry in entries:
+            if self._try(selector, entry):
+                yield
+        self._try(selector, chosen)
+
+    def _try(self, name: str, value: str | float | bool) -> bool:
+        """Set a feature; False where the camera does not take it."""
+        try:
+            self._features.set_value(name, value)
+            return True
+        except CameraLost:
+            raise
+        except CameraError:
+            return False
+
+    def _set(self, name: str, rule: Rule) -> None:
+        if self._features.find((name,)) is None:
+            return
+        neutral = self._neutral_value(name, rule)
+        if neutral is not None and self._value(name) != neutral:
+            self._try(name, neutral)
+
+    def _value(self, name: str) -> str | float | bool | None:
+        try:
+            return self._features.value(name)
+        except CameraLost:
+            raise
+        except CameraError:
+            return None
+
+    def _neutral_value(self, name: str, rule: Rule) -> str | float | bool | None:
+        """The value to be set; None where no value of this feature is known to be neutral."""
+        kind = self._features.kind(name)
+        if kind == "flag":
+            return False
+        if kind == "choice":
+            words = _OFF_WORDS if isinstance(rule.neutral, str) else rule.neutral
+            if rule.neutral == "one":
+                words = ("One", "ONE", "ONEX", "X1", "x1", "1x", "1", *_OFF_WORDS)
+            choices = self._features.choices(name)
+            return next((word for word in words if word in choices), None)
+        if kind != "number" or not isinstance(rule.neutral, str):
+            return None
+        try:
+            low, high = self._features.limits(name)
+        except CameraLost:
+            raise
+        except CameraError:
+            return None
+        wanted = {"off": 0.0, "least": low, "one": 1.0}[rule.neutral]
+        return min(max(wanted, low), high)
+
+    def _not_neutral(self) -> Iterator[tuple[str, Rule]]:
+        for name, rule in self._known or ():
+            for _ in self._entries_of_selector(name):
+                if self._features.find((name,)) is None:
+                    continue
+                neutral, now = self._neutral_value(name, rule), self._value(name)
+                if neutral is None or now is None or now == neutral:
+                    continue
+                if isinstance(now, float) and isinstance(neutral, float):
+                    if abs(now - neutral) <= 1e-3 * max(1.0, abs(neutral)) or self._is_switched_off(name):
+                        continue
+                    yield f"{name} is {now:g} and could not be set to {neutral:g}", rule
+                else:
+                    yield f"{name} is {now} and could not be set to {neutral}", rule
+
+    def _is_switched_off(self, name: str) -> bool:
+        """True where a flag of its own says that a number is not used."""
+        return any(self._value(name + end) in (False, "Off") for end in ("Enable", "Enabled"))
