@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import os
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -192,7 +193,8 @@ def dump_yaml(value: BaseModel) -> str:
 
     yaml = YAML()
     yaml.indent(mapping=2, sequence=4, offset=2)
-    yaml.width = 120
+    # A key that is folded over two lines, as one with a capture's name would be, cannot be read back.
+    yaml.width = sys.maxsize
     out = StringIO()
     yaml.dump(_numbers_in_rows(value.model_dump(mode="json", exclude_none=True)), out)
     return out.getvalue()

@@ -32,6 +32,7 @@ def diagnose_command(
         Path | None, typer.Option(help="Material file: the sample is triply degenerate with this dominant process.")
     ] = None,
     geometry: Annotated[Path | None, typer.Option(help="Geometry file of the object, with --reflectance.")] = None,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print every figure and every step.")] = False,
     version: Version = False,
 ) -> None:
     """Trace the residual between intensities and model to the effects that explain it; say so if none does."""
@@ -41,18 +42,17 @@ def diagnose_command(
     if reflectance is not None or geometry is not None:
         from processing.commands.loaded_late.diagnose_surface import diagnose_reflectance
 
-        diagnose_reflectance(captures, instrument, reflectance, geometry, write, json, report)
+        diagnose_reflectance(captures, instrument, reflectance, geometry, write, json, report, verbose)
         return
     from processing.commands.loaded_late.diagnose_summary import show, write_result
+    from processing.commands.progress_bar import progress_line
     from processing.diagnosis.instrument.run import diagnose_captures
     from processing.instrument.model import InstrumentModel
 
-    def say(line: str) -> None:
-        typer.echo(line, err=True)
-
     model = InstrumentModel.load(instrument)
-    judged, problem = diagnose_captures(captures, model, say)
-    show(judged.diagnosis)
+    with progress_line("diagnose", verbose) as say:
+        judged, problem = diagnose_captures(captures, model, say)
+    show(judged.diagnosis, verbose, written=write is not None)
     if json is not None:
         write_result(json, judged.diagnosis)
     if report is not None:
@@ -70,7 +70,7 @@ def diagnose_command(
 
         write_instrument(write, model, judged.diagnosis)
         if not judged.diagnosis.corrects:
-            say("nothing is corrected: the file adds how wrong M may be, for the error bars of `process reduce`")
+            typer.echo("nothing is corrected; the file adds how wrong M may be, for the error bars of `process reduce`")
         typer.echo(str(write))
 
 

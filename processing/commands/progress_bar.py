@@ -74,3 +74,26 @@ def _bar(what: str, *counts: object) -> Iterator[Progress]:
             yield bar
     finally:
         compile_watch.watchers.clear()
+
+
+@contextmanager
+def progress_line(what: str, verbose: bool) -> Iterator[Callable[[str], None]]:
+    """One line on stderr with the present step and the seconds so far; yields a function of the step.
+
+    `verbose`: every step stays, on a line of its own. Off a terminal nothing is drawn without it.
+    """
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    columns = (SpinnerColumn(), TextColumn(what), TimeElapsedColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("", total=None)
+
+        def say(step: str) -> None:
+            # Within the line: a broken one is not taken away at the end.
+            progress.update(task, description=step[: max(console.width - len(what) - 14, 0)])
+            if verbose:
+                console.print(step, soft_wrap=True, markup=False, highlight=False)
+
+        yield say

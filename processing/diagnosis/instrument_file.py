@@ -78,7 +78,8 @@ def write_instrument(path: Path, model: InstrumentModel, diagnosis: Diagnosis, n
         parse_yaml(text, InstrumentModel, source=str(path))
     except ConfigError as error:
         raise WriteError(
-            f"{error}: what was found is too much for one file. Diagnose fewer captures at once."
+            f"{error}: {path} was not written. If the file is too long, diagnose fewer captures at once; "
+            "else keep the result with `--json` and report it."
         ) from error
     holds = "see `effects`" if diagnosis.corrects else "nothing is corrected; `systematic` is how wrong M may be"
     write_new_text(path, file_head(f"Written by `diagnose`: {diagnosis.verdict}, {holds}.", note) + text)

@@ -6,6 +6,7 @@ fixed or turned by a named axis, and one or more detector channels (docs/convent
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -58,6 +59,12 @@ class AppliedEffect(Part):
     wavelength_nm: float | None = None
     indistinguishable_from: tuple[str, ...] = ()
     probability: float | None = None
+
+    @field_validator("captures")
+    @classmethod
+    def _short(cls, captures: tuple[str, ...]) -> tuple[str, ...]:
+        """Files written before 24 November 2026 name a capture TITLE (FILE.h5)."""
+        return tuple(re.sub(r".* \((.+)\.h5\)", r"\1", name) for name in captures)
 
 
 #: Values by name of effects by label; values of many states in one text.

@@ -53,11 +53,6 @@ class CountsCorrection:
         signal += added * np.float32(self.full_scale)
 
 
-def capture_name(capture: Capture) -> str:
-    """Identity of a capture in the list of captures of an effect."""
-    return f"{capture.header.title} ({capture.path.name})"
-
-
 def full_scale(capture: Capture, states: NDArray[np.int64]) -> float:
     """Top of the range above black, counts; for floating frames, their largest value."""
     detector = capture.header.detector
@@ -81,7 +76,7 @@ def capture_changes(capture: Capture, model: InstrumentModel, states: NDArray[np
     when = elapsed(capture.column("host_time_s")[seen], len(seen))
     top, run = full_scale(capture, seen), capture.run_of_states[seen]
     conditions = Conditions(angles, len(seen), channels, when, top, run)
-    return changes_of(model, conditions, capture_name(capture)).of_states(np.searchsorted(seen, states))
+    return changes_of(model, conditions, capture.name).of_states(np.searchsorted(seen, states))
 
 
 def extra_retardance(changes: Changes, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:

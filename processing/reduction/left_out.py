@@ -55,8 +55,7 @@ class LeftOut:
             entries = [_Entry.model_validate(entry) for entry in result["left_out"]]
         except (KeyError, TypeError, ValidationError) as error:
             raise ProcessError(f"{path} is no result of `diagnose --json` that tells what was left out.") from error
-        name = f"{capture.header.title} ({capture.path.name})"
-        mine = [entry for entry in entries if entry.capture == name]
+        mine = [entry for entry in entries if entry.capture == capture.name]
         if not mine:
             return cls()
         (entry,) = mine

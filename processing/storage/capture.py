@@ -131,6 +131,11 @@ class Capture(OpenH5):
         )
 
     @property
+    def name(self) -> str:
+        """The file's name without its ending: so instrument files and results name a capture."""
+        return self.path.stem
+
+    @property
     def checked(self) -> bool:
         """Whether the file has checksums, so that a change on the disc is noticed."""
         return self._sums is not None

@@ -232,7 +232,7 @@ def test_what_is_written_is_used_and_nothing_is_overwritten(configs, tmp_path, c
     assert left.images["after"].shape[0] == len(left.per_state["after"]) == STATES
     model = InstrumentModel.load(new)
     assert model.effects[0].kind == "psg_retardance"
-    assert path.name in model.effects[0].captures[0]
+    assert model.effects[0].captures == (path.stem,)
     # Found at 662 nm: it is not carried over to another wavelength.
     assert [len(model.at(nm).effects) for nm in (662, 451)] == [1, 0]
     assert diagnose_captures([path], model)[0].diagnosis.verdict == "consistent"

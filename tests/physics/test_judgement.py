@@ -43,7 +43,7 @@ def test_what_makes_the_residual_worse_explains_nothing() -> None:
 def test_a_chance_that_the_reading_gets_worse_refuses_the_correction_not_the_name() -> None:
     judged = Judgement(True, True, False, True, FALLS, chances=GROWS)
     assert judged.verdict == "explained"
-    assert judged.refused == "it would make worse: rms: 1 to 2"
+    assert judged.refused == "rms, from 1 to 2"
 
 
 def test_wiring_comes_first() -> None:

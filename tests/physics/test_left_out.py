@@ -161,7 +161,7 @@ def test_a_reduction_leaves_out_what_a_diagnosis_names(configs, tmp_path, weight
     path = taken(tmp_path, configs, bench, 5, air=True)
     result = tmp_path / "result.json"
     with Capture(path) as capture:
-        name = f"{capture.header.title} ({capture.path.name})"
+        name = capture.name
     bad = screened_capture(path, configs).left_out.frames
     entry = {"capture": name, "states": list(bad), "hits": [[3, 0, 11, 12]], "pixels": [[4, 5]]}
     result.write_text(json.dumps({"left_out": [entry]}))
@@ -199,7 +199,7 @@ def test_stokes_of_a_mosaic_leave_out_states_and_struck_pixels(synthetic_capture
     header = {"instrument_yaml": dump_yaml(model), "mosaic": model.mosaic}
     path = synthetic_capture(frames[:, None], {"psg": np.zeros(5)}, **header)
     with Capture(path) as capture:
-        name = f"{capture.header.title} ({capture.path.name})"
+        name = capture.name
     entry = {"capture": name, "states": [3], "hits": [[1, 0, 2, 4]], "pixels": [[6, 8]], "pitch": 2}
     result = tmp_path / "result.json"
     result.write_text(json.dumps({"left_out": [entry]}))

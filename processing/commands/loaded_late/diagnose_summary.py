@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import typer
@@ -9,12 +10,21 @@ import typer
 from processing.diagnosis.search.result import (
     CaptureReport,
     Combination,
-    Correction,
     Diagnosis,
     FoundEffect,
     Unexplained,
 )
 from processing.whole_file import write_new_text
+
+VERDICTS = {
+    "consistent": "consistent, nothing but noise is left",
+    "explained": "explained",
+    "partly_explained": "partly explained",
+    "unexplained": "unexplained",
+    "undetermined": "undetermined, a fault of typical size would not have been seen",
+}
+#: What a diagnosis recommends where no capture would tell more.
+NOTHING_NEEDED = "None needed."
 
 
 def write_result(path: Path, d: Diagnosis) -> None:
@@ -23,90 +33,144 @@ def write_result(path: Path, d: Diagnosis) -> None:
     typer.echo(str(path))
 
 
-def show(d: Diagnosis) -> None:
-    """Print a summary."""
-    if d.simulated:
-        typer.echo("SIMULATED data")
-    wavelengths = ", ".join(f"{w:g}" for w in d.wavelengths_nm)
-    typer.echo(f"{d.instrument}, {wavelengths} nm: {d.verdict.replace('_', ' ')}")
-    if d.verdict == "undetermined":
-        typer.echo("  nothing can be said: a fault of typical size would not have been seen")
+def show(d: Diagnosis, details: bool = False, written: bool = False) -> None:
+    """Print the residual, three lines for each cause, and what to do next; `details` adds all figures.
+
+    `written`: what holds goes into a file.
+    """
+    short = short_names(d)
+    head = "SIMULATED data, " if d.simulated else ""
+    refused = d.correction is not None and d.correction.refused is not None
+    _say(short, f"{head}{d.instrument}: {VERDICTS[d.verdict]}{', not corrected' if refused else ''}")
+    noise = "" if d.noise_floor_percent is None else f"; noise {d.noise_floor_percent:.3g} %"
+    kind = "residual" if d.noise_floor_percent is None else "residual beyond noise"
+    _say(short, f"{kind} {d.error_before.told} -> {d.error_after.told} of the mean signal{noise}")
+    for c in d.captures:
+        one = short.get(c.name, "capture")
+        line = f"  {one}  {c.name}" + (f", {c.wavelength_nm:g} nm" if c.wavelength_nm else "")
+        if short and c.error_before is not None and c.error_after is not None:
+            line += f": {c.error_before.told} -> {c.error_after.told}"
+        typer.echo(line)
     if d.wiring is not None:
-        typer.echo(f"  first of all: {d.wiring}")
-    before, after = d.error_before, d.error_after
-    typer.echo(f"  error before  {before.rms_percent:8.4f} % of the mean signal, chi2/dof {before.chi2_reduced:.4g}")
-    typer.echo(f"  error after   {after.rms_percent:8.4f} % of the mean signal, chi2/dof {after.chi2_reduced:.4g}")
-    if d.noise_floor_percent is not None:
-        typer.echo(f"  noise floor   {d.noise_floor_percent:8.4f} %")
-    typer.echo(f"  held out: {before.held_out}")
-    for capture in d.captures:
-        _show_capture(capture, several=len(d.wavelengths_nm) > 1)
+        _say(short, f"first of all: {d.wiring}")
     for line in d.noise.told if d.noise is not None else ():
-        typer.echo(f"  the noise is not what is declared: {line}")
+        _say(short, f"the noise is not what is declared: {line}")
     for left_out in d.left_out:
-        typer.echo(f"  left out of {left_out.capture}: {left_out.told}")
-    for effect in d.effects:
-        _show_effect(effect)
-    if d.correction is not None:
-        _show_correction(d.correction, d.corrects)
+        _say(short, f"left out of {left_out.capture}: {left_out.told}")
+    for number, effect in enumerate(d.effects, 1):
+        _show_effect(short, number, effect, noise)
+    _show_uncertainty(d)
     if d.unexplained is not None:
-        _show_unexplained(d.unexplained)
-    if d.unobservable:
-        typer.echo(f"  cannot be seen with these captures: {', '.join(d.unobservable)}")
-    typer.echo(f"  recommendation: {d.recommendation}")
+        _show_unexplained(short, d.unexplained)
+    if details:
+        _show_details(short, d)
+    _say(short, f"next: {d.recommendation}" if d.recommendation != NOTHING_NEEDED else "no further capture is needed")
+    if d.corrects and not written:
+        _say(short, "to apply it: the same command with --write NEW.yaml")
 
 
-def _show_capture(c: CaptureReport, several: bool) -> None:
-    """What was left out of a capture; its own residual where there are several wavelengths."""
-    if several and c.rms_before_percent is not None:
-        typer.echo(f"  {c.wavelength_nm:g} nm: {c.rms_before_percent:.4f} % -> {c.rms_after_percent:.4f} %, {c.name}")
-    if c.cut_off:
-        states = f"state{'s' if len(c.cut_off) > 1 else ''} {', '.join(str(k) for k in c.cut_off)}"
-        typer.echo(f"  left out: {states} of {c.name}, cut off at zero counts; raise the black level")
-    if c.binned > 1:
-        typer.echo(f"  fitted: means over squares of {c.binned} x {c.binned} pixels of {c.name}")
-    if c.dark_fraction > 0:
-        typer.echo(f"  left out as too dark, with their rim: {c.dark_fraction:.1%} of the pixels of {c.name}")
-    if c.steep_fraction > 0:
-        typer.echo(f"  left out at sharp edges: {c.steep_fraction:.1%} of the pixels of {c.name}")
-    if c.closure_before_percent is not None and c.closure_after_percent is not None:
-        typer.echo(f"  closure of {c.name}: {c.closure_before_percent:.3f} % -> {c.closure_after_percent:.3f} %")
+def short_names(d: Diagnosis) -> dict[str, str]:
+    """A letter for each of several captures."""
+    several = d.captures if len(d.captures) > 1 else ()
+    return {c.name: _letters(k) for k, c in enumerate(several)}
 
 
-def _show_unexplained(unexplained: Unexplained) -> None:
-    typer.echo("  unexplained structure is left:")
-    for line in unexplained.description:
-        typer.echo(f"    {line}")
-    if unexplained.empirical is not None:
-        e = unexplained.empirical
-        typer.echo(f"    empirical {e.kind} would leave {e.rms_percent_in_sample:.4f} % (in sample, names no cause)")
-        typer.echo(f"    would also fit: {', '.join(e.would_also_fit)}")
+def _letters(k: int) -> str:
+    return (_letters(k // 26 - 1) if k >= 26 else "") + chr(ord("A") + k % 26)
 
 
-def _show_effect(effect: FoundEffect) -> None:
+def _say(short: Mapping[str, str], line: str) -> None:
+    for name in sorted(short, key=len, reverse=True):
+        line = line.replace(name, short[name])
+    typer.echo(line)
+
+
+def _show_effect(short: Mapping[str, str], number: int, effect: FoundEffect, noise: str) -> None:
+    """A cause in three lines: name and value; residual without and with it; what becomes of it."""
     where = f" of {effect.element}" if effect.element else ""
     where += f" at {effect.wavelength_nm:g} nm" if effect.wavelength_nm is not None else ""
-    where += f", {effect.capture}" if effect.capture else ""
-    typer.echo(f"  {effect.kind}{where}: {_answer(effect)}")
-    for name, p in effect.parameters.items():
-        unit, note = "" if p.unit == "1" else f" {p.unit}", f" ({p.note})" if p.note else ""
-        typer.echo(f"      {name}: {p.told}{unit}{note}")
+    where += f" in {effect.capture}" if effect.capture and short else ""
+    values = ", ".join(
+        f"{name} {p.told}{'' if p.unit == '1' else f' {p.unit}'}{f' ({p.note})' if p.note else ''}"
+        for name, p in effect.parameters.items()
+    )
+    _say(short, f"{number}. {effect.kind}{where} ({_answer(effect)}): {values}")
+    if effect.residual_without is not None and effect.residual_with is not None:
+        _say(short, f"   residual {effect.residual_without.told} -> {effect.residual_with.told}{noise}")
+    _say(short, f"   not applied, because {effect.not_applied}" if effect.not_applied else "   applied")
+
+
+def _answer(effect: FoundEffect) -> str:
+    """How sure the name is, and what else it could be."""
+    if not effect.confident:
+        return "it helps, but its name may be wrong"
     if effect.indistinguishable_from:
-        typer.echo(f"      cannot be told from: {', '.join(effect.could_be)}")
+        return f"or {', '.join(effect.could_be)}"
+    if effect.probability is None or effect.answer is None:
+        return "found"
+    # Not more nines than a calibration can show.
+    sure = effect.probability >= 0.999
+    return (
+        f"{effect.answer}, probability over 0.999" if sure else f"{effect.answer}, probability {effect.probability:.3f}"
+    )
 
 
-def _show_correction(correction: Correction, corrects: bool) -> None:
-    """What would be written, apart from names: how much of it, and the figures that were looked at."""
-    kinds = ", ".join(dict.fromkeys(e.kind for e in correction.effects))
-    fate = f"refused: {correction.refused}" if correction.refused else "holds"
-    told = f"{kinds or 'the nominal values'}; {fate}" if kinds or corrects else "nothing is corrected"
-    typer.echo(f"  correction (means over what the data leave open): {told}")
-    for c in correction.combinations:
-        typer.echo(f"      determined together: {_combination(c)}")
+def _show_uncertainty(d: Diagnosis) -> None:
+    """How wrong M may be, before and after, with everything that these captures do not show."""
+    correction = d.correction
+    if correction is None:
+        return
     if correction.mueller is not None:
-        typer.echo(f"      {correction.mueller.told}")
-    for check in correction.checks:
-        typer.echo(f"      {check.name}: {check.before:.4g} -> {check.after:.4g}")
+        typer.echo(f"{correction.mueller.told}")
+    if correction.refused is not None and not any(e.not_applied for e in d.effects):
+        typer.echo(f"nothing is applied, because {correction.refused}")
+    elif not d.corrects and not d.effects:
+        typer.echo("nothing is corrected")
+
+
+def _show_details(short: Mapping[str, str], d: Diagnosis) -> None:
+    for error, when in ((d.error_before, "before"), (d.error_after, "after")):
+        typer.echo(f"rms of single intensities {when}: {error.rms_percent:.4f} %, chi2/dof {error.chi2_reduced:.4g}")
+    typer.echo(f"held out: {d.error_before.held_out}")
+    for capture in d.captures:
+        _show_capture(short, capture)
+    for effect in d.effects:
+        _say(short, f"{effect.kind}: explains {effect.evidence:.0f} in chi-square")
+    if d.correction is not None:
+        kinds = ", ".join(dict.fromkeys(e.kind for e in d.correction.effects))
+        _say(short, f"correction (means over what the data leave open): {kinds or 'none, or nominal values alone'}")
+        for c in d.correction.combinations:
+            _say(short, f"determined together: {_combination(c)}")
+        for check in d.correction.checks:
+            _say(short, f"{check.name}: {check.before:.4g} -> {check.after:.4g}")
+    if d.unobservable:
+        _say(short, f"cannot be seen with these captures: {', '.join(d.unobservable)}")
+
+
+def _show_capture(short: Mapping[str, str], c: CaptureReport) -> None:
+    """What was left out of a capture."""
+    of = f" of {short[c.name]}" if c.name in short else ""
+    if c.cut_off:
+        states = f"state{'s' if len(c.cut_off) > 1 else ''} {', '.join(str(k) for k in c.cut_off)}"
+        typer.echo(f"left out{of}: {states}, cut off at zero counts; raise the black level")
+    if c.binned > 1:
+        typer.echo(f"fitted{of}: means over squares of {c.binned} x {c.binned} pixels")
+    if c.dark_fraction > 0:
+        typer.echo(f"left out{of} as too dark, with their rim: {c.dark_fraction:.1%} of the pixels")
+    if c.steep_fraction > 0:
+        typer.echo(f"left out{of} at sharp edges: {c.steep_fraction:.1%} of the pixels")
+    if c.closure_before_percent is not None and c.closure_after_percent is not None:
+        typer.echo(f"closure{of}: {c.closure_before_percent:.3f} % -> {c.closure_after_percent:.3f} %")
+
+
+def _show_unexplained(short: Mapping[str, str], unexplained: Unexplained) -> None:
+    _say(short, "unexplained structure is left:")
+    for line in unexplained.description:
+        _say(short, f"   {line}")
+    if unexplained.empirical is not None:
+        e = unexplained.empirical
+        typer.echo(f"   empirical {e.kind} would leave {e.rms_percent_in_sample:.4f} % (in sample, names no cause)")
+        typer.echo(f"   would also fit: {', '.join(e.would_also_fit)}")
 
 
 def _combination(c: Combination) -> str:
@@ -115,15 +179,3 @@ def _combination(c: Combination) -> str:
     unit = "" if c.unit == "1" else f" {c.unit}"
     alone = ", ".join(f"{v:+.2g}" for v in c.open_by.values())
     return f"{terms} = {c.value:.4g} +- {c.stderr:.2g}{unit}; each alone may be off, together by {alone}"
-
-
-def _answer(effect: FoundEffect) -> str:
-    """How sure the name is, in words and numbers."""
-    explains = f"explains {effect.evidence:.0f} in chi-square"
-    if not effect.confident:
-        return f"{explains}; it helps, but its name may be wrong"
-    if effect.answer is None or effect.probability is None:
-        return explains
-    # Not more nines than a calibration can show.
-    probability = f"{effect.probability:.3f}" if effect.probability < 0.999 else "over 0.999"
-    return f"{effect.answer}, probability {probability}; {explains}"

@@ -20,11 +20,13 @@ def diagnose_reflectance(
     write: Path | None,
     json: Path | None,
     report: Path | None,
+    verbose: bool,
 ) -> None:
     """Diagnose, print a summary and write what was asked for. Raises ProcessError."""
     if reflectance is None or geometry is None:
         raise ProcessError("a diagnosis of the reflectance needs both --reflectance MATERIAL and --geometry GEOMETRY.")
     from processing.commands.loaded_late.diagnose_summary import show, write_result
+    from processing.commands.progress_bar import progress_line
     from processing.diagnosis.surface.run import diagnose_object
     from processing.diagnosis.surface.write import targets, write_surface
     from processing.geometry.viewing import ViewingGeometry
@@ -38,8 +40,9 @@ def diagnose_reflectance(
         load_reflectance(reflectance),
         ViewingGeometry.load(geometry),
     )
-    judged, problem = diagnose_object(captures, model, material, view, lambda line: typer.echo(line, err=True))
-    show(judged.diagnosis)
+    with progress_line("diagnose", verbose) as say:
+        judged, problem = diagnose_object(captures, model, material, view, say)
+    show(judged.diagnosis, verbose, written=write is not None)
     _show_surface(judged.diagnosis)
     if json is not None:
         write_result(json, judged.diagnosis)

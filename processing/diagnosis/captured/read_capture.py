@@ -52,7 +52,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     exposure = relative_exposure(capture, states)
     kind = capture.header.sample.kind
     data = CaptureData(
-        name=f"{capture.header.title} ({capture.path.name})",
+        name=capture.name,
         signal=np.nan_to_num(raw / np.float32(top)),
         conditions=Conditions(angles, len(states), names, when, top, capture.run_of_states[states]),
         exposure=exposure,

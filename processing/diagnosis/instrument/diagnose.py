@@ -126,10 +126,13 @@ def _told(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring: 
     unseen = unobservable(used.bench.whole, found)
     diagnosis = Diagnosis(
         verdict=verdict,
-        error_before=error(asked, solved.before),
-        error_after=error(asked, kept.after),
-        noise_floor_percent=floor(asked.near(kept.space, kept.fit.values)[0]),
-        effects=(*(e for c in names.named for e in told_effects(problem, c, names.doubt.get(c))), *switched),
+        error_before=error(asked, solved, solved.before),
+        error_after=error(asked, kept, kept.after),
+        noise_floor_percent=floor(asked, kept),
+        effects=(
+            *(e for c in names.named for e in told_effects(asked, solved, c, names.doubt.get(c), judgement.refused)),
+            *switched,
+        ),
         unobservable=(
             *dict.fromkeys(c.short for c in unseen),
             *(f"{c.candidates[0].short} (as many values as the data have)" for c in names.untold),

@@ -13,6 +13,7 @@ from processing.diagnosis.instrument.doubts import CHANGED
 from processing.diagnosis.instrument.mueller_slopes import mueller_slopes
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.systematic import ELEMENTS
+from processing.diagnosis.instrument.telling import stretch
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.guard import (
     NOTHING,
@@ -33,7 +34,7 @@ from processing.instrument.effects.base import FieldEffect, Switch
 
 def checks(problem: InstrumentProblem, solved: Solution) -> tuple[Check, ...]:
     """Held-out residual, rank and condition of W, before and after: if one gets worse, it is no explanation."""
-    out = [held_out_check(solved, _stretch(problem, solved))]
+    out = [held_out_check(solved, stretch(problem, solved))]
     several = len(problem.captures) > 1
     for k, data in enumerate(problem.captures):
         if several:
@@ -186,16 +187,6 @@ def lasts(later: PredictedChange, reasons: Collection[str] = ()) -> bool:
     Where the sample changed, what is found of the instrument may be a part of that.
     """
     return later.chance_worse <= CHANCE_WORSE and not any(reason in CHANGED for reason in reasons)
-
-
-def _stretch(problem: InstrumentProblem, solved: Solution) -> float:
-    """By how much a bend of the response stretches noise, and residual, relative to the signal."""
-    if not problem.noise_known:
-        return 1.0
-    before = problem.near(solved.base, solved.before_fit.values)[0]
-    after = problem.near(solved.space, solved.fit.values)[0]
-    old, new = (float(np.mean([m.noise_floor**2 for m in p.moments])) for p in (before, after))
-    return float(np.sqrt(new / old)) if old > 0 else 1.0
 
 
 def _rows(problem: InstrumentProblem, k: int, space: Space, fit: Fit) -> Array:

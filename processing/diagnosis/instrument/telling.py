@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
 from processing.diagnosis.instrument.closure import closure
@@ -13,10 +15,11 @@ from processing.diagnosis.instrument.systematic import Uncertain, systematic_err
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Answer, Cause, shown
 from processing.diagnosis.search.evidence import information
-from processing.diagnosis.search.fit import HeldOut
+from processing.diagnosis.search.fit import Fit, HeldOut
 from processing.diagnosis.search.judge import Judgement
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.result import (
+    BeyondNoise,
     CaptureReport,
     Correction,
     Error,
@@ -40,22 +43,56 @@ from processing.instrument.effects.base import (
 from processing.instrument.model import AppliedEffect, EffectParameter
 
 
-def error(problem: InstrumentProblem, out: HeldOut) -> Error:
+def error(problem: InstrumentProblem, solved: Solution, out: HeldOut, k: int | None = None) -> Error:
+    """A residual as it is told, of one capture `k` or of all, in the unit of the counts as they were taken."""
     held = "; ".join(dict.fromkeys(m.held_out for m in problem.moments))
     if problem.folds == 1:
         held = "nothing: too few values; each fitted value takes a degree of freedom"
-    return Error(rms_percent=100 * out.rms, chi2_reduced=out.chi2_reduced, held_out=held)
+    noise, rms, beyond = floor(problem, solved, k), 100 * out.rms, None
+    if noise is not None:
+        rms /= 1.0 if out is solved.before else stretch(problem, solved, k)
+        beyond = BeyondNoise.of(out.excess, out.freedom, noise)
+    return Error(rms_percent=rms, chi2_reduced=out.chi2_reduced, held_out=held, beyond_noise=beyond)
 
 
-def floor(problem: InstrumentProblem) -> float | None:
-    """Rms noise over the mean signal, percent; of the corrected counts, since a bend stretches both."""
+def floor(problem: InstrumentProblem, solved: Solution, k: int | None = None) -> float | None:
+    """Rms noise over the mean signal, percent, of the counts as they were taken: of one capture or of all."""
     if not problem.noise_known:
         return None
-    return 100 * float(np.sqrt(np.mean([m.noise_floor**2 for m in problem.moments])))
+    return 100 * _noise(problem, solved.base, solved.before_fit, k)
 
 
-def told_effects(problem: InstrumentProblem, cause: Cause, doubt: str | None) -> list[FoundEffect]:
+def stretch(problem: InstrumentProblem, solved: Solution, k: int | None = None) -> float:
+    """By how much a bend of the response that is undone stretches noise, and residual, relative to the signal."""
+    if not problem.noise_known:
+        return 1.0
+    taken = _noise(problem, solved.base, solved.before_fit, k)
+    return _noise(problem, solved.space, solved.fit, k) / taken if taken > 0 else 1.0
+
+
+def _noise(problem: InstrumentProblem, space: Space, fit: Fit, k: int | None) -> float:
+    moments = problem.near(space, fit.values)[0].moments
+    return float(np.sqrt(np.mean([m.noise_floor**2 for m in (moments if k is None else moments[k : k + 1])])))
+
+
+def left_without(problem: InstrumentProblem, solved: Solution, effects: Collection[Candidate]) -> HeldOut:
+    """What the correction would leave without some of its effects; for each degree of freedom, as after it."""
+    values = solved.fit.values.copy()
+    for candidate, part in zip(solved.space.candidates, solved.space.slices, strict=True):
+        if candidate in effects:
+            values[part] = 0.0
+    sums = problem.sums(solved.space, values, derivatives=False)
+    more = float(sums.excess.sum()) - solved.fit.excess
+    return solved.after.and_more(more, float(sums.square.sum() - solved.fit.sums.square.sum()))
+
+
+def told_effects(
+    problem: InstrumentProblem, solved: Solution, cause: Cause, doubt: str | None, not_applied: str | None
+) -> list[FoundEffect]:
     """A cause as it is told, given a reason to doubt it; one for each capture in which it shows."""
+    without = left_without(problem, solved, (*cause.candidates, *cause.alternatives))
+    if not any(c in solved.space.candidates for c in (*cause.candidates, *cause.alternatives)):
+        not_applied = not_applied or doubt or "it is not needed in addition to the other causes"
     answer, probability = told_answer(cause, doubt)
     told = []
     # Of one with values of its own in every capture, those captures are told in which it shows.
@@ -82,6 +119,9 @@ def told_effects(problem: InstrumentProblem, cause: Cause, doubt: str | None) ->
                 confident=doubt is None and cause.answer != "unknown",
                 probability=probability,
                 answer=answer,
+                residual_without=error(problem, solved, without),
+                residual_with=error(problem, solved, solved.after),
+                not_applied=not_applied,
             )
         )
     return told
@@ -104,16 +144,14 @@ def told_switches(problem: InstrumentProblem, solved: Solution) -> list[FoundEff
     for candidate, part in zip(solved.space.candidates, solved.space.slices, strict=True):
         if not isinstance(candidate.effect, Switch):
             continue
-        values = solved.fit.values.copy()
-        values[part] = 0.0
-        with_all = problem.sums(solved.space, values, derivatives=False).excess.sum()
-        gain = float(with_all - solved.fit.excess)
+        without = left_without(problem, solved, (candidate,))
+        gain = without.excess - solved.after.excess
         if gain > DECISIVE:
             told.append(
                 FoundEffect(
                     kind=candidate.kind,
                     element=candidate.place or None,
-                    parameters=parameters_of(candidate, values[part], values[part]),
+                    parameters=parameters_of(candidate, solved.fit.values[part], solved.fit.values[part]),
                     evidence=gain,
                     indistinguishable_from=(),
                     scope=scope_of(candidate),
@@ -122,6 +160,8 @@ def told_switches(problem: InstrumentProblem, solved: Solution) -> list[FoundEff
                     confident=True,
                     probability=1.0,
                     answer="sure",
+                    residual_without=error(problem, solved, without),
+                    residual_with=error(problem, solved, solved.after),
                 )
             )
     return told
@@ -268,8 +308,8 @@ def capture_report(
         steep_fraction=0.0 if data.steep is None else float(data.steep.mean()),
         cut_off=data.cut_off,
         wavelength_nm=data.wavelength_nm,
-        rms_before_percent=100 * solved.before.rms_of(k),
-        rms_after_percent=100 * solved.after.rms_of(k),
+        error_before=error(problem, solved.undone, solved.before.of(k), k),
+        error_after=error(problem, solved, solved.after.of(k), k),
         tests_before=before.tests,
         tests_after=after.tests,
         closure_before_percent=closure(problem, k, solved.base, solved.before_fit.values),

@@ -161,19 +161,27 @@ def score(sums: Sums, active: int, new: slice, weak: Array) -> tuple[float, Arra
 class HeldOut:
     """How well every fold is predicted by a fit to the others; see `Sums`.
 
-    `shares` (captures, 2): what each capture has of `square` and `count`.
+    `shares` (captures, 4): what each capture has of `square`, `count`, `excess` and `freedom`.
     """
 
     excess: float
     freedom: float
     square: float
     count: float
-    shares: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    shares: Array = field(default_factory=lambda: np.zeros((0, 4)))
 
     def rms_of(self, capture: int) -> float:
         """`rms` of one capture alone."""
-        square, count = self.shares[capture]
-        return float(np.sqrt(square / max(count, 1e-300)))
+        return self.of(capture).rms
+
+    def of(self, capture: int) -> HeldOut:
+        """The same of one capture alone."""
+        square, count, excess, freedom = self.shares[capture].tolist()
+        return HeldOut(excess, max(freedom, 1e-300), square, max(count, 1e-300))
+
+    def and_more(self, excess: float, square: float) -> HeldOut:
+        """The same with more left over, in units of the noise and of the signal."""
+        return HeldOut(self.excess + excess, self.freedom, self.square + square, self.count)
 
     @property
     def chi2_reduced(self) -> float:
@@ -203,7 +211,7 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
     local = np.zeros(space.size, dtype=bool)
     for candidate, part in zip(space.candidates, space.slices, strict=True):
         local[part] = isinstance(candidate.effect, ValuePerState) and by_state
-    total, shares = np.zeros(4), np.zeros((full.sums.shares.shape[0], 2))
+    total, shares = np.zeros(4), np.zeros((full.sums.shares.shape[0], 4))
     spent = np.zeros(space.size)
     for fold in range(problem.folds):
         others = [f for f in range(problem.folds) if f != fold]
@@ -230,7 +238,7 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
         total += (sums.excess[fold], sums.freedom[fold], sums.square[fold], sums.count[fold])
         shares += sums.shares[:, :, fold]
     if by_state:
-        _count_values(space, spent, shares)
+        _count_values(space, spent, shares, problem.noise_known)
     excess, freedom, square, count = map(float, total)
     return HeldOut(excess, freedom, square, count, shares)
 
@@ -243,12 +251,14 @@ def _determined(curvature: Array, weak: Array, local: BoolArray) -> Array:
     return shares
 
 
-def _count_values(space: Space, spent: Array, shares: Array) -> None:
+def _count_values(space: Space, spent: Array, shares: Array, noise_known: bool) -> None:
     """Values of single states take degrees of freedom of their capture away; what several share, of all alike."""
     for candidate, part in zip(space.candidates, space.slices, strict=True):
         if isinstance(candidate.effect, ValuePerState):
             mine = slice(None) if candidate.capture is None else candidate.capture
-            shares[mine, 1] -= spent[part].sum() / np.size(shares[mine, 1])
+            each = spent[part].sum() / np.size(shares[mine, 1])
+            shares[mine, 1] -= each
+            shares[mine, 2] += 2 * each * noise_known
 
 
 def _in_sample(space: Space, full: Fit, weak: Array) -> HeldOut:
@@ -257,7 +267,7 @@ def _in_sample(space: Space, full: Fit, weak: Array) -> HeldOut:
     freedom = float(full.sums.freedom.sum())
     share = max(1 - fitted / max(freedom, 1e-300), LEAST_FREEDOM)
     square, count = float(full.sums.square.sum()), float(full.sums.count.sum())
-    shares = full.sums.shares.sum(axis=2) * [1.0, share]
+    shares = full.sums.shares.sum(axis=2) * [1.0, share, 1.0, share]
     excess = float(full.sums.excess.sum())
     return HeldOut(excess, max(share * freedom, 1e-300), square, max(share * count, 1e-300), shares)
 

@@ -108,11 +108,12 @@ def chance_checks(quantity: str, change: PredictedChange) -> tuple[Check, Check]
             before=0.0,
             after=change.rounded_chance,
             holds=change.chance_worse <= CHANCE_WORSE,
+            is_chance=True,
         ),
     )
 
 
 def refusal(found: tuple[Check, ...]) -> str | None:
     """Why a correction is not written, in words; None if every figure holds."""
-    worse = [f"{c.name}: {c.before:.4g} to {c.after:.4g}" for c in found if not c.holds]
-    return "it would make worse: " + "; ".join(worse) if worse else None
+    worse = [c.told for c in found if not c.holds]
+    return "; ".join(worse) if worse else None

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
+from processing.diagnosis.search.rules import CHANCE_WORSE, LEAST_CHANGE
 from processing.instrument.model import AppliedEffect, EffectParameter, SystematicError
 
 Verdict = Literal["consistent", "explained", "partly_explained", "unexplained", "undetermined"]
@@ -15,19 +17,72 @@ class _Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+class BeyondNoise(_Part):
+    """The part of a residual that noise does not explain: rms of it, percent of the mean signal.
+
+    Residual, noise and error have one unit: that of the counts as they were taken, whatever is corrected.
+
+    Attributes
+    ----------
+    percent : zero where the residual is not larger than noise.
+    stderr : standard error; most : two standard errors of the mean square above it.
+    """
+
+    percent: float
+    stderr: float
+    most: float
+
+    @classmethod
+    def of(cls, excess: float, freedom: float, noise_percent: float) -> BeyondNoise:
+        """Of a chi-square that is larger than its `freedom` by `excess`, and of the rms noise of one intensity.
+
+        Examples
+        --------
+        >>> BeyondNoise.of(excess=18_000, freedom=1_000_000, noise_percent=1.25).told
+        '0.168 ± 0.007 %'
+        >>> BeyondNoise.of(excess=900, freedom=1_000_000, noise_percent=1.25).told
+        'under 0.08 %'
+        """
+        share, error = max(excess / freedom, 0.0), (2 / freedom) ** 0.5
+        return cls(
+            percent=noise_percent * share**0.5,
+            stderr=noise_percent * error / 2 / max(share, error) ** 0.5,
+            most=noise_percent * (share + 2 * error) ** 0.5,
+        )
+
+    @property
+    def told(self) -> str:
+        """With its error, or below which it is where noise alone could be as large."""
+        if 2 * self.percent**2 < self.most**2:
+            return f"under {self.most:.1g} %"
+        digits = max(0, 2 - math.floor(math.log10(self.percent)))
+        error = f"{self.stderr:.{digits}f}"
+        return f"{self.percent:.{digits}f}" + (f" ± {error} %" if float(error) > 0 else " %")
+
+
 class Error(_Part):
-    """Residual on data that the fit has not seen, for each degree of freedom; `held_out` says which data."""
+    """Residual on data that the fit has not seen, for each degree of freedom; `held_out` says which data.
+
+    `beyond_noise`: what of it noise does not explain; None where the noise is not known.
+    """
 
     rms_percent: float
     chi2_reduced: float
     held_out: str
+    beyond_noise: BeyondNoise | None = None
+
+    @property
+    def told(self) -> str:
+        """The residual beyond noise, or all of it where the noise is not known."""
+        return f"{self.rms_percent:.3g} %" if self.beyond_noise is None else self.beyond_noise.told
 
 
 class FoundEffect(_Part):
     """One effect with its values, the chi-square it explains on held-out data, and what else it could be.
 
     `probability` is that of this cause or one of those that it cannot be told from; `answer` says it in a word (sure,
-    likely, one of, unknown). `confident` is False where the name may be wrong.
+    likely, one of, unknown). `confident` is False where the name may be wrong. `residual_without` is that of the
+    correction without this effect, `residual_with` that of all of it; `not_applied` says why it is in no correction.
     """
 
     kind: str
@@ -42,6 +97,9 @@ class FoundEffect(_Part):
     confident: bool
     probability: float | None = None
     answer: str | None = None
+    residual_without: Error | None = None
+    residual_with: Error | None = None
+    not_applied: str | None = None
 
     @property
     def could_be(self) -> tuple[str, ...]:
@@ -94,6 +152,14 @@ class Check(_Part):
     before: float
     after: float
     holds: bool
+    is_chance: bool = False
+
+    @property
+    def told(self) -> str:
+        """Why it refuses a correction."""
+        if self.is_chance:
+            return f"{self.name}: {100 * self.after:.2g} %, where {100 * CHANCE_WORSE:g} % is the limit"
+        return f"{self.name}, from {self.before:.4g} to {self.after:.4g}"
 
 
 class Combination(_Part):
@@ -107,6 +173,11 @@ class Combination(_Part):
     stderr: float
     unit: str
     open_by: dict[str, float]
+
+
+def _not_less(size: float) -> str:
+    """An error of M/m00 in words; one that the rounding of counts makes alone is no figure."""
+    return f"{size:.2g}" if size > LEAST_CHANGE else f"less than {LEAST_CHANGE:g}"
 
 
 class MuellerError(_Part):
@@ -128,8 +199,8 @@ class MuellerError(_Part):
         largest = max(range(len(self.elements)), key=lambda k: self.elements[k])
         row, column = divmod(largest, 4)
         return (
-            f"M/m00 may still be off by {self.rms:.2g} (rms of its elements), most in M{row}{column} by "
-            f"{self.elements[largest]:.2g}, where {self.most} counts most"
+            f"M/m00 may still be off by {_not_less(self.rms)} (rms of its elements), most in M{row}{column} by "
+            f"{_not_less(self.elements[largest])}, where {self.most} counts most"
         )
 
 
@@ -156,7 +227,7 @@ class Correction(_Part):
 class CaptureReport(_Part):
     """One capture: what is known of it, and how far its residual is from noise, before and after.
 
-    `rms_before_percent`, `rms_after_percent`: on held-out data, as `Error.rms_percent`, of this capture alone.
+    `error_before`, `error_after`: on held-out data, of this capture alone.
     """
 
     name: str
@@ -171,8 +242,8 @@ class CaptureReport(_Part):
     tests_before: dict[str, float]
     tests_after: dict[str, float]
     wavelength_nm: float | None = None
-    rms_before_percent: float | None = None
-    rms_after_percent: float | None = None
+    error_before: Error | None = None
+    error_after: Error | None = None
     closure_before_percent: float | None = None
     closure_after_percent: float | None = None
 

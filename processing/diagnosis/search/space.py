@@ -22,7 +22,7 @@ class Sums:
     excess : (F,) sum of squares in units of the noise, minus what noise is expected to give (`freedom`, (F,)).
     square : (F,) sum of squares relative to the mean signal; count : (F,) the degrees of freedom behind it.
     gradient, curvature : (F, K), (F, K, K), half of the derivatives of the excess.
-    shares : (captures, 2, F) what each capture has of `square` and `count`.
+    shares : (captures, 4, F) what each capture has of `square`, `count`, `excess` and `freedom`.
     stretch : (F, K) half of the derivatives of `freedom`: a bend of the response stretches noise and structure alike.
     """
 
@@ -41,7 +41,7 @@ class Sums:
         f, k = folds, parameters
         a, b, c, d = np.zeros((4, f))
         gradient, stretch = np.zeros((2, f, k))
-        return cls(a, b, c, d, gradient, np.zeros((f, k, k)), stretch, np.zeros((captures, 2, f)))
+        return cls(a, b, c, d, gradient, np.zeros((f, k, k)), stretch, np.zeros((captures, 4, f)))
 
     def add(self, capture: int, part: Sums, acting: Acting, weight: float = 1.0) -> None:
         """Add the sums of one capture, derived by what is `acting` on it; its chi-square counts `weight`."""
@@ -49,7 +49,7 @@ class Sums:
         self.freedom += weight * part.freedom
         self.square += part.square
         self.count += part.count
-        self.shares[capture] += part.square, part.count
+        self.shares[capture] += part.square, part.count, part.excess, part.freedom
         if part.gradient.shape[1]:
             index = acting.index
             self.gradient[:, index] += weight * acting.spread(part.gradient)

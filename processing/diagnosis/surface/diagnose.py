@@ -11,11 +11,13 @@ from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause
 from processing.diagnosis.search.evidence import wanted_for_evidence, would_be_seen
+from processing.diagnosis.search.fit import HeldOut
 from processing.diagnosis.search.judge import Judgement, beyond_chance
 from processing.diagnosis.search.own_minima import OwnMinima, Visited
 from processing.diagnosis.search.posterior import Say
 from processing.diagnosis.search.range_of import rank_of
 from processing.diagnosis.search.result import (
+    BeyondNoise,
     CaptureReport,
     Correction,
     Diagnosis,
@@ -125,8 +127,8 @@ def _told(
     effects = _effects(problem, found, in_doubt)
     diagnosis = SurfaceDiagnosis(
         verdict=verdict,
-        error_before=_error(problem, kept.before.rms, kept.before.chi2_reduced),
-        error_after=_error(problem, kept.after.rms, kept.after.chi2_reduced),
+        error_before=_error(problem, kept.before),
+        error_after=_error(problem, kept.after),
         noise_floor_percent=100 * noise_floor(problem),
         effects=effects,
         unobservable=_unobservable(search, found.here),
@@ -211,8 +213,13 @@ def _degeneracy_in_doubt(problem: SurfaceProblem, solved: Solution) -> bool:
     return not any(full) and solved.before.rms * float(np.sqrt(max(excess, 0.0))) < AS_LIKELY
 
 
-def _error(problem: SurfaceProblem, rms: float, chi2: float) -> Error:
-    return Error(rms_percent=100 * rms, chi2_reduced=chi2, held_out=problem.held_out)
+def _error(problem: SurfaceProblem, out: HeldOut) -> Error:
+    return Error(
+        rms_percent=100 * out.rms,
+        chi2_reduced=out.chi2_reduced,
+        held_out=problem.held_out,
+        beyond_noise=BeyondNoise.of(out.excess, out.freedom, 100 * noise_floor(problem)),
+    )
 
 
 def _effects(problem: SurfaceProblem, found: _Found, in_doubt: bool) -> tuple[FoundEffect, ...]:
