@@ -32,9 +32,17 @@ def test_no_other_distribution_installs_our_names() -> None:
 
 def test_every_subpackage_is_in_the_wheel() -> None:
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    packaged = set(find_packages(str(ROOT), include=settings["tool"]["setuptools"]["packages"]["find"]["include"]))
+    packaged = set(find_packages(str(ROOT), **settings["tool"]["setuptools"]["packages"]["find"]))
     folders = {".".join(path.parent.relative_to(ROOT).parts) for name in NAMES for path in (ROOT / name).rglob("*.py")}
-    assert folders == packaged
+    # What judges the program is in the repository alone.
+    assert folders - packaged == {"simulators.blind"}
+    assert packaged <= folders
+
+
+def test_no_script_hides_a_program_of_debian() -> None:
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    # vim's is `view`.
+    assert set(scripts) == {"umov", "acquire", "process", "diagnose", "simulate"}
 
 
 def test_numpy_is_the_locked_one() -> None:
@@ -69,7 +77,9 @@ def test_the_wheel_works_where_there_is_no_checkout(tmp_path: Path) -> None:
         # Pages are made of more than Python.
         carried = set(file.namelist())
     pages = {f"viewer/{f.relative_to(ROOT / 'viewer')}" for f in (ROOT / "viewer").rglob("*.*") if f.suffix != ".pyc"}
+    assert not [name for name in carried if name.startswith("simulators/blind")]
     assert pages | {"processing/reports/design/umov.css", "processing/reports/design/page.html"} <= carried
+    environment = os.environ | {"PYTHONPATH": str(tmp_path / "installed")}
     # The folder stands in for site-packages; the lines below fail where the checkout is imported instead.
     code = (
         "import acquisition, sys; assert acquisition.__file__.startswith(sys.argv[1]);"
@@ -78,13 +88,18 @@ def test_the_wheel_works_where_there_is_no_checkout(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", code, str(tmp_path / "installed")],
         cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(tmp_path / "installed")},
+        env=environment,
         capture_output=True,
         text=True,
         check=False,
     )
     assert done.returncode == 0, done.stderr
     assert "nothing was moved" in done.stdout
+    program = "from processing.commands.program import main; main(['view', '-h'])"
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.stdout.startswith("Usage: umov view "), done.stderr
 
 
 @pytest.mark.parametrize(

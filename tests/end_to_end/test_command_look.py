@@ -9,6 +9,7 @@ from acquisition.commands.application import app as acquire
 from processing.commands.application import app as process
 from processing.commands.command_line import application, run
 from processing.commands.diagnose import app as diagnose
+from processing.commands.program import main as umov
 from simulators.cli import app as simulate
 from viewer.command import app as view
 
@@ -79,3 +80,23 @@ def test_ctrl_c_is_answered(capfd):
         run(app, [])
     assert end.value.code == 130
     assert capfd.readouterr().err == "interrupted; nothing that was finished is lost\n"
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_umov_has_every_command(name, capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["umov"])
+    monkeypatch.setenv("UMOV_DOOR", "")
+    for words, said in (([name, "-h"], f"umov {name} [OPTIONS]"), ([name, "--version"], f"umov {version('umov')}")):
+        with pytest.raises(SystemExit) as end:
+            umov(words)
+        assert not end.value.code
+        assert said in capsys.readouterr().out
+
+
+def test_umov_lists_its_commands(capsys):
+    for words, code in (([], 2), (["-h"], 0), (["fly"], 2)):
+        with pytest.raises(SystemExit) as end:
+            umov(words)
+        assert end.value.code == code
+        said = capsys.readouterr()
+        assert all(name in said.out + said.err for name in COMMANDS)

@@ -1,0 +1,48 @@
+"""The program `umov`: all commands under one name, `umov acquire`, `umov process reduce`, ..."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from importlib.metadata import distribution
+
+import typer
+
+from processing.commands.command_line import INTERRUPTED
+
+#: Entry points of the distribution that are commands of `umov`.
+GROUP = "umov.commands"
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Entry point of `umov`; ends in SystemExit.
+
+    The commands live in packages above this one, so they are found by their entry points, and only the one that is
+    asked for is imported.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    # Of this distribution alone: the metadata of all installed packages take half a second to read.
+    found = distribution("umov")
+    commands = {point.name: point for point in found.entry_points if point.group == GROUP}
+    usage = f"Usage: umov COMMAND [OPTIONS]\n\nCommands: {', '.join(commands)}\n\n`umov COMMAND -h` explains a command."
+    if not words or words[0] in ("-h", "--help"):
+        typer.echo(usage)
+        sys.exit(0 if words else 2)
+    if words[0] == "--version":
+        typer.echo(f"umov {found.version}")
+        sys.exit(0)
+    if words[0] not in commands:
+        typer.echo(f"error: No such command {words[0]!r}; there are: {', '.join(commands)}", err=True)
+        sys.exit(2)
+    # The command reads its words here, usage names the program by it; commands that are suggested begin with UMOV_DOOR.
+    sys.argv = [f"umov {words[0]}", *words[1:]]
+    os.environ.setdefault("UMOV_DOOR", "umov")
+    try:
+        commands[words[0]].load()()
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
+
+
+if __name__ == "__main__":
+    main()
