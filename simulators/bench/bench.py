@@ -2,7 +2,7 @@
 
 electrons = flux * exposure * (a . M . g) per pixel, with the true instrument; then dark current, shot noise, full
 well, read noise, gain, black level and digitizing. Random numbers come from (seed, exposure index), never from time:
-the same plan and seed give the same frames byte for byte.
+the same plan and seed give the same frames byte for byte, unless an effect changes with time.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from simulators.bench.effects.base import BenchEffect, Shot
 DETECTOR = Detector(black_level_counts=64.0, gain_e_per_count=2.6, read_noise_e=2.3, full_well_e=10_500.0, bits=12)
 DARK_CURRENT_E_PER_S = 2.0
 BLOCK_PIXELS = 1 << 16
+#: From one exposure to the next where nobody says when they are.
+STATE_PERIOD_S = 1.0
 
 
 class SceneImage(Protocol):
@@ -63,8 +65,6 @@ class SimulatedBench:
     seed : int
     effects : sequence of BenchEffect
         What happens on the bench besides; applied in this order within a stage.
-    state_period_s : float
-        Scheduled time from one exposure index to the next, for effects that depend on time.
     """
 
     def __init__(
@@ -79,7 +79,6 @@ class SimulatedBench:
         dark_current_e_per_s: float = DARK_CURRENT_E_PER_S,
         seed: int = 0,
         effects: Sequence[BenchEffect] = (),
-        state_period_s: float = 1.0,
     ) -> None:
         if detector.gain_e_per_count is None or detector.bits is None:
             raise ValueError("a simulated detector needs gain_e_per_count and bits")
@@ -89,7 +88,6 @@ class SimulatedBench:
         self.dark_current_e_per_s = dark_current_e_per_s
         self.seed = seed
         self.effects = tuple(effects)
-        self.state_period_s = state_period_s
         self._scene_key: tuple[float, float] | None = None
         self.put(scene, instrument, wavelength_nm)
 
@@ -112,6 +110,7 @@ class SimulatedBench:
         *,
         light: float = 1.0,
         omega_deg: float = 180.0,
+        time_s: float | None = None,
     ) -> NDArray[np.uint16]:
         """Counts of one exposure.
 
@@ -121,13 +120,14 @@ class SimulatedBench:
         index : number of the exposure; it seeds the noise.
         light : what the source gives of its nominal light; 0 with the shutter closed.
         omega_deg : true angle of the arm, unless `angles_deg` has "arm".
+        time_s : when it is, for effects that change with time; default: `STATE_PERIOD_S` from one index to the next.
 
         Returns
         -------
         ndarray of uint16, (rows, columns), or (channels, rows, columns) with several channels that do not share the
         detector as a mosaic or as beams side by side.
         """
-        expected, shot = self._expected(angles_deg, exposure_s, index, light, omega_deg)
+        expected, shot = self._expected(angles_deg, exposure_s, index, light, omega_deg, time_s)
         random = np.random.default_rng([self.seed, index + (1 << 31)])
         expected += np.float32(self.dark_current_e_per_s * exposure_s)
         electrons = random.poisson(np.maximum(expected, 0)).astype(np.float32)
@@ -145,13 +145,20 @@ class SimulatedBench:
         omega_deg: float = 180.0,
     ) -> Image:
         """Expected photo-electrons of an exposure, without dark current and noise; same shape as `expose`."""
-        return self._expected(angles_deg, exposure_s, index, light, omega_deg)[0]
+        return self._expected(angles_deg, exposure_s, index, light, omega_deg, None)[0]
 
     def _expected(
-        self, angles_deg: Mapping[str, float], exposure_s: float, index: int, light: float, omega_deg: float
+        self,
+        angles_deg: Mapping[str, float],
+        exposure_s: float,
+        index: int,
+        light: float,
+        omega_deg: float,
+        time_s: float | None,
     ) -> tuple[Image, Shot]:
         angles = dict(angles_deg)
-        shot = Shot(index, exposure_s, index * self.state_period_s, self.seed, dict(angles), float(light))
+        time_s = index * STATE_PERIOD_S if time_s is None else time_s
+        shot = Shot(index, exposure_s, time_s, self.seed, dict(angles), float(light))
         model = self.instrument
         for effect in self.effects:
             angles = effect.angles(angles, shot)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import math
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -58,6 +59,7 @@ class SimulatedRig:
         self._ports: dict[str, ServedPort] = {}
         self._user_angle: dict[str, Callable[[float], float]] = {}
         self._next_index = 0
+        self._started_s = time.monotonic()
         self._lock = threading.Lock()
 
     def start(self) -> None:
@@ -182,6 +184,8 @@ class SimulatedRig:
 
     def expose(self, info: ExposureInfo) -> NDArray[np.uint16]:
         """Counts (rows, columns) of the camera's region in an exposure that happens now."""
+        # Frames are stamped with real time, which motors on a busy machine do not keep.
+        time_s = (time.monotonic() - self._started_s) * self.config.clock_speed
         angles = self.true_angles_deg()
         light = self.light()
         with self._lock:
@@ -190,7 +194,7 @@ class SimulatedRig:
             if self.bench is None:
                 # Nobody has placed a sample: the camera looks into the dark.
                 return np.zeros((info.height, info.width), dtype=np.uint16)
-            counts = info.region_of(self.bench.expose(angles, info.exposure_s, index, light=light))
+            counts = info.region_of(self.bench.expose(angles, info.exposure_s, index, light=light, time_s=time_s))
         if self.config.stamp:
             stamp(counts, [angles[name] for name in sorted(angles)], bits=self.config.detector.bits or 12)
         return counts

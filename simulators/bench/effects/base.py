@@ -21,9 +21,9 @@ from processing.instrument.model import InstrumentModel
 
 @dataclass(frozen=True)
 class Shot:
-    """One exposure, as the effects see it. `time_s` is scheduled time, not wall time, so that runs repeat.
+    """One exposure, as the effects see it.
 
-    `light` is what the source gives of its nominal light.
+    `time_s` is when it is, by the clock that stamps the frames; `light` is what the source gives of its nominal light.
     """
 
     index: int
