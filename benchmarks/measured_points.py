@@ -100,6 +100,10 @@ class ReflectanceProblem:
         """Nothing is known from the slopes of noise here."""
         return np.zeros((space.size, space.size))
 
+    def time_noise(self, space: Space, values: Array) -> Array:
+        """These points have no times."""
+        return np.zeros(space.size)
+
     def residual_squares(self, space: Space, values: Array) -> Array:
         """Sum of squares (N,) that each point leaves over, in the units of the intensities."""
         q, size, _ = np.linalg.svd(self._columns(space, values), full_matrices=False)

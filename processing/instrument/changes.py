@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 
+#: Standard deviation of a normal distribution over its median absolute deviation.
+MAD_TO_SIGMA = 1.4826
 #: Names of the smooth terms of what varies over the image.
 FIELD_TERMS = ("x", "y", "x2", "xy", "y2")
 
@@ -27,6 +29,7 @@ class Conditions:
     channels : names of the detector channels.
     elapsed : (N,), time since the middle of the capture over its whole length, -0.5 to 0.5; state number
         instead of time where the capture has no clock.
+    elapsed_error : standard error of these times.
     full_scale : counts at the top of the detector's range.
     run : (N,) number, from 0, of the run that took each state; the source may jump between them.
     """
@@ -37,6 +40,7 @@ class Conditions:
     elapsed: Array
     full_scale: float = 1.0
     run: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, dtype=np.int64))
+    elapsed_error: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "run", np.broadcast_to(self.run, (self.states,)))
@@ -57,6 +61,17 @@ def elapsed(time_s: Array | None, states: int) -> Array:
         t = np.asarray(time_s, dtype=float)
     span = np.ptp(t)
     return np.asarray((t - t.min()) / span - 0.5 if span > 0 else np.zeros(states))
+
+
+def elapsed_error(time_s: Array, other_s: Array) -> float:
+    """Standard error of `elapsed`, as a second clock (N,) shows it; 0 where that does not run.
+
+    Of differences between one state and the next, whose median a clock that is set or begins anew does not move.
+    """
+    steps = np.diff(time_s) - np.diff(other_s)
+    if steps.size == 0 or not (np.all(np.isfinite(steps)) and np.ptp(other_s) > 0 and np.ptp(time_s) > 0):
+        return 0.0
+    return float(MAD_TO_SIGMA * np.median(np.abs(steps)) / np.sqrt(2) / np.ptp(time_s))
 
 
 def field_terms(x: Array, y: Array) -> Array:

@@ -96,6 +96,9 @@ class Bench:
     recorded: list[Callable[[dict[str, Array]], dict[str, Array]]] = field(default_factory=list)
     #: What the capture file says of the detector, where it is not the truth.
     declared: dict[str, float | None] = field(default_factory=dict)
+    #: (N,) when each state was taken, by the camera's clock; default: evenly. And how late the host stamped it.
+    times_s: Array | None = None
+    late_s: Array | float = 0.0
 
     def generated(self, angles: dict[str, float], state: int) -> Array:
         """Stokes vectors (..., 4) of the light on the sample; leading axes if the retardance varies over the image."""
@@ -298,7 +301,9 @@ def write_capture(
             h5[f"entry/instrument/{axis}/value"][...] = values
         states = h5["entry/states"]
         states["exposure_s"][...] = 0.1
-        states["host_time_s"][...] = np.arange(n) * 2.0
+        taken_s = np.arange(n) * 2.0 if bench.times_s is None else bench.times_s
+        states["host_time_s"][...] = taken_s + bench.late_s
+        states["camera_time_ns"][...] = np.rint(taken_s * 1e9).astype(np.int64)
         states["repeats"][...] = 1
         states["done"][...] = 1
         write_closing(h5, "complete", {})

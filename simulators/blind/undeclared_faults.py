@@ -203,8 +203,19 @@ def angle_per_state(bench: Bench, random: np.random.Generator, states: int, size
 
 def source_drift(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.003, 0.1)) -> Truth:
     size = draw_signed(random, *sizes)
-    bench.level.append(lambda k, a: 1 + size * (k / (states - 1) - 0.5))
+    times = np.arange(states) / (states - 1)
+    if random.random() < 0.5:
+        times = busy_machine(bench, random, states)
+    bench.level.append(lambda k, a: 1 + size * (times[k] - 0.5))
     return Truth("source_drift", "", {"fraction": size})
+
+
+def busy_machine(bench: Bench, random: np.random.Generator, states: int) -> Array:
+    """Times (N,), 0 to 1, at which a loaded machine takes the states; it stamps them up to 100 ms late."""
+    waits = 2.0 + random.exponential(random.choice([0.1, 1.0, 5.0]), states)
+    bench.times_s = np.cumsum(waits) - waits[0]
+    bench.late_s = random.exponential(random.choice([0.002, 0.03]), states)
+    return np.asarray(bench.times_s / bench.times_s[-1])
 
 
 def source_flicker(bench: Bench, random: np.random.Generator, states: int, sizes: Sizes = (0.002, 0.02)) -> Truth:

@@ -121,9 +121,9 @@ def test_failed_lamp_and_drifting_lamp_end_the_run(run_with):
     error, path = run_with(top=top, effects=fails)
     assert "of that of the first state" in str(error)
     assert _light(path) == 20
-    # Bench time runs a second a state: seven percent until the first pose comes again.
+    # Bench time runs fifty times as fast as real time: over five percent until the first pose comes again.
     plan = {"repeat_first": True}
-    error, path = run_with(plan=plan, top=top, effects=[{"kind": "source_drift", "fraction_per_hour": 6}])
+    error, path = run_with(plan=plan, top=top, effects=[{"kind": "source_drift", "fraction_per_hour": 6.0}])
     assert "drifted by +" in str(error)
     assert _light(path) == 44
     error, path = run_with(plan=plan, top=top)

@@ -41,6 +41,9 @@ class Valley:
     def noise_information(self, space: Space, values: np.ndarray) -> np.ndarray:
         return np.zeros((2, 2))
 
+    def time_noise(self, space: Space, values: np.ndarray) -> np.ndarray:
+        return np.zeros(values.size)
+
 
 @pytest.fixture
 def space() -> Space:

@@ -22,6 +22,7 @@ from simulators.blind.outside_list import ghost, image_lag, lamp_jump
 from simulators.blind.real_bench import Disc
 from simulators.blind.suite import declared_bench, state_angles
 from simulators.blind.undeclared_captures import Bench, digitize, expose, write_capture
+from simulators.blind.undeclared_faults import busy_machine
 
 STATES, PIXELS, NM = 40, 32, 662.0
 
@@ -96,6 +97,17 @@ def test_frames_that_are_read_with_the_next_ones_are_not_angles_of_an_axis(confi
     assert found.effects
     assert not sure(found)
     assert not found.applied()
+
+
+def test_a_lamp_that_drifts_while_the_machine_is_busy(configs, tmp_path):
+    """The states come unevenly, and the host stamps them late: the camera's clock shows by how much."""
+    model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(NM)
+    bench, random = declared_bench(model, NM, 96, False, 20_000.0), np.random.default_rng(7)
+    times = busy_machine(bench, random, STATES)
+    bench.late_s = random.exponential(0.5, STATES)
+    bench.level.append(lambda k, a: 1 + 0.1 * (times[k] - 0.5))
+    found = diagnosed(tmp_path, configs, bench)
+    assert [e.kind for e in found.effects] == [e.kind for e in found.applied()] == ["source_drift"]
 
 
 def test_a_lamp_that_jumps_is_no_source_that_drifts(configs, tmp_path, bench):

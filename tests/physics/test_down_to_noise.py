@@ -45,6 +45,9 @@ class Bench:
     def noise_information(self, space: Space, values: np.ndarray) -> np.ndarray:
         return np.zeros((values.size, values.size))
 
+    def time_noise(self, space: Space, values: np.ndarray) -> np.ndarray:
+        return np.zeros(values.size)
+
 
 @pytest.fixture
 def bench() -> tuple[Space, np.ndarray, np.ndarray, np.ndarray]:

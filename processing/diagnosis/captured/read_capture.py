@@ -14,7 +14,7 @@ from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.noise_estimate import estimated_noise
 from processing.diagnosis.captured.read_frames import read_frames
 from processing.diagnosis.search.rules import DARK_RIM, FAINTEST, FEWEST_FOR_SCATTER, MOST_CUT_OFF
-from processing.instrument.changes import Conditions, elapsed
+from processing.instrument.changes import Conditions, elapsed, elapsed_error
 from processing.instrument.model import InstrumentModel
 from processing.reduction.black import Black
 from processing.reduction.counts_to_signal import Correction
@@ -48,13 +48,14 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
     detector, integer = capture.header.detector, capture.integer_counts
     top = float(2**detector.bits - 1) - detector.black_level_counts if integer and detector.bits else frames.top
     angles = {name: value[states] for name, value in capture.angles_deg.items()}
-    when = elapsed(capture.column("host_time_s")[states], len(states))
+    host_s, camera_s = capture.column("host_time_s")[states], capture.column("camera_time_ns")[states] * 1e-9
+    when, when_error = elapsed(host_s, len(states)), elapsed_error(host_s, camera_s)
     exposure = relative_exposure(capture, states)
     kind = capture.header.sample.kind
     data = CaptureData(
         name=capture.name,
         signal=np.nan_to_num(raw / np.float32(top)),
-        conditions=Conditions(angles, len(states), names, when, top, capture.run_of_states[states]),
+        conditions=Conditions(angles, len(states), names, when, top, capture.run_of_states[states], when_error),
         exposure=exposure,
         sample=None if kind == "unknown" else known_mueller(capture.header.sample).reshape(16),
         slope=np.zeros(len(states)),

@@ -41,6 +41,8 @@ from processing.instrument.effects.base import (
     ImageShift,
     LevelEffect,
     PointwiseEffect,
+    SourceEffect,
+    ValuePerState,
 )
 from processing.instrument.model import InstrumentModel
 
@@ -309,6 +311,27 @@ class InstrumentProblem:
             if np.any(dc[:, -DERIVATIVES:]):
                 told = np.sum([noise_information(block, a, dc, moments) for block in moments.blocks], axis=0)
                 out[np.ix_(acting.index, acting.index)] += acting.spread_products(told)
+        return out
+
+    def time_noise(self, space: Space, values: Array) -> Array:
+        """Variance (K,) that errors of the frames' times make of a source's level in each state, where it drifts."""
+        out = np.zeros(space.size)
+        parts = dict(zip(space.candidates, space.slices, strict=True))
+        for k, (data, nm) in enumerate(zip(self.captures, self.wavelengths_nm, strict=True)):
+            conditions = data.conditions
+            acting = [c for c in parts if isinstance(c.effect, SourceEffect) and c.acts(k, nm)]
+            levels = [c for c in acting if isinstance(c.effect, ValuePerState)]
+            if conditions.elapsed_error == 0 or not levels:
+                continue
+            gains = []
+            for shift in (0.0, conditions.elapsed_error):
+                changes = Changes(replace(conditions, elapsed=conditions.elapsed + shift))
+                for c in acting:
+                    if c not in levels:
+                        c.apply(changes, self.models[k], values[parts[c]])
+                gains.append(np.broadcast_to(changes.gain, (conditions.states, len(conditions.channels)))[:, 0])
+            for c in levels:
+                out[parts[c]] = (gains[1] / gains[0] - 1) ** 2
         return out
 
     def _has_field(self, space: Space) -> bool:

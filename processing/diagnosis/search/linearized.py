@@ -62,11 +62,20 @@ def quadratic(problem: Problem, space: Space, x: Array, sums: Sums) -> Quadratic
     g = g - excess * a
     told = _told(problem, space, x, h, typical)
     h, g = h * np.outer(told, told), g * told
+    excess, g, h = _whatever(np.sqrt(problem.time_noise(space, x)) / typical, excess, g, h)
     value, vector = np.linalg.eigh(h)
     h = (vector * np.maximum(value, 0.0)) @ vector.T
     z = x / typical
     total = excess if problem.noise_known else excess + freedom
     return Quadratic(float(total - 2 * g @ z + z @ h @ z), g - h @ z, h)
+
+
+def _whatever(sigma: Array, excess: float, g: Array, h: Array) -> tuple[float, Array, Array]:
+    """A form whatever is added to its values (K,), each normal with `sigma` (K,), integrated out."""
+    there = np.flatnonzero(sigma)
+    s, across = sigma[there], h[:, there]
+    own = np.linalg.inv(np.eye(there.size) + across[there] * np.outer(s, s)) * np.outer(s, s)
+    return float(excess - g[there] @ own @ g[there]), g - across @ own @ g[there], h - across @ own @ across.T
 
 
 def _told(problem: Problem, space: Space, x: Array, h: Array, typical: Array) -> Array:

@@ -145,7 +145,7 @@ def _looking(
         if not (np.isfinite(form.excess) and np.all(np.isfinite(form.curvature))):
             return None
         sets = Sets(form, groups, noise or noise_of(problem, sums))
-        return _Round(x, _total(problem, sums), sets, climbed(sets))
+        return _Round(x, form.at(x / space.joined("typical")), sets, climbed(sets))
 
     return look
 

@@ -45,3 +45,7 @@ class Problem(Protocol):
     def noise_information(self, space: Space, values: Array) -> Array:
         """Part (K, K) of the curvature that is noise of image derivatives and tells nothing about the values."""
         ...
+
+    def time_noise(self, space: Space, values: Array) -> Array:
+        """Variance (K,) of values for each state that errors of the frames' times make; 0 of all others."""
+        ...

@@ -245,6 +245,10 @@ class SurfaceProblem:
             less[j] = noise * (_left(strength * here.most, tile) - before) / step
         return d, less
 
+    def time_noise(self, space: Space, values: Array) -> Array:
+        """None of these effects has a value for each state."""
+        return np.zeros(space.size)
+
     def noise_information(self, space: Space, values: Array) -> Array:
         """Part (K, K) of the curvature that comes from the noise of alpha_0 and tells nothing about the values."""
         out = np.zeros((space.size, space.size))
