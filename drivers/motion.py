@@ -9,7 +9,7 @@ import threading
 from abc import ABC, abstractmethod
 
 from drivers.agreed_reading import AgreeingReadings
-from drivers.axis_types import AxisConfig, AxisIdentity, Limits, Position
+from drivers.axis_types import NO_LIMIT_DEG, AxisConfig, AxisIdentity, Limits, Position
 from drivers.clock import REAL, Clock
 from drivers.errors import (
     CommandRejected,
@@ -198,6 +198,11 @@ class MotionAxis(ABC):
         return self.config.direction * user_deg + self.config.zero_deg
 
     @property
+    def controller_zero_deg(self) -> float:
+        """User angle at which the controller shows zero, where most stages end their homing."""
+        return self._to_user_deg(0.0)
+
+    @property
     def limits(self) -> Limits:
         """The tighter of the controller's and the rig file's limits, in user degrees."""
         ends = [None if end is None else self._to_user_deg(end) for end in (self._device_min_deg, self._device_max_deg)]
@@ -213,12 +218,12 @@ class MotionAxis(ABC):
         Raises
         ------
         LimitError
-            Outside the limits, or not a finite number.
+            Outside the limits, not a number, or 1e6 degrees and more, which no controller counts.
         """
         limits = self.limits
         low = -math.inf if limits.min_deg is None else limits.min_deg - ROUNDING_DEG
         high = math.inf if limits.max_deg is None else limits.max_deg + ROUNDING_DEG
-        if math.isfinite(target_deg) and low <= target_deg <= high:
+        if abs(target_deg) < NO_LIMIT_DEG and low <= target_deg <= high:
             return
         ends = " to ".join("no limit" if end is None else f"{end:g}" for end in (limits.min_deg, limits.max_deg))
         raise LimitError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -23,6 +23,8 @@ from acquisition.capture.operator import Operator
 from acquisition.capture.writer import PARTIAL, bytes_needed, check_space, seal_whole
 from acquisition.errors import AcquisitionError, Differs, InterlockOpened, PlanRefused, Stopped
 from acquisition.rig.config import RigConfig
+from acquisition.rig.continuous_rotation import states_deg, unwound
+from acquisition.rig.folded_angles import folded
 from acquisition.rig.guarded import guarded
 from acquisition.rig.interlocks import LOOK_S
 from acquisition.rig.rig import Rig
@@ -66,10 +68,13 @@ def check_all(jobs: Sequence[tuple[CampaignCapture, Job]], rig: Rig, folder: Pat
     """Check every capture against the devices and the disc; nothing moves. Returns failures and passes alike."""
     planned = []
     pose: dict[str, float] = {}
+    here = rig.where_once_homed()
     seen: dict[tuple[str, str], Check] = {}
     for capture, job in jobs:
-        for check in check_with_devices(job, rig, folder):
+        table = unwound(folded(job.table, rig), rig, here)
+        for check in check_with_devices(replace(job, table=table), rig, folder, here):
             seen.setdefault((check.what, check.found), check)
+        here |= states_deg(table)[-1]
         settings = rig.require_camera().settings
         size = bytes_needed(len(job.table), 1, (settings.height or 0, settings.width or 0))
         planned.append(Planned(capture, job, capture_seconds(job, rig, pose), size))

@@ -9,6 +9,7 @@ import numpy as np
 
 from acquisition.capture.plan import AutoExposure
 from acquisition.rig.rig import Rig
+from acquisition.rig.way import Pose
 from acquisition.screen.observer import Observer
 from processing.instrument.applied_effects import changes_at
 from processing.instrument.model import InstrumentModel
@@ -46,6 +47,7 @@ def brightest_states(table: StateTable, instrument: InstrumentModel, sample: str
 def find_exposure(
     rig: Rig,
     table: StateTable,
+    poses_deg: Sequence[Pose],
     instrument: InstrumentModel,
     sample: str,
     auto: AutoExposure,
@@ -54,8 +56,8 @@ def find_exposure(
 ) -> float:
     """Exposure in seconds at which the percentile of the brightest probed state comes to its target.
 
-    The axes are moved through the probed states with the light on. The result has three digits, so that it does not
-    depend on the last photon.
+    The axes are moved through `poses_deg` of the probed states with the light on. The result has three digits, so
+    that it does not depend on the last photon.
     """
     camera = rig.require_camera()
     black = rig.config.detector.black_level_counts
@@ -68,7 +70,7 @@ def find_exposure(
     if rig.source is not None:
         rig.source.set_light(True)
     for number, state in enumerate(brightest_states(table, instrument, sample)):
-        rig.move({axis: float(column[state]) for axis, column in table.angles_deg.items()})
+        rig.go(poses_deg[state], poses_deg)
         for _ in range(TRIES):
             rig.set_exposure(exposure_s, 1)
             for observer in observers:

@@ -13,8 +13,9 @@ import numpy as np
 from acquisition.capture.plan import ARM, AutoExposure, MeasurementPlan
 from acquisition.errors import PlanRefused
 from acquisition.rig.config import RigConfig
+from acquisition.rig.continuous_rotation import states_deg, turned, turns_to
 from acquisition.rig.rig import Rig
-from acquisition.rig.way import find_obstacle
+from acquisition.rig.way import find_obstacle, find_way
 from drivers.errors import LimitError
 from processing.doors import one_line
 from processing.instrument.applied_effects import changes_at
@@ -92,8 +93,7 @@ def check_plan(plan: MeasurementPlan, rig: RigConfig) -> list[Check]:
 
 def check_table(table: StateTable, rig: RigConfig, instrument: InstrumentModel) -> list[Check]:
     """Forbidden poses of every state and step, and whether the states determine a Mueller matrix."""
-    poses = [{axis: float(column[k]) for axis, column in table.angles_deg.items()} for k in range(len(table))]
-    checks = _free_ways(rig, poses)
+    checks = _free_ways(rig, states_deg(table))
     lacking = [axis for axis in instrument.axes if axis not in table.angles_deg]
     if lacking:
         found = f"instrument {instrument.name!r} turns with {', '.join(lacking)}, the plan does not"
@@ -149,8 +149,15 @@ def load_instrument(plan: MeasurementPlan, rig: RigConfig, read: ReadInstrument)
         raise PlanRefused([str(error)]) from error
 
 
-def check_devices(table: StateTable, rig: Rig) -> list[Check]:
-    """Every target against the limits of the controllers, and the way from here; nothing moves."""
+def check_devices(
+    table: StateTable, rig: Rig, state: int = 0, here_deg: Mapping[str, float] | None = None
+) -> list[Check]:
+    """Every target against the limits of the controllers, and the way to the state taken first; nothing moves.
+
+    Parameters
+    ----------
+    here_deg : where the axes will stand; None for where they stand once those without a reference are homed.
+    """
     checks = []
     for axis, column in table.angles_deg.items():
         try:
@@ -161,14 +168,19 @@ def check_devices(table: StateTable, rig: Rig) -> list[Check]:
         else:
             ends = f"{column.min():g} to {column.max():g} deg"
             checks.append(Check(f"limits of {axis}", True, ends))
-    first = {axis: float(column[0]) for axis, column in table.angles_deg.items()}
-    homed = {name: axis.read_position().deg for name, axis in rig.axes.items() if axis.is_homed()}
-    found = find_obstacle(rig.config, homed, homed | first)
-    checks.append(Check("first move", found is None, found or "free from here to the first state"))
+    checks.append(_check_first_move(table, rig, state, rig.where_once_homed() if here_deg is None else here_deg))
     checks += _check_park(rig)
     if rig.source is not None and rig.source.interlock_open():
         checks.append(Check("door", False, "the interlock circuit of the source is open; close it"))
     return checks
+
+
+def _check_first_move(table: StateTable, rig: Rig, state: int, here_deg: Mapping[str, float]) -> Check:
+    by = states_deg(turned(table, turns_to(table, rig, state, here_deg, {})))
+    if find_way(rig.config, here_deg, by[state], by, rig.limits, ARM) is None:
+        found = find_obstacle(rig.config, here_deg, {**here_deg, **by[state]}, by[state], rig.limits)
+        return Check("first move", False, f"to state {state} it meets {found}, and there is no way round it")
+    return Check("first move", True, f"free to state {state}")
 
 
 def _check_park(rig: Rig) -> list[Check]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -35,7 +36,7 @@ from processing.yaml_file import parse_yaml
 
 @dataclass(frozen=True)
 class Job:
-    """A capture that passed the checks that need no device."""
+    """A capture that passed the checks that need no device; `first` is the state that is taken first."""
 
     plan: MeasurementPlan
     rig: RigConfig
@@ -44,6 +45,7 @@ class Job:
     checks: tuple[Check, ...]
     seed: int | None = None
     exposure_known: bool = True
+    first: int = 0
 
 
 @dataclass(frozen=True)
@@ -82,9 +84,14 @@ def prepare(plan: MeasurementPlan, rig: RigConfig, read: ReadInstrument = Instru
     return Job(plan, rig, instrument, table, tuple(checks), seed, not isinstance(plan.exposure_s, AutoExposure))
 
 
-def check_with_devices(job: Job, rig: Rig, folder: Path) -> list[Check]:
-    """Limits, door, exposure and disc, as the devices have them; nothing moves."""
-    checks = check_devices(folded(job.table, rig), rig)
+def check_with_devices(job: Job, rig: Rig, folder: Path, here_deg: Mapping[str, float] | None = None) -> list[Check]:
+    """Limits, door, exposure and disc, as the devices have them; nothing moves.
+
+    Parameters
+    ----------
+    here_deg : where the axes will stand before the capture; None for where they stand once they are homed.
+    """
+    checks = check_devices(folded(job.table, rig), rig, job.first, here_deg)
     for exposure_s in np.unique(job.table.exposure_s)[::-1]:
         settings = rig.set_exposure(float(exposure_s), job.plan.repeats)
         read_back_s = settings.exposure_s or float(exposure_s)
@@ -141,11 +148,13 @@ def job_of(path: Path, rig: RigConfig | None = None, plan: MeasurementPlan | Non
             raise AcquisitionError(f"{path} is complete; there is nothing to go on with.")
         exposure_s = capture.planned_column("exposure_s")
         targets = capture.planned_targets_deg()
+        done = set(capture.done.tolist())
         plan = plan or stored_plan(capture)
         job = prepare(plan, rig or stored_rig(capture))
         require_same(capture, plan, job.rig, job.instrument)
     # The targets as they were: an endless axis may have begun some turns away from zero.
     table = replace(job.table, angles_deg=targets)
+    job = replace(job, first=next((state for state in range(len(table)) if state not in done), 0))
     known = np.isfinite(exposure_s)
     if not known.any():
         return replace(job, table=table)

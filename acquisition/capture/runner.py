@@ -15,12 +15,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from acquisition.capture.auto_exposure import find_exposure
-from acquisition.capture.plan import AutoExposure
+from acquisition.capture.plan import ARM, AutoExposure
 from acquisition.capture.repeated_state import RepeatedState
-from acquisition.capture.time_ledger import TimeLedger
+from acquisition.capture.time_ledger import Entry, TimeLedger
 from acquisition.capture.wall_clock import WallClock
 from acquisition.capture.writer import CaptureWriter, StateRecord
 from acquisition.errors import RunFailed
+from acquisition.rig.continuous_rotation import states_deg, turned
 from acquisition.rig.interlocks import Interlocks
 from acquisition.rig.rig import Rig
 from acquisition.screen.observer import Observer, StateReport
@@ -86,6 +87,7 @@ class CaptureRunner:
     saturation_limit : fraction of saturated pixels from which a state raises TooBright; None never.
     mosaic : True for a polarization sensor.
     lit_darks : comparison of darks and lights that has seen the states of earlier runs; None for a new one.
+    turns : whole turns that the axes add to the angles of `table`, where they reach its states only so.
     """
 
     def __init__(
@@ -100,6 +102,7 @@ class CaptureRunner:
         saturation_limit: float | None = None,
         mosaic: bool = False,
         lit_darks: LitDarks | None = None,
+        turns: Mapping[str, int] | None = None,
     ) -> None:
         self.rig = rig
         self.table = table
@@ -110,7 +113,9 @@ class CaptureRunner:
         self.ledger = TimeLedger(rig.clock)
         self.messages = Messages()
         self.interlocks = Interlocks(rig, self.warn, continue_after_interlock)
+        self.poses_deg = states_deg(turned(table, turns or {}))
         self._here: dict[str, float] = {}
+        self._at: int | None = None
         self._light: bool | None = None
         self._retakes: dict[int, int] = {}
         self._pending: deque[int] = deque()
@@ -132,6 +137,7 @@ class CaptureRunner:
         """
         self._pending = deque(pending)
         self._here.clear()
+        self._at = None
         self._retakes.clear()
         exposed: _Exposed | None = None
         try:
@@ -159,11 +165,26 @@ class CaptureRunner:
         for observer in self.observers:
             observer.activity(text)
 
+    def go(self, state: int, why: Entry) -> None:
+        """Go to the pose of a state, from wherever the axes stand, by an allowed way; `why` is the ledger's entry.
+
+        Raises
+        ------
+        AcquisitionError
+            There is no allowed way.
+        """
+        targets = self.poses_deg[state]
+        self.tell("moving " + ", ".join(f"{axis} to {angle:g}" for axis, angle in targets.items()))
+        with self.ledger.time(why):
+            self.rig.go(targets, self.poses_deg, ARM)
+
     def find_exposure(self, instrument: InstrumentModel, sample: str, auto: AutoExposure) -> None:
         """Probe the brightest states and take the exposure that they ask for. Moves the axes, lights the sample."""
         self.tell("looking for the exposure")
         with self.ledger.time("probing"):
-            found_s = find_exposure(self.rig, self.table, instrument, sample, auto, self.observers, self.warn)
+            found_s = find_exposure(
+                self.rig, self.table, self.poses_deg, instrument, sample, auto, self.observers, self.warn
+            )
         self._light = None
         self._scale_exposure(found_s / auto.start_s)
 
@@ -195,7 +216,14 @@ class CaptureRunner:
     # --- one state ---------------------------------------------------------------------------------------
 
     def _take(self, state: int, before: _Exposed | None) -> _Exposed | None:
-        targets = {axis: float(column[state]) for axis, column in self.table.angles_deg.items()}
+        targets = self.poses_deg[state]
+        if self._at != state - 1 and not self.rig.is_free(targets):
+            # The way from one state to the next is free, as the plan's check has found; other ways may not be.
+            if before is not None:
+                self._collect(before)
+                before = None
+            self.go(state, "moving")
+        self._at = state
         changed = {axis: target for axis, target in targets.items() if self._here.get(axis) != target}
         # The longest move first: the others start while it is under way.
         changed = dict(sorted(changed.items(), key=lambda item: -self._move_s(*item)))

@@ -20,7 +20,7 @@ from acquisition.capture.runner import CaptureRunner, TooBright
 from acquisition.capture.writer import CaptureWriter, as_partial
 from acquisition.cleanup import run_all
 from acquisition.errors import AcquisitionError, Stopped
-from acquisition.rig.continuous_rotation import unwound
+from acquisition.rig.continuous_rotation import turns_to, unwound
 from acquisition.rig.folded_angles import folded
 from acquisition.rig.interlocks import LightSoFar, light_so_far
 from acquisition.rig.rig import Rig
@@ -146,6 +146,7 @@ def _run(
     if rig.simulation is not None:
         watchers.append(Announcer(rig.simulation.announce))
     auto = job.plan.exposure_s
+    first = pending[0] if pending else 0
     runner = CaptureRunner(
         rig,
         job.table,
@@ -157,6 +158,7 @@ def _run(
         saturation_limit=1 - auto.percentile / 100 if isinstance(auto, AutoExposure) else None,
         mosaic=job.instrument.mosaic is not None,
         lit_darks=None if earlier is None else earlier.darks,
+        turns={} if earlier is None else turns_to(job.table, rig, first, rig.where_once_homed(), {}),
     )
     status: Status = "failed"
     failure: BaseException | None = None
@@ -169,13 +171,13 @@ def _run(
         observer.run_started(title_of(job.plan), job.table, len(pending), job.instrument.mosaic)
     try:
         with stop.failing_here():
-            _go_to_start(job, rig, runner)
+            _go_to_start(job, rig, runner, first)
             whole = _take_states(job, runner, pending)
         if whole:
             status = "complete"
         else:
             status = "aborted"
-            _park(rig, watchers)
+            _park(rig, runner)
     except (KeyboardInterrupt, Stopped) as interrupt:
         status, failure = "aborted", interrupt
     except (AcquisitionError, DeviceError) as error:
@@ -221,7 +223,7 @@ def _require_reference(rig: Rig, home: bool) -> None:
         )
 
 
-def _go_to_start(job: Job, rig: Rig, runner: CaptureRunner) -> None:
+def _go_to_start(job: Job, rig: Rig, runner: CaptureRunner, first: int) -> None:
     # A wavelength that the source does not have ends the run before anything turns.
     if rig.source is not None and rig.source.selects_wavelength:
         rig.source.select(job.plan.wavelength_nm)
@@ -230,21 +232,14 @@ def _go_to_start(job: Job, rig: Rig, runner: CaptureRunner) -> None:
         runner.tell(f"homing {', '.join(unhomed)}")
         with runner.ledger.time("homing"):
             rig.home(unhomed)
-    first = {axis: float(column[0]) for axis, column in job.table.angles_deg.items()}
     # The arm goes first and alone: what stands on it and the sample are what it can hit.
-    for axes in ([ARM], [axis for axis in first if axis != ARM]):
-        targets = {axis: first[axis] for axis in axes if axis in first}
-        if targets:
-            runner.tell("moving " + ", ".join(f"{axis} to {angle:g}" for axis, angle in targets.items()))
-            with runner.ledger.time("approach"):
-                rig.move(targets)
+    runner.go(first, "approach")
 
 
-def _park(rig: Rig, observers: Sequence[Observer]) -> None:
+def _park(rig: Rig, runner: CaptureRunner) -> None:
     if rig.config.park_deg:
-        for observer in observers:
-            observer.activity("parking")
-        rig.move(rig.config.park_deg)
+        runner.tell("parking")
+        rig.go(rig.config.park_deg, runner.poses_deg)
 
 
 def _shut(rig: Rig) -> Callable[[], None]:
@@ -296,7 +291,11 @@ def _result(path: Path, status: Status, job: Job, runner: CaptureRunner) -> Resu
     with Capture(path) as capture:
         saturated = capture.column("saturated_fraction")
         done = capture.done
-        off = [np.abs(capture.angles_deg[axis] - target[done]) for axis, target in job.table.angles_deg.items()]
+        off = [
+            # A part of the states may have been taken some turns away.
+            np.abs((capture.angles_deg[axis] - target[done] + 180.0) % 360.0 - 180.0)
+            for axis, target in job.table.angles_deg.items()
+        ]
     worst = float(np.max(saturated, initial=0.0))
     worst_angle = float(np.max(off, initial=0.0))
     return Result(

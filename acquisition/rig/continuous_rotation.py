@@ -3,29 +3,75 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
 from acquisition.rig.rig import Rig
+from acquisition.rig.way import find_way
 from processing.instrument.states import StateTable
 
 #: An endless axis unwinds once it has come this far: position counters are not endless.
 UP_TO_DEG = 36_000.0
 
 
-def unwound(table: StateTable, rig: Rig) -> StateTable:
-    """The table with its endless axes moved on by whole turns, so that the first state lies ahead of where they stand.
+def unwound(table: StateTable, rig: Rig, here_deg: Mapping[str, float] | None = None) -> StateTable:
+    """The table with its endless axes moved by whole turns, so that the first state lies ahead of where they stand.
 
-    They come to every state from below then, and never turn back the way they came.
+    They come to every state from below then, and never turn back the way they came. Where the way ahead is forbidden,
+    they go to the first state by another turn.
+
+    Parameters
+    ----------
+    here_deg : where the axes stand; None for where they stand once those without a reference are homed.
     """
-    angles = dict(table.angles_deg)
-    for name in rig.config.endless:
-        axis = rig.axes[name]
-        free = axis.limits.min_deg is None and axis.limits.max_deg is None
-        if free and name in angles and np.ptp(angles[name]) > 0 and axis.is_homed():
-            here = axis.read_position().deg
-            turns = math.ceil((here - 1e-3 - float(angles[name].min())) / 360.0)
-            if turns > 0 and here < UP_TO_DEG:
-                angles[name] = angles[name] + 360.0 * turns
+    here = rig.where_once_homed() if here_deg is None else here_deg
+    ahead = {}
+    for name in _endless(table, rig):
+        if name in here and np.ptp(table.angles_deg[name]) > 0:
+            turns = math.ceil((here[name] - 1e-3 - float(table.angles_deg[name].min())) / 360.0)
+            if turns > 0 and here[name] < UP_TO_DEG:
+                ahead[name] = turns
+    return turned(table, turns_to(table, rig, 0, here, ahead))
+
+
+def turned(table: StateTable, turns: Mapping[str, int]) -> StateTable:
+    """The table with whole turns added to its axes."""
+    angles = {name: column + 360.0 * turns.get(name, 0) for name, column in table.angles_deg.items()}
     return replace(table, angles_deg=angles)
+
+
+def turns_to(
+    table: StateTable, rig: Rig, state: int, here_deg: Mapping[str, float], wanted: Mapping[str, int]
+) -> dict[str, int]:
+    """Whole turns to add to the endless axes of a table, so that the way to one of its states is free.
+
+    Parameters
+    ----------
+    wanted : turns to add where the way with them is free, or no way is.
+    """
+    names = _endless(table, rig)
+    choices = []
+    for name in names:
+        there = round((here_deg.get(name, 0.0) - float(table.angles_deg[name][state])) / 360.0)
+        choices.append(list(dict.fromkeys([wanted.get(name, 0), there, there + 1, there - 1, 0])))
+    for chosen in product(*choices):
+        turns = dict(zip(names, chosen, strict=True))
+        by = states_deg(turned(table, turns))
+        if find_way(rig.config, here_deg, by[state], by, rig.limits) is not None:
+            return turns
+    return dict(wanted)
+
+
+def states_deg(table: StateTable) -> list[dict[str, float]]:
+    """Angle of each axis in each state."""
+    return [{axis: float(column[k]) for axis, column in table.angles_deg.items()} for k in range(len(table))]
+
+
+def _endless(table: StateTable, rig: Rig) -> Sequence[str]:
+    free = (
+        name for name in rig.config.endless if rig.limits[name].min_deg is None and rig.limits[name].max_deg is None
+    )
+    return [name for name in free if name in table.angles_deg]

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Self
 
 from acquisition.cleanup import Step, run_all
 from acquisition.errors import AcquisitionError
 from acquisition.rig.config import RigConfig
-from acquisition.rig.way import concerned, find_homing_obstacle, find_obstacle
+from acquisition.rig.way import Pose, concerned, find_homing_obstacle, find_obstacle, find_way
 from drivers.camera import Camera, CameraSettings
 from drivers.clock import REAL, Clock
 from drivers.errors import DeviceError, LimitError, MotionFailed
-from drivers.motion import Motion, MotionAxis, Position
+from drivers.motion import Limits, Motion, MotionAxis, Position
 from drivers.registry import open_axis, open_camera, open_source
 from drivers.serial_link import LineRegistry
 from drivers.source import LightSource
@@ -198,7 +198,7 @@ class Rig:
         MotionFailed
             Every axis has been sent a stop by then.
         """
-        found = find_homing_obstacle(self.config, names, self._where_known())
+        found = find_homing_obstacle(self.config, names, self.where_known())
         if found is not None:
             raise AcquisitionError(f"{found}. Nothing was moved.")
         for name in names:
@@ -213,9 +213,25 @@ class Rig:
         for name, slack in self.config.backlash_deg.items():
             if name in targets_deg and targets_deg[name] < self.axes[name].read_position().deg - 1e-6:
                 below[name] = targets_deg[name] - slack
-        if below and self._allowed(below):
-            self.wait(self.start_moves(dict(targets_deg) | below))
+        beyond = dict(targets_deg) | below
+        if below and self._allowed(beyond):
+            self.wait(self.start_moves(beyond))
         return self.wait(self.start_moves(targets_deg))
+
+    def go(self, targets_deg: Pose, by: Sequence[Pose] = (), first: str | None = None) -> None:
+        """Move to a pose by the way that `find_way` finds, if need be round what is forbidden.
+
+        Raises
+        ------
+        AcquisitionError
+            There is no such way; nothing was moved.
+        """
+        way = find_way(self.config, self.where_known(), targets_deg, by, self.limits, first)
+        if way is None:
+            # Says what is met.
+            self._check_way(targets_deg)
+        for targets in way or []:
+            self.move(targets)
 
     def _allowed(self, targets_deg: Mapping[str, float]) -> bool:
         try:
@@ -241,19 +257,42 @@ class Rig:
         return motions
 
     def _check_way(self, targets_deg: Mapping[str, float]) -> None:
-        if not concerned(self.config) & targets_deg.keys():
-            # Not even a position is read then: most moves are of rotators that nothing can hit.
-            return
-        here = self._where_known()
-        found = find_obstacle(self.config, here, here | dict(targets_deg), targets_deg)
+        found = self._met(targets_deg)
         if found is not None:
             raise AcquisitionError(f"move to {dict(targets_deg)} meets {found}. Nothing was moved.")
 
-    def _where_known(self) -> dict[str, float]:
+    def is_free(self, targets_deg: Mapping[str, float]) -> bool:
+        """Whether the axes can move there straight away."""
+        return self._met(targets_deg) is None
+
+    def _met(self, targets_deg: Mapping[str, float]) -> str | None:
+        if not concerned(self.config) & targets_deg.keys():
+            # Not even a position is read then: most moves are of rotators that nothing can hit.
+            return None
+        here = self.where_known()
+        return find_obstacle(self.config, here, here | dict(targets_deg), targets_deg, self.limits)
+
+    @property
+    def limits(self) -> dict[str, Limits]:
+        """Limits of every axis, the tighter ones of controller and rig file."""
+        return {name: axis.limits for name, axis in self.axes.items()}
+
+    def where_known(self) -> dict[str, float]:
         """Angles of the axes that forbidden poses and solids speak of, as far as they are known."""
         # Where an axis without a reference stands is not known, whatever it reads.
         axes = {name: self.axes[name] for name in concerned(self.config) if name in self.axes}
         return {name: axis.read_position().deg for name, axis in axes.items() if axis.is_homed()}
+
+    def where_once_homed(self) -> dict[str, float]:
+        """Angle of every axis after those without a reference have been homed, as far as the rig file tells.
+
+        Where it does not, an axis is taken to end at its controller's zero.
+        """
+        ends = {name: path.ends_deg for name, path in self.config.homing.items()}
+        return {
+            name: axis.read_position().deg if axis.is_homed() else ends.get(name, axis.controller_zero_deg)
+            for name, axis in self.axes.items()
+        }
 
     def wait(self, motions: Mapping[str, Motion]) -> dict[str, Position]:
         """Wait for all motions and return the positions read back at rest.

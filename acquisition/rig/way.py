@@ -1,22 +1,34 @@
-"""What is in the way of a move or of homing: forbidden poses, and solids that would come too near."""
+"""What is in the way of a move or of homing, and which way is free: forbidden poses, and solids that come too near."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
+from typing import TYPE_CHECKING, TypeAlias
 
 from acquisition.rig import clearance, forbidden_poses
-from acquisition.rig.forbidden_poses import find_forbidden, spanned, touches
+from acquisition.rig.forbidden_poses import EDGE_DEG, find_forbidden, spanned, touches
+from drivers.axis_types import Limits
 
 if TYPE_CHECKING:
     from acquisition.rig.sections import RigSections
 
 ANYWHERE = (-math.inf, math.inf)
+#: Axes that take part in a detour; the number of poses that it tries doubles with each.
+MOST_AXES = 8
+
+#: An angle of each axis, in degrees.
+Pose: TypeAlias = Mapping[str, float]
 
 
 def find_obstacle(
-    rig: RigSections, start_deg: Mapping[str, float], end_deg: Mapping[str, float], moving: Iterable[str] | None = None
+    rig: RigSections,
+    start_deg: Pose,
+    end_deg: Pose,
+    moving: Iterable[str] | None = None,
+    limits: Mapping[str, Limits] | None = None,
 ) -> str | None:
     """What a move meets anywhere on its way, in words; None if the way is free.
 
@@ -24,10 +36,13 @@ def find_obstacle(
     ----------
     start_deg, end_deg : angles of the axes before and after; an axis in neither may be anywhere.
     moving : axes that move; what concerns none of them is not asked about. None for all.
+    limits : of the axes; None for those of the rig file.
     """
+    if limits is None:
+        limits = {name: Limits(*axis.limits_deg) for name, axis in rig.axes.items() if axis and axis.limits_deg}
     names = None if moving is None else set(moving)
     boxes = [box for box in rig.forbidden if names is None or box.ranges_deg.keys() & names]
-    box = find_forbidden(boxes, start_deg, end_deg)
+    box = find_forbidden(boxes, start_deg, end_deg, limits)
     if box is not None:
         return forbidden_poses.describe(box)
     carriers = _carriers(rig)
@@ -35,6 +50,72 @@ def find_obstacle(
         return None
     clash = clearance.find_clash(rig.solids, spanned(start_deg, end_deg))
     return None if clash is None else clearance.describe(clash, rig.solids.margin_mm)
+
+
+def find_way(
+    rig: RigSections,
+    start_deg: Pose,
+    target_deg: Pose,
+    by: Sequence[Pose] = (),
+    limits: Mapping[str, Limits] | None = None,
+    first: str | None = None,
+) -> list[dict[str, float]] | None:
+    """The fewest moves that lead to a target without meeting anything, or None.
+
+    Parameters
+    ----------
+    start_deg : where the axes stand; one that is not in it may be anywhere, or stands at its target.
+    by : poses that a detour may lead through, as those of the states of a capture.
+    limits : of the axes; None for those of the rig file.
+    first : axis that goes first and alone where that way is free.
+
+    Returns
+    -------
+    Targets of each move. In each, all axes start together. A detour leads through the poses of `by`, and through those
+    in which some of the axes stand at their target and the others do not.
+    """
+    places = dict(target_deg) | dict(start_deg)
+    if first is not None and first in target_deg and len(target_deg) > 1:
+        alone = {first: target_deg[first]}
+        others = {name: angle for name, angle in target_deg.items() if name != first}
+        both = ((places, alone), (places | alone, others))
+        if all(find_obstacle(rig, here, here | move, move, limits) is None for here, move in both):
+            return [alone, others]
+    asked = [name for name in concerned(rig) if name in places]
+    turning = [name for name in asked if abs(target_deg.get(name, places[name]) - places[name]) > EDGE_DEG]
+    start = {name: places[name] for name in asked}
+    end = start | {name: target_deg[name] for name in asked if name in target_deg}
+    if len(turning) > MOST_AXES:
+        turning = []
+    corners = product(*((start[name], end[name]) for name in turning))
+    nodes = [end, *(start | dict(zip(turning, corner, strict=True)) for corner in corners)]
+    nodes += [start | {name: pose[name] for name in asked if name in pose} for pose in by]
+    came_from: dict[int, int | None] = {}
+    reached = deque[int]()
+
+    def reach(from_node: int | None) -> None:
+        here = start if from_node is None else nodes[from_node]
+        for node, pose in enumerate(nodes):
+            if node not in came_from:
+                moving = [name for name in asked if pose[name] != here[name]]
+                if find_obstacle(rig, here, pose, moving, limits) is None:
+                    came_from[node] = from_node
+                    reached.append(node)
+                    if node == 0:
+                        return
+
+    reach(None)
+    while reached and 0 not in came_from:
+        reach(reached.popleft())
+    if 0 not in came_from:
+        return None
+    poses, node = [end], came_from[0]
+    while node is not None:
+        poses.insert(0, nodes[node])
+        node = came_from[node]
+    detour = zip([start, *poses], poses[:-1], strict=False)
+    turned = [{name: pose[name] for name in asked if pose[name] != before[name]} for before, pose in detour]
+    return [*turned, dict(target_deg)]
 
 
 def concerned(rig: RigSections) -> set[str]:
