@@ -99,6 +99,9 @@ class RecordedRig:
         self.note("trigger", self._exposures)
         return RecordedExposure(self, self._exposures)
 
+    def is_free(self, targets_deg: Mapping[str, float]) -> bool:
+        return True
+
     def start_moves(self, targets_deg: Mapping[str, float]) -> dict[str, Any]:
         self.note("start", dict(targets_deg), list(targets_deg))
         return {name: SimpleNamespace(expected_s=MOVE_S, target_deg=target) for name, target in targets_deg.items()}
