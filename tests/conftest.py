@@ -24,6 +24,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--rig", default=None, help="rig file of real hardware for tests/hardware")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _own_home(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Keep the list of rig files that a user has used out of the home folder of whoever tests."""
+    os.environ["XDG_CONFIG_HOME"] = str(tmp_path_factory.mktemp("config"))
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Give each test process a loopback interface of its own, where it may.
 

@@ -13,7 +13,7 @@ from viewer.campaigns import STATUS, CampaignView, read_campaign
 from viewer.jobs import Jobs
 from viewer.library import Entry, Library, NotHere, made_from
 from viewer.pages import file_of, pages_of
-from viewer.starting import campaign_files
+from viewer.starting import campaign_files, resumed_with
 
 #: Files on one page of a list; more are found by searching.
 MOST = 300
@@ -62,6 +62,7 @@ def campaign(request: Request) -> HTMLResponse:
         view=view,
         statuses=STATUS,
         bars=[asdict(bar) for bar in view.bars],
+        resumes=resumed_with(pages.library.root / view.name),
     )
 
 

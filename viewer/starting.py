@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,9 @@ from starlette.responses import HTMLResponse, JSONResponse, StreamingResponse
 from acquisition import CONFIGS, Campaign
 from acquisition.campaign.identity import read_identity
 from acquisition.campaign.log import PLAN
+from acquisition.commands.defaults import DEFAULT_RIG
+from acquisition.rig.config import load_rig
+from acquisition.rig.own_rigs import is_own_rig, own_campaign
 from processing.errors import ProcessError
 from processing.reflectance.base import kinds
 from processing.storage.capture import Capture
@@ -44,7 +48,14 @@ def _campaign(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
     if file is None:
         raise NotHere(f"{asked.get('file')}: there is no such campaign file")
     campaign = Campaign.load(file)
-    command = ["acquire", "--campaign", str(file), "--out", str(library.root)]
+    rig = campaign.rig or DEFAULT_RIG
+    if not (is_own_rig(rig) or rig.resolve().is_relative_to(CONFIGS.resolve())):
+        raise ProcessError(
+            f"{file.name} names the rig file {rig}, which you have not used before, and a rig file names devices and "
+            f"commands. Look at it, then use it once in a terminal: acquire --campaign {shlex.quote(str(file))} "
+            f"--rig {shlex.quote(str(rig))} --dry-run"
+        )
+    command = ["acquire", "--campaign", str(file), "--rig", str(rig), "--out", str(library.root)]
     if asked.get("yes"):
         command.append("--yes")
     return jobs.start(f"campaign {campaign.name}", command, {"campaign": campaign.name}, library.root)
@@ -60,14 +71,44 @@ def campaign_files(library: Library) -> dict[str, Path]:
 
 def _resume(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
     folder = library.path(asked.get("folder", ""))
-    identity = read_identity(folder)
-    if identity is None:
+    if read_identity(folder) is None:
         raise NotHere(f"{asked.get('folder')}: no campaign was begun in this folder")
-    command = ["acquire", "--campaign", str(folder / PLAN), "--rig", str(identity.get("rig_file"))]
-    command += ["--out", str(folder.parent)]
+    command = resume_command(folder)
+    if command is None:
+        raise ProcessError(
+            f"{folder.name} was not begun by you on this machine, and what it names is not run. In a terminal: acquire "
+            f"--campaign {shlex.quote(str(folder / PLAN))} --rig RIG.yaml --out {shlex.quote(str(folder.parent))}"
+        )
     return jobs.start(
         f"campaign {folder.name}, gone on with", command, {"campaign": library.name(folder)}, library.root
     )
+
+
+def resume_command(folder: Path) -> list[str] | None:
+    """The command that resumes the campaign in a folder, with the user's own files; None where it is not theirs."""
+    own = own_campaign(folder)
+    if own is None:
+        return None
+    campaign, rig = own
+    # A folder that is the second of its name is found by the same command with --as-new.
+    more = [] if folder.name == Campaign.load(campaign).name else ["--as-new"]
+    return ["acquire", "--campaign", str(campaign), "--rig", str(rig), "--out", str(folder.parent), *more]
+
+
+def resumed_with(folder: Path) -> tuple[str, list[str]] | None:
+    """What a page would run to resume the campaign in a folder, as typed, and the commands that its rig file names.
+
+    None where the campaign is not the user's own.
+    """
+    try:
+        command = resume_command(folder)
+        if command is None:
+            return None
+        rig = load_rig(command[command.index("--rig") + 1])
+    except ProcessError:
+        return None
+    named = [rig.alert, rig.notify.command if rig.notify else (), (rig.notify and rig.notify.webhook) or ""]
+    return shlex.join(command), [one if isinstance(one, str) else shlex.join(one) for one in named if one]
 
 
 def _reduce(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:

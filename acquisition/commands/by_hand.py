@@ -150,10 +150,9 @@ def snap(
 def _load(rig: Path | None) -> RigConfig:
     from rich.console import Console
 
-    from acquisition.commands.single import say_simulated
-    from acquisition.rig.config import load_rig
+    from acquisition.commands.single import given_rig, say_simulated
 
-    config = load_rig(rig or DEFAULT_RIG)
+    config = given_rig(rig or DEFAULT_RIG)
     say_simulated(Console(stderr=True), config)
     return config
 

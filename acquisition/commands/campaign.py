@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 
 from acquisition.campaign import run as campaign_run
-from acquisition.campaign.identity import campaign_identity, folder_for, require_same_campaign, with_devices
+from acquisition.campaign.identity import IDENTITY, campaign_identity, folder_for, require_same_campaign, with_devices
 from acquisition.campaign.log import INDEX, LOG, CampaignFolder
 from acquisition.campaign.plan import Campaign
 from acquisition.campaign.run import CampaignRun, Planned
@@ -20,8 +20,8 @@ from acquisition.campaign.summary import SUMMARY, summary_lines
 from acquisition.capture.checks import Check, refuse_failed
 from acquisition.capture.operator import Operator
 from acquisition.commands.defaults import DEFAULT_RIG, INTERRUPTED
-from acquisition.commands.single import Options, live_page, say_simulated, seeded, show_checks
-from acquisition.rig.config import load_rig
+from acquisition.commands.single import Options, given_rig, live_page, say_simulated, seeded, show_checks
+from acquisition.rig.own_rigs import is_own_rig, note_campaign
 from acquisition.rig.rig import Rig
 from acquisition.screen.notify import notifying
 from acquisition.screen.observer import Observer
@@ -29,6 +29,7 @@ from acquisition.screen.progress import ConsoleProgress
 from acquisition.screen.rows import print_rows
 from acquisition.screen.run_file import RunFile
 from acquisition.stop_request import StopRequest
+from processing.doors import one_line
 from processing.yaml_file import ConfigError
 
 
@@ -37,8 +38,8 @@ def run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Obs
     console = Console(stderr=True)
     _refuse_with_campaign(options, file)
     campaign = Campaign.load(file)
-    rig_file = options.rig or campaign.rig or DEFAULT_RIG
-    rig_config = seeded(load_rig(rig_file), options.seed)
+    rig_file = options.rig or _rig_of(campaign, file) or DEFAULT_RIG
+    rig_config = seeded(given_rig(rig_file), options.seed)
     jobs = campaign_run.prepare(campaign, rig_config)
     identity = campaign_identity(campaign, jobs, rig_config, rig_file.resolve())
     folder = folder_for(options.out / campaign.name, identity, options.as_new)
@@ -54,6 +55,7 @@ def run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Obs
     refuse_failed(checks)
     held = CampaignFolder(folder, campaign)
     held.begin_with(identity)
+    note_campaign(folder, file, rig_file)
     try:
         operator = Operator(console.print, stop, options.yes, rig_config.simulated)
         told = RunFile(folder, rig_config.simulated)
@@ -76,6 +78,23 @@ def run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Obs
     after = shlex.join(filter(None, [os.environ.get("UMOV_DOOR"), *words]))
     typer.echo(f"next: {after}" if done else "next: the same command goes on where it stopped")
     return 0 if done else INTERRUPTED
+
+
+def _rig_of(campaign: Campaign, file: Path) -> Path | None:
+    """The rig that a campaign file names; in a folder of captures, only if the user has used it before.
+
+    Raises
+    ------
+    ConfigError
+        It is in a folder of captures, which may be somebody else's.
+    """
+    if campaign.rig is None or not (file.parent / IDENTITY).exists() or is_own_rig(campaign.rig):
+        return campaign.rig
+    raise ConfigError(
+        f"{one_line(file)} lies with captures and names the rig file {one_line(campaign.rig)}, which you have not used "
+        f"before. Commands and paths are not taken from a data folder. Look at it, then give it yourself: acquire "
+        f"--campaign {shlex.quote(one_line(file))} --rig RIG.yaml"
+    )
 
 
 def _refuse_with_campaign(options: Options, file: Path) -> None:

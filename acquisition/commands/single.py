@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shlex
 from collections.abc import Iterator
@@ -17,6 +18,7 @@ from acquisition.capture.checks import Check, refuse_failed
 from acquisition.capture.estimate import capture_seconds
 from acquisition.capture.free_name import free_name
 from acquisition.capture.header import default_name
+from acquisition.capture.identity import rig_content
 from acquisition.capture.job import Job, Result, check_with_devices, job_of, prepare, stored_plan, stored_rig
 from acquisition.capture.machine_checks import check_machine
 from acquisition.capture.operator import Operator
@@ -25,6 +27,7 @@ from acquisition.capture.writer import PARTIAL, seal_whole
 from acquisition.commands.defaults import CONFIGS, DEFAULT_RIG, INTERRUPTED
 from acquisition.rig.config import RigConfig, load_rig
 from acquisition.rig.guarded import guarded
+from acquisition.rig.own_rigs import note_rig, own_rigs
 from acquisition.rig.rig import Rig
 from acquisition.screen.notify import notifying
 from acquisition.screen.observer import Observer
@@ -32,6 +35,8 @@ from acquisition.screen.progress import ConsoleProgress
 from acquisition.screen.rows import print_rows
 from acquisition.screen.run_file import RunFile
 from acquisition.stop_request import StopRequest
+from processing.doors import one_line
+from processing.errors import ProcessError
 from processing.storage.capture import Capture
 from processing.storage.capture_schema import Sample
 from processing.yaml_file import ConfigError
@@ -103,12 +108,50 @@ def _job(options: Options) -> tuple[Job, Path, bool]:
         job = prepare(plan_of(options), rig_of(options))
         return job, options.out / default_name(job.plan), False
     _refuse_with_resume(options)
-    rig = load_rig(options.rig) if options.rig else None
+    with Capture(options.resume) as capture:
+        plan = stored_plan(capture)
+        rig = given_rig(options.rig) if options.rig else own_rig_of(capture, options.as_new)
     if not options.as_new:
         return job_of(options.resume, rig), options.resume, True
-    with Capture(options.resume) as capture:
-        plan, rig = stored_plan(capture), rig or stored_rig(capture)
     return prepare(plan, rig), options.resume.with_name(options.resume.name.removesuffix(PARTIAL)), False
+
+
+def own_rig_of(capture: Capture, exactly: bool) -> RigConfig:
+    """The user's own rig file that a capture was begun with, as far as its content tells.
+
+    Parameters
+    ----------
+    exactly : False for one of the same name if none has the same content.
+
+    Raises
+    ------
+    ConfigError
+        There is none. The rig in the capture is not used: its commands and paths may be somebody else's.
+    """
+    stored, mode = stored_rig(capture), capture.header.mode
+    alike = []
+    for file in (*own_rigs(stored.name), DEFAULT_RIG):
+        with contextlib.suppress(ProcessError):
+            rig = seeded(load_rig(file), stored.simulator.seed if stored.simulator else None)
+            if mode in rig.modes and rig_content(rig, mode) == rig_content(stored, mode):
+                return rig
+            if file != DEFAULT_RIG:
+                alike.append(rig)
+    if alike and not exactly:
+        return alike[0]
+    path = one_line(capture.path)
+    raise ConfigError(
+        f"{path} was begun with rig {one_line(stored.name)!r}, and you have not used such a rig file before. Devices, "
+        f"commands and paths are not taken from a data file. Give yours: acquire --resume {shlex.quote(path)} "
+        f"--rig RIG.yaml{' --as-new' if exactly else ''}"
+    )
+
+
+def given_rig(file: Path) -> RigConfig:
+    """Read a rig file that the user has given, and note that it is theirs. Raises ConfigError."""
+    rig = load_rig(file)
+    note_rig(file, rig.name)
+    return rig
 
 
 def _sealed(path: Path) -> Path | None:
@@ -149,7 +192,7 @@ def sample_of(name: str) -> Sample:
 
 def rig_of(options: Options) -> RigConfig:
     """The rig file, or the simulated rig."""
-    return seeded(load_rig(options.rig or DEFAULT_RIG), options.seed)
+    return seeded(given_rig(options.rig or DEFAULT_RIG), options.seed)
 
 
 def seeded(rig: RigConfig, seed: int | None) -> RigConfig:

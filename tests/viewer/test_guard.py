@@ -1,5 +1,6 @@
 """Only a browser on this machine that was given the whole address is answered, and no page of another site."""
 
+import json
 import os
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from starlette.testclient import TestClient
 from viewer.application import application
 
 TOKEN = "the-token"
+HERE = {"origin": "http://127.0.0.1:8000"}
 ADDRESSES = ("/", "/style.css", "/static/plots.js", "/capture?file=one.h5", "/frame?file=one.h5", "/events?folder=.")
 
 
@@ -96,3 +98,20 @@ def test_a_name_is_text_of_the_page_and_nothing_else(lab):
     assert page.status_code == 200
     assert "<img src=x" not in page.text
     assert "its name is not UTF-8" in page.text
+
+
+def test_a_campaign_of_somebody_else_is_not_resumed_from_the_page(client, lab, tmp_path, monkeypatch, configs):
+    """Neither the rig file nor the campaign file that a data folder names is opened or run."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "home"))
+    night = lab / "night"
+    night.mkdir()
+    (night / "identity.json").write_text(json.dumps({"rig_file": str(tmp_path / "evil.yaml"), "plan": {"a.h5": {}}}))
+    answer = client.post("/start", json={"what": "resume", "folder": "night"}, headers=HERE)
+    assert answer.status_code == 422
+    assert "was not begun by you" in answer.text
+    campaign = (configs / "campaigns" / "red_sphere.yaml").read_text()
+    (lab / "c.yaml").write_text(campaign.replace("kind: campaign", f"kind: campaign\nrig: {tmp_path / 'evil.yaml'}"))
+    answer = client.post("/start", json={"what": "campaign", "file": "c.yaml"}, headers=HERE)
+    assert answer.status_code == 422
+    assert "which you have not used before" in answer.text
+    assert not (lab / ".umov").exists() or not list((lab / ".umov").glob("jobs/*"))
