@@ -35,6 +35,8 @@ def lab(small_rig, configs, tmp_path) -> Path:
     folder.mkdir()
     wedge = [{"kind": "image_drift", "axis": "psa", "wedge_pixels": 0.4}]
     shutil.move(small_rig(effects=wedge, rows=120, columns=120, clock_speed=20), folder / "rig.yaml")
+    # As a command in a terminal does: a page starts nothing with a rig file that was not used before.
+    note_rig(folder / "rig.yaml", "simulated RGB950")
     campaign = {
         "kind": "campaign",
         "name": "evening",
