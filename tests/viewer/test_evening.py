@@ -15,6 +15,8 @@ from PIL import Image
 from playwright.sync_api import ConsoleMessage, Page, Route, expect, sync_playwright
 from ruamel.yaml import YAML
 
+from acquisition.rig.own_rigs import note_rig
+
 #: However long a busy machine takes; the limit of a test ends a hang.
 PATIENCE_MS = 300_000
 
