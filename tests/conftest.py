@@ -6,6 +6,7 @@ import os
 import socket
 import struct
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -66,15 +67,27 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(scope="session")
-def shared_data() -> Path:
-    """Folder of the real measurements; without it a test skips, in CI it fails."""
-    folder = ROOT.parent / "shared" / "data"
-    if folder.is_dir():
-        return folder
-    message = f"the real measurements are not at {folder}"
-    if os.environ.get("CI"):
-        pytest.fail(message)
-    pytest.skip(message)
+def public_files() -> Callable[[str], dict[str, Path]]:
+    """Files of a set of public measured data by its name (docs/measured-data.md); each was checked.
+
+    Sets in tests/data are there everywhere. For the others the folder UMOV_DATA, or ../shared/data, is used: without
+    them a test skips, in CI it fails.
+    """
+    from processing.public_data.sets import SHIPPED, find_files
+
+    other = Path(os.environ.get("UMOV_DATA", ROOT.parent / "shared" / "data"))
+
+    @cache
+    def files(name: str) -> dict[str, Path]:
+        found = find_files(name, [SHIPPED, other])
+        if found is None:
+            message = f"the data set {name} is not in {other}; get it: ./lab data get {name}, UMOV_DATA=data"
+            if os.environ.get("CI"):
+                pytest.fail(message)
+            pytest.skip(message)
+        return found
+
+    return files
 
 
 @pytest.fixture(scope="session")

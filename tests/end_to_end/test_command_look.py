@@ -6,6 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 from acquisition.commands.application import app as acquire
+from acquisition.commands.public_data import app as data
 from processing.commands.application import app as process
 from processing.commands.command_line import application, run
 from processing.commands.diagnose import app as diagnose
@@ -13,7 +14,14 @@ from processing.commands.program import main as umov
 from simulators.cli import app as simulate
 from viewer.command import app as view
 
-COMMANDS = {"acquire": acquire, "process": process, "diagnose": diagnose, "simulate": simulate, "view": view}
+COMMANDS = {
+    "acquire": acquire,
+    "process": process,
+    "diagnose": diagnose,
+    "simulate": simulate,
+    "view": view,
+    "data": data,
+}
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -31,6 +31,8 @@ from ruamel.yaml import YAML
 from acquisition.campaign.plan import Campaign
 from acquisition.commands.application import app as acquire_app
 from acquisition.commands.application import main as acquire
+from acquisition.commands.public_data import app as data_app
+from acquisition.commands.public_data import main as data
 from acquisition.rig.config import load_rig
 from processing.commands.application import app as process_app
 from processing.commands.application import main as process
@@ -42,13 +44,14 @@ from viewer.command import app as view_app
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
-RUNS = {"acquire": acquire, "process": process, "diagnose": diagnose}
+RUNS = {"acquire": acquire, "process": process, "diagnose": diagnose, "data": data}
 APPS = {
     "acquire": acquire_app,
     "process": process_app,
     "diagnose": diagnose_app,
     "simulate": simulate_app,
     "view": view_app,
+    "data": data_app,
 }
 MODULES = {"simulate": "simulators.cli", "view": "viewer.command"}
 FIRST_CAPTURE = ["./lab", "acquire", "--omega", "35"]

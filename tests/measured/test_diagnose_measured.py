@@ -1,7 +1,5 @@
 """`diagnose` on real measurements: nothing is set for a data set beyond its train in YAML."""
 
-import csv
-import json
 import os
 from pathlib import Path
 
@@ -15,39 +13,35 @@ from processing.diagnosis.instrument_file import extended
 from processing.diagnosis.search.result import Check
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
+from processing.public_data.conversion import StateTable, mirror_means, single_detector, tables_of
+from processing.public_data.sets import SHIPPED
 from processing.storage.capture import Capture
 from processing.storage.importing import ImportRequest, import_capture, read_sample
 
 pytestmark = pytest.mark.measured
 
-EXACT_DEG = {0: 0.0, 23: 22.5, 45: 45.0, 68: 67.5, 90: 90.0, 113: 112.5, 135: 135.0, 158: 157.5}
 
-
-def imported(folder: Path, lines: list[str], instrument: Path, wavelength_nm: float, sample: str) -> Path:
-    states = folder / "states.csv"
-    states.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    out = folder / "capture.h5"
+def imported(folder: Path, table: StateTable, instrument: Path) -> Path:
+    out = folder / f"{table.name}.h5"
     import_capture(
         ImportRequest(
-            states=states,
+            states=table.write(folder)[0],
             out=out,
-            wavelength_nm=wavelength_nm,
+            wavelength_nm=table.wavelength_nm,
             instrument=instrument,
-            sample=read_sample(sample),
+            sample=read_sample(table.sample),
             overwrite=True,
         )
     )
     return out
 
 
-def wollaston(shared_data: Path, folder: Path, instrument: Path, wavelength_nm: int) -> tuple[Path, np.ndarray]:
+def wollaston(public_files, folder: Path, instrument: Path, wavelength_nm: int) -> tuple[Path, np.ndarray]:
     """Capture of air, and the sum of both channels in the order of its states."""
-    data = json.loads((shared_data / "drr-wollaston-nir/cal_results.json").read_text())
-    theta, left, right = (np.array(data[f"Cal_{k}{wavelength_nm}"]) for k in ("theta", "Il_", "Ir_"))
-    order = np.argsort(theta)
-    lines = ["state,psg_deg,channel_left,channel_right"]
-    lines += [f"{k},{np.rad2deg(theta[n]):.6f},{left[n]},{right[n]}" for k, n in enumerate(order)]
-    return imported(folder, lines, instrument, wavelength_nm, "air"), (left + right)[order]
+    tables = tables_of("drr-wollaston-nir", public_files("drr-wollaston-nir"))
+    table = next(t for t in tables if t.name == f"air_{wavelength_nm}nm")
+    total = np.array([[float(word) for word in row.split(",")[2:]] for row in table.rows]).sum(axis=1)
+    return imported(folder, table, instrument), total
 
 
 # With both channels at 1200 nm; the ratio alone is below.
@@ -60,20 +54,20 @@ def wollaston(shared_data: Path, folder: Path, instrument: Path, wavelength_nm: 
         (1950, 0.2, 0.45, {"generator_ellipticity"}),
     ],
 )
-def test_wollaston_at_other_wavelengths(shared_data, configs, tmp_path, wavelength_nm, least, most, sure):
+def test_wollaston_at_other_wavelengths(public_files, configs, tmp_path, wavelength_nm, least, most, sure):
     instrument = configs / "instruments/drr_wollaston.yaml"
-    path, _ = wollaston(shared_data, tmp_path, instrument, wavelength_nm)
+    path, _ = wollaston(public_files, tmp_path, instrument, wavelength_nm)
     d = diagnose_captures([path], InstrumentModel.load(instrument))[0].diagnosis
     assert least < d.error_after.rms_percent < most
     assert sure <= {e.kind for e in d.effects if e.confident}
 
 
-def test_where_the_source_counts_for_nothing_the_ratio_is_all(shared_data, configs, tmp_path):
+def test_where_the_source_counts_for_nothing_the_ratio_is_all(public_files, configs, tmp_path):
     """`free_source` in the train: 46 ratios at 1200 nm, of which a level of the source for each state takes nothing."""
     file = configs / "instruments/drr_wollaston.yaml"
     instrument = tmp_path / "ratio.yaml"
     instrument.write_text(file.read_text(encoding="utf-8") + "free_source: true\n", encoding="utf-8")
-    path, _ = wollaston(shared_data, tmp_path, instrument, 1200)
+    path, _ = wollaston(public_files, tmp_path, instrument, 1200)
     d = diagnose_captures([path], InstrumentModel.load(instrument))[0].diagnosis
     assert d.correction.refused is None
     assert 0.1 < d.error_after.rms_percent < 0.27
@@ -81,26 +75,16 @@ def test_where_the_source_counts_for_nothing_the_ratio_is_all(shared_data, confi
     assert any(e.confident for e in d.effects)
 
 
-def telescope(shared_data: Path, folder: Path, instrument: Path) -> dict[int, Path]:
-    """Captures of air by wavelength in nm, which are made as they are asked for."""
-    by_wavelength: dict[int, list[str]] = {}
-    with (shared_data / "dual-beam-charis-nir/fluxes.csv").open() as file:
-        for r in csv.DictReader(file):
-            lines = by_wavelength.setdefault(round(float(r["wavelength_nm"])), [])
-            noise = float(r["stderr"]) / np.sqrt(2)
-            lines.append(f"{len(lines)},{r['hwp_deg']},{r['image_rotator_deg']},{r['left']},{r['right']},{noise}")
-    head = "state,hwp_deg,image_rotator_deg,channel_left,channel_right,sigma"
-    out = {}
-    for wavelength, lines in by_wavelength.items():
-        (folder / str(wavelength)).mkdir()
-        out[wavelength] = imported(folder / str(wavelength), [head, *lines], instrument, wavelength, "air")
-    return out
+def telescope(public_files, folder: Path, instrument: Path) -> dict[int, Path]:
+    """Captures of air by wavelength in nm."""
+    tables = tables_of("dual-beam-charis-nir", public_files("dual-beam-charis-nir"))
+    return {int(table.wavelength_nm): imported(folder, table, instrument) for table in tables}
 
 
-def test_the_telescope_at_one_wavelength(shared_data, configs, tmp_path):
+def test_the_telescope_at_one_wavelength(public_files, configs, tmp_path):
     """By itself it does not tell what is depolarized: with that open nothing of M would be certain enough."""
     instrument = configs / "instruments/dual_beam_charis.yaml"
-    path = telescope(shared_data, tmp_path, instrument)[1686]
+    path = telescope(public_files, tmp_path, instrument)[1686]
     model = InstrumentModel.load(instrument)
     plain = tuple(name for name in model.calibrate if not name.endswith("depolarization"))
     belongs = {name: rule for name, rule in model.belongs_to.items() if not name.endswith("depolarization")}
@@ -111,12 +95,10 @@ def test_the_telescope_at_one_wavelength(shared_data, configs, tmp_path):
     assert 0.05 < left < 0.25
 
 
-def held_out_of_each(
-    shared_data: Path, configs: Path, tmp_path: Path, wavelengths: tuple[int, ...] | None
-) -> list[Check]:
+def held_out_of_each(public_files, configs: Path, tmp_path: Path, wavelengths: tuple[int, ...] | None) -> list[Check]:
     """What a joint fit leaves at each wavelength of states that it did not see."""
     instrument = configs / "instruments/dual_beam_charis.yaml"
-    paths = telescope(shared_data, tmp_path, instrument)
+    paths = telescope(public_files, tmp_path, instrument)
     chosen = [paths[nm] for nm in wavelengths or paths]
     d = diagnose_captures(chosen, InstrumentModel.load(instrument))[0].diagnosis
     assert d.correction.refused is None
@@ -124,36 +106,32 @@ def held_out_of_each(
     return [c for c in d.correction.checks if c.name.startswith("rms on held-out data of")]
 
 
-def test_four_wavelengths_of_the_telescope_share_the_angles_of_their_states(shared_data, configs, tmp_path):
-    told = held_out_of_each(shared_data, configs, tmp_path, (1575, 1744, 1932, 2139))
+def test_four_wavelengths_of_the_telescope_share_the_angles_of_their_states(public_files, configs, tmp_path):
+    told = held_out_of_each(public_files, configs, tmp_path, (1575, 1744, 1932, 2139))
     assert len(told) == 4
     assert all(0.01 < c.after < 0.2 < c.before for c in told)
 
 
 @pytest.mark.skipif("UMOV_SLOW" not in os.environ, reason="takes six minutes: UMOV_SLOW=1")
 @pytest.mark.timeout(1800)
-def test_all_wavelengths_of_the_telescope(shared_data, configs, tmp_path):
-    told = held_out_of_each(shared_data, configs, tmp_path, None)
+def test_all_wavelengths_of_the_telescope(public_files, configs, tmp_path):
+    told = held_out_of_each(public_files, configs, tmp_path, None)
     assert len(told) == 22
     assert sum(c.after <= 0.25 for c in told) >= 18
 
 
-def single_detector(shared_data: Path, folder: Path, instrument: Path, wavelength_nm: int, rows: int) -> Path:
+def one_detector(public_files, folder: Path, instrument: Path, wavelength_nm: int, beside: int) -> Path:
     """Capture of air, the mean of so many rows (2 nm apart) on both sides of a wavelength."""
-    table = np.genfromtxt(shared_data / "drr-single-detector-vis/air_2021.csv", delimiter=",", skip_header=1)
-    at = int(np.argmin(np.abs(table[:, 0] - wavelength_nm)))
-    lines = ["state,psg_deg,psa_deg,channel_camera"]
-    lines += [f"{n},{6 * n},{30 * n},{v}" for n, v in enumerate(table[at - rows : at + rows + 1, 1:].mean(axis=0))]
-    return imported(folder, lines, instrument, wavelength_nm, "air")
+    (file,) = public_files("drr-single-detector-vis").values()
+    return imported(folder, single_detector(file, wavelength_nm, beside), instrument)
 
 
 @pytest.mark.long
-def test_ten_wavelengths_share_their_mechanics(shared_data, configs, tmp_path):
+def test_ten_wavelengths_share_their_mechanics(public_files, configs, tmp_path):
     instrument = configs / "instruments/drr_single_detector.yaml"
     paths = []
     for wavelength in range(450, 901, 50):
-        (tmp_path / str(wavelength)).mkdir()
-        paths.append(single_detector(shared_data, tmp_path / str(wavelength), instrument, wavelength, 0))
+        paths.append(one_detector(public_files, tmp_path, instrument, wavelength, 0))
     d = diagnose_captures(paths, InstrumentModel.load(instrument))[0].diagnosis
     assert d.correction.refused is None
     assert d.error_after.rms_percent < 0.95 * d.error_before.rms_percent
@@ -164,18 +142,18 @@ def test_ten_wavelengths_share_their_mechanics(shared_data, configs, tmp_path):
 
 # One row of the table has a noise of 0.75, 0.81 and 1.20 %; a mean of eleven (20 nm) has a third of it.
 @pytest.mark.parametrize(("wavelength_nm", "before", "after"), [(450, 1.5, 0.6), (850, 0.8, 0.55), (1000, 2.0, 1.2)])
-def test_one_detector_behind_two_plates(shared_data, configs, tmp_path, wavelength_nm, before, after):
+def test_one_detector_behind_two_plates(public_files, configs, tmp_path, wavelength_nm, before, after):
     instrument = configs / "instruments/drr_single_detector.yaml"
-    path = single_detector(shared_data, tmp_path, instrument, wavelength_nm, 5)
+    path = one_detector(public_files, tmp_path, instrument, wavelength_nm, 5)
     d = diagnose_captures([path], InstrumentModel.load(instrument))[0].diagnosis
     assert d.correction.refused is None
     assert d.error_before.rms_percent > before
     assert 0.3 < d.error_after.rms_percent < after
 
 
-def test_wollaston_the_source_is_the_cause(shared_data, configs, tmp_path):
+def test_wollaston_the_source_is_the_cause(public_files, configs, tmp_path):
     instrument = configs / "instruments/drr_wollaston.yaml"
-    path, total = wollaston(shared_data, tmp_path, instrument, 1600)
+    path, total = wollaston(public_files, tmp_path, instrument, 1600)
     judged, problem = diagnose_captures([path], InstrumentModel.load(instrument))
     d = judged.diagnosis
     assert d.error_before.rms_percent > 2.0
@@ -192,15 +170,9 @@ def test_wollaston_the_source_is_the_cause(shared_data, configs, tmp_path):
 
 
 @pytest.mark.timeout(900)
-def test_mirror_frames_down_to_a_quarter_percent(shared_data, configs, tmp_path):
+def test_mirror_frames_down_to_a_quarter_percent(configs, tmp_path):
     instrument = configs / "instruments/drr_imaging_630nm.yaml"
-    with (shared_data / "drr-imaging-630nm/roi_stats_630nm.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    lines = ["state,psg_deg,psa_deg,analyzer_deg,channel_camera"]
-    for k, row in enumerate(rows):
-        psg, psa = (EXACT_DEG[int(row[f"{r}_retarder_deg_nominal_rounded"])] for r in ("psg", "psa"))
-        lines.append(f"{k},{psg},{psa},{row['psa_polarizer_deg']},{row['roi_mean_dn']}")
-    path = imported(tmp_path, lines, instrument, 630, "mirror")
+    path = imported(tmp_path, mirror_means(SHIPPED / "drr-imaging-630nm/roi_stats_630nm.csv"), instrument)
     d = diagnose_captures([path], InstrumentModel.load(instrument))[0].diagnosis
     assert d.error_before.rms_percent == pytest.approx(1.42, abs=0.03)
     assert d.error_after.rms_percent < 0.25
@@ -209,14 +181,12 @@ def test_mirror_frames_down_to_a_quarter_percent(shared_data, configs, tmp_path)
 
 
 @pytest.mark.timeout(900)
-def test_the_gain_learnt_on_one_picture_mends_another(shared_data, configs, tmp_path):
+def test_the_gain_learnt_on_one_picture_mends_another(public_files, configs, tmp_path):
     instrument = configs / "instruments/linear_stokes.yaml"
-    folder = shared_data / "dofp-imx250mzr"
+    tables = {table.name: table for table in tables_of("dofp-imx250mzr", public_files("dofp-imx250mzr"))}
 
     def capture(name: str) -> Path:
-        (tmp_path / name).mkdir()
-        file = folder / f"polanalyser_{name}_IMX250MZR.png"
-        return imported(tmp_path / name, ["state,file", f"0,{file}"], instrument, 550, "unknown")
+        return imported(tmp_path, tables[name], instrument)
 
     model = InstrumentModel.load(instrument)
     learnt = diagnose_captures([capture("camera")], model)[0].diagnosis

@@ -24,8 +24,8 @@ def direction(theta_deg, phi_deg):
     return np.stack([np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)], axis=-1)
 
 
-def problem_of(shared_data, wavelength_um):
-    rows = np.genfromtxt(shared_data / "ptfe-mueller-brdf/PTFE.data.csv", delimiter=",", skip_header=1)
+def problem_of(public_files, wavelength_um):
+    rows = np.genfromtxt(public_files("ptfe-mueller-brdf")["PTFE.data.csv"], delimiter=",", skip_header=1)
     s = rows[rows[:, 0] == wavelength_um]
     # Axes of the file: docs/reflectance.md.
     flip = np.diag([1.0, 1.0, 1.0, -1.0])
@@ -41,8 +41,8 @@ def problem_of(shared_data, wavelength_um):
 
 
 @pytest.mark.parametrize("wavelength_um", FOUND)
-def test_scattering_in_the_volume_helps_and_polarized_diffuse_does_not(shared_data, wavelength_um):
-    problem = problem_of(shared_data, wavelength_um)
+def test_scattering_in_the_volume_helps_and_polarized_diffuse_does_not(public_files, wavelength_um):
+    problem = problem_of(public_files, wavelength_um)
     nothing = Space(())
     fit = minimize(problem, nothing, np.zeros(0))
     before = held_out(problem, nothing, fit)
@@ -58,8 +58,8 @@ def test_scattering_in_the_volume_helps_and_polarized_diffuse_does_not(shared_da
 
 
 @pytest.mark.parametrize("wavelength_um", FOUND)
-def test_a_fitted_index_runs_to_its_bound(shared_data, wavelength_um):
-    problem = problem_of(shared_data, wavelength_um)
+def test_a_fitted_index_runs_to_its_bound(public_files, wavelength_um):
+    problem = problem_of(public_files, wavelength_um)
     (index,) = (c for c in problem.pool() if c.kind == "refractive_index")
     free = replace(index, parameters=(replace(index.parameters[0], lower=-0.34), index.parameters[1]))
     left = {}

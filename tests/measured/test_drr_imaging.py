@@ -9,6 +9,7 @@ import scipy.io
 from processing.calibration.known_sample import part_of
 from processing.calibration.train import fit_trains
 from processing.instrument.model import InstrumentModel
+from processing.public_data.conversion import tables_of
 from processing.reduction.mueller import reduce_mueller
 from processing.storage.capture import Capture
 from processing.storage.images import MuellerImage
@@ -17,8 +18,6 @@ from processing.storage.product import Step
 
 pytestmark = pytest.mark.measured
 
-#: The file names hold rounded degrees (the data's README): the grid has steps of 22.5.
-EXACT_DEG = {0: 0.0, 23: 22.5, 45: 45.0, 68: 67.5, 90: 90.0, 113: 112.5, 135: 135.0, 158: 157.5}
 FREE = (
     "psg_retarder.retardance_deg",
     "psa_retarder.retardance_deg",
@@ -28,30 +27,22 @@ FREE = (
 )
 
 
-def states_csv(folder: Path, target: Path) -> Path:
-    """states.csv from file names <a1>_<a2>_<a3>.png or <a2>_<a3>.png: analyzer (not rounded), PSG and PSA retarder."""
-    lines = ["state,analyzer_deg,psg_deg,psa_deg,file"]
-    for k, file in enumerate(sorted(folder.glob("*.png"))):
-        *analyzer, psg, psa = (int(part) for part in file.stem.split("_"))
-        lines.append(f"{k},{analyzer[0] if analyzer else 0},{EXACT_DEG[psg]},{EXACT_DEG[psa]},{file}")
-    target.write_text("\n".join(lines), encoding="utf-8")
-    return target
-
-
-def imported(source: Path, target: Path, configs: Path, sample: str) -> Path:
+def imported(files: dict[str, Path], name: str, target: Path, configs: Path) -> Path:
+    """Capture of the frames "mirror" or "smileys"."""
+    table = next(t for t in tables_of("drr-imaging-630nm", files) if t.name == name)
     request = ImportRequest(
-        states=states_csv(source, target.with_suffix(".csv")),
+        states=table.write(target.parent)[0],
         out=target,
         wavelength_nm=630,
         instrument=configs / "instruments/drr_imaging_630nm.yaml",
-        sample=read_sample(sample),
+        sample=read_sample(table.sample),
     )
     import_capture(request)
     return target
 
 
-def test_smileys_are_almost_perfect_depolarizers(shared_data: Path, configs: Path, tmp_path: Path) -> None:
-    path = imported(shared_data / "drr-imaging-630nm/Data/Smileys/630", tmp_path / "smileys.h5", configs, "unknown")
+def test_smileys_are_almost_perfect_depolarizers(public_files, configs: Path, tmp_path: Path) -> None:
+    path = imported(public_files("drr-imaging-630nm"), "smileys", tmp_path / "smileys.h5", configs)
     with Capture(path) as capture:
         assert len(capture.role) == 64
         assert not capture.simulated
@@ -72,9 +63,9 @@ def test_smileys_are_almost_perfect_depolarizers(shared_data: Path, configs: Pat
     assert np.max(np.abs(np.median(off, axis=1))) < 0.01
 
 
-def test_mirror_gives_the_train(shared_data: Path, configs: Path, tmp_path: Path) -> None:
-    source = shared_data / "drr-imaging-630nm"
-    path = imported(source / "Data/Reflexion/630", tmp_path / "mirror.h5", configs, "mirror")
+def test_mirror_gives_the_train(public_files, configs: Path, tmp_path: Path) -> None:
+    files = public_files("drr-imaging-630nm")
+    path = imported(files, "mirror", tmp_path / "mirror.h5", configs)
     model = InstrumentModel.load(configs / "instruments/drr_imaging_630nm.yaml").at(630)
     with Capture(path) as capture:
         assert len(capture.role) == 512
@@ -84,7 +75,7 @@ def test_mirror_gives_the_train(shared_data: Path, configs: Path, tmp_path: Path
     assert found["psa_retarder.retardance_deg"] == pytest.approx(72.4, abs=0.1)
     assert result.residual_over_mean == pytest.approx(0.014, abs=0.0005)
     # The authors' own fit of the same frames: zeros are subtracted there, and modulo 90 degrees for a retarder.
-    theirs = scipy.io.loadmat(str(source / "calibration_reflexion.mat"))
+    theirs = scipy.io.loadmat(str(files["calibration_reflexion.mat"]))
     for name, key, period in (
         ("analyzer.azimuth_deg", "theta_0_a", 180),
         ("psg_retarder.azimuth_deg", "alpha_0_g", 90),

@@ -28,8 +28,8 @@ def report() -> SimpleNamespace:
 
 
 @pytest.fixture(scope="module")
-def table(shared_data: Path) -> np.ndarray:
-    rows = np.genfromtxt(shared_data / "ptfe-mueller-brdf/PTFE.data.csv", delimiter=",", skip_header=1)
+def table(public_files) -> np.ndarray:
+    rows = np.genfromtxt(public_files("ptfe-mueller-brdf")["PTFE.data.csv"], delimiter=",", skip_header=1)
     assert rows.shape == (7296, 21)
     return rows
 

@@ -47,8 +47,8 @@ def load(rows: np.ndarray, wavelength_um: float, turn: float = -1.0) -> Ptfe:
 
 
 @pytest.fixture(scope="module")
-def rows(shared_data) -> np.ndarray:
-    table = np.genfromtxt(shared_data / "ptfe-mueller-brdf/PTFE.data.csv", delimiter=",", skip_header=1)
+def rows(public_files) -> np.ndarray:
+    table = np.genfromtxt(public_files("ptfe-mueller-brdf")["PTFE.data.csv"], delimiter=",", skip_header=1)
     assert table.shape == (7296, 21)
     return table
 

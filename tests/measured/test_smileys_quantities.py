@@ -20,10 +20,10 @@ DISC, BACKGROUND = (slice(140, 180), slice(190, 230)), (slice(300, 340), slice(6
 
 
 @pytest.fixture(scope="module")
-def product(shared_data: Path, configs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def product(public_files, configs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     imported = runpy.run_path(str(Path(__file__).with_name("test_drr_imaging.py")))["imported"]
     folder = tmp_path_factory.mktemp("smileys")
-    path = imported(shared_data / "drr-imaging-630nm/Data/Smileys/630", folder / "c.h5", configs, "unknown")
+    path = imported(public_files("drr-imaging-630nm"), "smileys", folder / "c.h5", configs)
     with Capture(path) as capture:
         assert capture.instrument is not None
         reduce_mueller(capture, capture.instrument, folder / "m.h5", (Step("reduce", {}),))

@@ -9,6 +9,7 @@ import pytest
 from processing.calibration.known_sample import part_of
 from processing.calibration.train import fit_trains
 from processing.instrument.model import InstrumentModel
+from processing.public_data.conversion import tables_of
 from processing.reduction.mueller import reduce_mueller
 from processing.storage.capture import Capture
 from processing.storage.images import MuellerImage
@@ -18,25 +19,14 @@ from processing.storage.product import Step
 pytestmark = pytest.mark.measured
 
 
-def states_csv(data: Path, prefix: str, wavelength: int, target: Path) -> Path:
-    """states.csv from the JSON keys: the generator angle in degrees, sorted, and one column a channel."""
-    raw = json.loads(data.read_text(encoding="utf-8"))
-    theta = np.degrees(raw[f"{prefix}theta{wavelength}"])
-    lines = ["state,psg_deg,channel_left,channel_right"]
-    for state, k in enumerate(np.argsort(theta)):
-        left, right = (raw[f"{prefix}I{side}_{wavelength}"][k] for side in "lr")
-        lines.append(f"{state},{float(theta[k])!r},{left!r},{right!r}")
-    target.write_text("\n".join(lines), encoding="utf-8")
-    return target
-
-
 @pytest.mark.parametrize("wavelength", [1300, 1600])
-def test_two_channels_a_state(wavelength: int, shared_data: Path, configs: Path, tmp_path: Path) -> None:
-    folder = shared_data / "drr-wollaston-nir"
+def test_two_channels_a_state(wavelength: int, public_files, configs: Path, tmp_path: Path) -> None:
+    files = public_files("drr-wollaston-nir")
+    tables = {table.name: table for table in tables_of("drr-wollaston-nir", files)}
     instrument = configs / "instruments/drr_wollaston.yaml"
-    for name, prefix, sample in (("cal", "Cal_", "air"), ("sample", "", "unknown")):
+    for name, measured, sample in (("cal", "air", "air"), ("sample", "plate", "unknown")):
         request = ImportRequest(
-            states=states_csv(folder / f"{name}_results.json", prefix, wavelength, tmp_path / f"{name}.csv"),
+            states=tables[f"{measured}_{wavelength}nm"].write(tmp_path)[0],
             out=tmp_path / f"{name}.h5",
             wavelength_nm=wavelength,
             instrument=instrument,
@@ -45,7 +35,7 @@ def test_two_channels_a_state(wavelength: int, shared_data: Path, configs: Path,
         header = import_capture(request)
         assert header.channels == ("left", "right")
         assert header.sample.kind == sample
-    raw = json.loads((folder / "cal_results.json").read_text(encoding="utf-8"))
+    raw = json.loads(files["cal_results.json"].read_text(encoding="utf-8"))
     with Capture(tmp_path / "cal.h5") as capture:
         stored = np.stack([capture.frames(k)[:, 0, 0] for k in range(46)])
         assert sorted(stored[:, 0]) == sorted(raw[f"Cal_Il_{wavelength}"])
