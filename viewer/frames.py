@@ -118,7 +118,7 @@ def preview(request: Request) -> Response:
         counts = opened.frames(state)[channel]
         top, black = saturation(opened), opened.header.detector.black_level_counts
     mean = window.mean(counts)
-    high = float(np.nanmax(mean)) if top is None else top
+    high = float(np.nanmax(mean))
     grey = np.nan_to_num(np.clip((mean - black) / max(high - black, 1.0), 0, 1)) * 255
     picture = np.repeat(grey.astype(np.uint8)[..., np.newaxis], 3, axis=2)
     if top is not None:

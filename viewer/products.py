@@ -21,6 +21,8 @@ from viewer.planes import Window, sent
 
 #: Kinds that hold Mueller matrices.
 MATRICES = ("mueller", "extrapolated")
+#: The map that a page opens on; default: that with the name of the kind.
+FIRST = {"stokes": "s0", "quantities": "depolarization_index"}
 
 
 def product(request: Request) -> HTMLResponse:
@@ -52,9 +54,10 @@ def product(request: Request) -> HTMLResponse:
 
 
 def maps_of(opened: Product) -> list[dict[str, Any]]:
-    """What can be looked at: each dataset without its errors, one entry for each number of a vector."""
+    """Maps of a product, its main one first: each dataset without its errors, one entry for each number of a vector."""
     found = []
-    for name in opened.names:
+    first = FIRST.get(opened.kind, opened.kind)
+    for name in sorted(opened.names, key=lambda name: name != first):
         if name.endswith("_errors") or name in ("mueller", "mueller_covariance"):
             continue
         count = opened.get(name, slice(0, 1)).size // opened.shape[1]

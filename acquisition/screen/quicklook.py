@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.reduction.black import Black
+from processing.reports.colours import upper_end
+from processing.reports.figure_style import clipped
 from processing.storage.capture import Capture
 
 #: Longest side of the maps in the figure, pixels; a larger frame is thinned out.
@@ -35,13 +37,13 @@ def draw(path: Path) -> Path:
     figure.subplots_adjust(left=0.01, right=0.985, bottom=0.13, top=0.84, wspace=0.2)
     for axes, image, title, limits in (
         (left, mean, "mean, counts above dark", (0.0, None)),
-        (middle, modulation, "modulation", (0.0, 1.0)),
+        (middle, modulation, "modulation", (0.0, upper_end(modulation))),
     ):
         shown = axes.imshow(image, cmap="gray" if axes is left else "viridis", vmin=limits[0], vmax=limits[1])
         axes.set_title(title)
         axes.set_xticks([])
         axes.set_yticks([])
-        figure.colorbar(shown, ax=axes, shrink=0.8)
+        figure.colorbar(shown, ax=axes, shrink=0.8, extend=clipped(image, *shown.get_clim()))
     right.plot(states, levels, "o-", markersize=3, linewidth=0.8)
     right.set_xlabel("state")
     right.set_ylabel("frame mean, counts above dark")

@@ -59,6 +59,24 @@ def colours_of(name: str, units: str) -> str:
     return PLAIN
 
 
+def upper_end(values: NDArray[np.floating]) -> float:
+    """Where the scale of a positive quantity ends: values far beyond the others, as at an object's limb, are clipped.
+
+    The smaller of the 99.5th percentile and Tukey's outer fence, Q3 + 3 (Q3 - Q1). Where half of the values are equal
+    the fence says nothing, and where none is finite the end is 1.
+
+    Examples
+    --------
+    >>> upper_end(np.r_[np.linspace(0.1, 0.2, 97), [1.0, 1.1, 1.2]]) < 0.4
+    True
+    """
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return 1.0
+    first, third, end = (float(v) for v in np.percentile(finite, [25, 75, END_PERCENT]))
+    return max(min(end, third + 3 * (third - first)) if third > first else end, 1e-30)
+
+
 def scale_of(name: str, units: str, values: NDArray[np.floating]) -> Scale:
     """Colours and limits for a map: a period for orientations, symmetric about zero for signed quantities."""
     colours = colours_of(name, units)
@@ -71,7 +89,7 @@ def scale_of(name: str, units: str, values: NDArray[np.floating]) -> Scale:
         return Scale(colours, -most, most)
     if colours in (LIGHT, ERROR):
         return Scale(colours, 0.0, max(float(high), 1e-6))
-    return Scale(colours, float(low), max(float(high), float(low) + 1e-6))
+    return Scale(colours, float(low), max(upper_end(finite), float(low) + 1e-6))
 
 
 @cache

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.errors import ProcessError
-from processing.reports.colours import SIGNED
+from processing.reports.colours import SIGNED, upper_end
 from processing.reports.figure_style import (
     CYCLIC,
     WORST_ORIENTATION_DEG,
@@ -66,17 +66,18 @@ def product_figure(product: Product) -> Figure:
     if product.kind == "xi0":
         xi0, errors, valid = (thin(product.get(name)) for name in ("xi0", "xi0_errors", "valid"))
         shown = np.where(valid > 0, xi0, np.nan)
-        limit = max(percentile(errors[valid > 0], 95), 1e-6)
         known = np.where(errors <= UNKNOWN_XI0, errors, np.nan)
-        label = f"standard error of $\\xi_0$ (grey: > {UNKNOWN_XI0:g})"
         panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = [
-            ("$\\xi_0$ where valid", shown, {"cmap": "viridis", "vmin": 0.25, "vmax": percentile(shown, 99.8)}),
             (
-                label,
-                known,
-                {"cmap": "magma", "vmin": 0, "vmax": limit},
+                f"$\\xi_0$ (grey: not valid, {100 * np.mean(valid == 0):.0f} % of the image)",
+                shown,
+                {"cmap": "viridis", "vmin": 0.25, "vmax": max(upper_end(shown), 0.26)},
             ),
-            ("valid", valid, {"cmap": "gray", "vmin": 0, "vmax": 1}),
+            (
+                f"standard error of $\\xi_0$ (grey: > {UNKNOWN_XI0:g})",
+                known,
+                {"cmap": "magma", "vmin": 0, "vmax": max(percentile(errors[valid > 0], 95), 1e-6)},
+            ),
         ]
         return map_figure(panels, _title(product), product.simulated)
     if product.kind == "quantities":
@@ -125,7 +126,11 @@ def stokes_figure(maps: dict[str, NDArray[Any]], title: str, simulated: bool) ->
     angle = np.where(maps["aolp_deg_errors"] <= WORST_ORIENTATION_DEG, maps["aolp_deg"], np.nan)
     panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = [
         ("$S_0$ / counts", maps["s0"], {"cmap": "gray", "vmin": 0}),
-        ("degree of linear polarization", maps["dolp"], {"cmap": "viridis", "vmin": 0}),
+        (
+            "degree of linear polarization",
+            maps["dolp"],
+            {"cmap": "viridis", "vmin": 0, "vmax": upper_end(maps["dolp"])},
+        ),
         ("its standard error", maps["dolp_errors"], {"cmap": "magma", "vmin": 0}),
         ("angle of linear polarization, PSA frame / degrees", angle, CYCLIC),
     ]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from processing.polarization.quantities import PAPER_PAIRS
 from processing.polarization.scalar_files import scalar_quantities
-from processing.reports.colours import SIGNED, colours_of
+from processing.reports.colours import SIGNED, colours_of, upper_end
 from processing.reports.figure_style import CYCLIC, WORST_ORIENTATION_DEG, grid_figure, percentile, thin
 from processing.storage.product import Product
 
@@ -49,7 +49,11 @@ def quantities_figure(product: Product, title: str) -> Figure:
         (label("entropy", "entropy"), get("entropy"), {"vmax": 1}),
         (label("depolarization power (Lu-Chipman)", "depolarization_power"), get("depolarization_power"), {"vmax": 1}),
         (label("retardance (Lu-Chipman) / deg", "retardance_deg"), get("retardance_deg"), {"vmin": 0, "vmax": 180}),
-        (label("DoLP, unpolarized light", "polarizance_linear"), get("polarizance_linear"), {"vmin": 0}),
+        (
+            label("DoLP, unpolarized light", "polarizance_linear"),
+            get("polarizance_linear"),
+            {"vmin": 0, "vmax": upper_end(get("polarizance_linear"))},
+        ),
         ("AoLP, unpolarized light, PSA frame / deg", orientation("polarizance_orientation_deg"), CYCLIC),
         (
             label("$|D|$ of the dominant process", "dominant_diattenuation_linear"),

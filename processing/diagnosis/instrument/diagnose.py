@@ -47,12 +47,16 @@ from processing.instrument.model import InstrumentModel
 
 @dataclass(frozen=True)
 class Judged:
-    """The diagnosis, the correction before and after, and the residuals of both for the report."""
+    """The diagnosis, the correction before and after, and the residuals of both for the report.
+
+    `explained` is the residual with all causes that were found, also where the correction is refused.
+    """
 
     diagnosis: Diagnosis
     found: Solution
     before: tuple[Residual, ...]
     after: tuple[Residual, ...]
+    explained: tuple[Residual, ...]
 
 
 def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | None = None) -> Judged:
@@ -155,7 +159,7 @@ def _told(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring: 
         left_out=not_measured(problem),
         noise=noise_report(problem),
     )
-    return Judged(diagnosis, kept, used.before, used.after if kept is solved else used.before)
+    return Judged(diagnosis, kept, used.before, used.after if kept is solved else used.before, used.after)
 
 
 def _unexplained(used: Outcome, names: Names) -> Unexplained:

@@ -6,20 +6,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.instrument.diagnose import Judged
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import add_response
-from processing.diagnosis.instrument.structure import Residual
+from processing.diagnosis.instrument.structure import harmonics_of
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.range_of import rank_of
 from processing.diagnosis.search.rules import HARMONICS
 from processing.diagnosis.search.space import Space
 from processing.polarization.cloude import xi0_and_dominant
-from processing.reports.colours import SIGNED
+from processing.reports.colours import SIGNED, upper_end
 from processing.reports.design import style, templates
-from processing.reports.figure_style import png
+from processing.reports.figure_style import clipped, png
 from processing.reports.template import Figure as Picture
 from processing.whole_file import write_new_text
 
@@ -86,63 +87,141 @@ def _ranking(judged: Judged) -> list[list[str]]:
 
 def _capture(judged: Judged, problem: InstrumentProblem, k: int) -> dict[str, Any]:
     """Title, figures and the change of the Mueller elements of one capture."""
-    before, after = judged.before[k], judged.after[k]
     return {
         "name": problem.captures[k].name,
         "figures": [
-            Picture(png(_maps(before, after)), "Residual over the image"),
-            Picture(png(_states(before, after)), "Residual of each state, and its harmonics"),
+            Picture(png(_pattern(judged, problem, k)), "Leading pattern of the residual, before and after"),
+            Picture(png(_states(judged, k)), "Residual of each state, before and after"),
         ],
         "change": _change(judged, problem, k),
     }
 
 
-def _maps(before: Residual, after: Residual) -> Figure:
+def _pattern(judged: Judged, problem: InstrumentProblem, k: int) -> Figure:
+    """The leading pattern of the residual before: where, in which states, at which harmonics; and what remains of it.
+
+    All is drawn of means over squares of pixels: the noise of single pixels would hide what is left.
+    """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10, 8), layout="constrained")
-    axes = figure.subplots(2, 2)
-    pairs = ((before, "before"), (after, "after"))
-    loud = [np.sqrt(np.mean(r.image.astype(float) ** 2, axis=0)) for r, _ in pairs]
-    states = [np.tensordot(before.leading, np.nan_to_num(r.image.astype(float)), 1) for r, _ in pairs]
-    top = max(float(np.nanmax(m)) if np.isfinite(m).any() else 1.0 for m in loud)
-    wide = max(float(np.abs(m).max()) for m in states) or 1.0
-    for column, (_, name) in enumerate(pairs):
-        image = axes[0, column].imshow(loud[column], vmin=0, vmax=top)
-        axes[0, column].set_title(f"{name}: rms over the states")
-        figure.colorbar(image, ax=axes[0, column], label="residual / noise of one intensity")
-        image = axes[1, column].imshow(states[column], vmin=-wide, vmax=wide, cmap=SIGNED)
-        axes[1, column].set_title(f"{name}: leading pattern over the states of before")
-        figure.colorbar(image, ax=axes[1, column], label="amplitude / noise of one intensity")
-        for axis in axes[:, column]:
-            axis.set_xlabel("column, pixels")
-            axis.set_ylabel("row, pixels")
-    return figure
-
-
-def _states(before: Residual, after: Residual) -> Figure:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10, 3.8), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    left.plot(before.per_state, "o-", ms=3, label="before")
-    left.plot(after.per_state, "o-", ms=3, label="after")
+    before, after = judged.before[k], judged.explained[k]
+    names = "before", _after(judged)
+    cells = [_cells(r.image) for r in (before, after)]
+    used = np.isfinite(cells[0]).all(axis=0) & np.isfinite(cells[1]).all(axis=0)
+    flat = [image[:, used] for image in cells]
+    values, vectors = np.linalg.eigh(flat[0] @ flat[0].T)
+    leading, share = vectors[:, -1], values[-1] / max(values.sum(), 1e-300)
+    maps = [np.tensordot(leading, image, 1) for image in cells]
+    # The sign of an eigenvector is arbitrary: positive where most of the image is.
+    if np.nansum(maps[0]) < 0:
+        leading, maps = -leading, [-m for m in maps]
+    where = leading @ flat[0]
+    states = [f @ where / max(float(np.linalg.norm(where)), 1e-300) / max(where.size, 1) ** 0.5 for f in flat]
+    figure = Figure(figsize=(11, 8.4), layout="constrained")
+    halves: Any = figure.subfigures(2, 1, height_ratios=[1.15, 1])
+    upper, lower = halves
+    wide = max(upper_end(np.abs(maps[0])), 1e-6)
+    axes = upper.subplots(1, 2)
+    for axis, name, image in zip(axes, names, maps, strict=True):
+        shown = axis.imshow(image, vmin=-wide, vmax=wide, cmap=SIGNED, extent=_extent(before.image), aspect="equal")
+        axis.set_title(name)
+        axis.set_xlabel("column, pixels")
+        axis.set_ylabel("row, pixels")
+        axis.set_facecolor("0.85")
+    upper.suptitle("leading pattern of the residual: its amplitude over the image")
+    upper.colorbar(shown, ax=axes, label="residual / noise of one intensity", extend=clipped(maps[0], -wide, wide))
+    left, right = lower.subplots(1, 2, width_ratios=[1.6, 1])
+    for line, name in zip(states, names, strict=True):
+        left.plot(line, "o-", ms=3, label=name)
+    left.axhline(0, color="0.5", lw=0.8)
     left.set_xlabel("state (and channel)")
-    left.set_ylabel("rms residual / noise of one intensity")
-    left.set_title("each state, over the pixels")
-    left.set_ylim(bottom=0)
+    left.set_ylabel("residual / noise of one intensity")
+    left.set_title(f"the pattern over the states: {100 * share:.0f} % of the residual before")
     left.legend()
+    channels = problem.captures[k].signal.shape[1]
     orders = np.arange(1, HARMONICS + 1)
-    for k, axis in enumerate(before.harmonics):
-        right.bar(orders + 0.1 * k - 0.2, before.harmonics[axis], 0.1, color=f"C{k}", alpha=0.4, label=f"{axis} before")
-        right.bar(orders + 0.1 * k, after.harmonics[axis], 0.1, color=f"C{k}", label=f"{axis} after")
+    turned = {name: v for name, v in problem.captures[k].conditions.angles_deg.items() if np.ptp(v) > 0}
+    for n, (axis_name, angles) in enumerate(turned.items()):
+        for line, name, alpha, shift in zip(states, names, (0.4, 1.0), (-0.2, 0.0), strict=True):
+            # Of two channels the one that shows it best: in their mean a difference would be lost.
+            parts = line.reshape(-1, channels)
+            best = np.argmax(np.sum(states[0].reshape(-1, channels) ** 2, axis=0))
+            heights = harmonics_of(parts[:, best], angles)
+            right.bar(orders + 0.1 * n + shift, heights, 0.1, color=f"C{n}", alpha=alpha, label=f"{axis_name} {name}")
     right.set_xlabel("harmonic, periods a turn")
     right.set_ylabel("amplitude / noise of one intensity")
-    right.set_title("harmonics of the mean residual")
+    right.set_title("its harmonics")
     right.set_xticks(orders)
-    if before.harmonics:
+    if turned:
         right.legend(fontsize=7)
     return figure
+
+
+def _after(judged: Judged) -> str:
+    return "after" if judged.after is judged.explained else "with the causes (not applied)"
+
+
+def _states(judged: Judged, k: int) -> Figure:
+    """Residual of each state before and after, of means over squares of pixels."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 3.4), layout="constrained")
+    axis = figure.subplots()
+    before = judged.before[k]
+    for residual, name in ((before, "before"), (judged.explained[k], _after(judged))):
+        rms = np.sqrt(np.nanmean(_cells(residual.image) ** 2, axis=(1, 2)))
+        axis.plot(rms, "o-", ms=3, label=name)
+    side = _cell_side(before.image)
+    if (noise := _noise_of_cells(judged.explained[k].image)) is not None:
+        axis.axhline(noise, color="0.5", ls="--", label="noise")
+    axis.set_xlabel("state (and channel)")
+    axis.set_ylabel("rms residual / noise of one intensity")
+    axis.set_title(f"each state, over squares of {side} x {side} pixels" if side > 1 else "each state, over the pixels")
+    axis.set_ylim(bottom=0)
+    axis.legend()
+    return figure
+
+
+def _cell_side(image: NDArray[np.floating]) -> int:
+    """Side of the squares in pixels: about 40 along the longer side of an image."""
+    return max(1, round(float(max(image.shape[1:])) / 40))
+
+
+def _squares(image: NDArray[np.floating]) -> Array:
+    """Values (L, rows, columns, N) of the pixels of each square."""
+    side = _cell_side(image)
+    height, width = (max(length // side, 1) for length in image.shape[1:])
+    down, across = min(side, image.shape[1]), min(side, image.shape[2])
+    parts = image[:, : height * down, : width * across].astype(float)
+    parts = parts.reshape(len(image), height, down, width, across).swapaxes(2, 3)
+    return parts.reshape(len(image), height, width, down * across)
+
+
+def _cells(image: NDArray[np.floating]) -> Array:
+    """Means (L, rows, columns) over squares of pixels; NaN where less than half of the pixels are used."""
+    values = _squares(image)
+    number = np.isfinite(values).sum(axis=-1)
+    means = np.nansum(values, axis=-1) / np.maximum(number, 1)
+    return np.where(number >= max(values.shape[-1] / 2, 1), means, np.nan)
+
+
+def _noise_of_cells(image: NDArray[np.floating]) -> float | None:
+    """Standard deviation of the mean over a square, from the scatter inside the squares; None of single pixels.
+
+    The fit has taken its part of the noise away already.
+    """
+    values = _squares(image)
+    full = values[np.isfinite(values).all(axis=-1)]
+    number = values.shape[-1]
+    if number == 1 or not full.size:
+        return None
+    return float(np.sqrt(full.var(axis=-1, ddof=1).mean() / number))
+
+
+def _extent(image: NDArray[np.floating]) -> tuple[float, float, float, float]:
+    side = _cell_side(image)
+    height, width = (max(length // side, 1) * side for length in image.shape[1:])
+    return -0.5, width - 0.5, height - 0.5, -0.5
 
 
 def _change(judged: Judged, problem: InstrumentProblem, k: int) -> dict[str, Any] | None:

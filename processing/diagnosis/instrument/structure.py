@@ -120,7 +120,7 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     n, channels = data.signal.shape[:2]
     mean = r[:, good].mean(axis=1) if good.any() else np.zeros(rows)
     states = mean.reshape(n, channels).mean(axis=1)
-    harmonics = {axis: _harmonics(states, v) for axis, v in data.conditions.angles_deg.items()}
+    harmonics = {axis: harmonics_of(states, v) for axis, v in data.conditions.angles_deg.items()}
     flat = r[:, good]
     moment = flat @ flat.T / max(flat.shape[1], 1)
     value, vector = np.linalg.eigh(moment.astype(np.float64))
@@ -137,7 +137,7 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     )
 
 
-def _harmonics(states: Array, angles_deg: Array) -> Array:
+def harmonics_of(states: Array, angles_deg: Array) -> Array:
     """Amplitudes (HARMONICS,) of values (N,) of the states in periods of a turn."""
     turns = np.deg2rad(angles_deg)
     return np.array([2 * abs(np.mean(states * np.exp(1j * h * turns))) for h in range(1, HARMONICS + 1)])
