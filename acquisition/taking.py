@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from acquisition.capture import session
@@ -13,10 +14,13 @@ from acquisition.capture.plan import MeasurementPlan
 from acquisition.errors import AcquisitionError
 from acquisition.rig.config import RigConfig
 from acquisition.rig.rig import Rig
+from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
 
 
-def take_capture(plan: MeasurementPlan, rig: RigConfig, folder: Path | str, home: bool = False) -> Path:
+def take_capture(
+    plan: MeasurementPlan, rig: RigConfig, folder: Path | str, home: bool = False, observers: Sequence[Observer] = ()
+) -> Path:
     """Check everything, take the capture, seal it; Ctrl-C ends it after the state that is being taken.
 
     The guard of `acquire` (docs/acquisition.md) does not stand beside it.
@@ -28,6 +32,9 @@ def take_capture(plan: MeasurementPlan, rig: RigConfig, folder: Path | str, home
     home
         Home axes without a reference before the first move; nothing homes unless asked here or by the rig file.
 
+    observers
+        Are told what happens, as the progress bar of `acquire` is.
+
     Raises
     ------
     AcquisitionError, DeviceError
@@ -37,7 +44,7 @@ def take_capture(plan: MeasurementPlan, rig: RigConfig, folder: Path | str, home
     with StopRequest() as stop, Rig(rig) as devices:
         refuse_failed(check_with_devices(job, devices, Path(folder)))
         with free_name(Path(folder) / default_name(plan)) as path:
-            result = session.take(job, devices, path, stop, home=home)
+            result = session.take(job, devices, path, stop, observers, home=home)
     if result.status != "complete":
         raise AcquisitionError(f"{result.path} was stopped ({result.status}); `acquire --resume` goes on with it.")
     return result.path

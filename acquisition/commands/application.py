@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from acquisition.commands import by_hand, custody_commands
+from acquisition.commands import by_hand, custody_commands, demo
 from acquisition.commands.defaults import INTERRUPTED, RigFile
 from processing.commands.command_line import Version, application
 
@@ -74,6 +74,7 @@ def capture(
 
 by_hand.register(app)
 custody_commands.register(app)
+demo.register(app)
 
 
 def _stoppable(action: Callable[[StopRequest], int]) -> int:

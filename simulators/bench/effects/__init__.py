@@ -19,7 +19,7 @@ from simulators.bench.effects.optics import (
 )
 from simulators.bench.effects.source import SourceDrift, SourceFlicker, SourceLevel, SourceStep, UnevenLight
 
-#: Any of them, told apart by `kind`; docs/adding-an-effect.md names the one for each effect of `diagnose`.
+#: Any of them, told apart by `kind`; docs/effects.md has one for each effect of `diagnose`.
 AnyBenchEffect = Annotated[
     AngleOffset
     | AngleScale

@@ -1,0 +1,1 @@
+"""`./lab demo`: undeclared faults, captures, diagnosis, correction, and the truth, on the simulated rig."""

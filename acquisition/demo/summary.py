@@ -1,0 +1,41 @@
+"""The result of the demo in words: built-in faults with what was found, and the figures before and after."""
+
+from __future__ import annotations
+
+from acquisition.demo.loop import Demo
+from processing.diagnosis.search.result import FoundEffect
+
+#: Values of one effect that fit on a line.
+MOST_VALUES = 2
+NOT_FOUND = "not found"
+
+
+def cause_rows(demo: Demo) -> list[tuple[str, str]]:
+    """Each built-in fault with the effect found for it, then the effects found for none of them."""
+    rows, matched = [], list[FoundEffect]()
+    for fault in demo.faults:
+        found = demo.found_for(fault)
+        matched += found
+        rows.append((f"{fault.kind}: {fault.size}", told(found[0]) if found else NOT_FOUND))
+    others = [e for e in demo.judged.diagnosis.effects if not any(e is m for m in matched)]
+    return rows + [("nothing", told(e)) for e in others]
+
+
+def told(effect: FoundEffect) -> str:
+    """Kind, values with their errors, and how sure the name is."""
+    values, units = zip(*((p.told, p.unit) for p in effect.parameters.values()), strict=True)
+    shown = ", ".join(values[:MOST_VALUES]) + (", ..." if len(values) > MOST_VALUES else "")
+    shown += "" if units[0] == "1" else f" {units[0]}"
+    equal = len({name.partition("[")[0] for name in effect.indistinguishable_from} - {effect.kind})
+    sure = effect.answer if effect.confident and effect.answer else "uncertain"
+    return f"{effect.kind}: {shown} ({f'one of {equal + 1} equal names' if equal else sure})"
+
+
+def figure_rows(demo: Demo) -> list[tuple[str, str, str, str]]:
+    """Name, value before, value after, and what photon noise alone gives."""
+    d, before, after = demo.judged.diagnosis, demo.before, demo.after
+    return [
+        ("residual beyond noise", d.error_before.told, d.error_after.told, ""),
+        ("error of M/m00", f"{before.mueller_rms:.4f}", f"{after.mueller_rms:.4f}", f"{after.mueller_noise:.4f}"),
+        ("error of xi0", f"{before.xi0_rms:.4f}", f"{after.xi0_rms:.4f}", f"{after.xi0_noise:.4f}"),
+    ]

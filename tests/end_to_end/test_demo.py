@@ -1,0 +1,60 @@
+"""`./lab demo`: the loop as one command, on three seeds, and on twenty with UMOV_SLOW=1."""
+
+import hashlib
+import os
+import re
+from pathlib import Path
+
+import pytest
+
+from acquisition.demo.truth import draw_faults, drawable
+from acquisition.rig.config import load_rig
+from processing.yaml_file import ConfigError
+
+SEEDS = range(1, 21) if os.environ.get("UMOV_SLOW") else (1, 2, 3)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_loop_is_closed(acquire, tmp_path, seed):
+    code, out, err = acquire("demo", "--seed", seed, "--out", tmp_path)
+    assert code == 0, err
+    (folder,) = tmp_path.iterdir()
+    # What was built in is shown at the end alone, and it is what was sealed at the beginning.
+    before, after = out.split("The truth is opened")
+    drawn = draw_faults(seed, 2, (), 44)
+    assert all(fault.size not in before for fault in drawn)
+    assert all(f"built in  {fault.kind}: {fault.size}" in after for fault in drawn)
+    sealed = re.search(r"SHA-256 ([0-9a-f]{16})", before)[1]
+    assert hashlib.sha256((folder / "rig.yaml").read_bytes()).hexdigest().startswith(sealed)
+    assert set(load_rig(folder / "rig.yaml").simulator.effects) >= {fault.effect for fault in drawn}
+    # Nothing is found that is not there, and the Mueller matrix is not worse.
+    assert not re.search(r"built in  nothing\n.*\(sure\)", after)
+    first, last = (float(text) for text in re.search(r"error of M/m00 +(\S+) +(\S+)", after).groups())
+    assert last <= 1.01 * first
+    assert (folder / "demo.png").stat().st_size > 50_000
+    assert (folder / "corrected.yaml").exists()
+    assert (folder / "report.html").exists()
+
+
+def test_same_seed_same_faults():
+    first, again, other = (draw_faults(seed, 2, (), 44) for seed in (5, 5, 6))
+    assert first == again != other
+
+
+@pytest.mark.parametrize("kind", drawable())
+def test_every_kind_can_be_asked_for(kind):
+    (fault,) = draw_faults(1, 1, [kind], 44)
+    assert fault.kind == kind
+    assert re.search(r"\d", fault.size)
+
+
+def test_what_cannot_be_drawn_is_refused_with_its_reason(acquire, tmp_path):
+    code, _, err = acquire("demo", "--only", "detector_offset", "--out", tmp_path)
+    assert code == 2
+    assert err == "error: --only detector_offset: the dark states of the default plan measure it.\n"
+    with pytest.raises(ConfigError, match="there is no such fault, only psg_retardance"):
+        draw_faults(1, 1, ["lamp"], 44)
+    with pytest.raises(ConfigError, match="only 1 different faults"):
+        draw_faults(1, 2, ["source_drift"], 44)
+    assert not any(Path(tmp_path).iterdir())
