@@ -42,15 +42,15 @@ def xi0() -> Task:
 
 
 def all_quantities() -> Task:
-    """`process quantities`: noise taken off magnitudes and eigenvalues, "not determined" where it is not."""
+    """`process quantities`: noise taken off magnitudes and eigenvalues, an interval in every pixel."""
     image = _image()
 
     def first_order() -> None:
-        with mock.patch.object(quantities, "limit"), mock.patch.object(quantities, "coherency_noise"):
+        with mock.patch.object(quantities, "_set_intervals"):
             quantities.quantities_block(replace(image), (), PAPER_PAIRS)
 
     task = Task(
-        f"all quantities with their limits, {PIXELS} pixels",
+        f"all quantities with intervals, {PIXELS} pixels",
         None,
         lambda: quantities.quantities_block(replace(image), (), PAPER_PAIRS),
     )

@@ -1,121 +1,179 @@
-"""Pull, bias and coverage of every quoted error bar: quantity x light level x sample, by Monte Carlo.
+"""Pull and coverage of every quoted error bar, by Monte Carlo: quantity x light x sample x instrument x darks.
 
-    python benchmarks/error_bars.py [--pixels 1000] [--states "24 random states"] [--out table.md]
+    python benchmarks/error_bars.py [--pixels 1000] [--short] [--out cells.csv]
 
-Each of five samples is measured many times at 20, 200 and 20 000 electrons a state with own Poisson and read noise
-(`noisy_images.py`), and goes through the same functions as `process quantities` and `process xi0`. An entry is
-"rms pull / mean pull / coverage of +- 1 error in %"; "-" where the program says "not determined" in most pixels, with
-the part of the pixels that are determined in brackets where it does in some. Components are taken together.
+Each of 19 samples is measured `--pixels` times with own Poisson and read noise (`noisy_images.py`) and goes through the
+same functions as `process reduce`, `process quantities` and `process xi0`. Every pixel counts. A quantity that the
+sample does not have (the azimuth of no diattenuation) is left out. Components are taken together.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+import csv
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from noisy_images import LIGHT_LEVELS, five_samples, noisy_image, state_tables
+from noisy_images import nineteen_samples, noisy_image, seven_instruments
 
 from processing.maps.quantities import EXTRA, quantities_block
 from processing.maps.xi0 import eigenvalue_block
-from processing.polarization.cloude import coherency_eigenvalues
+from processing.polarization.magnitude import NORMAL_95
 from processing.polarization.quantities import PAPER_PAIRS
 from processing.reports.colours import period_deg
 
+LIGHT = (20.0, 60.0, 200.0, 2000.0, 20_000.0)
+DARKS = (0, 1, 4)
 #: Brightness of the truth: its noise is below rounding.
 BRIGHT = 1e13
 #: A quantity that varies by less than this in the truth's own error is fixed by definition.
 FIXED = 1e-9
+#: Of float32, and of what is zero.
+ROUNDING = 1e-6
+#: A quantity whose error at `BRIGHT` is larger than this does not exist.
+UNDEFINED = 0.01
 
 
-class Entry(NamedTuple):
-    """How well one error bar holds."""
+@dataclass(frozen=True)
+class Cell:
+    """How well one error bar holds.
+
+    Attributes
+    ----------
+    has_interval : part of the pixels that have one.
+    in_68, in_95 : part of the truths within the intervals; a pixel without one does not cover.
+    rms, mean : of the pulls.
+    """
 
     quantity: str
-    sample: str
+    instrument: str
+    darks: int
     electrons: float
-    determined: float
+    sample: str
+    has_interval: float
+    in_68: float
+    in_95: float
     rms: float
-    bias: float
-    coverage: float
+    mean: float
 
 
-def entries(
-    sample: str, electrons: float, pixels: int, extra: tuple[str, ...] = (), w: np.ndarray | None = None
-) -> Iterator[Entry]:
-    """Every quantity of one sample at one light level, with the RGB950's states or those of w (N, 16)."""
-    matrix = five_samples()[sample]
-    truth = quantities_block(noisy_image(matrix[None], BRIGHT, 0, w), extra, PAPER_PAIRS)
-    image = noisy_image(np.tile(matrix, (pixels, 1, 1)), electrons, 7, w)
-    found = quantities_block(image, extra, PAPER_PAIRS)
-    for name in found:
-        if f"{name}_errors" in found and name not in ("coherency_eigenvalues", "eigenvalue_deviation"):
-            yield _entry(name, sample, electrons, found[name], found[f"{name}_errors"], truth[name])
-    xi = coherency_eigenvalues(matrix[None])[0]
-    for k in range(4):
-        values, errors = found["coherency_eigenvalues"][k], found["coherency_eigenvalues_errors"][k]
-        yield _entry(f"coherency_eigenvalues[{k}]", sample, electrons, values, errors, xi[k])
-    of_xi0 = eigenvalue_block(image)
-    yield _entry("process xi0", sample, electrons, of_xi0["xi0"], of_xi0["xi0_errors"], xi[0])
+def cells(
+    instrument: str,
+    darks: int,
+    electrons: float,
+    pixels: int,
+    samples: Sequence[str] = (),
+    extra: Sequence[str] = EXTRA,
+) -> Iterator[Cell]:
+    """Every quantity of every sample, or of those named."""
+    w = seven_instruments()[instrument]
+    matrices = {name: m for name, m in nineteen_samples().items() if not samples or name in samples}
+    stack = np.stack(list(matrices.values()))
+    truth = _planes(noisy_image(stack, BRIGHT, 0, w), extra)
+    seed = [7, darks, int(electrons), list(seven_instruments()).index(instrument)]
+    found = _planes(noisy_image(np.repeat(stack, pixels, axis=0), electrons, seed, w, darks), extra)
+    for k, sample in enumerate(matrices):
+        mine = slice(k * pixels, (k + 1) * pixels)
+        for name in found:
+            if f"{name}_errors" not in found:
+                continue
+            value, error = (found[n][..., mine].astype(float) for n in (name, f"{name}_errors"))
+            true, true_error = (truth[n][..., k : k + 1].astype(float) for n in (name, f"{name}_errors"))
+            if name == "mueller":
+                true = stack[k].reshape(4, 4, 1, 1) * electrons / w[:, 0].mean()
+                true_error = 1e-6 * np.ones_like(true)
+            bounds = found.get(f"{name}_95")
+            if bounds is None:
+                low, high = value - NORMAL_95 * error, value + NORMAL_95 * error
+            else:
+                low, high = bounds[..., mine].astype(float)
+            period = period_deg(name, "degree" if name.endswith("_deg") else "")
+            off = value - true
+            if period is not None:
+                off -= period * np.round(off / period)
+            exists = np.isfinite(true) & (true_error < UNDEFINED * (180 if "_deg" in name else 1))
+            exists = np.broadcast_to(exists & (np.nan_to_num(error).max(axis=-1, keepdims=True) > FIXED), value.shape)
+            if not exists.any():
+                continue
+            known = exists & np.isfinite(error) & np.isfinite(value)
+            tolerance = ROUNDING + 3 * true_error
+            with np.errstate(invalid="ignore", divide="ignore"):
+                pull = (off / error)[known]
+                inside_95 = ((off <= value - low + tolerance) & (off >= value - high - tolerance))[exists]
+                inside_68 = (np.abs(off) <= error + tolerance)[exists]
+                if f"{name}_68" in found:
+                    bounds = found[f"{name}_68"][..., mine]
+                    inside_68 = ((bounds[0] <= true) & (true <= bounds[1]))[exists]
+            # Where there is no value the interval is everything.
+            unknown = (~np.isfinite(value) & (low <= true + tolerance) & (true - tolerance <= high))[exists]
+            inside_68, inside_95 = inside_68 | unknown, inside_95 | unknown
+            yield Cell(
+                name,
+                instrument,
+                darks,
+                electrons,
+                sample,
+                float((exists & ~np.isnan(low)).sum() / exists.sum()),
+                float(inside_68.mean()),
+                float(inside_95.mean()),
+                float(np.sqrt(np.mean(pull**2))) if pull.size else np.nan,
+                float(np.mean(pull)) if pull.size else np.nan,
+            )
 
 
-def _entry(
-    name: str, sample: str, electrons: float, values: np.ndarray, errors: np.ndarray, truth: np.ndarray
-) -> Entry:
-    error = values.astype(float) - truth
-    if (period := period_deg(name, "degree" if name.endswith("_deg") else "")) is not None:
-        error -= period * np.round(error / period)
-    known = np.isfinite(error) & np.isfinite(errors) & (errors > FIXED)
-    varies = known.mean(axis=-1, keepdims=True) > 0.5
-    pull = (error / np.where(known, errors, 1))[known & varies]
-    share = float(known.mean())
-    if not pull.size:
-        return Entry(name, sample, electrons, share, np.nan, np.nan, np.nan)
-    return Entry(
-        name,
-        sample,
-        electrons,
-        share,
-        float(np.sqrt(np.mean(pull**2))),
-        float(np.mean(pull)),
-        float(np.mean(np.abs(pull) < 1)),
-    )
-
-
-def table(pixels: int, extra: tuple[str, ...] = EXTRA, w: np.ndarray | None = None) -> str:
-    """The whole table in Markdown."""
-    samples = list(five_samples())
-    cells = {
-        (e.quantity, e.electrons, e.sample): _cell(e)
-        for sample in samples
-        for electrons in LIGHT_LEVELS
-        for e in entries(sample, electrons, pixels, extra, w)
+def _planes(image: object, extra: Sequence[str]) -> dict[str, np.ndarray]:
+    found = quantities_block(image, tuple(extra), PAPER_PAIRS)  # type: ignore[arg-type]
+    xi0 = eigenvalue_block(image)  # type: ignore[arg-type]
+    return found | {
+        "mueller": image.values,  # type: ignore[attr-defined]
+        "mueller_errors": image.errors,  # type: ignore[attr-defined]
+        "process xi0": xi0["xi0"],
+        "process xi0_errors": xi0["xi0_errors"],
+        "process xi0_68": xi0["xi0_68"],
+        "process xi0_95": xi0["xi0_95"],
     }
-    names = list(dict.fromkeys(name for name, _, _ in cells))
-    lines = [f"| quantity | electrons | {' | '.join(samples)} |", "|---|---|" + "---|" * len(samples)]
-    for name in names:
-        for electrons in LIGHT_LEVELS:
-            row = [cells.get((name, electrons, sample), "") for sample in samples]
-            lines.append(f"| {name} | {electrons:g} | " + " | ".join(row) + " |")
+
+
+def table(found: Sequence[Cell]) -> str:
+    """Markdown: of every quantity and light level the median and the range of coverage and pulls."""
+    lines = ["| quantity | electrons | cells | 68 % | 95 % | pull | in all limits |", "|---|---|---|---|---|---|---|"]
+    for name in dict.fromkeys(c.quantity for c in found):
+        for electrons in dict.fromkeys(c.electrons for c in found):
+            some = [c for c in found if c.quantity == name and c.electrons == electrons]
+            if some:
+                parts = [[100 * c.in_68 for c in some], [100 * c.in_95 for c in some]]
+                shown = [f"{np.median(p):.0f} ({min(p):.0f} to {max(p):.0f})" for p in parts]
+                pulls = [c.rms for c in some if np.isfinite(c.rms)]
+                pull = f"{np.median(pulls):.2f} ({min(pulls):.2f} to {max(pulls):.2f})" if pulls else "-"
+                good = sum(holds(c) for c in some)
+                lines.append(f"| {name} | {electrons:g} | {len(some)} | {' | '.join(shown)} | {pull} | {good} |")
     return "\n".join(lines) + "\n"
 
 
-def _cell(e: Entry) -> str:
-    if not np.isfinite(e.rms) or e.determined < 0.5:
-        return "-"
-    part = "" if e.determined > 0.99 else f" ({100 * e.determined:.0f} %)"
-    return f"{e.rms:.2f} / {e.bias:+.2f} / {100 * e.coverage:.0f}{part}"
+def holds(cell: Cell) -> bool:
+    """Whether a cell is within the limits: 64 to 72 %, 93 to 97 %, pulls of 0.9 to 1.1."""
+    return 0.64 <= cell.in_68 <= 0.72 and 0.93 <= cell.in_95 <= 0.97 and 0.9 <= cell.rms <= 1.1
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pixels", type=int, default=1000)
-    parser.add_argument("--states", choices=state_tables(), default="RGB950's 40", help="good and poor states")
-    parser.add_argument("--out", type=Path)
+    parser.add_argument("--short", action="store_true", help="one instrument, no darks")
+    parser.add_argument("--out", type=Path, help="every cell as CSV")
     arguments = parser.parse_args()
-    text = table(arguments.pixels, w=state_tables()[arguments.states])
+    instruments = list(seven_instruments())[: 1 if arguments.short else None]
+    every = [
+        cell
+        for instrument in instruments
+        for darks in DARKS[: 1 if arguments.short else None]
+        for electrons in LIGHT
+        for cell in cells(instrument, darks, electrons, arguments.pixels)
+    ]
     if arguments.out:
-        arguments.out.write_text(text, encoding="utf-8")
-    print(text)
+        with arguments.out.open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.DictWriter(stream, list(asdict(every[0])))
+            writer.writeheader()
+            writer.writerows(asdict(cell) for cell in every)
+    print(table(every))

@@ -54,6 +54,11 @@ def state_tables() -> dict[str, np.ndarray]:
     }
 
 
+def seven_instruments() -> dict[str, np.ndarray]:
+    """The state tables, and the RGB950's states at 451 nm."""
+    return state_tables() | {"RGB950's 40 at 451 nm": rgb950(451)}
+
+
 def random_processes(count: int, seed: int) -> np.ndarray:
     """Mueller-Jones matrices (count, 4, 4) with m00 = 1, even over all Jones matrices."""
     parts = np.random.default_rng(seed).normal(size=(2, count, 4))
@@ -82,7 +87,7 @@ def five_samples() -> dict[str, np.ndarray]:
 def noisy_image(
     matrices: np.ndarray,
     electrons: float,
-    seed: int,
+    seed: int | list[int],
     w: np.ndarray | None = None,
     darks: int = 0,
     read_noise_e: float = READ_NOISE_E,
@@ -124,3 +129,37 @@ def noisy_image(
         facts={"weighted": False},
         dark=dark,
     )
+
+
+def nineteen_samples() -> dict[str, np.ndarray]:
+    """Matrices (4, 4) with m00 = 1: the five kinds, and those at which a quantity ends, folds or is not unique."""
+    pure = five_samples()["non-depolarizing"]
+
+    def polarizer(extinction: float) -> np.ndarray:
+        matrix = mueller.diattenuator(0.3, 1.0, 1 / extinction)
+        return np.asarray(matrix / matrix[0, 0])
+
+    def retarder(degrees: float) -> np.ndarray:
+        return triply_degenerate.mueller_matrix(mueller.retarder(0.4, np.deg2rad(degrees)), 0.97)
+
+    # Small eigenvalues 3 % apart, as those of the paper's sphere at 662 nm.
+    second = mueller.retarder(0.9, 2.0) @ mueller.IDEAL_MIRROR
+    apart = triply_degenerate.mueller_matrix(pure, 0.55) + 0.03 * (second - mueller.IDEAL_DEPOLARIZER)
+    weak = np.diag([1.0, 0.06, 0.055, 0.05])
+    weak[1, 0], weak[0, 1] = 0.03, 0.02
+    return five_samples() | {
+        "ideal depolarizer": np.array(mueller.IDEAL_DEPOLARIZER, dtype=float),
+        "nearly ideal depolarizer": weak,
+        "DoLP 0.2": triply_degenerate.mueller_matrix(polarizer(10), 0.25 + 0.75 * 0.2 / 0.8182),
+        "air": np.eye(4),
+        "mirror": np.array(mueller.IDEAL_MIRROR, dtype=float),
+        "polarizer 1:10": polarizer(10),
+        "polarizer 1:100": polarizer(100),
+        "polarizer 1:1000": polarizer(1000),
+        "polarizer 1:10000": polarizer(10_000),
+        "retarder 2": retarder(2),
+        "retarder 90": retarder(90),
+        "retarder 178": retarder(178),
+        "retarder 180": retarder(180),
+        "triply degenerate, 3 % off": apart,
+    }

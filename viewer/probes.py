@@ -114,7 +114,7 @@ def _planes(product: Product, region: Region) -> list[dict[str, Any]]:
     told = []
     for name in product.names:
         # The flags are told in words.
-        if name.endswith(("_errors", "covariance")) or name in ("mueller", "pixel_flags"):
+        if name.endswith(("_errors", "_95", "covariance")) or name in ("mueller", "pixel_flags"):
             continue
         values = product.get(name, region.rows)[..., region.columns]
         if values.size // region.pixels > 4:

@@ -58,7 +58,7 @@ def maps_of(opened: Product) -> list[dict[str, Any]]:
     found = []
     first = FIRST.get(opened.kind, opened.kind)
     for name in sorted(opened.names, key=lambda name: name != first):
-        if name.endswith("_errors") or name in ("mueller", "mueller_covariance"):
+        if name.endswith(("_errors", "_95")) or name in ("mueller", "mueller_covariance"):
             continue
         count = opened.get(name, slice(0, 1)).size // opened.shape[1]
         common: dict[str, Any] = {"name": name, "about": opened.long_name(name), "units": opened.units(name)}

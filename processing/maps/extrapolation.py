@@ -5,6 +5,7 @@ Jarecki and Kupinski, Sec. V-C.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -99,6 +100,11 @@ class ExtrapolatedImage:
     def matrices(self) -> NDArray[np.float32]:
         """View (rows, columns, 4, 4)."""
         return np.moveaxis(self.values, (0, 1), (-2, -1))
+
+    def moments_of(self, elements: Sequence[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Traces (rows, columns) of C and C^2, C being the covariance of these elements: they have one error."""
+        total = np.square(self.errors.reshape(16, *self.correlation.shape)[list(elements)].astype(float)).sum(axis=0)
+        return total, total**2
 
     def variance_of(self, gradient: NDArray[np.floating]) -> NDArray[np.float64]:
         """First-order variance (rows, columns) of a quantity with gradient (rows, columns, 16) by the elements."""

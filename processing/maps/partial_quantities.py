@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import BoolArray
-from processing.maps.first_order_limits import limit_vectors
+from processing.maps.intervals import set_angles, set_magnitudes
 from processing.polarization import gradients
 from processing.polarization.quantities import POLARIZATIONS, NamedStokes
 from processing.storage.images import MuellerImage
@@ -51,10 +51,10 @@ def partial_block(image: MuellerImage, names: list[str], pairs: Pairs) -> dict[s
     with np.errstate(divide="ignore", invalid="ignore"):
         derived = gradients.diattenuation(m) | gradients.polarizance(m) | gradients.pairs(m, pairs)
         for name in names:
-            value, gradient = derived[name]
-            found[name] = value.astype(np.float32)
-            found[f"{name}_errors"] = np.sqrt(image.variance_of(gradient)).astype(np.float32)
-    limit_vectors(found)
+            found[name] = derived[name].value.astype(np.float32)
+            found[f"{name}_errors"] = np.sqrt(image.variance_of(derived[name].gradient)).astype(np.float32)
+        set_magnitudes(found, derived, m, image)
+        set_angles(found)
     found["lit"] = (image.values[0, 0] > LIT_ERRORS * np.nan_to_num(image.errors[0, 0])).astype(np.uint8)
     return found
 

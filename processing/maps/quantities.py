@@ -13,13 +13,26 @@ from processing.arrays import RealArray
 from processing.errors import ProcessError
 from processing.maps.coherency_noise import coherency_noise
 from processing.maps.extrapolation import EXTRAPOLATED, ExtrapolatedImage
-from processing.maps.first_order_limits import limit
+from processing.maps.intervals import (
+    SEEN,
+    has_own_95,
+    set_angles,
+    set_any_dominant,
+    set_depolarization_power,
+    set_differential,
+    set_eigenvalues,
+    set_magnitudes,
+    set_retardance,
+    set_symmetric,
+    widen_dominant,
+)
 from processing.maps.partial_quantities import Pairs, determined_maps, partial_block, partial_facts
-from processing.maps.sent_back import sent_back_block, sent_back_facts, sent_back_planes
+from processing.maps.sent_back import OF_MATRICES, sent_back_block, sent_back_facts, sent_back_planes
 from processing.polarization import gradients
 from processing.polarization.decompositions.differential import differential
 from processing.polarization.decompositions.lu_chipman import lu_chipman
 from processing.polarization.decompositions.symmetric import symmetric
+from processing.polarization.eigenvalue_noise import corrected
 from processing.polarization.propagation import Derived
 from processing.polarization.quantities import PAPER_PAIRS
 from processing.polarization.scalar_files import scalar_quantities
@@ -158,7 +171,7 @@ def _maps(product: Product, extra: Sequence[str], pairs: Pairs) -> _Maps:
     sent = {} if extra else sent_back_planes(product)
     if sent:
         return _Maps(
-            _with_errors(sent),
+            with_errors(sent, lambda name: has_own_95(OF_MATRICES.get(name, name))),
             lambda rows: sent_back_block(product, rows, sent),
             lambda writer: sent_back_facts(writer, sent),
         )
@@ -166,12 +179,12 @@ def _maps(product: Product, extra: Sequence[str], pairs: Pairs) -> _Maps:
     partial = _determined(product, extra, pairs)
     if partial:
         return _Maps(
-            _with_errors({name: maps[name] for name in [*partial, "lit"]}),
+            with_errors({name: maps[name] for name in [*partial, "lit"]}),
             lambda rows: partial_block(MuellerImage.of(product, rows), partial, pairs),
             lambda writer: partial_facts(writer, partial),
         )
     return _Maps(
-        _with_errors(maps) | _NOISE,
+        with_errors(maps) | _NOISE,
         lambda rows: quantities_block(image_of(product, rows), extra, pairs),
         lambda writer: _facts(writer, maps),
     )
@@ -199,13 +212,15 @@ def _determined(product: Product, extra: Sequence[str], pairs: Pairs) -> list[st
     return names
 
 
-def _with_errors(maps: Mapping[str, Plane]) -> dict[str, Plane]:
+def with_errors(maps: Mapping[str, Plane], own_95: Callable[[str], bool] = has_own_95) -> dict[str, Plane]:
+    """The planes of maps, of their standard errors and, where +- 1.96 errors is not it, of their 95 % intervals."""
     planes = dict(maps)
     for name, plane in maps.items():
         if plane.dtype is np.float32:
-            planes[f"{name}_errors"] = Plane(
-                plane.leading, plane.units, f"standard errors of {name}; NaN: not determined"
-            )
+            planes[f"{name}_errors"] = Plane(plane.leading, plane.units, f"half the 68 % interval of {name}")
+            if own_95(name):
+                title = f"lower and upper bound of the 95 % interval of {name}"
+                planes[f"{name}_95"] = Plane((2, *plane.leading), plane.units, title)
     return planes
 
 
@@ -251,16 +266,15 @@ def quantities_block(
         if "differential" in extra:
             derived |= gradients.differential_quantities(lit)
         found: dict[str, NDArray[Any]] = {}
-        for name, (value, gradient) in derived.items():
+        for name, quantity in derived.items():
+            value, gradient = quantity.value, quantity.gradient
             found[name] = value.astype(np.float32)
             each = gradient.reshape(-1, *m.shape[:2], 16)
             errors = [np.sqrt(image.variance_of(g)) for g in each]
             found[f"{name}_errors"] = np.stack(errors).reshape(value.shape).astype(np.float32)
-    found["retardance_vector_covariance"] = _covariance(image, derived["retardance_vector_deg"].gradient)
-    found["td_missed_noise"] = np.zeros_like(found["td_missed"])
-    polar = lu_chipman(m)
-    noise = coherency_noise(image) if isinstance(image, MuellerImage) else None
-    limit(found, noise, _relative_error(image), polar.depolarizer)
+        found["retardance_vector_covariance"] = _covariance(image, derived["retardance_vector_deg"].gradient)
+        polar = lu_chipman(m)
+        _set_intervals(found, derived, m, image, polar.depolarizer)
     found["lit"] = np.isfinite(lit[..., 0, 0]).astype(np.uint8)
     found["lu_chipman_defined"] = polar.defined.astype(np.uint8)
     found["negative_determinant"] = polar.negative_determinant.astype(np.uint8)
@@ -269,6 +283,59 @@ def quantities_block(
     if "differential" in extra:
         found["differential_defined"] = differential(lit).defined.astype(np.uint8)
     return found
+
+
+def _set_intervals(
+    found: dict[str, NDArray[Any]],
+    derived: Mapping[str, Derived],
+    m: NDArray[np.float64],
+    image: MuellerImage | ExtrapolatedImage,
+    depolarizer: NDArray[np.floating],
+) -> None:
+    """What first order does not give: see `processing.maps.intervals`."""
+    retardance_errors = found["retardance_deg_errors"], found["retardance_linear_deg_errors"]
+    diattenuation_error = found["diattenuation_errors"]
+    factor: NDArray[np.float64] | float = 1.0
+    found["td_missed_noise"] = np.zeros_like(found["td_missed"])
+    if isinstance(image, MuellerImage):
+        noise = coherency_noise(image)
+        xi = np.moveaxis(found["coherency_eigenvalues"], 0, -1).astype(float)
+        set_eigenvalues(found, noise, corrected(xi, noise, image.covariance_of_depolarizer()))
+        factor = widen_dominant(found, noise)
+    set_magnitudes(found, derived, m, image, factor)
+    set_angles(found)
+    if isinstance(image, MuellerImage):
+        set_any_dominant(found, derived, np.isfinite(factor))
+    weakest = np.abs(_symmetric_eigenvalues(np.nan_to_num(depolarizer[..., 1:, 1:]))).min(axis=0)
+    # What is left of the light after the diattenuator carries the noise of all of it.
+    passed = 1 - np.square(np.asarray(derived["diattenuation"].value) + diattenuation_error)
+    is_determined = (passed > 0) & (weakest * passed > SEEN * _relative_error(image))
+    set_retardance(found, derived, *retardance_errors, is_determined)
+    set_depolarization_power(found, passed > SEEN * _relative_error(image))
+    if "differential_retardance_deg" in found:
+        set_differential(found, is_determined & _is_principal(found))
+    if "symmetric_d1" in found:
+        set_symmetric(found, _relative_error(image))
+
+
+def _is_principal(found: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
+    """Whether the logarithm of M exists, and retardance is more than three errors from where it jumps."""
+    retardance, error = (found[f"differential_retardance_deg{end}"] for end in ("", "_errors"))
+    return np.asarray(180 - retardance > SEEN * error)
+
+
+def _symmetric_eigenvalues(a: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Eigenvalues (3, ...) of symmetric matrices (..., 3, 3) from their invariants, far quicker than LAPACK.
+
+    Good to half the digits where two are equal, which is plenty for a limit.
+    """
+    mean = np.trace(a, axis1=-2, axis2=-1) / 3
+    rest = a - mean[..., None, None] * np.eye(3)
+    size = np.sqrt(np.einsum("...ij,...ij->...", rest, rest) / 6)
+    x, y, z = rest[..., 0, :], rest[..., 1, :], rest[..., 2, :]
+    determinant = np.einsum("...i,...i->...", x, np.cross(y, z))
+    turn = np.arccos(np.clip(np.nan_to_num(determinant / (2 * size**3)), -1, 1)) / 3
+    return np.stack([mean + 2 * size * np.cos(turn + 2 * np.pi * k / 3) for k in range(3)])
 
 
 def _covariance(image: MuellerImage | ExtrapolatedImage, gradient: NDArray[np.floating]) -> NDArray[np.float32]:

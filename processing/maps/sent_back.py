@@ -27,6 +27,8 @@ _NAMES = {
         Plane((), "degree", f"angle of linear polarization {_BACK}, 0 to 180, from +x of the analyzer frame"),
     ),
 }
+#: The name that the same quantity of a matrix has, by its name here.
+OF_MATRICES = {own: name for name, (own, _) in _NAMES.items()}
 
 
 def sent_back_planes(product: Product) -> dict[str, Plane]:
@@ -61,8 +63,9 @@ def sent_back_block(product: Product, rows: slice, planes: dict[str, Plane]) -> 
     found = partial_block(column, wanted, {})
     out = {"lit": found["lit"]}
     for name in wanted:
-        for suffix in ("", "_errors"):
-            out[_NAMES[name][0] + suffix] = found[name + suffix]
+        for suffix in ("", "_errors", "_95"):
+            if name + suffix in found:
+                out[_NAMES[name][0] + suffix] = found[name + suffix]
     return out
 
 

@@ -50,7 +50,7 @@ def depolarization_index(m: RealArray) -> dict[str, Derived]:
     with np.errstate(divide="ignore", invalid="ignore"):
         gradient = m.reshape(*m.shape[:-2], 16) / (3 * m00**2 * value)[..., None]
         gradient[..., 0] = -value / m00
-    return {"depolarization_index": Derived(value, gradient)}
+    return {"depolarization_index": Derived(value, gradient, tuple(range(1, 16)))}
 
 
 def diattenuation(m: RealArray) -> dict[str, Derived]:
@@ -73,10 +73,10 @@ def _vector(name: str, v: RealArray, m00: RealArray, elements: tuple[int, int, i
     size = quantities.magnitude(v)
     with np.errstate(divide="ignore", invalid="ignore"):
         whole = np.sum(np.moveaxis(v, -1, 0)[..., None] * slope, axis=0) / size[..., None]
-    return {name: Derived(size, whole)} | _parts(name, v, slope)
+    return {name: Derived(size, whole, elements)} | _parts(name, v, slope, elements[:2])
 
 
-def _parts(name: str, v: RealArray, slope: RealArray) -> dict[str, Derived]:
+def _parts(name: str, v: RealArray, slope: RealArray, elements: tuple[int, ...] = ()) -> dict[str, Derived]:
     """Linear part, circular part and orientation of a vector v (..., 3) with gradient slope (3, ..., 16)."""
     linear = quantities.linear_magnitude(v)
     v1, v2 = v[..., 0, None], v[..., 1, None]
@@ -84,7 +84,7 @@ def _parts(name: str, v: RealArray, slope: RealArray) -> dict[str, Derived]:
         along = (v1 * slope[0] + v2 * slope[1]) / linear[..., None]
         across = np.rad2deg(0.5) * (v1 * slope[1] - v2 * slope[0]) / linear[..., None] ** 2
     return {
-        f"{name}_linear": Derived(linear, along),
+        f"{name}_linear": Derived(linear, along, elements, None if elements else slope[:2]),
         f"{name}_circular": Derived(v[..., 2], slope[2]),
         f"{name}_orientation_deg": Derived(np.rad2deg(quantities.orientation(v)), across),
     }
@@ -127,6 +127,8 @@ def lu_chipman_quantities(m: RealArray) -> dict[str, Derived]:
     found = _numeric(values, m, (*RETARDER, "depolarization_power", *axes), period)
     parts = [found.pop(name) for name in axes]
     vector = Derived(np.stack([p.value for p in parts]), np.stack([p.gradient for p in parts]))
+    for name, count in (("retardance_deg", 3), ("retardance_linear_deg", 2)):
+        found[name] = found[name]._replace(parts=vector.gradient[:count])
     fast = found["retardance_fast_axis_deg"]
     either = Derived(np.mod(fast.value, 90.0), fast.gradient)
     return found | {"retardance_axis_or_90_deg": either, "retardance_vector_deg": vector}
@@ -169,8 +171,10 @@ def differential_quantities(m: RealArray) -> dict[str, Derived]:
     linear, circular, axis = vector["_linear"], vector["_circular"], vector["_orientation_deg"]
     to_deg = np.rad2deg(1.0)
     return {
-        "differential_retardance_deg": Derived(to_deg * size, to_deg * whole),
-        "differential_retardance_linear_deg": Derived(to_deg * linear.value, to_deg * linear.gradient),
+        "differential_retardance_deg": Derived(to_deg * size, to_deg * whole, parts=to_deg * slope[:3]),
+        "differential_retardance_linear_deg": Derived(
+            to_deg * linear.value, to_deg * linear.gradient, parts=to_deg * slope[:2]
+        ),
         "differential_retardance_fast_axis_deg": axis,
         "differential_retardance_circular_deg": Derived(to_deg * circular.value, to_deg * circular.gradient),
         "differential_diattenuation_linear": _parts("", diattenuation, slope[3:6])["_linear"],

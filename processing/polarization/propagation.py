@@ -25,6 +25,10 @@ class Derived(NamedTuple):
     """(..., pixels...)"""
     gradient: RealArray
     """(..., pixels..., 16)"""
+    elements: tuple[int, ...] = ()
+    """Of the length of a vector of elements over m00: their numbers, row-major."""
+    parts: RealArray | None = None
+    """Of the length of another vector: gradients (n, pixels..., 16) of its components."""
 
 
 def numeric_gradient(

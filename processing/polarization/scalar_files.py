@@ -1,8 +1,8 @@
 """Finds the quantities that are one file each: `scalars/NAME.py`, and plug-ins of the entry point `umov.quantities`.
 
 Such a module has `value(m)`, from Mueller matrices (..., 4, 4) to numbers (...), and the first line of its docstring is
-what the map is called. Optional: `gradient(m)` (..., 16), else differences are taken; `UNITS`; `COMPONENTS`, the
-number of elements of the vector whose length it is.
+what the map is called. Optional: `gradient(m)` (..., 16), else differences are taken; `UNITS`; `ELEMENTS`, the numbers
+(row-major, m00 is 0) of the elements that are the vector whose length it is.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Scalar:
     name, title, units : as in products.
     value : from matrices (..., 4, 4) to (...).
     gradient : to (..., 16); None: by differences.
-    components : elements of the vector whose length it is; 0: it is no length.
+    elements : those of the vector whose length it is; empty: it is no length.
     """
 
     name: str
@@ -42,14 +42,15 @@ class Scalar:
     units: str
     value: Callable[[RealArray], RealArray]
     gradient: Callable[[RealArray], RealArray] | None
-    components: int
+    elements: tuple[int, ...]
 
     def derived(self, m: RealArray) -> Derived:
         """Value and gradient of Mueller matrices (..., 4, 4)."""
         m = np.asarray(m, dtype=float)
         if self.gradient is not None:
-            return Derived(self.value(m), self.gradient(m))
-        return Derived(self.value(m), numeric_gradient(lambda x: self.value(x)[..., None], m)[..., 0, :])
+            return Derived(self.value(m), self.gradient(m), self.elements)
+        slope = numeric_gradient(lambda x: self.value(x)[..., None], m)[..., 0, :]
+        return Derived(self.value(m), slope, self.elements)
 
 
 @cache
@@ -79,5 +80,5 @@ def _scalar(name: str, module: ModuleType) -> Scalar:
         getattr(module, "UNITS", ""),
         module.value,
         getattr(module, "gradient", None),
-        getattr(module, "COMPONENTS", 0),
+        tuple(getattr(module, "ELEMENTS", ())),
     )

@@ -12,6 +12,7 @@ from processing.errors import NotDetermined
 from processing.instrument.applied_effects import changes_at
 from processing.instrument.changes import Changes
 from processing.instrument.model import InstrumentModel
+from processing.polarization.magnitude import directions, interval
 from processing.reduction.counts_to_signal import Correction
 from processing.reduction.cut_off import without_cut_off
 from processing.reduction.effects_of_capture import CountsCorrection, capture_changes, counts_correction
@@ -45,9 +46,11 @@ PLANES = {
     "s2_errors": Plane((), "count", "standard errors of s2"),
     "stokes_covariance": Plane((6,), "count2", _COVARIANCE),
     "dolp": Plane((), "", "degree of linear polarization, without what noise adds to S1^2 + S2^2; over S0"),
-    "dolp_errors": Plane((), "", "standard errors of dolp; NaN: not above three of them, an upper limit"),
+    "dolp_errors": Plane((), "", "half the 68 % interval of dolp"),
+    "dolp_95": Plane((2,), "", "lower and upper bound of the 95 % interval of dolp"),
     "aolp_deg": Plane((), "degree", "angle of linear polarization, 0 to 180, from +x of the analyzer frame"),
-    "aolp_deg_errors": Plane((), "degree", "standard errors of aolp_deg; NaN: dolp is noise, no angle is determined"),
+    "aolp_deg_errors": Plane((), "degree", "half the 68 % interval of aolp_deg; 90: any angle"),
+    "aolp_deg_95": Plane((2,), "degree", "lower and upper bound of the 95 % interval of aolp_deg"),
     "closure": Plane((), "count", "what the model cannot explain of the four channels: I0 + I90 - I45 - I135 if ideal"),
     "pixel_flags": Plane((), "", f"0 = good; bits: {Mask.meaning()}", np.uint8),
 }
@@ -60,10 +63,8 @@ SYSTEMATIC = {
     "aolp_deg_systematic": Plane((), "degree", f"systematic standard errors of aolp_deg: {_LEFT}"),
 }
 
-#: A degree of polarization has an error bar, and so an angle, above this many of its errors.
-SEEN = 3.0
 #: Without light there is no degree and no angle of polarization; S itself is a measurement all the same.
-RATIOS = ("dolp", "dolp_errors", "aolp_deg", "aolp_deg_errors", "dolp_systematic", "aolp_deg_systematic")
+RATIOS = tuple(f"{name}{part}" for name in ("dolp", "aolp_deg") for part in ("", "_errors", "_95", "_systematic"))
 
 
 def channel_rows(
@@ -204,11 +205,10 @@ def stokes(
         across = v * v * c11 + u * u * c22 - 2 * u * v * c12
         cross = u * c01 + v * c02
         dolp_variance = (along - 2 * dolp * cross + dolp**2 * c00) / s0**2
-        dolp_errors, aolp_errors = np.sqrt(np.maximum(dolp_variance, 0.0)), 0.5 * np.sqrt(across) / linear
-        noise = ~(dolp > SEEN * dolp_errors)
-        dolp_errors[noise] = aolp_errors[noise] = np.nan
-        # Noise across the vector (S1, S2) adds its square.
-        dolp = np.sqrt(np.maximum(linear**2 - across, 0.0)) / s0
+        own = ((c11 + c22) / s0**2, (c11**2 + c22**2 + 2 * c12**2) / s0**4)
+        degree = interval(dolp, np.maximum(dolp_variance, 0.0), *own)
+        halves = [np.rad2deg(half) / 2 for half in directions(np.sqrt(np.maximum(across, 0.0)) / linear)]
+    angle = np.rad2deg(aolp)
     found = {
         "s0": s0,
         "s1": s1,
@@ -217,8 +217,10 @@ def stokes(
         "s1_errors": np.sqrt(c11),
         "s2_errors": np.sqrt(c22),
     }
-    found |= {"stokes_covariance": covariance, "dolp": dolp, "dolp_errors": dolp_errors, "closure": closure}
-    found |= {"aolp_deg": np.rad2deg(aolp), "aolp_deg_errors": np.rad2deg(aolp_errors)}
+    found |= {"stokes_covariance": covariance, "closure": closure}
+    found |= {"dolp": degree.value, "dolp_errors": degree.error, "dolp_95": np.stack([degree.low, degree.high])}
+    found |= {"aolp_deg": angle, "aolp_deg_errors": halves[0]}
+    found |= {"aolp_deg_95": np.stack([angle - halves[1], angle + halves[1]])}
     return {name: np.asarray(values, dtype=np.float32) for name, values in found.items()}
 
 

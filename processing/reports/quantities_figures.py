@@ -70,7 +70,7 @@ def quantities_figure(product: Product, title: str) -> Figure:
         if name in product.names:
             panels.append((label(name.replace("_", " "), name), get(name), {"vmin": 0}))
     for name in product.names:
-        if name in PAPER_PAIRS or ("_to_" in name and not name.endswith("_errors")):
+        if name in PAPER_PAIRS or ("_to_" in name and not name.endswith(("_errors", "_95"))):
             text = name.replace("_", " ") + " over $m_{00}$"
             panels.append((label(text, name), get(name), {"cmap": "gray", "vmin": 0}))
     return grid_figure(panels, f"{title}\n($\\pm$: median standard error of a pixel)", product.simulated)
@@ -80,7 +80,7 @@ def _partial_figure(product: Product, title: str) -> Figure:
     lit = thin(product.get("lit")) > 0
     panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = []
     for name in product.names:
-        if name == "lit" or name.endswith("_errors"):
+        if name == "lit" or name.endswith(("_errors", "_95")):
             continue
         shown = np.where(lit, thin(product.get(name)), np.nan)
         colours = colours_of(name, product.units(name))

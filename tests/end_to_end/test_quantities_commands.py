@@ -82,7 +82,8 @@ def test_all_maps_with_errors(process: Run, capture: Path, tmp_path: Path) -> No
         np.testing.assert_array_equal(lit, np.arange(COLUMNS) >= 10 * np.ones((ROWS, 1)))
         for name, value in expected.items():
             pull = ((product.get(name) - value) / product.get(f"{name}_errors"))[lit]
-            assert pull.std() == pytest.approx(1, abs=0.1), name
+            # The error of what follows from near eigenvalues has the noise between them, too.
+            assert (0.7 if name == "td_missed" else 0.9) < pull.std() < 1.1, name
             assert pull.mean() == pytest.approx(0, abs=0.2), name
         xi = product.get("coherency_eigenvalues")
         np.testing.assert_allclose(xi.sum(axis=0)[lit], 1, atol=1e-5)

@@ -1,27 +1,86 @@
-"""Every error bar of `process quantities` on five kinds of sample: a short form of `benchmarks/error_bars.py`."""
+"""Every error bar of `process quantities` and `process xi0`: the short form of `benchmarks/error_bars.py`."""
 
 import numpy as np
 import pytest
-from error_bars import entries
-from noisy_images import five_samples, noisy_image
+from error_bars import cells
+from magnitude_table import node
+from noisy_images import nineteen_samples, noisy_image, seven_instruments
 
 from processing.maps.quantities import EXTRA, quantities_block
 from processing.polarization import mueller, triply_degenerate
+from processing.polarization.magnitude import ALONG, COMPONENTS, TABLE, interval
 
-PIXELS = 400
+PIXELS = 300
+#: Three standard deviations of a part of PIXELS, below the limits of docs/error-bars.md.
+LEAST_68, LEAST_95 = 0.64 - 3 * np.sqrt(0.68 * 0.32 / PIXELS), 0.93 - 3 * np.sqrt(0.95 * 0.05 / PIXELS)
+#: Of entropy and the sorted elements of the symmetric decomposition (docs/error-bars.md, "What does not hold").
+LOOSE = ("entropy", "symmetric_d1", "symmetric_d2", "symmetric_d3")
 
 
-@pytest.mark.parametrize("electrons", [20, 200, 20_000])
-@pytest.mark.parametrize("sample", five_samples())
-def test_pulls_have_unit_variance_where_there_is_an_error_bar(sample, electrons):
-    found = list(entries(sample, electrons, PIXELS, EXTRA))
-    # Sampling scatters by 0.035 (more where components are few and tails wide); second order is what 20 electrons show.
-    room = 0.45 if electrons == 20 else 0.2
-    for e in found:
-        if e.determined > 0.85:
-            assert e.rms == pytest.approx(1, abs=room), e
-    # Something must be left of them.
-    assert sum(e.determined > 0.85 for e in found) > (6 if electrons == 20 else 15)
+@pytest.mark.parametrize(("electrons", "darks"), [(200, 0), (2000, 1), (20_000, 4)])
+def test_every_interval_covers_for_every_sample(electrons: float, darks: int) -> None:
+    found = list(cells("RGB950's 40", darks, electrons, PIXELS, extra=EXTRA))
+    low = [c for c in found if c.quantity not in LOOSE and (c.in_68 < LEAST_68 or c.in_95 < LEAST_95)]
+    # 800 cells: two in a thousand are beyond three standard deviations by chance.
+    assert len(low) <= 4, low
+    assert all(c.in_95 > 0.85 for c in found if c.quantity != "entropy"), min(found, key=lambda c: c.in_95)
+    assert {c.has_interval for c in found} == {1.0}
+
+
+@pytest.mark.parametrize("name", ["diattenuation", "polarizance_purity", "depolarization_index", "mueller"])
+def test_where_nothing_is_polarized_intervals_hold_as_often_as_they_claim(name: str) -> None:
+    found = cells("RGB950's 40", 0, 200, 1500, ["ideal depolarizer", "nearly ideal depolarizer", "air"], ())
+    for cell in found:
+        if cell.quantity == name:
+            # The noise of the 15 elements is not quite alike in all directions, which the interval does not know.
+            assert 0.63 < cell.in_68 < 0.76, cell
+            assert 0.92 < cell.in_95 < 0.98, cell
+
+
+def test_depolarization_power_of_a_depolarizer_has_no_bias() -> None:
+    cell = next(
+        c for c in cells("RGB950's 40", 0, 200, 1500, ["ideal depolarizer"], ()) if c.quantity == "depolarization_power"
+    )
+    # Its 95 % interval covered 28 %, and the mean pull was -2.35.
+    assert cell.in_95 > 0.93
+    assert abs(cell.mean) < 1
+
+
+@pytest.mark.parametrize("extinction", [100, 1000, 10_000])
+def test_a_polarizer_has_no_retardance_with_a_narrow_interval(extinction: int) -> None:
+    matrix = nineteen_samples()[f"polarizer 1:{extinction}"]
+    found = quantities_block(noisy_image(np.tile(matrix, (PIXELS, 1, 1)), 200, 2), (), {})
+    low, high = found["retardance_deg_95"]
+    # 7 to 17 % of the pixels said 176 +- 7 degrees.
+    assert np.mean(low > 1) < 0.05
+    assert np.nanmedian(high - low) > 90
+
+
+def test_a_mean_of_darks_is_one_error_of_m00() -> None:
+    matrix = nineteen_samples()["triply degenerate"]
+    truth = quantities_block(noisy_image(matrix[None], 1e13, 0), (), {})["depolarization_index"]
+    image = noisy_image(np.tile(matrix, (1500, 1, 1)), 1000, 3, darks=1, read_noise_e=30)
+    found = quantities_block(image, (), {})
+    pull = (found["depolarization_index"] - truth) / found["depolarization_index_errors"]
+    # It was 1.67.
+    assert np.sqrt(np.mean(pull**2)) == pytest.approx(1, abs=0.06)
+
+
+@pytest.mark.parametrize("components", [1, 2, 3, 6, 15])
+@pytest.mark.parametrize("length", [0.0, 0.7, 2.0, 5.0, 14.0])
+def test_an_interval_of_a_length_covers_at_every_length(components: int, length: float) -> None:
+    noise = np.random.default_rng(components).normal(size=(4000, components))
+    noise[:, 0] += length
+    seen = np.linalg.norm(noise, axis=1)
+    found = interval(seen, np.ones_like(seen), np.full_like(seen, components), np.full_like(seen, components))
+    assert np.mean((found.low <= length) & (length <= found.high)) == pytest.approx(0.95, abs=0.017)
+    assert np.mean(np.abs(found.value - length) <= found.error) == pytest.approx(0.69, abs=0.05)
+
+
+def test_the_table_of_intervals_is_what_its_program_makes() -> None:
+    with np.load(TABLE) as stored:
+        assert stored["lengths"].shape[:2] == (len(COMPONENTS), len(ALONG))
+        np.testing.assert_allclose(stored["lengths"][4, 5], node(COMPONENTS[4], ALONG[5]), atol=1e-5)
 
 
 def block(matrix: np.ndarray, electrons: float) -> dict[str, np.ndarray]:
@@ -29,12 +88,11 @@ def block(matrix: np.ndarray, electrons: float) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize(("axis", "electrons"), [(0.4, 200), (0.4, 20_000), (0.0, 20_000), (np.pi / 2, 200)])
-def test_near_180_degrees_the_axis_is_not_determined_but_the_pair_of_axes_is(axis, electrons):
+def test_near_180_degrees_the_axis_is_not_determined_but_the_pair_of_axes_is(axis: float, electrons: float) -> None:
     found = block(triply_degenerate.mueller_matrix(mueller.retarder(axis, np.pi), 0.9), electrons)
-    fast, errors = found["retardance_fast_axis_deg"], found["retardance_fast_axis_deg_errors"]
-    assert np.std(fast) > 20  # it flips
-    # Three errors from 180 degrees by chance: 0.3 %.
-    assert np.isfinite(errors).mean() < 0.01
+    assert np.std(found["retardance_fast_axis_deg"]) > 20  # it flips
+    low, high = found["retardance_fast_axis_deg_95"]
+    assert np.mean(high - low > 170) > 0.9
     assert found["retardance_axis_flip"].mean() > 0.1
     # Of the two axes: 0 and 90 degrees are the same.
     apart = (found["retardance_axis_or_90_deg"] - np.rad2deg(axis) + 45) % 90 - 45
@@ -42,7 +100,7 @@ def test_near_180_degrees_the_axis_is_not_determined_but_the_pair_of_axes_is(axi
     assert np.sqrt(np.mean(pull**2)) == pytest.approx(1, abs=0.15)
 
 
-def test_farther_from_180_degrees_the_axis_is_determined():
+def test_farther_from_180_degrees_the_axis_is_determined() -> None:
     found = block(triply_degenerate.mueller_matrix(mueller.retarder(0.4, np.deg2rad(170)), 0.9), 20_000)
     pull = (found["retardance_fast_axis_deg"] - np.rad2deg(0.4)) / found["retardance_fast_axis_deg_errors"]
     assert np.sqrt(np.mean(pull**2)) == pytest.approx(1, abs=0.15)
@@ -50,7 +108,7 @@ def test_farther_from_180_degrees_the_axis_is_determined():
 
 
 @pytest.mark.parametrize("degrees", [69, 178, 179, 180])
-def test_the_joint_region_of_the_retardance_vector_covers_at_180_degrees_too(degrees):
+def test_the_joint_region_of_the_retardance_vector_covers_at_180_degrees_too(degrees: float) -> None:
     m = triply_degenerate.mueller_matrix(mueller.retarder(0.4, np.deg2rad(degrees)) @ mueller.rotation(0.2), 0.9)
     found, truth = block(m, 200), block(m, 1e13)["retardance_vector_deg"].reshape(3, -1)[:, :1]
     packed = found["retardance_vector_covariance"].reshape(6, -1)
@@ -65,16 +123,14 @@ def test_the_joint_region_of_the_retardance_vector_covers_at_180_degrees_too(deg
     assert np.mean(distance < 7.815) == pytest.approx(0.95, abs=0.04)
 
 
-@pytest.mark.parametrize("degrees", [180, 179, 178])
-def test_the_error_bar_of_a_folded_retardance_covers(degrees):
-    found = block(triply_degenerate.mueller_matrix(mueller.retarder(0.4, np.deg2rad(degrees)), 0.9), 200)
-    off = np.abs(found["retardance_deg"] - degrees) / found["retardance_deg_errors"]
-    # At 180 degrees half a normal distribution; half an error and an error away the fold only helps.
-    assert np.mean(off < 1) > 0.68 - 3 * np.sqrt(0.68 * 0.32 / PIXELS)
-    assert np.mean(off < 1.96) > 0.95 - 3 * np.sqrt(0.95 * 0.05 / PIXELS)
-
-
-def test_noise_alone_is_taken_off_what_td_misses():
-    found = block(triply_degenerate.mueller_matrix(five_samples()["non-depolarizing"], 0.6), 200)
+def test_noise_alone_is_taken_off_what_td_misses() -> None:
+    found = block(triply_degenerate.mueller_matrix(nineteen_samples()["non-depolarizing"], 0.6), 200)
     assert np.median(found["td_missed"]) < 0.3 * np.median(found["td_missed_noise"])
-    assert np.isnan(found["td_missed_errors"]).mean() > 0.9
+    assert np.mean(found["td_missed"] < 2 * found["td_missed_errors"]) > 0.9
+
+
+@pytest.mark.parametrize("instrument", list(seven_instruments())[1:])
+def test_poor_states_have_intervals_that_cover_too(instrument: str) -> None:
+    found = list(cells(instrument, 0, 20_000, PIXELS, ["triply degenerate", "retarder 90", "mirror-like"], ()))
+    low = [c for c in found if c.quantity not in LOOSE and (c.in_68 < LEAST_68 or c.in_95 < LEAST_95)]
+    assert len(low) <= 3, low

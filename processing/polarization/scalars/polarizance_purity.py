@@ -8,8 +8,8 @@ import numpy as np
 
 from processing.arrays import RealArray
 
-#: It is the length of a vector of so many elements: noise adds to its square, and is taken off.
-COMPONENTS = 6
+#: It is the length of the vector of these elements over m00, apart from a factor.
+ELEMENTS = (1, 2, 3, 4, 8, 12)
 
 
 def value(m: RealArray) -> RealArray:

@@ -8,8 +8,8 @@ import numpy as np
 
 from processing.arrays import RealArray
 
-#: It is the length of a vector of so many elements: noise adds to its square, and is taken off.
-COMPONENTS = 9
+#: It is the length of the vector of these elements over m00, apart from a factor.
+ELEMENTS = (5, 6, 7, 9, 10, 11, 13, 14, 15)
 
 
 def value(m: RealArray) -> RealArray:

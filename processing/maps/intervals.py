@@ -1,0 +1,326 @@
+"""Intervals of derived maps where value +- error is not enough: every pixel has one, whatever it shows.
+
+First order holds for what is smooth over the errors. Magnitudes, angles of short vectors, retardance near 180 degrees
+and what divides by a weak factor are not; docs/quantities.md, "Standard errors", says what is done for each.
+`<name>_errors` is half the 68 % interval, `<name>_95` the lower and upper bound of the 95 % interval.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from processing.arrays import Array
+from processing.polarization.eigenvalue_noise import CorrectedXi0, EigenvalueNoise
+from processing.polarization.magnitude import NORMAL_95, directions, interval, sum_of_singular_values
+from processing.polarization.propagation import Derived
+from processing.polarization.quantities import entropy
+from processing.polarization.scalar_files import scalar_quantities
+
+Planes = dict[str, NDArray[Any]]
+
+#: Probabilities that fast and slow axis have changed places from which on the 68 and 95 % interval holds both.
+FLIPPED = (0.2, 0.02)
+#: Equal eigenvalues mix by all of the noise between them, and less and less up to this many times it.
+APART = 5.0
+#: Equal eigenvalues are seen apart by the noise between them times the root of this, on average.
+_REPELLED = 4.0
+#: A rotation is determined where the weakest factor that it is divided by is this many times its noise.
+SEEN = 3.0
+#: Angles whose range is all directions, by what they are angles of.
+ANGLES = (
+    "diattenuation_orientation_deg",
+    "polarizance_orientation_deg",
+    "dominant_diattenuation_orientation_deg",
+    "dominant_polarizance_orientation_deg",
+    "retardance_fast_axis_deg",
+    "retardance_axis_or_90_deg",
+    "differential_retardance_fast_axis_deg",
+)
+#: Ranges of what the differential decomposition gives; where it does not exist any of them may be.
+DIFFERENTIAL = {
+    "retardance_deg": (0.0, 180.0),
+    "retardance_linear_deg": (0.0, 180.0),
+    "retardance_fast_axis_deg": (0.0, 180.0),
+    "retardance_circular_deg": (-180.0, 180.0),
+    "diattenuation_linear": (0.0, np.inf),
+    **{f"depolarization_{k}": (-np.inf, np.inf) for k in (1, 2, 3)},
+}
+SIGNED = ("retardance_circular_deg", "retardance_vector_deg")
+#: Maps whose 95 % interval is a plane of its own; of all others it is value +- 1.96 error.
+OWN_95 = (
+    *ANGLES,
+    *SIGNED,
+    *(f"{name}{part}" for name in ("diattenuation", "polarizance") for part in ("", "_linear")),
+    *(f"dominant_{name}_{part}" for name in ("diattenuation", "polarizance") for part in ("linear", "circular")),
+    "coherency_eigenvalues",
+    "depolarization_index",
+    "depolarization_power",
+    "retardance_deg",
+    "retardance_linear_deg",
+    *(f"symmetric_d{k}" for k in (1, 2, 3)),
+    *(f"differential_{short}" for short in DIFFERENTIAL),
+)
+
+
+def has_own_95(name: str) -> bool:
+    """Whether a map has a plane `<name>_95`."""
+    scalar = scalar_quantities().get(name)
+    return name in OWN_95 or (scalar is not None and bool(scalar.elements))
+
+
+class Noise(Protocol):
+    """What an image knows of the errors of its elements."""
+
+    def variance_of(self, gradient: NDArray[np.floating]) -> Array: ...
+
+    def moments_of(self, elements: tuple[int, ...]) -> tuple[Array, Array]: ...
+
+
+def set_magnitudes(
+    planes: Planes, derived: Mapping[str, Derived], m: Array, image: Noise, widened: Array | float = 1.0
+) -> None:
+    """Replace value and error of every length of a vector, and add its 95 % interval.
+
+    Parameters
+    ----------
+    m : (..., 4, 4), the matrices of which `derived` is.
+    widened : (...), factor by which the errors of the dominant process are larger than to first order.
+    """
+    for name, quantity in derived.items():
+        if name not in planes or not (quantity.elements or quantity.parts is not None):
+            continue
+        along = np.square(planes[f"{name}_errors"].astype(float))
+        total, square = _moments(quantity, m, image)
+        if name.startswith("dominant_"):
+            total, square = total * np.square(widened), square * np.power(widened, 4)
+        _put(planes, name, *interval(np.asarray(quantity.value, dtype=float), along, total, square))
+
+
+def _moments(quantity: Derived, m: Array, image: Noise) -> tuple[Array, Array]:
+    """tr C and tr C^2 of the vector whose length a quantity is."""
+    if quantity.parts is None:
+        vector = m.reshape(*m.shape[:-2], 16)[..., quantity.elements]
+        # How the length is normalized.
+        scale = np.square(quantity.value) / np.square(vector).sum(axis=-1)
+        total, square = image.moments_of(quantity.elements)
+        return scale * total, scale**2 * square
+    own = [image.variance_of(part) for part in quantity.parts]
+    total, square = sum(own, np.zeros(())), sum((v**2 for v in own), np.zeros(()))
+    for i, first in enumerate(quantity.parts):
+        for j in range(i):
+            mixed = (image.variance_of(first + quantity.parts[j]) - own[i] - own[j]) / 2
+            square = square + 2 * mixed**2
+    return total, square
+
+
+def set_angles(planes: Planes) -> None:
+    """Fieller's interval for the direction of a vector: all directions where it may be zero."""
+    for name in ANGLES:
+        if name not in planes:
+            continue
+        either = name == "retardance_axis_or_90_deg"
+        halves = directions(np.deg2rad(2 * planes[f"{name}_errors"].astype(float)), both_ends=either)
+        half_68, half_95 = (np.rad2deg(h) / 2 for h in halves)
+        value = planes[name]
+        _put(planes, name, value, half_68, value - half_95, value + half_95)
+
+
+def set_retardance(
+    planes: Planes, derived: Mapping[str, Derived], error: Array, linear_error: Array, is_determined: NDArray[np.bool_]
+) -> None:
+    """Retardance also folds at 180 degrees, where fast and slow axis, right and left, are one.
+
+    Where the rotation is not determined, the intervals hold every retarder. `set_magnitudes` and `set_angles` are done.
+
+    Parameters
+    ----------
+    error, linear_error : (...), of the retardance and of its linear part, to first order.
+    """
+    error, linear_error = error.astype(float), linear_error.astype(float)
+    whole = np.asarray(derived["retardance_deg"].value, dtype=float)
+    gap = 180 - whole
+    planes["retardance_axis_flip"] = ndtr(-gap / error).astype(np.float32)
+    flips = [planes["retardance_axis_flip"] > limit for limit in FLIPPED]
+    upper = whole > 90
+    for name, raw in (("retardance_deg", error), ("retardance_linear_deg", linear_error)):
+        value = np.asarray(derived[name].value, dtype=float)
+        share = value / whole
+        one = np.square(share * error)
+        found = interval(share * gap, one, one, one**2)
+        # The part of the linear retardance: its first and, about all of it, its second order.
+        parted = np.sqrt(np.maximum(np.square(raw) - one, 0))
+        bent = np.square(NORMAL_95 * planes["retardance_circular_deg_errors"].astype(float)) / 360 * (raw is not error)
+        low, high = (np.hypot(b - found.value, NORMAL_95 * parted) for b in (found.low, found.high))
+        top = 180 * share
+        folded = (
+            top - found.value,
+            np.hypot(found.error, parted),
+            top - found.value - high,
+            np.minimum(top - found.value + low + bent, 180.0),
+        )
+        plain = (planes[name], planes[f"{name}_errors"], *planes[f"{name}_95"])
+        everything = (plain[0], np.maximum(value, 180 - value), 0.0, 180.0)
+        chosen = [np.where(upper, a, b) for a, b in zip(folded, plain, strict=True)]
+        _put(planes, name, *(np.where(is_determined, a, b) for a, b in zip(chosen, everything, strict=True)))
+    for name in SIGNED:
+        value, spread = planes[name].astype(float), planes[f"{name}_errors"].astype(float)
+        # The same retarder, turned the other way round.
+        other = value * (1 - 360 / whole)
+        half = np.where(flips[0], spread + np.abs(other - value), spread)
+        far = [np.where(flips[1], pick(value, other), value) for pick in (np.minimum, np.maximum)]
+        low, high = far[0] - NORMAL_95 * spread, far[1] + NORMAL_95 * spread
+        half, low, high = (
+            np.where(is_determined, a, b) for a, b in ((half, 180 + np.abs(value)), (low, -180.0), (high, 180.0))
+        )
+        _put(planes, name, value, half, low, high)
+    value = planes["retardance_fast_axis_deg"].astype(float)
+    error_68, bounds = planes["retardance_fast_axis_deg_errors"], planes["retardance_fast_axis_deg_95"]
+    half = np.where(flips[0] | ~is_determined, 90.0, error_68)
+    wide = flips[1] | ~is_determined
+    _put(
+        planes,
+        "retardance_fast_axis_deg",
+        value,
+        half,
+        *(np.where(wide, value + s, b) for s, b in zip((-90, 90), bounds, strict=True)),
+    )
+    name = "retardance_axis_or_90_deg"
+    value, bounds = planes[name].astype(float), planes[f"{name}_95"]
+    half = np.where(is_determined, planes[f"{name}_errors"], 45.0)
+    _put(
+        planes,
+        name,
+        value,
+        half,
+        *(np.where(is_determined, b, value + s) for s, b in zip((-45, 45), bounds, strict=True)),
+    )
+
+
+def set_depolarization_power(planes: Planes, is_determined: NDArray[np.bool_]) -> None:
+    """Noise makes three singular values of nothing, and their sum is what the power is short of 1."""
+    name = "depolarization_power"
+    value = planes[name].astype(float)
+    unit = np.sqrt(3) * planes[f"{name}_errors"].astype(float)
+    found = sum_of_singular_values(3 * (1 - value), unit)
+    chosen = (
+        (1 - found.value / 3, value),
+        (found.error / 3, np.maximum(value, 1 - value)),
+        (1 - found.high / 3, 0.0),
+        (1 - found.low / 3, 1.0),
+    )
+    _put(planes, name, *(np.where(is_determined, a, b) for a, b in chosen))
+
+
+def set_differential(planes: Planes, is_determined: NDArray[np.bool_]) -> None:
+    """Whole ranges where the logarithm does not exist or is next to where it does not."""
+    for short, bounds in DIFFERENTIAL.items():
+        name = f"differential_{short}"
+        value, error = planes[name].astype(float), planes[f"{name}_errors"].astype(float)
+        known = planes.get(f"{name}_95", np.stack([value - NORMAL_95 * error, value + NORMAL_95 * error]))
+        half = np.where(is_determined, error, np.maximum(value - bounds[0], bounds[1] - value))
+        ends = [np.where(is_determined, own, end) for own, end in zip(known, bounds, strict=True)]
+        _put(planes, name, value, half, *ends)
+
+
+def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, found: CorrectedXi0) -> None:
+    """Noise taken off eigenvalues, which it pushes apart, and off what follows from them.
+
+    xi0 is that of `process xi0`. The others keep their mean; their deviations from it lose what noise adds.
+    """
+    xi, errors = planes["coherency_eigenvalues"].astype(float), planes["coherency_eigenvalues_errors"].astype(float)
+    deviation = planes["eigenvalue_deviation"].astype(float)
+    observed = np.sum(deviation**2, axis=0)
+    real = np.sqrt(np.maximum(1 - noise.others / observed, 0))
+    among = np.sqrt(noise.others / 8)
+    gaps = np.stack([xi[1] - xi[2], np.minimum(xi[1] - xi[2], xi[2] - xi[3]), xi[2] - xi[3]])
+    mixed = np.maximum(among - gaps / APART, 0)
+    mean = (1 - found.xi0) / 3
+    spread = np.hypot(errors[1:], mixed)
+    xi = np.stack([found.xi0, *(mean + real * deviation)])
+    errors = np.stack([found.stderr, *spread])
+    bounds = (
+        [found.interval_95[0], *(xi[1:] - NORMAL_95 * spread)],
+        [found.interval_95[1], *(xi[1:] + NORMAL_95 * spread)],
+    )
+    _put(planes, "coherency_eigenvalues", xi, errors, np.stack(bounds[0]), np.stack(bounds[1]))
+    planes["eigenvalue_deviation"] = (real * deviation).astype(np.float32)
+    planes["eigenvalue_deviation_errors"] = np.hypot(planes["eigenvalue_deviation_errors"], mixed).astype(np.float32)
+    missed = planes["td_missed"].astype(float)
+    planes["td_missed_noise"] = (missed * np.sqrt(noise.others / observed)).astype(np.float32)
+    planes["td_missed"] = (missed * real).astype(np.float32)
+    planes["td_missed_errors"] = np.hypot(planes["td_missed_errors"], mixed.max(axis=0)).astype(np.float32)
+    physical = np.clip(xi, 0, None)
+    physical /= physical.sum(axis=0)
+    # At an eigenvalue of zero the logarithm has no slope; within three errors of it that of one error is taken.
+    slopes = (np.log(np.maximum(np.maximum(xi, errors), 1e-12)) + 1) / np.log(4)
+    widest = np.sqrt(np.sum(np.square(slopes * errors), axis=0))
+    edge = (xi < SEEN * errors).any(axis=0)
+    planes["entropy"] = entropy(np.moveaxis(physical, 0, -1)).astype(np.float32)
+    planes["entropy_errors"] = np.where(edge, widest, planes["entropy_errors"]).astype(np.float32)
+
+
+def set_symmetric(planes: Planes, relative: Array) -> None:
+    """Elements of the symmetric decomposition are sorted: near ones mix, and noise alone makes some.
+
+    Parameters
+    ----------
+    relative : (...), root mean square error of an element other than m00, over m00.
+    """
+    names = [f"symmetric_d{k}" for k in (1, 2, 3)]
+    value = np.stack([np.ones_like(planes[names[0]]), *(planes[n] for n in names)]).astype(float)
+    error = np.stack([np.zeros_like(value[0]), *(planes[f"{n}_errors"] for n in names)]).astype(float)
+    near = ~(np.abs(np.diff(value, axis=0)) > SEEN * np.hypot(error[:-1], error[1:]))
+    for k, name in enumerate(names):
+        mixed = near[k] | near[min(k + 1, 2)] | (np.abs(value[k + 1]) < SEEN * relative)
+        spread = np.hypot(error[k + 1], np.where(mixed, 2 * relative, 0))
+        known = np.isfinite(spread)
+        bounds = value[k + 1] - NORMAL_95 * spread, value[k + 1] + NORMAL_95 * spread
+        low, high = (np.where(known, b, end) for b, end in zip(bounds, (-1.0, 1.0), strict=True))
+        _put(planes, name, value[k + 1], spread, low, high)
+
+
+def widen_dominant(planes: Planes, noise: EigenvalueNoise) -> Array:
+    """Errors of the dominant process for the gap without noise, which pushes eigenvalues apart.
+
+    `set_eigenvalues` is done. Returns the factor (...), NaN where the process is not determined.
+    """
+    xi = planes["coherency_eigenvalues"].astype(float)
+    gap = xi[0] - xi[1]
+    # Two processes whose eigenvalues were equal would be seen this far apart.
+    seen = (gap + np.sqrt(gap**2 + 4 * _REPELLED * noise.coupling**2)) / 2
+    factor = np.where(gap > SEEN * noise.coupling, seen / gap, np.nan)
+    for name in [n for n in planes if n.startswith("dominant_") and not n.endswith("_errors")]:
+        planes[f"{name}_errors"] = planes[f"{name}_errors"] * factor.astype(np.float32)
+    return factor
+
+
+def set_any_dominant(planes: Planes, derived: Mapping[str, Derived], is_determined: NDArray[np.bool_]) -> None:
+    """Every process is in the intervals where the dominant one is not determined. The others are done."""
+    for name in [n for n in derived if n.startswith("dominant_")]:
+        value = np.where(is_determined, planes[name], derived[name].value)
+        error = planes[f"{name}_errors"]
+        low, high = (value - 90, value + 90) if name.endswith("_deg") else (0.0 if "_linear" in name else -1.0, 1.0)
+        bounds = planes.get(f"{name}_95", (value - NORMAL_95 * error, value + NORMAL_95 * error))
+        half = np.where(is_determined, error, np.maximum(value - low, high - value))
+        if name == "dominant_mueller_jones":
+            planes[f"{name}_errors"] = np.asarray(half, dtype=np.float32)
+        else:
+            ends = [np.where(is_determined, b, end) for b, end in zip(bounds, (low, high), strict=True)]
+            _put(planes, name, value, half, *ends)
+
+
+def _put(planes: Planes, name: str, value: Array, error: Array, low: Array, high: Array) -> None:
+    planes[name] = np.asarray(value, dtype=np.float32)
+    planes[f"{name}_errors"] = np.asarray(error, dtype=np.float32)
+    planes[f"{name}_95"] = np.stack([low, high]).astype(np.float32)
+
+
+def _normal(planes: Planes, name: str) -> Planes:
+    """Value, error and the interval of a normal distribution."""
+    value, error = planes[name].astype(float), planes[f"{name}_errors"].astype(float)
+    return {"value": value, "error": error, "low": value - NORMAL_95 * error, "high": value + NORMAL_95 * error}
