@@ -149,10 +149,9 @@ def test_a_file_that_is_not_meant_is_called_what_it_is(run, acquire, capture, co
     for arguments, words in (
         (("reduce", product), "is a product of `process`, and a capture is asked for"),
         (("reduce", text), "cannot be opened as HDF5: it is of another kind"),
-        (("reduce", folder), "is a folder, and a file is asked for"),
+        (("reduce", folder), "holds no captures. Give files, or the folder that they are in"),
         (("reduce", capture, "--instrument", rig), "kind: must be 'instrument', not 'rig'; is it the right file?"),
         (("reduce", capture, "--instrument", capture), "a file of this kind at most"),
-        (("reduce", capture, "--out", folder), "is a folder. Give the name of a file"),
         (("export", product, "--to", "png", "--out", "no/where"), "there is no folder no. Make it"),
         (("xi0", product, "--out", "no/where.h5"), "there is no folder no. Make it"),
         (("xi0", product, "--out", "xi0.png"), "what this makes is an HDF5 file; give a name that ends in .h5"),

@@ -136,7 +136,11 @@ def test_axostep_mueller_files(process: Run, capture: Path, tmp_path: Path) -> N
     code, _, err = process("quantities", back, "--out", tmp_path / "q.h5")
     assert code == 0, err
     assert "holds no standard errors" in err
-    assert process("to-axostep", product)[0] == 2
+    # The same again is unchanged; another file of that name is not replaced.
+    assert process("to-axostep", product)[0] == 0
+    file.write_bytes(b"of somebody else")
+    code, _, err = process("to-axostep", product)
+    assert (code, "exists" in err) == (2, True)
     code, _, err = process("from-axostep", product)
     assert code == 2
     assert "expected a .cmmi or .bmmi file" in err
