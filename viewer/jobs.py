@@ -104,7 +104,8 @@ class Jobs:
     def job(self, name: str) -> Job:
         """A job by its name. Raises NotHere."""
         path = self._folder / name / "job.json"
-        if "/" in name or "\0" in name or not path.is_file():
+        # os.path.isfile, unlike Path.is_file, takes a name of any length.
+        if "/" in name or "\0" in name or not os.path.isfile(path):
             raise NotHere(f"{name}: nothing of that name was started here")
         facts = read_json(path)
         return Job(**{**facts, "command": tuple(facts["command"])})

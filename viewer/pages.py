@@ -16,6 +16,9 @@ from processing.errors import ProcessError
 from processing.reports.design import style
 from viewer.library import Entry, Library
 
+#: Most bytes that a page sends: the names of its files.
+MOST_SENT = 1 << 20
+
 
 class Pages:
     """Draws pages of one folder.
@@ -75,7 +78,12 @@ def file_of(request: Request, name: str = "file") -> Path:
 
 async def fields_of(request: Request) -> dict[str, str]:
     """The texts that a page sends, as JSON. Raises ProcessError."""
-    asked = parse_json(await request.body(), "what the page sent")
+    sent = b""
+    async for part in request.stream():
+        sent += part
+        if len(sent) > MOST_SENT:
+            raise ProcessError(f"a page sends at most {MOST_SENT:,} bytes")
+    asked = parse_json(sent, "what the page sent")
     if not isinstance(asked, dict) or not all(isinstance(value, str) for value in asked.values()):
         raise ProcessError("a page sends named texts")
     return asked

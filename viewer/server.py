@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import resource
 import secrets
 import socket
 import sys
+import tempfile
 import webbrowser
 from pathlib import Path
 
@@ -29,10 +31,24 @@ def serve(folder: Path, port: int, browser: bool) -> None:
     typer.echo(f"view: {address}")
     typer.echo("Ctrl-C ends it; runs started from the page go on.", err=True)
     sys.stdout.flush()
-    if browser:
-        webbrowser.open(address)
+    # A browser that never asks holds a connection; those who ask must find one more.
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most if most != resource.RLIM_INFINITY else 1 << 16, most))
+    way_in = _open_in_browser(address) if browser else None
     # Addresses hold the token, so no request is ever logged.
     settings = uvicorn.Config(
         application(folder, token), log_level="warning", access_log=False, timeout_graceful_shutdown=1, lifespan="off"
     )
-    uvicorn.Server(settings).run(sockets=[listener])
+    try:
+        uvicorn.Server(settings).run(sockets=[listener])
+    finally:
+        if way_in is not None:
+            way_in.unlink(missing_ok=True)
+
+
+def _open_in_browser(address: str) -> Path:
+    """Open the address by way of a page that this user alone can read: every user sees the words of a command."""
+    with tempfile.NamedTemporaryFile("w", prefix="umov-view-", suffix=".html", delete=False) as file:
+        file.write(f'<!doctype html><meta http-equiv="refresh" content="0; url={address}"><title>view</title>')
+    webbrowser.open(Path(file.name).as_uri())
+    return Path(file.name)

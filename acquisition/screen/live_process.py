@@ -6,6 +6,7 @@ draws a picture once however many ask for it. Nothing is given without the token
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import mmap
@@ -15,7 +16,7 @@ import socket
 import sys
 import threading
 from collections.abc import Callable
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http import HTTPStatus
 from importlib.resources import files
 from typing import Any, ClassVar, TypeVar
 from urllib.parse import parse_qs, urlsplit
@@ -31,6 +32,12 @@ Drawn = TypeVar("Drawn")
 
 #: Browsers answered at the same time; others are told to come again.
 CLIENTS = 8
+#: Connections whose request is not there yet; fewer than a process may have open.
+WAITING = 256
+#: Connections that the system takes before we do.
+BACKLOG = 1024
+#: Largest request without what is sent along, bytes.
+LONGEST_HEAD = 1 << 14
 #: A browser that is silent, or does not read, for so long is given up.
 PATIENCE_S = 3.0
 #: Largest message from the measuring program.
@@ -98,104 +105,107 @@ class Shown:
     _drawing: ClassVar[threading.Lock] = threading.Lock()
 
 
-class Server(ThreadingHTTPServer):
-    """Answers at most `CLIENTS` browsers at a time."""
+class Page:
+    """Answers browsers: page, state, pictures and the stop button.
 
-    daemon_threads = True
+    Whoever connects waits without taking a place until the whole request is there, with the token; the longest waiting
+    gives way to the newest. The stop button needs no place at all.
 
-    def __init__(self, listener: socket.socket, handler: type[BaseHTTPRequestHandler]) -> None:
-        super().__init__(listener.getsockname(), handler, bind_and_activate=False)
-        self.socket.close()
-        self.socket = listener
-        self._free = threading.BoundedSemaphore(CLIENTS)
+    Parameters
+    ----------
+    link : to the measuring program.
+    """
 
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Serve it in a thread, or refuse it at once."""
-        if self._free.acquire(blocking=False):
-            super().process_request(request, client_address)
-            return
-        with contextlib.suppress(OSError):
-            request.settimeout(0)
-            request.send(b"HTTP/1.0 503 Busy\r\nContent-Length: 0\r\nRetry-After: 1\r\n\r\n")
-        self.shutdown_request(request)
+    def __init__(self, shown: Shown, link: socket.socket, token: str) -> None:
+        self._shown, self._link, self._token = shown, link, token.encode()
+        self._waiting: dict[asyncio.StreamWriter, None] = {}
+        self._clients = 0
 
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """One browser; its place is free afterwards."""
+    async def serve(self, listener: socket.socket) -> None:
+        """Serve for ever."""
+        server = await asyncio.start_server(self._meet, sock=listener, limit=LONGEST_HEAD, backlog=BACKLOG)
+        await server.serve_forever()
+
+    async def _meet(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        # A browser that goes away in mid-sentence is no news.
+        with contextlib.suppress(OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+            self._waiting[writer] = None
+            if len(self._waiting) > WAITING:
+                oldest = next(iter(self._waiting))
+                del self._waiting[oldest]
+                oldest.transport.abort()
+            try:
+                head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), PATIENCE_S)
+            finally:
+                self._waiting.pop(writer, None)
+            await asyncio.wait_for(self._answer(head.decode("latin-1"), writer), PATIENCE_S)
+            # What is sent along is not kept; closed at once, the browser would not read the answer.
+            writer.write_eof()
+            async with asyncio.timeout(PATIENCE_S):
+                while await reader.read(LONGEST_HEAD):
+                    pass
+        writer.transport.abort()
+
+    async def _answer(self, head: str, writer: asyncio.StreamWriter) -> None:
         try:
-            super().process_request_thread(request, client_address)
-        finally:
-            self._free.release()
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """A browser that goes away in mid-sentence is no news."""
-
-
-class Handler(BaseHTTPRequestHandler):
-    """Page, state, pictures and the stop button."""
-
-    shown: ClassVar[Shown]
-    link: ClassVar[socket.socket]
-    token: ClassVar[str]
-    timeout = PATIENCE_S
-
-    def do_GET(self) -> None:
-        """Page, state and pictures."""
-        path = self._allowed()
-        if path is None:
+            first, *lines = head.split("\r\n")
+            method, target, _ = first.split(" ")
+            url = urlsplit(target)
+        except ValueError:
+            await _send(writer, 400, "text/plain", b"no request")
             return
-        if path == "/":
-            page = files("acquisition.screen").joinpath("live_view.html").read_text(encoding="utf-8")
-            self._send(200, "text/html; charset=utf-8", page.replace("/* design */", style()).encode())
-        elif path == "/state":
-            self._send(200, "application/json", json.dumps(self.shown.snapshot()).encode())
-        elif path in ("/frame.png", "/quick.png"):
-            image = self.shown.picture(path[1:])
-            self._send(200 if image else 404, "image/png", image or b"")
+        headers = {name.strip().lower(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
+        refusal = self._refusal(method, headers, parse_qs(url.query).get("token", [""])[0])
+        if refusal is not None:
+            await _send(writer, 403, "text/plain", refusal)
+        elif (method, url.path) == ("POST", "/stop"):
+            self._link.send(b"stop")
+            await _send(writer, 200, "text/plain", b"stopping")
+        elif method != "GET":
+            await _send(writer, 404, "text/plain", b"there is no such action")
+        elif self._clients >= CLIENTS:
+            await _send(writer, 503, "text/plain", b"", "Retry-After: 1\r\n")
         else:
-            self._send(404, "text/plain", b"there is no such page")
+            self._clients += 1
+            try:
+                await _send(writer, *await asyncio.to_thread(self._content, url.path))
+            finally:
+                self._clients -= 1
 
-    def do_POST(self) -> None:
-        """The stop button."""
-        path = self._allowed()
-        if path == "/stop":
-            self.link.send(b"stop")
-            self._send(200, "text/plain", b"stopping")
-        elif path is not None:
-            self._send(404, "text/plain", b"there is no such action")
-
-    def _allowed(self) -> str | None:
-        """The path asked for; None, and an answer, for anyone without the token or from another machine's page."""
-        url = urlsplit(self.path)
+    def _refusal(self, method: str, headers: dict[str, str], given: str) -> bytes | None:
+        """What is said to anyone without the token or from a page of another site."""
+        host = headers.get("host", "")
         # Another site that resolves its name to this machine sends its own name as host.
-        host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
-        given = parse_qs(url.query).get("token", [""])[0]
-        if host not in ("127.0.0.1", "localhost"):
-            self._send(403, "text/plain", b"only for a browser on this machine")
-        elif not secrets.compare_digest(given.encode(), self.token.encode()):
-            self._send(403, "text/plain", b"the token is missing or wrong")
-        else:
-            return url.path
+        if host.rsplit(":", 1)[0] not in ("127.0.0.1", "localhost"):
+            return b"only for a browser on this machine"
+        if not secrets.compare_digest(given.encode(errors="replace"), self._token):
+            return b"the token is missing or wrong"
+        origin = headers.get("origin")
+        if origin != f"http://{host}" and not (origin is None and method == "GET"):
+            return b"asked for by a page of another site"
         return None
 
-    def _send(self, code: int, kind: str, body: bytes) -> None:
-        try:
-            self.send_response(code)
-            self.send_header("Content-Type", kind)
-            self.send_header("Content-Length", str(len(body)))
-            self.send_header("Cache-Control", "no-store")
-            self.send_header(
-                "Content-Security-Policy",
-                "default-src 'none'; img-src 'self'; style-src 'unsafe-inline'; "
-                "script-src 'unsafe-inline'; connect-src 'self'",
-            )
-            self.send_header("Referrer-Policy", "no-referrer")
-            self.end_headers()
-            self.wfile.write(body)
-        except (BrokenPipeError, ConnectionResetError, TimeoutError):
-            self.close_connection = True
+    def _content(self, path: str) -> tuple[int, str, bytes]:
+        if path == "/":
+            page = files("acquisition.screen").joinpath("live_view.html").read_text(encoding="utf-8")
+            return 200, "text/html; charset=utf-8", page.replace("/* design */", style()).encode()
+        if path == "/state":
+            return 200, "application/json", json.dumps(self._shown.snapshot()).encode()
+        if path in ("/frame.png", "/quick.png"):
+            image = self._shown.picture(path[1:])
+            return (200 if image else 404), "image/png", image or b""
+        return 404, "text/plain", b"there is no such page"
 
-    def log_message(self, format: str, *args: Any) -> None:
-        """Requests are no news."""
+
+async def _send(writer: asyncio.StreamWriter, code: int, kind: str, body: bytes, more: str = "") -> None:
+    head = (
+        f"HTTP/1.1 {code} {HTTPStatus(code).phrase}\r\nContent-Type: {kind}\r\nContent-Length: {len(body)}\r\n"
+        "Cache-Control: no-store\r\nReferrer-Policy: no-referrer\r\nConnection: close\r\n"
+        "Content-Security-Policy: default-src 'none'; img-src 'self'; style-src 'unsafe-inline'; "
+        f"script-src 'unsafe-inline'; connect-src 'self'\r\n{more}\r\n"
+    )
+    writer.write(head.encode() + body)
+    await writer.drain()
 
 
 def take_updates(link: socket.socket, memory: int, shown: Shown) -> None:
@@ -233,8 +243,8 @@ def main() -> None:
         return
     token = settings.pop("token")
     shown = Shown(**settings)
-    server = Server(listener, type("PageHandler", (Handler,), {"shown": shown, "link": link, "token": token}))
-    threading.Thread(target=server.serve_forever, daemon=True).start()
+    page = Page(shown, link, token)
+    threading.Thread(target=lambda: asyncio.run(page.serve(listener)), daemon=True).start()
     take_updates(link, int(sys.argv[3]), shown)
 
 

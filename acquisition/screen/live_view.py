@@ -53,7 +53,7 @@ class LiveView(Observer):
         self._memory = os.memfd_create("umov live frame")
         self._mapped: mmap.mmap | None = None
         self._page_is_done = True
-        self._listener = socket.create_server(("127.0.0.1", port), backlog=16)
+        self._listener = socket.create_server(("127.0.0.1", port), backlog=1024)
         token = secrets.token_urlsafe(16)
         self.url = f"http://127.0.0.1:{self._listener.getsockname()[1]}/?token={token}"
         self._settings = {"token": token, "black": black, "full_scale": full_scale, "simulated": simulated}

@@ -6,10 +6,12 @@ import itertools
 import json
 import os
 import re
+import resource
 import shutil
 import socket
 import subprocess
 import sys
+import threading
 import time
 import urllib.error
 import urllib.request
@@ -142,11 +144,13 @@ def running(small_rig, configs, tmp_path):
     child.communicate()
 
 
-def _get(url, path, host=None, method="GET"):
+def _get(url, path, host=None, method="GET", origin=None, data=None):
     base, query = url.split("/?")
-    request = urllib.request.Request(base + path.replace("TOKEN", query), method=method)
+    request = urllib.request.Request(base + path.replace("TOKEN", query), method=method, data=data)
     if host:
         request.add_header("Host", host)
+    if origin:
+        request.add_header("Origin", origin)
     with urllib.request.urlopen(request) as answer:
         return answer.status, answer.read()
 
@@ -187,15 +191,18 @@ def test_page_shows_the_capture_and_its_button_stops_it(running, browser):
 
 def test_everything_needs_the_token_and_a_local_host(running):
     child, url, _ = running
-    for path, host, method in (
-        ("/stop", None, "POST"),
-        ("/stop?token=wrong", None, "POST"),
-        ("/stop?TOKEN", "evil.example", "POST"),
-        ("/state?TOKEN", "evil.example", "GET"),
-        *((path, None, "GET") for path in ("/", "/state", "/frame.png", "/quick.png", "/frame.png?token=")),
+    own = url.split("/?")[0]
+    for path, host, method, origin in (
+        ("/stop", None, "POST", own),
+        ("/stop?token=wrong", None, "POST", own),
+        ("/stop?TOKEN", "evil.example", "POST", "http://evil.example"),
+        ("/state?TOKEN", "evil.example", "GET", None),
+        *(("/stop?TOKEN", None, "POST", origin) for origin in (None, "http://evil.example", "null", f"{own}9")),
+        ("/state?TOKEN", None, "GET", "http://evil.example"),
+        *((path, None, "GET", None) for path in ("/", "/state", "/frame.png", "/quick.png", "/frame.png?token=")),
     ):
         with pytest.raises(urllib.error.HTTPError) as refused:
-            _get(url, path, host, method)
+            _get(url, path, host, method, origin)
         assert refused.value.code == 403, path
         refused.value.close()
     assert json.loads(_get(url, "/state?TOKEN")[1])["simulated"] is True
@@ -327,6 +334,79 @@ def test_the_stop_button_reaches_the_run():
     with told.view as view:
         view.run_started("stopping", None, 5, None)
         told.wait_for(lambda state: state.get("title") == "stopping")
-        assert _get(view.url, "/stop?TOKEN", method="POST") == (200, b"stopping")
+        assert _get(view.url, "/stop?TOKEN", method="POST", origin=view.url.split("/?")[0]) == (200, b"stopping")
         while not told.stop.requested:
             time.sleep(0.01)
+
+
+def slow_connections(port, count):
+    """Browsers without a token that begin a request and never end it; those given up connect again."""
+    import selectors
+
+    ended, made = threading.Event(), threading.Event()
+
+    def attack():
+        links = []
+        with selectors.DefaultSelector() as waiting:
+
+            def connect():
+                link = socket.socket()
+                link.setblocking(False)
+                link.connect_ex(("127.0.0.1", port))
+                waiting.register(link, selectors.EVENT_WRITE)
+                links.append(link)
+
+            for _ in range(count):
+                connect()
+            while not ended.is_set():
+                for key, _ in waiting.select(0.01):
+                    link = key.fileobj
+                    with contextlib.suppress(OSError):
+                        link.send(b"GET /state HTTP/1.1\r\nHost: 127.0.0.1\r\n")
+                    waiting.unregister(link)
+                made.set()
+        for link in links:
+            link.close()
+
+    thread = threading.Thread(target=attack, daemon=True)
+    thread.start()
+    made.wait()
+
+    def end():
+        ended.set()
+        thread.join()
+
+    return end
+
+
+@pytest.mark.parametrize("body", [0, 64 << 20])
+def test_stop_answers_under_a_thousand_slow_connections(body):
+    """Of strangers without the token, with foreign hosts and origins beside them; a large body is not kept."""
+    resource.setrlimit(resource.RLIMIT_NOFILE, (4096, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
+    told = Told()
+    with told.view as view:
+        view.run_started("attacked", None, 5, None)
+        told.wait_for(lambda state: state.get("title") == "attacked")
+        own = view.url.split("/?")[0]
+        end = slow_connections(int(own.rsplit(":", 1)[1]), 1000)
+        for host, origin in (("evil.example", own), (None, "http://evil.example")):
+            with pytest.raises(urllib.error.HTTPError) as refused:
+                _get(view.url, "/stop?TOKEN", host, "POST", origin)
+            refused.value.close()
+        assert not told.stop.requested
+        begin_s = time.monotonic()
+        threading.Thread(target=_stop, args=(view.url, own, body), daemon=True).start()
+        while not told.stop.requested and time.monotonic() - begin_s < 20:
+            time.sleep(0.005)
+        stopped_s = time.monotonic() - begin_s
+        memory = int(re.search(r"VmHWM:\s+(\d+)", Path(f"/proc/{view._process.pid}/status").read_text())[1])
+        end()
+    print(f"stopped after {stopped_s:.3f} s; memory of the page {memory / 1024:.0f} MiB")
+    assert told.stop.requested
+    assert stopped_s < 1.0
+    assert memory < 400 << 10
+
+
+def _stop(url, own, body):
+    with contextlib.suppress(OSError, urllib.error.URLError):
+        _get(url, "/stop?TOKEN", method="POST", origin=own, data=bytes(body))

@@ -115,3 +115,27 @@ def test_a_campaign_of_somebody_else_is_not_resumed_from_the_page(client, lab, t
     assert answer.status_code == 422
     assert "which you have not used before" in answer.text
     assert not (lab / ".umov").exists() or not list((lab / ".umov").glob("jobs/*"))
+
+
+def test_a_body_that_is_too_large_is_refused_before_it_is_kept(client):
+    answer = client.post("/start", content=(b"x" * (1 << 16) for _ in range(1000)), headers=HERE)
+    assert answer.status_code == 422
+    assert "at most" in answer.text
+
+
+@pytest.mark.parametrize("name", ["x" * 5000, "x" * 300, "..", "a/b", "a\0b", ""])
+def test_a_job_that_is_not_there_is_not_found(client, name):
+    assert client.get("/job", params={"name": name}).status_code == 404
+
+
+def test_the_token_is_not_on_the_command_line_of_the_browser(monkeypatch):
+    from viewer import server
+
+    opened = []
+    monkeypatch.setattr(server.webbrowser, "open", opened.append)
+    page = server._open_in_browser(f"http://127.0.0.1:1/{TOKEN}/")
+    assert opened == [page.as_uri()]
+    assert TOKEN not in opened[0]
+    assert TOKEN in page.read_text()
+    assert page.stat().st_mode & 0o077 == 0
+    page.unlink()
