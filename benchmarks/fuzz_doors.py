@@ -4,9 +4,11 @@ Run: .venv/bin/python benchmarks/fuzz_doors.py [--door capture] [--seconds 3600 
      [--keep DIR]
 
 Each input is read in a process of its own kind, with 1 GiB of memory beside what the program itself has and 5 s of
-processor time. Counted are: refused (an error of the user's, exit code 2, in lines of a bearable length), accepted
-(read to the end, and what was read is looked at for nonsense), and what must not be: tracebacks, crashes, hangs,
-nonsense accepted. The exit code is 1 if there is any; --keep saves those inputs.
+processor time. One input in eight is a pipe, a device, a link or a circle of links in the place of the file. Counted
+are: refused (an error of the user's, exit code 2, in lines of a bearable length), accepted (read to the end, and what
+was read is looked at for nonsense), and what must not be: tracebacks, crashes, hangs, nonsense accepted, and obeyed,
+where a command that the file names was run or a place that it names was written. The exit code is 1 if there is any;
+--keep saves those inputs.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+from fuzz_mutators import TRAP, put_impostor
 from fuzz_seeds import DOORS, fresh
 
 MEMORY = 1 << 30
@@ -36,7 +39,9 @@ PROCESSOR_S = 5.0
 #: A loaded machine lets a process wait; its own time is what counts, and this only ends the waiting.
 WAIT_S = 60.0
 LONGEST_LINE = 1000
-BAD = ("traceback", "crash", "hang", "nonsense")
+BAD = ("traceback", "crash", "hang", "nonsense", "obeyed")
+#: One input in so many is no file.
+IMPOSTORS = 8
 
 
 def _serve(door: str, pipe: Connection) -> None:
@@ -114,12 +119,18 @@ def fuzz(name: str, seed: int, inputs: int | None, seconds: float | None, keep: 
                 raise SystemExit(f"{name}: the sound file {source.name} was not accepted: {words}")
         while found.total() < (inputs or 1 << 60) and time.monotonic() < end_s:
             path = fresh(rng.choice(sources), Path(folder))
-            door.spoil(rng, path)
+            if rng.randrange(IMPOSTORS) == 0:
+                put_impostor(rng, path)
+            else:
+                door.spoil(rng, path)
             what, words = reader.read(path)
+            if TRAP.exists():
+                what, words = "obeyed", f"{TRAP} was made"
+                TRAP.unlink()
             found[what] += 1
             if what in BAD:
                 print(f"{name} input {found.total()}: {what}: {words}", flush=True)
-                if keep is not None:
+                if keep is not None and path.is_file():
                     keep.mkdir(parents=True, exist_ok=True)
                     shutil.copy(path, keep / f"{name}_{seed}_{found.total()}_{path.name}")
     reader.close()

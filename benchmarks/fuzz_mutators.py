@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import os
 import random
 import struct
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,10 +15,14 @@ import h5py
 import numpy as np
 from ruamel.yaml import YAML
 
+#: What a hostile file names as a command or a place to write to: a file there says that somebody obeyed.
+TRAP = Path(tempfile.gettempdir()) / f"umov-trap-{os.getpid()}"
 #: Values that no measurement means.
 ODD: tuple[Any, ...] = (
     float("nan"), float("inf"), float("-inf"), -1, 0, 1e308, -1e-308, 2**63, 10**40, 1e9, "", " ", "nan", "\u2028",
     "x" * 5000, None, True, [], {}, [[]], [1, 2, 3], {"a": 1}, "../../etc/passwd", "/dev/zero", "/dev/stdin", "a\nb",
+    str(TRAP), f"$(touch {TRAP})", f"`touch {TRAP}`", ["/usr/bin/touch", str(TRAP)], f"| touch {TRAP}", "a\x1b[2J\x07",
+    "[/A]", "[bold]", "4_5",
 )  # fmt: skip
 ODD_BYTES = (
     b"\0",
@@ -45,7 +51,39 @@ ODD_TEXT = (
     "!!binary x",
     "\t",
     ",,,",
+    f'!!python/object/apply:os.system ["touch {TRAP}"]',
+    "\x1b[2J",
 )
+
+
+def put_impostor(rng: random.Random, path: Path) -> None:
+    """Something that is no plain file, or lies elsewhere, in the place of a file."""
+    path.unlink()
+    pipe = path.with_name(f"pipe_of_{path.name}")
+    if not pipe.exists():
+        os.mkfifo(pipe)
+    places = (pipe, path.name, "/proc/kmsg", "/dev/zero", "/dev/tty", "/proc/self/mem", "..", str(TRAP), "/sys/kernel")
+    if (place := rng.choice((*places, None))) is None:
+        os.mkfifo(path)
+    else:
+        path.symlink_to(place)
+
+
+def put_elsewhere(rng: random.Random, h5: h5py.File, name: str) -> None:
+    """A part of an HDF5 file that lies in a pipe, a device or a file that is not there."""
+    pipe = Path(h5.filename).with_name("pipe_of_parts")
+    if not pipe.exists():
+        os.mkfifo(pipe)
+    place = rng.choice((str(pipe), "/proc/kmsg", "/dev/zero", "/etc/passwd", str(TRAP)))
+    how = rng.randrange(3)
+    if how == 0:
+        h5[name] = h5py.ExternalLink(place, "/x")
+    elif how == 1:
+        h5.create_dataset(name, (4,), "u1", external=[(place, 0, 4)])
+    else:
+        layout = h5py.VirtualLayout((4,), "u1")
+        layout[:] = h5py.VirtualSource(place, "x", shape=(4,))
+        h5.create_virtual_dataset(name, layout)
 
 
 def spoil_bytes(rng: random.Random, data: bytes) -> bytes:
@@ -168,6 +206,9 @@ def spoil_h5(rng: random.Random, path: Path) -> None:
 
 
 def _put_odd(rng: random.Random, h5: h5py.File, name: str) -> None:
+    if rng.random() < 0.2:
+        put_elsewhere(rng, h5, name)
+        return
     shapes = ((), (0,), (3,), (44,), (2, 2), (1 << 40,), (44, 1, 1 << 20, 1 << 20), (44, 1, 4, 4))
     shape, kind = rng.choice(shapes), rng.choice(["f8", "u1", "i4", "S3", "c16", "f2", "u8"])
     if np.prod(shape, dtype=object) > 10_000:

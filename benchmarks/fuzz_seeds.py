@@ -364,7 +364,9 @@ def _index_files(folder: Path) -> Sequence[Path]:
 
 
 def _index(path: Path) -> str | None:
-    shutil.copy(path, path.with_name("index.json"))
+    index = path.with_name("index.json")
+    # What was spoilt itself, which may be a link or a pipe; the sound one is read again.
+    shutil.copy(path, index) if path.name == "sound.json" else path.rename(index)
     found = read_index(path.parent)
     return None if all(isinstance(entry, dict) for entry in found.values()) else "an entry that is none"
 
@@ -394,5 +396,6 @@ DOORS: dict[str, Door] = {
 def fresh(source: Path, folder: Path) -> Path:
     """A copy of a sound file to be spoilt, beside the files that belong to it."""
     target = folder / f"spoilt_{source.name}"
+    target.unlink(missing_ok=True)
     shutil.copy(source, target)
     return target

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import stat
 import warnings
@@ -26,12 +27,18 @@ MOST_JSON_BYTES = 16 << 20
 BOOKS = 1 << 18
 #: Most pixels of a frame (8192 x 8192).
 MOST_PIXELS = 1 << 26
+#: Control characters, and those that turn the direction of a text.
+CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 #: Deepest nesting of lists and mappings; our own files have 8.
 MOST_DEPTH = 40
 
 
-def require_file(path: Path, error: type[ProcessError] = ProcessError, most_bytes: int | None = None) -> int:
+def require_file(
+    path: Path, error: type[ProcessError] = ProcessError, most_bytes: int | None = None, may_be_empty: bool = False
+) -> int:
     """Size of a regular file in bytes; a pipe or a device would be read for ever.
+
+    Files of the kernel, as /proc/kmsg, say that they are empty, and reading some of them never ends.
 
     Raises
     ------
@@ -49,6 +56,8 @@ def require_file(path: Path, error: type[ProcessError] = ProcessError, most_byte
         raise error(
             f"{path}: has {found.st_size:,} bytes, a file of this kind at most {most_bytes:,}. Is it the right one?"
         )
+    if found.st_size == 0 and not may_be_empty:
+        raise error(f"{one_line(path)}: cannot be read: it is empty")
     return found.st_size
 
 
@@ -138,9 +147,11 @@ def require_picture(path: Path, error: type[ProcessError] = ProcessError) -> Non
 
 def read_text(path: Path, error: type[ProcessError] = ProcessError, most_bytes: int = MOST_TEXT_BYTES) -> str:
     """Text of a UTF-8 file, with or without a byte order mark. Raises `error`."""
-    require_file(path, error, most_bytes)
+    size = require_file(path, error, most_bytes, may_be_empty=True)
     try:
-        return path.read_text(encoding="utf-8-sig")
+        # No more than was looked at, and without waiting: another program may have put a pipe there meanwhile.
+        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+            return (file.read(size) or b"").decode("utf-8-sig")
     except OSError as why:
         raise error(f"{path}: cannot be read ({why.strerror})") from why
     except UnicodeDecodeError as why:
@@ -160,6 +171,11 @@ def parse_json(text: str | bytes, source: str, error: type[ProcessError] = Proce
 def read_json(path: Path, error: type[ProcessError] = ProcessError) -> Any:
     """Value of a JSON file. Raises `error`."""
     return parse_json(read_text(path, error, MOST_JSON_BYTES), str(path), error)
+
+
+def is_line(text: str) -> bool:
+    """Whether a text has no control characters, which move a terminal's cursor, and none that turn its direction."""
+    return not CONTROL.search(text)
 
 
 def require_shallow(value: Any) -> None:

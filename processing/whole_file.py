@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +13,7 @@ from processing.errors import ProcessError
 
 
 @contextmanager
-def whole_file(path: Path, *, new: bool = False) -> Iterator[Path]:
+def whole_file(path: Path, *, new: bool = False, follow: bool = True) -> Iterator[Path]:
     """A name to write to; the file gets its own, and replaces one of that name, when the block has ended well.
 
     Where the block fails, on a full disc say, nothing of it is left and a file that was there is as it was.
@@ -19,6 +21,7 @@ def whole_file(path: Path, *, new: bool = False) -> Iterator[Path]:
     Parameters
     ----------
     new : replace nothing, not even a file that came while the block ran.
+    follow : a link is written through; False replaces the link, for names that nobody gave.
 
     Raises
     ------
@@ -26,7 +29,8 @@ def whole_file(path: Path, *, new: bool = False) -> Iterator[Path]:
         There is one, and `new` was asked for.
     OSError
     """
-    path = path.resolve()
+    # Not Path.resolve(), which raises RuntimeError where links go in a circle.
+    path = Path(os.path.realpath(path)) if follow else path
     if not new and path.exists() and not path.is_file():
         # A terminal or a pipe: there is nothing to replace.
         yield path
@@ -64,9 +68,25 @@ def _take_free_name(beside: Path, path: Path) -> None:
         beside.unlink()
 
 
-def write_whole_text(path: Path, text: str) -> None:
+def open_plain(path: Path, flags: int) -> int:
+    """Open a file of one's own for writing, made if it is not there.
+
+    Raises
+    ------
+    OSError
+        Somebody has put a link, a pipe or a device there, or a second name of another file.
+    """
+    file = os.open(path, flags | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+    found = os.fstat(file)
+    if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+        os.close(file)
+        raise OSError(errno.EEXIST, "something else than a file of its own is there", str(path))
+    return file
+
+
+def write_whole_text(path: Path, text: str, *, follow: bool = True) -> None:
     """Write text as UTF-8, wholly or not at all. Raises OSError."""
-    with whole_file(path) as new:
+    with whole_file(path, follow=follow) as new:
         new.write_text(text, encoding="utf-8")
 
 

@@ -17,7 +17,7 @@ from ruamel.yaml.composer import Composer
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import AliasEvent
 
-from processing.doors import MOST_DEPTH, one_line, read_text
+from processing.doors import MOST_DEPTH, is_line, one_line, read_text
 from processing.errors import ProcessError
 from processing.yaml_words import mistakes_of, names_in, words_of
 
@@ -29,6 +29,8 @@ _Scalar: TypeAlias = tuple[tuple[Any, ...], Any]
 #: value, so that this is about two seconds; a table of 5000 states of two axes fits.
 MOST_BYTES = 256 << 10
 MOST_NODES = 10_500
+#: Largest number: the largest quantity here is an electron count.
+MOST = 1e18
 #: Lines of a message about a file with very many mistakes.
 MOST_LINES = 30
 
@@ -88,6 +90,8 @@ class _BoundedComposer(Composer):
 def parse_yaml(text: str, model: type[Model], source: str = "text") -> Model:
     """Validate YAML text as `model`; `source` names it in errors. Raises ConfigError."""
     tree = _tree(text, source)
+    if lines := _not_meant(source, tree):
+        raise _refusal(source, lines)
     try:
         value = model.model_validate(_plain(tree))
     except ValidationError as error:
@@ -98,6 +102,7 @@ def parse_yaml(text: str, model: type[Model], source: str = "text") -> Model:
     # As the model understood them: the text "nan" and the word true become numbers where one is asked for.
     understood = list(_scalars(value.model_dump(exclude_unset=True)))
     lines = _not_finite(source, tree, understood) + _truths_as_numbers(source, tree, understood)
+    lines += _beyond(source, tree, understood)
     if lines:
         raise _refusal(source, lines)
     return value
@@ -117,6 +122,29 @@ def _truths_as_numbers(source: str, tree: CommentedMap, understood: Iterable[_Sc
         f"{_place(source, tree, where)}: must be a number, not {str(value).lower()}"
         for where, value in _scalars(tree)
         if isinstance(value, bool) and type(became.get(where)) in (int, float)
+    ] + [
+        f"{_place(source, tree, where)}: write numbers without _"
+        for where, value in _scalars(tree)
+        if isinstance(value, str) and "_" in value and value != where[-1] and type(became.get(where)) in (int, float)
+    ]
+
+
+def _not_meant(source: str, tree: CommentedMap) -> list[str]:
+    """Texts with control characters, which would reach a terminal, and numbers with underscores."""
+    lines = []
+    for where, value in _scalars(tree):
+        if isinstance(value, str) and not is_line(value.replace("\n", "").replace("\t", "")):
+            lines.append(f"{source}:{_line(tree, where)}: control characters in a text")
+        elif getattr(value, "_underscore", None):
+            lines.append(f"{_place(source, tree, where)}: write numbers without _")
+    return lines
+
+
+def _beyond(source: str, tree: CommentedMap, understood: Iterable[_Scalar]) -> list[str]:
+    return [
+        f"{_place(source, tree, where)}: {one_line(value, 40)} is beyond anything that can be meant"
+        for where, value in understood
+        if isinstance(value, int | float) and math.isfinite(value) and abs(value) > MOST
     ]
 
 
@@ -172,7 +200,7 @@ def named_files(path: Path) -> Iterator[tuple[str, Path]]:
     ------
     ConfigError
     """
-    return _named_files(path, (), {path.resolve()})
+    return _named_files(path, (), {Path(os.path.realpath(path))})
 
 
 def _named_files(path: Path, before: tuple[Any, ...], seen: set[Path]) -> Iterator[tuple[str, Path]]:
@@ -181,8 +209,8 @@ def _named_files(path: Path, before: tuple[Any, ...], seen: set[Path]) -> Iterat
     for where, value in _scalars(_tree(path.read_text(encoding="utf-8"), str(path))):
         if not isinstance(value, str) or not os.path.isfile(file := path.parent / value):
             continue
-        if file.resolve() not in seen:
-            seen.add(file.resolve())
+        if (real := Path(os.path.realpath(file))) not in seen:
+            seen.add(real)
             yield ".".join(str(part) for part in (*before, *where)), file
             yield from _named_files(file, (*before, *where), seen)
 

@@ -21,6 +21,7 @@ from acquisition.errors import AcquisitionError
 from processing.doors import read_json, read_text
 from processing.errors import ProcessError
 from processing.storage.capture import Capture
+from processing.whole_file import open_plain
 from processing.yaml_file import ConfigError, dump_yaml, load_yaml
 
 log = logging.getLogger(__name__)
@@ -76,7 +77,7 @@ class CampaignFolder:
         line = {"time": datetime.datetime.now().astimezone().isoformat(timespec="milliseconds"), "event": event}
         text = json.dumps(line | details, default=str) + "\n"
         path = self.folder / LOG
-        with self._room_for(path), path.open("ab+") as file:
+        with self._room_for(path), open(open_plain(path, os.O_RDWR | os.O_APPEND), "ab+") as file:
             # A line that was cut off by a full disc must not spoil the next.
             end = file.seek(0, os.SEEK_END)
             if end and file.seek(end - 1) is not None and file.read(1) != b"\n":
@@ -93,7 +94,8 @@ class CampaignFolder:
     def _write_whole(self, path: Path, text: str) -> None:
         new = path.with_name(path.name + ".new")
         with self._room_for(path):
-            with new.open("w", encoding="utf-8") as file:
+            with open(open_plain(new, os.O_WRONLY), "w", encoding="utf-8") as file:
+                file.truncate(0)
                 file.write(text)
                 file.flush()
                 os.fsync(file.fileno())

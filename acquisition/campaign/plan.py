@@ -19,6 +19,7 @@ class _Part(BaseModel):
 
 
 Angle = Annotated[float, Field(allow_inf_nan=False)]
+ByWavelength = Annotated[dict[float, Annotated[float, Field(gt=0)]], Tag("by wavelength")]
 
 
 class AngleSteps(_Part):
@@ -72,7 +73,10 @@ class Campaign(_Part):
     wavelengths_nm: tuple[Annotated[float, Field(gt=0)], ...] = Field(min_length=1)
     omega_deg: AngleSteps | Annotated[tuple[Angle, ...], Field(min_length=1)]
     exposure_s: (
-        Annotated[Seconds | Annotated[dict[float, float], Tag("by wavelength")] | Auto, Discriminator(exposure_kind)]
+        Annotated[
+            Seconds | ByWavelength | Auto,
+            Discriminator(exposure_kind),
+        ]
         | None
     ) = None
     references: tuple[Reference, ...] = ()
@@ -87,6 +91,17 @@ class Campaign(_Part):
             if unknown or not reference.modes:
                 known = ", ".join(self.plans)
                 raise ValueError(f"a reference in mode {', '.join(unknown) or 'none'}; `plans` has {known}")
+        return self
+
+    @model_validator(mode="after")
+    def _nothing_twice(self) -> Self:
+        angles = () if isinstance(self.omega_deg, AngleSteps) else self.omega_deg
+        for what, values in (
+            ("wavelength", self.wavelengths_nm), ("angle", angles), ("sample", [s.name or s.kind for s in self.samples])
+        ):  # fmt: skip
+            for k, value in enumerate(values):
+                if value in values[:k]:
+                    raise ValueError(f"the {what} {value} is there twice; each is taken once")
         return self
 
     @classmethod

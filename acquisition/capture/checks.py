@@ -16,6 +16,7 @@ from acquisition.rig.config import RigConfig
 from acquisition.rig.continuous_rotation import states_deg, turned, turns_to
 from acquisition.rig.rig import Rig
 from acquisition.rig.way import find_obstacle, find_way
+from drivers.axis_types import NO_LIMIT_DEG
 from drivers.errors import LimitError
 from processing.doors import one_line
 from processing.instrument.applied_effects import changes_at
@@ -93,6 +94,10 @@ def check_plan(plan: MeasurementPlan, rig: RigConfig) -> list[Check]:
 
 def check_table(table: StateTable, rig: RigConfig, instrument: InstrumentModel) -> list[Check]:
     """Forbidden poses of every state and step, and whether the states determine a Mueller matrix."""
+    for axis, column in table.angles_deg.items():
+        if not np.all(np.abs(column) < NO_LIMIT_DEG):
+            found = f"{column[np.argmin(np.abs(column) < NO_LIMIT_DEG)]:g} deg; no controller counts so far"
+            return [Check(f"angles of {axis}", False, found)]
     checks = _free_ways(rig, states_deg(table))
     lacking = [axis for axis in instrument.axes if axis not in table.angles_deg]
     if lacking:

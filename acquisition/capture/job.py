@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from acquisition.capture.checks import (
     Check,
@@ -153,7 +154,11 @@ def job_of(path: Path, rig: RigConfig | None = None, plan: MeasurementPlan | Non
         job = prepare(plan, rig or stored_rig(capture))
         require_same(capture, plan, job.rig, job.instrument)
     # The targets as they were: an endless axis may have begun some turns away from zero.
+    _require_same_targets(path, job, targets)
+    if np.any(exposure_s <= 0):
+        raise AcquisitionError(f"{path} is damaged: an exposure of {np.nanmin(exposure_s):g} s is planned in it.")
     table = replace(job.table, angles_deg=targets)
+    refuse_failed(check_table(table, job.rig, job.instrument))
     job = replace(job, first=next((state for state in range(len(table)) if state not in done), 0))
     known = np.isfinite(exposure_s)
     if not known.any():
@@ -162,6 +167,21 @@ def job_of(path: Path, rig: RigConfig | None = None, plan: MeasurementPlan | Non
     factor = float(np.median(exposure_s[known] / table.exposure_s[known]))
     exposure_s = np.where(known, exposure_s, factor * table.exposure_s)
     return replace(job, table=replace(table, exposure_s=exposure_s), exposure_known=True)
+
+
+def _require_same_targets(path: Path, job: Job, targets: Mapping[str, NDArray[np.float64]]) -> None:
+    """Refuse targets that are not those of the plan, but for turns, or half turns where the rig folds them."""
+    for axis, planned in job.table.angles_deg.items():
+        stored, period = targets.get(axis), float(job.rig.fold_deg.get(axis, 360))
+        if stored is None or stored.shape != planned.shape:
+            raise AcquisitionError(f"{path} is damaged: it has not the targets of axis {axis} that its plan asks for.")
+        off = np.abs((stored - planned + period / 2) % period - period / 2)
+        if not np.all(off < 1e-6):
+            state = int(np.argmin(off < 1e-6))
+            raise AcquisitionError(
+                f"{path} is damaged: state {state} has axis {axis} at {stored[state]:g} deg, its plan at "
+                f"{planned[state]:g} deg. Nothing was moved. Begin the capture again: acquire --resume FILE --as-new"
+            )
 
 
 def stored_plan(capture: Capture) -> MeasurementPlan:

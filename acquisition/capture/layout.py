@@ -15,6 +15,7 @@ import numpy as np
 
 from acquisition.capture.text_box import TextBox
 from processing.storage.capture_schema import STATUS_TYPE, reserve_texts
+from processing.whole_file import open_plain
 
 #: Attribute of the entry: at which byte of the file its status stands.
 STATUS_AT = "status_at"
@@ -40,7 +41,8 @@ def put_layout(path: Path, needed: int, make: Callable[[h5py.File], None], begin
     OSError
         The disc has not enough room, or fails.
     """
-    file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
+    file = open_plain(path, os.O_WRONLY)
+    os.ftruncate(file, 0)
     memory = os.memfd_create("capture layout", os.MFD_CLOEXEC)
     try:
         # A limit on the size of files holds for memory too: it is met here, and not inside HDF5.

@@ -12,7 +12,7 @@ import typer
 
 from acquisition.commands import by_hand, custody_commands, demo
 from acquisition.commands.defaults import INTERRUPTED, RigFile
-from processing.commands.command_line import Version, application
+from processing.commands.command_line import Version, application, shown
 
 if TYPE_CHECKING:
     from acquisition.stop_request import StopRequest
@@ -111,9 +111,9 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _report(error: BaseException, code: int, text: str | None = None) -> NoReturn:
-    typer.echo(f"error: {text or error}", err=True)
+    typer.echo(f"error: {shown(text or error)}", err=True)
     for note in getattr(error, "__notes__", []):
-        typer.echo(note, err=True)
+        typer.echo(shown(note), err=True)
     sys.exit(code)
 
 

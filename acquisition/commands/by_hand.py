@@ -38,17 +38,19 @@ def doctor(
 ) -> None:
     """Tell what is there and what is wrong; moves nothing. Exit code 1 if anything is wrong."""
     from rich.console import Console
+    from rich.markup import escape
 
     from acquisition.commands.doctor import examine
     from acquisition.screen.rows import print_rows
     from acquisition.stop_request import StopRequest
+    from processing.commands.command_line import shown
 
     config = _load(rig)
     there = []
     with StopRequest(patience=1), Console(stderr=True).status("looking at the rig") as status:
         for finding in examine(config, out, frames):
             there.append(finding)
-            status.update(f"looking at the rig: {finding.what} done")
+            status.update(f"looking at the rig: {escape(shown(finding.what))} done")
     print_rows(finding.row for finding in there)
     if wrong := [finding.what for finding in there if finding.well is False]:
         typer.echo(f"not as it should be: {', '.join(wrong)}", err=True)

@@ -6,6 +6,7 @@ import contextlib
 import os
 import shlex
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import typer
@@ -26,10 +27,11 @@ from acquisition.rig.rig import Rig
 from acquisition.screen.notify import notifying
 from acquisition.screen.observer import Observer
 from acquisition.screen.progress import ConsoleProgress
-from acquisition.screen.rows import print_rows
+from acquisition.screen.rows import print_rows, say
 from acquisition.screen.run_file import RunFile
 from acquisition.stop_request import StopRequest
 from processing.doors import one_line
+from processing.whole_file import write_whole_text
 from processing.yaml_file import ConfigError
 
 
@@ -57,7 +59,7 @@ def run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Obs
     held.begin_with(identity)
     note_campaign(folder, file, rig_file)
     try:
-        operator = Operator(console.print, stop, options.yes, rig_config.simulated)
+        operator = Operator(partial(say, console), stop, options.yes, rig_config.simulated)
         told = RunFile(folder, rig_config.simulated)
         with (
             notifying(rig_config.notify, folder, rig_config.simulated) as notifier,
@@ -111,7 +113,7 @@ def _sum_up(held: CampaignFolder, names: Sequence[str]) -> list[str]:
     """Write the summary into the folder, whatever the run came to, if the disc takes it."""
     lines = summary_lines(held.folder, names, held.index)
     with contextlib.suppress(OSError):
-        (held.folder / SUMMARY).write_text("\n".join(lines) + "\n", encoding="utf-8")
+        write_whole_text(held.folder / SUMMARY, "\n".join(lines) + "\n", follow=False)
     return lines
 
 

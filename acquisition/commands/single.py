@@ -8,6 +8,7 @@ import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import typer
@@ -32,7 +33,7 @@ from acquisition.rig.rig import Rig
 from acquisition.screen.notify import notifying
 from acquisition.screen.observer import Observer
 from acquisition.screen.progress import ConsoleProgress
-from acquisition.screen.rows import print_rows
+from acquisition.screen.rows import print_rows, say
 from acquisition.screen.run_file import RunFile
 from acquisition.stop_request import StopRequest
 from processing.doors import one_line
@@ -76,13 +77,13 @@ def run(options: Options, stop: StopRequest) -> int:
     job, path, resuming = _job(options)
     sample = job.plan.sample.name or job.plan.sample.kind
     say_simulated(console, job.rig)
-    operator = Operator(console.print, stop, options.yes, job.rig.simulated)
+    operator = Operator(partial(say, console), stop, options.yes, job.rig.simulated)
     with Rig(job.rig, ask=operator.confirm) as rig:
         checks = [*check_machine(job.rig, [sample]), *check_with_devices(job, rig, path.parent)]
         if options.dry_run:
             show_checks(Console(), (*job.checks, *checks))
             refuse_failed(checks)
-            Console().print(f"about {capture_seconds(job, rig):.0f} s; nothing was moved", markup=False)
+            say(Console(), f"about {capture_seconds(job, rig):.0f} s; nothing was moved")
             return 0
         refuse_failed(checks)
         if stop.requested:
@@ -199,6 +200,8 @@ def seeded(rig: RigConfig, seed: int | None) -> RigConfig:
     """The rig with another seed of its simulated noise. Raises ConfigError for a real rig."""
     if seed is None:
         return rig
+    if not 0 <= seed < 1 << 63:
+        raise ConfigError(f"--seed {seed}: a seed is a whole number from 0 to 2^63")
     if rig.simulator is None:
         raise ConfigError(f"--seed {seed}: rig {rig.name!r} has no simulator, its noise has no seed")
     return rig.model_copy(update={"simulator": rig.simulator.model_copy(update={"seed": seed})})
@@ -214,14 +217,14 @@ def live_page(wanted: bool, rig: RigConfig, stop: StopRequest, console: Console)
 
     full_scale = (1 << (rig.detector.bits or 16)) - 1
     with LiveView(rig.simulated, rig.detector.black_level_counts, full_scale, stop) as view:
-        console.print(f"live view: {view.url}", soft_wrap=True, highlight=False, markup=False)
+        say(console, f"live view: {view.url}")
         yield [view]
 
 
 def say_simulated(console: Console, rig: RigConfig) -> None:
     """Say on the console that nothing of this is a measurement."""
     if rig.simulated:
-        console.print(f"SIMULATED: rig {rig.name!r}, emulated devices, no hardware", style="bold red", highlight=False)
+        say(console, f"SIMULATED: rig {rig.name!r}, emulated devices, no hardware", "bold red")
 
 
 def show_checks(console: Console, checks: tuple[Check, ...]) -> None:

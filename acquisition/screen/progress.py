@@ -10,6 +10,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Column
 
 from acquisition.screen.observer import Mosaic, Observer, StateReport
+from acquisition.screen.rows import say
+from processing.commands.command_line import shown
 from processing.instrument.states import StateTable
 
 #: Seconds between two lines where the output is a file or a pipe.
@@ -69,9 +71,9 @@ class ConsoleProgress(Observer):
 
     def activity(self, text: str) -> None:
         if self._bar is not None:
-            self._bar.update(self._task, description=text)
+            self._bar.update(self._task, description=shown(text))
         else:
-            self._console.print(text, markup=False, soft_wrap=True)
+            say(self._console, text)
 
     def state_done(self, report: StateReport) -> None:
         self._done += 1
@@ -88,9 +90,7 @@ class ConsoleProgress(Observer):
         elif time.monotonic() - self._line_s > LINE_EVERY_S:
             self._line_s = time.monotonic()
             left_s = (self._line_s - self._start_s) / self._done * (self._pending - self._done)
-            self._console.print(
-                f"{text}  {self._done}/{self._pending}, {left_s:.0f} s left", markup=False, soft_wrap=True
-            )
+            say(self._console, f"{text}  {self._done}/{self._pending}, {left_s:.0f} s left")
 
     def warning(self, text: str) -> None:
         self._print(f"warning: {text}")
@@ -101,8 +101,7 @@ class ConsoleProgress(Observer):
             self._bar = None
 
     def _print(self, text: str) -> None:
-        console = self._console if self._bar is None else self._bar.console
-        console.print(text, markup=False, highlight=False, soft_wrap=True)
+        say(self._console if self._bar is None else self._bar.console, text)
 
 
 def _duration(seconds: float) -> str:

@@ -11,6 +11,7 @@ from processing.reduction.black import Black
 from processing.reports.colours import upper_end
 from processing.reports.figure_style import clipped
 from processing.storage.capture import Capture
+from processing.whole_file import whole_file
 
 #: Longest side of the maps in the figure, pixels; a larger frame is thinned out.
 LARGEST = 600
@@ -54,7 +55,8 @@ def draw(path: Path) -> Path:
     else:
         figure.suptitle(title)
     target = path.with_name(path.name.removesuffix(".partial").removesuffix(".h5") + ".png")
-    figure.savefig(target, dpi=110)
+    with whole_file(target, follow=False) as new:
+        figure.savefig(new, dpi=110)
     return target
 
 

@@ -19,6 +19,7 @@ from acquisition.screen.observer import Mosaic, Observer, StateReport
 from processing.doors import read_json
 from processing.errors import ProcessError
 from processing.instrument.states import StateTable
+from processing.whole_file import open_plain
 
 #: Seconds between two versions of the file.
 EVERY_S = 0.3
@@ -105,7 +106,9 @@ class RunFile(Observer):
             self._changed.wait()
             self._changed.clear()
             with contextlib.suppress(OSError):
-                new.write_text(json.dumps(self._facts), encoding="utf-8")
+                with open(open_plain(new, os.O_WRONLY), "w", encoding="utf-8") as file:
+                    file.truncate(0)
+                    file.write(json.dumps(self._facts))
                 os.replace(new, self._path)
             self._ended.wait(EVERY_S)
 

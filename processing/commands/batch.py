@@ -217,7 +217,7 @@ def files_of(
         if not taken:
             raise ProcessError(f"{source} holds no {what}. Give files, or the folder that they are in.")
         found += taken
-    return list({path.resolve(): path for path in found}.values())
+    return list({os.path.realpath(path): path for path in found}.values())
 
 
 def captures_and(products: Iterable[str]) -> Callable[[Path], bool]:

@@ -13,6 +13,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.exceptions import TyperException
 
+from processing.doors import CONTROL
 from processing.errors import ProcessError
 
 INTERRUPTED = 130
@@ -20,6 +21,11 @@ INTERRUPTED = 130
 # all packages. Before it ends, the interpreter would look for cycles in all that the libraries keep.
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")
 atexit.register(gc.freeze)
+
+
+def shown(text: object) -> str:
+    """Text as a terminal may get it: control characters of file names and devices as escapes, lines as they are."""
+    return CONTROL.sub(lambda found: found[0] if found[0] in "\n\t" else ascii(found[0])[1:-1], str(text))
 
 
 def _tell_version(wanted: bool) -> None:
@@ -81,13 +87,13 @@ def run(app: typer.Typer, argv: Sequence[str] | None = None) -> None:
     try:
         app(args=None if argv is None else list(argv))
     except ProcessError as error:
-        typer.echo(f"error: {error}", err=True)
+        typer.echo(f"error: {shown(error)}", err=True)
         sys.exit(error.exit_code)
     except FileNotFoundError as error:
-        typer.echo(f"error: {error.filename}: no such file or folder", err=True)
+        typer.echo(f"error: {shown(error.filename)}: no such file or folder", err=True)
         sys.exit(2)
     except OSError as error:
-        typer.echo(f"error: {error}", err=True)
+        typer.echo(f"error: {shown(error)}", err=True)
         sys.exit(1)
     except SystemExit as ended:
         # Typer turns Ctrl-C into this exit code, without a word.

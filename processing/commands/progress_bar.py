@@ -59,7 +59,7 @@ def _bar(what: str, *counts: object) -> Iterator[Progress]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = (TextColumn(what), BarColumn(), *counts, TimeRemainingColumn())
+    columns = (TextColumn(what, markup=False), BarColumn(), *counts, TimeRemainingColumn())
     console = Console(stderr=True)
 
     def compiling() -> None:
@@ -86,7 +86,12 @@ def progress_line(what: str, verbose: bool) -> Iterator[Callable[[str], None]]:
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     console = Console(stderr=True)
-    columns = (SpinnerColumn(), TextColumn(what), TimeElapsedColumn(), TextColumn("{task.description}"))
+    columns = (
+        SpinnerColumn(),
+        TextColumn(what, markup=False),
+        TimeElapsedColumn(),
+        TextColumn("{task.description}", markup=False),
+    )
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("", total=None)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -92,7 +93,7 @@ def write_report(
     ProcessError : nothing to report, `out` exists, or simulated and measured data are mixed.
     """
     require_place(out, overwrite)
-    files = [f for f in collect(sources) if f.resolve() != out.resolve()]
+    files = [f for f in collect(sources) if os.path.realpath(f) != os.path.realpath(out)]
     simulated = _kind_of_data(files)
     sections: list[Section] = []
     for count, file in enumerate(files, 1):

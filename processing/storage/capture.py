@@ -68,6 +68,8 @@ class Capture(OpenH5):
                 else f"{self.path} is {made}, and a capture is asked for: the file that it was made from."
             )
         version = int(self._h5.attrs["umov_schema"])
+        if version != self._h5.attrs["umov_schema"] or version < 1:
+            raise CaptureError(f"{self.path} has capture schema {self._h5.attrs['umov_schema']}, which never was.")
         if version > SCHEMA_VERSION:
             raise CaptureError(
                 f"{self.path} has capture schema {version}; this program reads up to {SCHEMA_VERSION}. Update it."

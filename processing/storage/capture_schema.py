@@ -13,8 +13,9 @@ from typing import Annotated, Any, Literal, Self
 import h5py
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
+from processing.doors import is_line
 from processing.storage.nexus import (
     PIXEL_AXES,
     add_group,
@@ -83,6 +84,24 @@ class _Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
+def _line(text: str) -> str:
+    if not is_line(text):
+        raise ValueError("control characters in a text")
+    return text
+
+
+def _rectangular(rows: tuple[tuple[str, ...], ...] | None) -> tuple[tuple[str, ...], ...] | None:
+    if rows is not None and (not rows or not rows[0] or len({len(row) for row in rows}) > 1):
+        raise ValueError("its rows are not all equally long")
+    return rows
+
+
+#: A text of one line that a terminal shows as it is.
+Line = Annotated[str, AfterValidator(_line)]
+#: What lies before each pixel of a cell of the sensor, row by row.
+Cell = Annotated[tuple[tuple[Line, ...], ...] | None, AfterValidator(_rectangular)]
+
+
 class Sample(_Part):
     """What stood at the centre. `mueller` (16 numbers, row-major) goes with kind "mueller".
 
@@ -90,7 +109,7 @@ class Sample(_Part):
     """
 
     kind: SampleKind = "unknown"
-    name: str = ""
+    name: Line = ""
     mueller: Annotated[tuple[float, ...], Field(min_length=16, max_length=16)] | None = None
 
     @model_validator(mode="after")
@@ -117,31 +136,31 @@ class Detector(_Part):
 class CaptureHeader(_Part):
     """Everything about a capture that is known before its first state."""
 
-    title: str
+    title: Line
     simulated: bool
-    mode: str
-    wavelength_nm: float
+    mode: Line
+    wavelength_nm: float = Field(gt=0)
     omega_deg: float | None = None
-    illumination: str | None = None
+    illumination: Line | None = None
     sample: Sample = Sample()
     detector: Detector = Detector()
-    channels: tuple[str, ...] = ("camera",)
-    mosaic: tuple[tuple[str, ...], ...] | None = None
+    channels: tuple[Line, ...] = ("camera",)
+    mosaic: Cell = None
     #: Names of the channels whose images lie side by side in each frame.
-    beams: tuple[str, ...] | None = None
+    beams: tuple[Line, ...] | None = None
     instrument_yaml: str = ""
     plan_yaml: str = ""
     rig_yaml: str = ""
     camera_settings_json: str = "{}"
     devices_json: str = "{}"
-    versions: dict[str, str] = {}
-    seed: int | None = None
+    versions: dict[Line, Line] = {}
+    seed: int | None = Field(default=None, ge=0, lt=1 << 63)
     #: Axes whose targets were moved into their travel by whole multiples of so many degrees.
     folded_deg: dict[str, float] = {}
     #: Every feature of the camera with its value when the capture began; in a note of its own, not in header_json.
     camera_nodes: dict[str, str] = Field(default={}, exclude=True)
     #: Colour before each pixel from the first of the frames on, for a sensor with a colour filter.
-    colours: tuple[tuple[str, ...], ...] | None = None
+    colours: Cell = None
 
 
 def create_layout(

@@ -11,6 +11,7 @@ from typing import Any, Self
 
 import h5py
 import numpy as np
+from numpy.lib.format import MAGIC_PREFIX
 
 from processing.doors import one_line, require_file
 from processing.errors import ProcessError
@@ -23,6 +24,8 @@ DAMAGE = (
 )
 #: Most states of a capture and most numbers of a table beside the frames.
 MOST_STATES = 100_000
+#: Most groups and datasets of a file; ours have a few hundred.
+MOST_LINKS = 20_000
 #: A compressed dataset larger than this many times its storage is none that a camera made (deflate ends at 1032).
 MOST_RATIO = 1100
 
@@ -33,12 +36,33 @@ def open_h5(path: Path, error: type[ProcessError], hint: str = "") -> h5py.File:
     if (heap := endless_heap(path)) is not None:
         raise error(f"{path} cannot be read as HDF5: its texts at byte {heap:,} are damaged. {hint}".strip())
     try:
-        return h5py.File(path, "r")
+        h5 = h5py.File(path, "r")
     except DAMAGE as why:
         if not h5py.is_hdf5(path):
             raise error(f"{path} cannot be opened as HDF5: it is of another kind, or its beginning is damaged") from why
         text = f"{path} cannot be opened as HDF5 ({one_line(why)}). It is truncated or damaged. {hint}"
         raise error(text.strip()) from why
+    with closed_if_damaged(h5, error, f"{path} cannot be read"):
+        _require_own(h5)
+    return h5
+
+
+def _require_own(h5: h5py.File) -> None:
+    """Raise ValueError where a part of a file lies in another one: that may be a pipe, or what nobody meant to give."""
+    count = 0
+
+    def look(name: str, link: h5py.HardLink | h5py.SoftLink | h5py.ExternalLink) -> str | None:
+        nonlocal count
+        count += 1
+        if isinstance(link, h5py.ExternalLink):
+            return f"{one_line(name)} is a link into another file, {one_line(link.filename)}"
+        node = h5.get(name) if isinstance(link, h5py.HardLink) else None
+        if isinstance(node, h5py.Dataset) and (node.is_virtual or node.external):
+            return f"{one_line(name)} lies in another file"
+        return f"more than {MOST_LINKS:,} parts" if count > MOST_LINKS else None
+
+    if (found := h5.visititems_links(look)) is not None:
+        raise ValueError(found)
 
 
 class OpenH5:
@@ -132,6 +156,9 @@ def read_npy(path: Path, error: type[ProcessError], most_bytes: int | None = Non
     """An array of plain numbers in a .npy file, as a read-only memory map. Raises `error`."""
     require_file(path, error, most_bytes)
     try:
+        with open(path, "rb") as file:
+            if file.read(len(MAGIC_PREFIX)) != MAGIC_PREFIX:
+                raise error(f"{path} is no .npy file")
         values = np.load(path, mmap_mode="r", allow_pickle=False)
     except (*DAMAGE, SyntaxError, EOFError, tokenize.TokenError) as why:
         # The header is Python's text, and damaged text is a matter of its parser.

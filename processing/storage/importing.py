@@ -89,7 +89,7 @@ def import_capture(
     if detector.bits is None and source.dtype.kind == "u":
         detector = detector.model_copy(update={"bits": 8 * source.dtype.itemsize})
     header = CaptureHeader(
-        title=request.title or f"imported from {request.states.resolve().parent.name}/{request.states.name}",
+        title=request.title or one_line(f"imported from {request.states.resolve().parent.name}/{request.states.name}"),
         simulated=False,
         mode="import",
         wavelength_nm=request.wavelength_nm,

@@ -24,6 +24,8 @@ KNOWN = ("state", "role", "file", "time_s", "exposure_s", "sigma")
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_ .-]{0,63}")
 #: What may stand between columns; a spreadsheet takes semicolons where the comma is in the numbers.
 DELIMITERS = ",;\t"
+#: Largest angle in degrees; controllers count no further.
+MOST_DEG = 1e6
 MOST_COLUMNS = 200
 MOST_STATES = 100_000
 
@@ -106,7 +108,11 @@ def read_states(path: Path, axes: Sequence[str]) -> StatesFile:
     decimal_commas = delimiter == ";" and any("," in text for texts in cells.values() for text in texts)
     numbers = {n: _numbers(path, lines, n, texts, role, decimal_commas) for n, texts in cells.items()}
     files = _files(path, lines, columns["file"]) if "file" in columns else None
-    _check_sigma(path, lines, numbers.get("sigma"))
+    _check_above_zero(path, lines, "sigma", numbers.get("sigma"))
+    _check_above_zero(path, lines, "exposure_s", numbers.get("exposure_s"))
+    _check_angles(path, lines, [n for n in names if n not in KNOWN and not n.startswith(CHANNEL_PREFIX)], numbers)
+    if set(role) <= {"dark"}:
+        raise ImportFailed(f"{path}: every state is dark; give the role of those with light in the column role")
     return StatesFile(
         path=path,
         line=tuple(lines),
@@ -155,10 +161,17 @@ def _is_known(header: str, name: str, axes: Sequence[str]) -> bool:
     return name in KNOWN or name in axes or name.startswith(CHANNEL_PREFIX) or header.endswith("_deg")
 
 
-def _check_sigma(path: Path, lines: list[int], sigma: NDArray[np.float64] | None) -> None:
-    for line, value in zip(lines, () if sigma is None else sigma, strict=sigma is not None):
+def _check_above_zero(path: Path, lines: list[int], name: str, values: NDArray[np.float64] | None) -> None:
+    for line, value in zip(lines, () if values is None else values, strict=values is not None):
         if value <= 0:
-            raise ImportFailed(f"{path}:{line}: column sigma: {value:g}; the noise of a value is above 0")
+            raise ImportFailed(f"{path}:{line}: column {name}: {value:g} is not above 0")
+
+
+def _check_angles(path: Path, lines: list[int], names: Sequence[str], values: dict[str, NDArray[np.float64]]) -> None:
+    for name in names:
+        for line, value in zip(lines, values[name], strict=True):
+            if abs(value) > MOST_DEG:
+                raise ImportFailed(f"{path}:{line}: column {name}: {value:g} is no angle; at most {MOST_DEG:g} degrees")
 
 
 def _axis_name(header: str) -> str:
@@ -212,7 +225,7 @@ def _numbers(
             out[k] = np.nan
             continue
         try:
-            out[k] = float(text.translate(points))
+            out[k] = math.nan if "_" in text else float(text.translate(points))
         except ValueError:
             out[k] = np.nan
         if not math.isfinite(out[k]):

@@ -45,7 +45,7 @@ class SimulatorConfig(_Part):
     `detector` the same for the detector. `stamp` writes the true axis angles into the first pixels of each frame.
     """
 
-    seed: int = Field(default=1, ge=0)
+    seed: int = Field(default=1, ge=0, lt=1 << 63)
     clock_speed: float = Field(default=10.0, gt=0, description="simulated seconds for a real second")
     rows: int = Field(default=600, gt=0)
     columns: int = Field(default=600, gt=0)

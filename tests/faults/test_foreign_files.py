@@ -25,7 +25,7 @@ def theirs(run_with, tmp_path):
         if state == 2:
             raise AcquisitionError("enough")
 
-    touch = ["/usr/bin/touch", str(tmp_path / "was_run")]
+    touch = ["/bin/sh", "-c", f"touch {tmp_path / 'was_run'}"]
     top = {"alert": touch, "notify": {"command": touch}, "wire_log": str(tmp_path / "wires")}
     _, path = run_with(act, plan=SHORT, top=top)
     (tmp_path / "rig.yaml").rename(tmp_path / "gone.yaml")
@@ -54,7 +54,7 @@ def test_the_own_rig_file_says_what_is_run(nobody, theirs, acquire, tmp_path):
     """The rig of the same name that was used before, although the file's own names other commands."""
     yaml = YAML()
     rig = yaml.load(tmp_path / "gone.yaml")
-    mine = ["/usr/bin/touch", str(tmp_path / "mine_was_run")]
+    mine = ["/bin/sh", "-c", f"touch {tmp_path / 'mine_was_run'}"]
     rig |= {"notify": {"command": mine}, "alert": []}
     del rig["wire_log"]
     yaml.dump(rig, tmp_path / "mine.yaml")
