@@ -89,13 +89,22 @@ class Part:
         """(N * channels, pixels)."""
         return self.signal.reshape(self.signal.shape[0] * self.signal.shape[1], -1)
 
+    @property
+    def throughputs(self) -> int:
+        """Numbers that are eliminated: one for each pixel, in each state where the level of the source is free."""
+        pixels = int(self.data.shape[1])
+        return pixels * len(self.signal) if self.model.projects_source else pixels
+
     def residual(self, model: InstrumentModel) -> NDArray[np.float64]:
-        """(N * channels * pixels,), over the mean signal, with the best throughput of each pixel."""
+        """(N * channels * pixels,), over the mean signal, with the best throughputs."""
         weight = np.ones(self.signal.shape[0]) if self.exposure is None else self.exposure
         w = model.rows(self.angles_deg, changes_at(model, self.angles_deg)) * weight[:, None, None]
         shape = w.reshape(-1, 16) @ self.sample.reshape(16)
-        throughput = shape @ self.data / (shape @ shape)
-        return np.asarray((self.data - shape[:, None] * throughput).reshape(-1) / np.mean(self.data))
+        # What has a throughput in common: a state, or all of them.
+        shape = shape.reshape(len(weight) if model.projects_source else 1, -1, 1)
+        data = self.data.reshape(*shape.shape[:2], -1)
+        throughput = np.sum(shape * data, axis=1, keepdims=True) / np.sum(shape**2, axis=1, keepdims=True)
+        return np.asarray((data - shape * throughput).reshape(-1) / np.mean(data))
 
 
 def part_of(capture: Capture, model: InstrumentModel, rows: slice, columns: slice) -> Part:

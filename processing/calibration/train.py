@@ -191,7 +191,7 @@ class _Fit:
         self._bases = [shared.base(values) for values in self.nominal]
         self._matrices = [shared.matrix(part.wavelength_nm) for part in parts]
         self._edges = np.cumsum([part.data.size for part in parts])[:-1]
-        throughputs = sum(part.data.shape[1] for part in parts)
+        throughputs = sum(part.throughputs for part in parts)
         size = sum(part.data.size for part in parts)
         self.freedom = size - throughputs - len(shared.unknown)
         if self.freedom <= 0:
@@ -255,7 +255,7 @@ class _Fit:
         for nm in np.unique(wavelengths):
             here = np.flatnonzero(wavelengths == nm).tolist()
             square = sum(float(np.sum(left[k] ** 2)) for k in here)
-            free = sum(self.parts[k].data.size - self.parts[k].data.shape[1] - float(pulled[k].sum()) for k in here)
+            free = sum(self.parts[k].data.size - self.parts[k].throughputs - float(pulled[k].sum()) for k in here)
             total = float(np.sum(found.fun**2)) / self.freedom
             out[here] = max(np.sqrt(square / free if free >= 1 else total), LEAST_RESIDUAL)
         return out

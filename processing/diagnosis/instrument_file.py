@@ -24,13 +24,17 @@ def extended(model: InstrumentModel, diagnosis: Diagnosis) -> InstrumentModel:
     is corrected, what is known of how wrong M may be is put in all the same, in place of what was known of it.
     """
     values: dict[str, dict[str, Dispersive]] = {}
+    errors = dict(model.stderr)
     for name, entry in diagnosis.calibrated.items() if diagnosis.corrects else ():
         element, _, field = name.rpartition(".")
         old = model.value_of(name)
         values.setdefault(element, {})[field] = _merged(old or 0.0, entry, diagnosis.wavelengths_nm)
+        known = entry.model_copy(update={"value": entry.stderr or 0.0})
+        errors[name] = _merged(errors.get(name, 0.0), known, diagnosis.wavelengths_nm)
     systematic = diagnosis.systematic()
     told = [s.wavelength_nm for s in systematic]
     update = {
+        "stderr": errors,
         "effects": (*model.effects, *diagnosis.applied()),
         "systematic": (*(s for s in model.systematic if s.wavelength_nm not in told), *systematic),
     }

@@ -136,9 +136,10 @@ class InstrumentModel(Part):
     `belongs_to` says of such values, and of kinds of effects, what they belong to where that is not the rule: a
     spectrograph sees one run of the axes at all wavelengths (`rotation_slip: mechanics`), the axis of an achromatic
     plate turns with the wavelength (`plate.azimuth_deg: dispersion`).
+    `stderr` holds standard errors of values that `diagnose` fitted, by the names that `calibrate` has.
     `systematic` is what `diagnose` leaves uncertain; `process reduce` carries it into its error bars.
-    `free_source`: the source has a level of its own in every state, so only ratios of the channels of one state count
-    where the sample is known.
+    Where two channels or more see one source, its level in each state is projected out; `free_source: false` says
+    that it has the same level in all states.
     """
 
     kind: Literal["instrument"] = "instrument"
@@ -152,7 +153,8 @@ class InstrumentModel(Part):
     beams: tuple[str, ...] | None = None
     calibrate: tuple[str, ...] = ()
     belongs_to: dict[str, Belongs] = Field(default={})
-    free_source: bool = False
+    free_source: bool | None = None
+    stderr: dict[str, Dispersive] = Field(default={})
     effects: tuple[AppliedEffect, ...] = ()
     systematic: tuple[SystematicError, ...] = ()
 
@@ -177,6 +179,11 @@ class InstrumentModel(Part):
     def load(cls, path: Path | str) -> InstrumentModel:
         """Read an instrument file. Raises ConfigError with file, line and key."""
         return load_yaml(path, cls)
+
+    @property
+    def projects_source(self) -> bool:
+        """Whether the level of the source in each state is projected out: two channels or more see one source."""
+        return len(self.channels) > 1 if self.free_source is None else self.free_source
 
     @property
     def pitch(self) -> int:
@@ -205,7 +212,13 @@ class InstrumentModel(Part):
                 f"instrument {self.name!r} is given at {_listing(self.wavelengths_nm)} nm; "
                 f"asked for {wavelength_nm:g} nm. Use an instrument file that has it."
             )
-        resolved = _resolve(self.model_dump(), wavelength_nm, self.name)
+        given = self.model_dump()
+        given["stderr"] = {
+            name: error
+            for name, error in given["stderr"].items()
+            if not isinstance(error, dict) or _listed(wavelength_nm, tuple(error))
+        }
+        resolved = _resolve(given, wavelength_nm, self.name)
 
         def holds(found: dict[str, Any]) -> bool:
             # What was found at one wavelength is not carried over to another, unless it belongs to none.
@@ -257,7 +270,7 @@ class InstrumentModel(Part):
 
     def generator_states(self, angles_deg: Mapping[str, ArrayLike], changes: Changes | None = None) -> Array:
         """Stokes vectors g (states, 4): first column of the generator train's Mueller matrix."""
-        n = _state_count(angles_deg)
+        n = _state_count(angles_deg, changes)
         stokes = np.zeros((n, 4))
         stokes[:, 0] = 1.0
         for element in self.generator:
@@ -266,7 +279,7 @@ class InstrumentModel(Part):
 
     def analyzer_states(self, angles_deg: Mapping[str, ArrayLike], changes: Changes | None = None) -> Array:
         """Analyzer vectors a (states, channels, 4): first row of each channel's train."""
-        n = _state_count(angles_deg)
+        n = _state_count(angles_deg, changes)
         common = [_matrices(e, angles_deg, n, changes) for e in self.analyzer]
         out = np.empty((n, len(self.channels), 4))
         for k, channel in enumerate(self.channels):
@@ -337,8 +350,9 @@ def _detected(w: Array, changes: Changes) -> Array:
     return np.asarray(w)
 
 
-def _state_count(angles_deg: Mapping[str, ArrayLike]) -> int:
-    counts = {np.size(v) for v in angles_deg.values()} or {1}
+def _state_count(angles_deg: Mapping[str, ArrayLike], changes: Changes | None) -> int:
+    # Where nothing turns, only what changes from state to state tells how many there are.
+    counts = {np.size(v) for v in angles_deg.values()} or {1 if changes is None else changes.conditions.states}
     if len(counts) != 1:
         raise ValueError(f"every axis needs one angle a state; got {sorted(counts)}")
     return counts.pop()

@@ -38,6 +38,7 @@ from processing.reduction.sent_light import SentLight
 from processing.reduction.solvers.field import Field, FieldSolver
 from processing.reduction.solvers.inversion import ELEMENTS, Inversion
 from processing.reduction.solvers.plain import MuellerSolver
+from processing.reduction.source_level import LeveledSource, SourceLevels
 from processing.reduction.systematic import Systematic
 from processing.storage.capture import Capture, CaptureError
 from processing.storage.mueller_planes import MUELLER_PLANES
@@ -158,14 +159,22 @@ def measurement_matrix(
 
 
 def field_of(
-    capture: Capture, model: InstrumentModel, states: NDArray[np.int64], changes: Changes | None
+    capture: Capture,
+    model: InstrumentModel,
+    states: NDArray[np.int64],
+    changes: Changes | None,
+    level: NDArray[np.float64] | None = None,
 ) -> Field | None:
-    """W where retardances vary over the image; None where W is the same everywhere."""
+    """W where retardances vary over the image; None where W is the same everywhere.
+
+    `level` (states,) : of the source.
+    """
     if changes is None or not changes.field_retardance_rad:
         return None
 
     def matrix(extra: NDArray[np.float64]) -> NDArray[np.float64]:
-        return measurement_matrix(capture, model, states, with_extra(changes, extra)).reshape(-1, 16)
+        w = measurement_matrix(capture, model, states, with_extra(changes, extra))
+        return (w if level is None else w * level[:, None, None]).reshape(-1, 16)
 
     return Field(matrix, lambda x, y: extra_retardance(changes, x, y))
 
@@ -212,12 +221,14 @@ def reduce_mueller(
     states, cut_off = without_cut_off(capture, left_out.rest_of(every, capture.path))
     cut_off = [*left_out.warnings, *cut_off]
     changes = capture_changes(capture, model, states)
-    w = measurement_matrix(capture, model, states, changes)
-    what = "".join(f"{text}: " for text in (capture.path, *cut_off))
-    inversion = Inversion.of(w.reshape(-1, 16), what, determined_basis(model))
     correction = correction or Correction.of(capture)
     struck = _among(left_out.hits, every, states)
     reader = BlockReader(capture, states, correction, counts_correction(changes, model), struck)
+    basis = determined_basis(model)
+    source = LeveledSource.of(reader, model, basis, varies=changes is not None and bool(changes.field_retardance_rad))
+    w, levels = source.leveled(measurement_matrix(capture, model, states, changes))
+    what = "".join(f"{text}: " for text in (capture.path, *cut_off))
+    inversion = Inversion.of(w.reshape(-1, 16), what, basis, levels.spent if levels else 0.0)
     choice = choice or Choice()
     noise = choice.noise or noise_of(capture, states)
     if inversion.rank < ELEMENTS and (choice.physical or (changes is not None and changes.field_retardance_rad)):
@@ -225,22 +236,26 @@ def reduce_mueller(
             f"{capture.path}: instrument {model.name!r} determines {inversion.rank} of 16 numbers; --physical and "
             "field_retardance need all of them. Leave them away."
         )
-    solver = choice.solver(MuellerSolver(inversion, reader, noise), field_of(capture, model, states, changes))
+    field = field_of(capture, model, states, changes, levels.relative if levels else None)
+    solver = choice.solver(MuellerSolver(inversion, reader, noise), field)
     planes = choice.planes(known_noise=noise is not None)
     sent = SentLight.of(inversion)
     planes |= SENT_PLANES if sent is not None else {}
-    systematic = _systematic(capture, model, states, inversion)
+    systematic = _systematic(capture, model, states, inversion, source)
     if systematic is not None:
         planes |= SYSTEMATIC if sent is None else SENT_SYSTEMATIC
     with ProductWriter(out, "mueller", capture.header, capture.frame_shape, planes, steps, overwrite) as product:
         product.array("measurement_matrix", w, "", "W (state, channel, 16): intensity = W . vec(M), row-major")
+        if levels is not None:
+            product.array("source_level", levels.relative, "", "level of the source in each state over its mean")
+            product.array("source_level_errors", levels.stderr, "", "standard errors of source_level")
         _store_noise(product, noise, solver)
         # HDF5 lets the interpreter go while it writes: one block is stored while the next is solved.
         with ThreadPoolExecutor(1) as storing:
             stored: Future[None] | None = None
             for rows in capture.row_blocks(BLOCK_PIXELS):
                 if rows.stop > product.rows_done:
-                    block = _block(solver, rows, planes, systematic, sent)
+                    block = _block(solver, rows, planes, systematic, sent, levels)
                     if stored:
                         stored.result()
                     stored = storing.submit(product.write, rows, **block)
@@ -255,6 +270,8 @@ def reduce_mueller(
             raise CaptureError(f"{capture.path}: {error}{_without_numbers(capture, states)}") from error
         facts["warnings"] += cut_off
         facts |= _further_facts(choice, sent)
+        if levels is not None:
+            facts["source"] = levels.told
         product.seal(facts)
     return facts
 
@@ -289,13 +306,17 @@ def _store_noise(product: ProductWriter, noise: NoiseModel | None, solver: Solve
 
 
 def _systematic(
-    capture: Capture, model: InstrumentModel, states: NDArray[np.int64], inversion: Inversion
+    capture: Capture,
+    model: InstrumentModel,
+    states: NDArray[np.int64],
+    inversion: Inversion,
+    source: LeveledSource,
 ) -> Systematic | None:
     if not model.systematic:
         return None
 
     def matrix(other: InstrumentModel) -> NDArray[np.float64]:
-        return measurement_matrix(capture, other, states, capture_changes(capture, other, states))
+        return source.leveled(measurement_matrix(capture, other, states, capture_changes(capture, other, states)))[0]
 
     def counts(other: InstrumentModel) -> CountsCorrection | None:
         return counts_correction(capture_changes(capture, other, states), other)
@@ -304,10 +325,17 @@ def _systematic(
 
 
 def _block(
-    solver: Solver, rows: slice, planes: Mapping[str, Plane], systematic: Systematic | None, sent: SentLight | None
+    solver: Solver,
+    rows: slice,
+    planes: Mapping[str, Plane],
+    systematic: Systematic | None,
+    sent: SentLight | None,
+    levels: SourceLevels | None,
 ) -> dict[str, NDArray[Any]]:
     frames = solver.reader.read(rows)
     found = solver.solve(frames)
+    if levels is not None:
+        levels.add_errors(found, solver.inversion)
     mask = found["pixel_flags"]
     lost = (mask & np.uint8(Mask.NOT_FINITE | Mask.BAD | Mask.NOT_DETERMINED)) != 0
     if sent is not None:

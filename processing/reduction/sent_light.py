@@ -68,7 +68,7 @@ class SentLight:
         plain: MuellerSolver = getattr(solver, "plain", solver)
         inversion = plain.inversion
         stokes = (self.rows @ mueller).astype(np.float32)
-        n, dof = inversion.w.shape[0], inversion.degrees_of_freedom
+        n, dof = inversion.w.shape[0], inversion.free
         if plain.noise is None:
             variance = np.tile(residual_rms**2 * n / dof if dof else np.nan, (n, 1))
         else:

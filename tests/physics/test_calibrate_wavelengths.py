@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from processing.calibration.known_sample import part_of
+from processing.calibration.known_sample import Part, part_of
 from processing.calibration.train import fit_trains
 from processing.commands.application import app
 from processing.instrument.model import InstrumentModel
@@ -85,3 +85,13 @@ def test_command_writes_all_wavelengths(captures, configs, tmp_path):
         assert fitted.retardance_deg - old.retardance_deg == pytest.approx(first, abs=0.1)
     # What no capture told is as it was.
     assert InstrumentModel.load(new).at(524).generator[1] == InstrumentModel.load(file).at(524).generator[1]
+
+
+def test_a_source_that_flickers_does_not_move_the_values_of_two_channels(configs):
+    """One throughput for all states would turn a flicker of 20 % into degrees."""
+    model = InstrumentModel.load(configs / "instruments/drr_wollaston.yaml").at(662)
+    true = model.with_values({"psg_retarder": {"azimuth_deg": 3.0}, "psa_retarder": {"retardance_deg": 94.0}})
+    angles, random = {"psg": 4.0 * np.arange(46)}, np.random.default_rng(1)
+    signal = true.rows(angles) @ np.eye(4).reshape(16) * random.uniform(0.8, 1.2, (46, 1))
+    (found,) = fit_trains([Part(model, angles, signal, np.eye(4))], ["psg_retarder.azimuth_deg", FREE[2]])
+    assert found.values == pytest.approx([3.0, 94.0], abs=1e-5)

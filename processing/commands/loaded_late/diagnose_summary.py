@@ -50,9 +50,12 @@ def show(d: Diagnosis, details: bool = False, written: bool = False) -> None:
         line = f"  {one}  {c.name}" + (f", {c.wavelength_nm:g} nm" if c.wavelength_nm else "")
         if short and c.error_before is not None and c.error_after is not None:
             line += f": {c.error_before.told} -> {c.error_after.told}"
+        if c.source_percent is not None:
+            line += f"; level of the source projected out, it varies by {c.source_percent:.2g} %"
         typer.echo(line)
-    if d.wiring is not None:
-        _say(short, f"first of all: {d.wiring}")
+    for head, text in (("first of all", d.wiring), ("not determined", d.branch)):
+        if text is not None:
+            _say(short, f"{head}: {text}")
     for line in d.noise.told if d.noise is not None else ():
         _say(short, f"the noise is not what is declared: {line}")
     for left_out in d.left_out:

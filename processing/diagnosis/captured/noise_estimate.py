@@ -14,6 +14,8 @@ from processing.diagnosis.search.rules import FEW_ROWS, LEAST_SCATTER
 COMPONENTS = 16
 #: [pixels] That are looked at.
 PIXELS = 20_000
+#: [of the mean variance] Least variance without light.
+LEAST_FLOOR = 0.01
 #: [levels] Of the signal at which their scatter is told.
 LEVELS = 24
 
@@ -47,15 +49,16 @@ def estimated_noise(data: CaptureData) -> CaptureData:
     (slope, floor), _ = nnls(
         np.stack([np.maximum(mean, 0), np.ones(LEVELS)], axis=1) * weight[:, None], variance * weight
     )
+    # Counts of zero have a noise all the same: where the line leads to none, they would weigh as much as they like.
+    floor = max(floor, LEAST_FLOOR * float(np.mean(square)), 1e-12)
     # Weighted as it will be used, the scatter must come out as one.
-    predicted = slope * np.maximum(signal, 0) + max(floor, 1e-12)
-    correction = float(np.mean(square / predicted))
+    correction = float(np.mean(square / (slope * np.maximum(signal, 0) + floor)))
     slope, floor = slope * correction, floor * correction
     n = data.signal.shape[0]
     return replace(
         data,
         slope=np.full(n, slope),
-        floor=np.full(n, max(floor, 1e-12)),
+        floor=np.full(n, floor),
         noise_known=True,
         noise_estimated=True,
         noise_source="estimated from the scatter over pixels that is left after the leading components of the states",

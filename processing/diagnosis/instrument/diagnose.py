@@ -50,9 +50,11 @@ class Judged:
     """The diagnosis, the correction before and after, and the residuals of both for the report.
 
     `explained` is the residual with all causes that were found, also where the correction is refused.
+    `problem` is what they are the answer to: on the branch nearest to the instrument file, without a mistake of wiring.
     """
 
     diagnosis: Diagnosis
+    problem: InstrumentProblem
     found: Solution
     before: tuple[Residual, ...]
     after: tuple[Residual, ...]
@@ -156,10 +158,11 @@ def _told(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring: 
         simulated=any(c.simulated for c in problem.captures),
         correction=correction(problem, found, solved, any_cause, judgement, lasting, kept),
         wiring=judgement.first,
+        branch=used.bench.branch,
         left_out=not_measured(problem),
         noise=noise_report(problem),
     )
-    return Judged(diagnosis, kept, used.before, used.after if kept is solved else used.before, used.after)
+    return Judged(diagnosis, problem, kept, used.before, used.after if kept is solved else used.before, used.after)
 
 
 def _unexplained(used: Outcome, names: Names) -> Unexplained:

@@ -33,8 +33,7 @@ def mueller_slopes(
         changes = problem.changes(k, mine, own)
         columns = partial(_all_columns, problem, k)
         w, c = columns(changes), problem.coefficients(k, changes)
-        u, size, vt = np.linalg.svd(w * moments.counts[:, None], full_matrices=False)
-        u, size, vt = u[:, size > RANK * size[0]], size[size > RANK * size[0]], vt[size > RANK * size[0]]
+        u, size, vt = _decomposed(w * moments.counts[:, None])
         dw, dc = problem.slopes(k, mine, own, w, columns), problem.slopes_of_counts(k, mine, own, c)
         scale = 1 / moments.sigma[:, None]
         for block in moments.blocks[:: problem.folds if moments.tiles is None else 1]:
@@ -44,6 +43,10 @@ def mueller_slopes(
             unknown = left[k] ** 2 * block.pixels / max(float(m00 @ m00), 1e-300)
             back = (vt.T * (size / (size**2 + unknown))) @ u.T
             m = back @ y
+            if problem.has_free_level(k):
+                # A reduction projects the level of each state out: a common factor of its channels moves no element.
+                u1, size1, vt1 = _decomposed(_without_levels(w * moments.counts[:, None], m, problem.channels(k)))
+                back = (vt1.T * (size1 / (size1**2 + unknown))) @ u1.T
             slopes = -np.einsum("el,klm,mr->ker", back, dw, m, optimize=True)
             for j in np.flatnonzero(np.any(dc, axis=(1, 2))):
                 slopes[j] += back @ (np.einsum("fl,flr->lr", dc[j], block.z) * scale)
@@ -53,6 +56,21 @@ def mueller_slopes(
                 products[element][np.ix_(acting.index, acting.index)] += acting.spread_products(of_all @ of_all.T)
             light += bright
     return products, light
+
+
+def _decomposed(w: Array) -> tuple[Array, Array, Array]:
+    """Singular value decomposition of rows (L, 16), of what they determine."""
+    u, size, vt = np.linalg.svd(w, full_matrices=False)
+    keep = size > RANK * size[0]
+    return u[:, keep], size[keep], vt[keep]
+
+
+def _without_levels(w: Array, m: Array, channels: int) -> Array:
+    """Rows (L, 16) without what a factor of each state does to the signal of Mueller matrices m (16, R)."""
+    signal = (w @ np.linalg.svd(m, full_matrices=False)[0][:, 0]).reshape(-1, channels, 1)
+    rows = w.reshape(*signal.shape[:2], -1)
+    common = np.sum(signal * rows, axis=1, keepdims=True) / np.maximum(np.sum(signal**2, axis=1, keepdims=True), 1e-300)
+    return np.asarray((rows - signal * common).reshape(w.shape))
 
 
 def _all_columns(problem: InstrumentProblem, k: int, changes: Changes) -> Array:

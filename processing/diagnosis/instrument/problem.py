@@ -10,6 +10,7 @@ of the counts.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import partial
 
@@ -30,7 +31,7 @@ from processing.diagnosis.instrument.tile_rows import tile_columns
 from processing.diagnosis.instrument.tile_slopes import slopes_of_tiles
 from processing.diagnosis.instrument.tile_sums import add_tiles
 from processing.diagnosis.instrument.undone import distance, exactly_undone, movable, undoing
-from processing.diagnosis.search.candidate import Candidate, nominal_values, pool
+from processing.diagnosis.search.candidate import Candidate, SourceLevel, nominal_values, pool
 from processing.diagnosis.search.range_of import range_of
 from processing.diagnosis.search.rules import ENOUGH_SOUND, EXACT
 from processing.diagnosis.search.space import Space, Sums
@@ -96,14 +97,27 @@ class InstrumentProblem:
         known = any(c.sample is not None for c in self.captures)
         return nominal_values(self.model, self.captures[0].conditions, self.wavelengths_nm) if known else ()
 
-    def pool(self) -> tuple[Candidate, ...]:
-        """Every effect at every place of the captures."""
-        found = pool(self.model, [c.conditions for c in self.captures], self.wavelengths_nm)
-        return tuple(c for c in found if not (isinstance(c.effect, LevelEffect) and self._is_projected_out(c)))
+    def levels(self) -> tuple[Candidate, ...]:
+        """Levels of the sources that several channels see, where the sample is unknown; else they are projected out."""
+        effect = SourceLevel()
+        return tuple(
+            Candidate(effect, "", effect.parameters(self.models[k], data.conditions, ""), k)
+            for k, data in enumerate(self.captures)
+            if self.has_free_level(k) and data.sample is None
+        )
 
-    def _is_projected_out(self, level: Candidate) -> bool:
-        """Whether every source that it acts on has a free level, which takes it up."""
-        return all(self._free_source(k) for k, nm in enumerate(self.wavelengths_nm) if level.acts(k, nm))
+    def has_free_level(self, capture: int) -> bool:
+        """Whether the source has a level of its own in each state of a capture, which its channels tell."""
+        return self.models[capture].projects_source and self.captures[capture].conditions.states > 1
+
+    def pool(self) -> tuple[Candidate, ...]:
+        """Every effect at every place of the captures, without those that a free level of the source takes up."""
+        found = pool(self.model, [c.conditions for c in self.captures], self.wavelengths_nm)
+
+        def is_taken_up(level: Candidate) -> bool:
+            return all(self.has_free_level(k) for k, nm in enumerate(self.wavelengths_nm) if level.acts(k, nm))
+
+        return tuple(c for c in found if not (isinstance(c.effect, LevelEffect) and is_taken_up(c)))
 
     def powers(self) -> list[tuple[int, Array]]:
         """Rows that the unknowns leave over, and the power of each component of the signal, for each capture."""
@@ -169,6 +183,13 @@ class InstrumentProblem:
         """Drop what was built for another model or other states; the moments of the counts stay."""
         self._others = []
         self._built = [{} for _ in self.captures]
+
+    def with_models(self, models: Sequence[InstrumentModel]) -> InstrumentProblem:
+        """The same captures against other models of the same instrument."""
+        out = copy(self)
+        out.models, out.model = tuple(models), models[0]
+        out.forget_linearizations()
+        return out
 
     def undivided(self) -> InstrumentProblem:
         """The same with nothing held out: one set of unknowns for all states, not one for each part of them."""
@@ -256,12 +277,21 @@ class InstrumentProblem:
         a = w if data.sample is None else (w @ data.sample)[:, None]
         return np.asarray(a / self.moments[capture].sigma[:, None])
 
+    def channels(self, capture: int) -> int:
+        """Channels of the detector."""
+        return len(self.captures[capture].conditions.channels)
+
+    def predicted(self, capture: int, changes: Changes) -> Array:
+        """Intensities (N, channels) of a capture of a known sample, for a throughput of one and a steady source."""
+        rows = self._columns_of_one_source(capture, changes) * self.moments[capture].sigma[:, None]
+        return rows.reshape(self.captures[capture].signal.shape[:2])
+
     def _free_source(self, capture: int) -> bool:
-        return self.models[capture].free_source and self.captures[capture].sample is not None
+        return self.has_free_level(capture) and self.captures[capture].sample is not None
 
     def _rows_apart(self, capture: int) -> int | None:
         """How many rows a state has, where each has unknowns of its own."""
-        return len(self.captures[capture].conditions.channels) if self._free_source(capture) else None
+        return self.channels(capture) if self._free_source(capture) else None
 
     def coefficients(self, capture: int, changes: Changes) -> Array:
         """Coefficient of every feature (F, L) in the corrected counts."""

@@ -47,5 +47,5 @@ def diagnose_captures(
         with Capture(path) as capture:
             models.append(model.nominal_at(capture.header.wavelength_nm))
             data.append(screened(read_capture(capture, models[-1]), models[-1], say))
-    problem = InstrumentProblem(models, data)
-    return diagnose(problem, say, model), problem
+    judged = diagnose(InstrumentProblem(models, data), say, model)
+    return judged, judged.problem

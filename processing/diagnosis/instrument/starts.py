@@ -29,8 +29,8 @@ def first_values(problem: InstrumentProblem, base: Space, pool: Sequence[Candida
     if fit.rms < (NEAR_ENOUGH if several else FAR_OFF):
         return _by_candidate(base, fit.values)
     say("far off: searching from many starts")
-    if not base.size:
-        return _far(problem, pool, fit)
+    if not any(isinstance(c.effect, NominalValue) for c in base.candidates):
+        return _far(problem, pool, base, fit)
     if not several:
         return _searched(problem, base, pool, fit)
     found = along_wavelengths(problem, base, say)
@@ -101,13 +101,14 @@ def _anywhere(candidate: Candidate) -> bool:
     return isinstance(candidate.effect, NominalValue) and candidate.parameters[0].typical >= NEAR_DEG
 
 
-def _far(problem: InstrumentProblem, pool: Sequence[Candidate], fit: Fit) -> Values:
-    best, out = LESS_FROM_AFAR * fit.excess, {}
+def _far(problem: InstrumentProblem, pool: Sequence[Candidate], base: Space, fit: Fit) -> Values:
+    best, out = LESS_FROM_AFAR * fit.excess, _by_candidate(base, fit.values)
     for candidate in pool:
+        space = Space((*base.candidates, candidate))
         for start in candidate.starts:
-            tried = minimize(problem, Space((candidate,)), start)
+            tried = minimize(problem, space, np.concatenate([fit.values, start]))
             if tried.excess < best:
-                best, out = tried.excess, {candidate: tried.values}
+                best, out = tried.excess, _by_candidate(space, tried.values)
     return out
 
 

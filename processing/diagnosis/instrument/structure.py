@@ -111,8 +111,9 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     around = _around(signal)
     signal[:, ~used], free[:, ~used] = 0.0, 0.0
     expected = free
+    per_scale = np.where(used, 1 / np.where(used, pixels.scale, 1.0), 0.0)
     for row, of_row in enumerate(expected):
-        of_row *= pixels.variance_of(row) / level[row] ** 2 / np.maximum(pixels.scale, 1e-300)
+        of_row *= pixels.variance_of(row) / level[row] ** 2 * per_scale
     good = np.asarray(np.isfinite(r).all(axis=0))
     images = Images(r, around, expected, good)
     alike = _alike(data)

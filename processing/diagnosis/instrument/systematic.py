@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from processing.arrays import Array
 from processing.diagnosis.instrument.mueller_slopes import mueller_slopes
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.candidate import Candidate, SourceLevel
 from processing.diagnosis.search.odds import MOST_ODDS
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import MOST_STORED, SMALL_PART, STORED_SHARE, TAKES_PART, UNSEEN
@@ -125,7 +125,8 @@ def _unseen(found: Posterior) -> Array:
 
 def _takes_part(found: Posterior, k: int) -> bool:
     candidate = found.space.candidates[k]
-    if isinstance(candidate.effect, FieldEffect | Switch):
+    # Levels of a source are projected out by each reduction, which carries their errors itself.
+    if isinstance(candidate.effect, FieldEffect | Switch | SourceLevel):
         return False
     if not candidate.state_chosen:
         return True

@@ -12,7 +12,7 @@ from processing.diagnosis.instrument.doubts import PART_OF_LEFT
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.structure import Residual
 from processing.diagnosis.instrument.systematic import Uncertain, systematic_error
-from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.candidate import Candidate, SourceLevel
 from processing.diagnosis.search.causes import Answer, Cause, shown
 from processing.diagnosis.search.evidence import information
 from processing.diagnosis.search.fit import Fit, HeldOut
@@ -198,7 +198,7 @@ def correction(
                 )
             )
     # Values that are merely nominal are nowhere near what is true.
-    known = judgement.refused is None or not solved.base.size
+    known = judgement.refused is None or not any(c.place for c in solved.base.candidates)
     uncertain = systematic_error(problem, found, used) if known else None
     return Correction(
         effects=tuple(effects),
@@ -231,7 +231,8 @@ def calibrated(problem: InstrumentProblem, found: Posterior, solved: Solution) -
     """Nominal values as fitted: one number, or one for each wavelength where they differ."""
     part = dict(zip(found.space.candidates, found.space.slices, strict=True))
     values: dict[str, dict[float, tuple[float, float]]] = {}
-    for candidate, where in zip(solved.base.candidates, solved.base.slices, strict=True):
+    nominal = {c: p for c, p in zip(solved.base.candidates, solved.base.slices, strict=True) if c.place}
+    for candidate, where in nominal.items():
         covariance = found.covariance[part[candidate], part[candidate]]
         for one, (fitted,), ((variance,),) in by_wavelength(candidate, solved.fit.values[where], covariance):
             for model, wavelength in zip(problem.models, problem.wavelengths_nm, strict=True):
@@ -239,7 +240,7 @@ def calibrated(problem: InstrumentProblem, found: Posterior, solved: Solution) -
                     start = float(model.value_of(candidate.place))  # type: ignore[arg-type]
                     value = start + float(fitted), float(np.sqrt(max(variance, 0.0)))
                     values.setdefault(candidate.place, {})[wavelength] = value
-    unit = {c.place: c.parameters[0].unit for c in solved.base.candidates}
+    unit = {c.place: c.parameters[0].unit for c in nominal}
     return {place: _by_wavelength(each, unit[place]) for place, each in values.items()}
 
 
@@ -307,6 +308,7 @@ def capture_report(
         dark_fraction=data.dark_fraction,
         steep_fraction=0.0 if data.steep is None else float(data.steep.mean()),
         cut_off=data.cut_off,
+        source_percent=_source_percent(problem, k, solved),
         wavelength_nm=data.wavelength_nm,
         error_before=error(problem, solved.undone, solved.before.of(k), k),
         error_after=error(problem, solved, solved.after.of(k), k),
@@ -315,6 +317,21 @@ def capture_report(
         closure_before_percent=closure(problem, k, solved.base, solved.before_fit.values),
         closure_after_percent=closure(problem, k, solved.space, solved.fit.values),
     )
+
+
+def _source_percent(problem: InstrumentProblem, k: int, solved: Solution) -> float | None:
+    """Standard deviation of the level of the source over the states, where channels tell it."""
+    if not problem.has_free_level(k):
+        return None
+    found = dict(zip(solved.space.candidates, solved.space.slices, strict=True))
+    own = [p for c, p in found.items() if isinstance(c.effect, SourceLevel) and c.capture == k]
+    level = 1 + solved.fit.values[own[0]] if own else None
+    if level is None:
+        data, mine = problem.captures[k], solved.space.acting(k, problem.wavelengths_nm[k])
+        seen = problem.predicted(k, problem.changes(k, mine.space, mine.of(solved.fit.values)))
+        measured = data.signal[:, :, data.usable].mean(axis=2, dtype=float)
+        level = np.sum(measured * seen, axis=1) / np.sum(seen**2, axis=1)
+    return 100 * float(np.std(level) / np.mean(level))
 
 
 def not_measured(problem: InstrumentProblem) -> tuple[NotMeasured, ...]:

@@ -7,6 +7,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from processing.arrays import Array
+from processing.diagnosis.instrument.branches import nearest_branch
 from processing.diagnosis.instrument.features import MARGIN
 from processing.diagnosis.instrument.noise_of_light import scatter_prefers
 from processing.diagnosis.instrument.problem import InstrumentProblem
@@ -40,6 +41,8 @@ from processing.instrument.effects.base import (
     Switch,
     ValuePerState,
 )
+from processing.instrument.elements import number
+from processing.instrument.model import InstrumentModel
 from processing.storage.capture import CaptureError
 
 #: [times] That the noise is taken from a first look at the counts before anything is weighed.
@@ -63,7 +66,7 @@ class WholeBench:
     def __init__(self, problem: InstrumentProblem, say: Say) -> None:
         self.problem, self.say = problem, say
         self.whole = problem.undivided() if problem.holds_out_states else problem
-        self.base = Space(problem.nominal())
+        self.base = Space((*problem.nominal(), *problem.levels()))
         self.pool = problem.pool()
         self._free = [c.values_per_pixel - self._unknowns(k) for k, c in enumerate(self.whole.captures)]
         if max(self._free) <= 0:
@@ -72,12 +75,35 @@ class WholeBench:
                 f"{most} intensities of a pixel are no more than what is unknown of it: nothing is left over that "
                 "could speak against the model. Take more states than the sample has unknowns, or a known sample."
             )
-        self._start = first_values(self.whole, self.base, self.pool, say)
+        branch = nearest_branch(self.whole, first_values(self.whole, self.base, self.pool, say))
+        self._start, self.branch = branch.values, branch.told
+        self._linearize_there()
+
+    def _linearize_there(self) -> None:
+        """Take the azimuths found for those of the model: a prior about far ones would widen with their distance."""
+        azimuths = [c for c in self._start if c in self.base.candidates and c.place.endswith("azimuth_deg")]
+        space = Space(tuple(azimuths))
+        values = np.concatenate([np.zeros(0), *(self._start[c] for c in azimuths)])
+
+        def there(k: int, model: InstrumentModel) -> InstrumentModel:
+            acting = space.acting(k, self.whole.wavelengths_nm[k])
+            shifts = zip(acting.space.candidates, acting.of(values), strict=True)
+            new: dict[str, dict[str, float]] = {}
+            for candidate, shift in shifts:
+                nominal = number(model.value_of(candidate.place) or 0.0)
+                new.setdefault(candidate.place.rpartition(".")[0], {})["azimuth_deg"] = nominal + float(shift)
+            return model.with_values(new)
+
+        models = [there(k, model) for k, model in enumerate(self.whole.models)]
+        same = self.problem is self.whole
+        self.whole = self.whole.with_models(models)
+        self.problem = self.whole if same else self.problem.with_models(models)
+        self._start |= {c: np.zeros(c.size) for c in azimuths}
 
     @property
     def train_is_off(self) -> bool:
         """Nominal values, of one wavelength, none of which fit, whatever the source and the channels do beside them."""
-        if not self.base.size or len(set(self.whole.wavelengths_nm)) > 1:
+        if not self.problem.nominal() or len(set(self.whole.wavelengths_nm)) > 1:
             return False
         # With one channel a value for each state takes up any mistake.
         beside = len(self.whole.model.channels) > 1
@@ -232,7 +258,7 @@ class WholeBench:
         for data in (self.whole.captures[k] for k in captures):
             if self.whole.noise_known and data.usable.sum() > 1:
                 return True
-            told += len(self.whole.model.channels) - (self.whole.model.free_source and data.sample is not None)
+            told += len(self.whole.model.channels) - (self.whole.model.projects_source and data.sample is not None)
         return sum(self._seen_by(c) <= captures for c in values) < told
 
     def _posterior(

@@ -146,11 +146,7 @@ def _turned_mosaics(problem: InstrumentProblem) -> Iterator[Wiring]:
 
 
 def _changed(problem: InstrumentProblem, change: Callable[[InstrumentModel], InstrumentModel]) -> InstrumentProblem:
-    out = copy.copy(problem)
-    out.models = tuple(change(m) for m in problem.models)
-    out.model = out.models[0]
-    out.forget_linearizations()
-    return out
+    return problem.with_models([change(m) for m in problem.models])
 
 
 def _with_values(problem: InstrumentProblem, updates: Mapping[str, Mapping[str, Any]]) -> InstrumentProblem:

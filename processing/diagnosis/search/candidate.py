@@ -16,6 +16,7 @@ from processing.errors import ProcessError
 from processing.instrument.applied_effects import instrument_effects
 from processing.instrument.changes import Changes, Conditions
 from processing.instrument.effects.base import FromAState, FromFileOnly, InstrumentEffect
+from processing.instrument.effects.source_flicker import SourceFlicker
 from processing.instrument.model import Belongs, InstrumentModel
 from processing.instrument.nominal import FIELDS, KIND, shift_nominal
 
@@ -162,6 +163,15 @@ class NominalValue(InstrumentEffect):
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         shift_nominal(changes, model, place, values[0])
+
+
+class SourceLevel(SourceFlicker):
+    """The level of a source that several channels see, in each state of a capture: always there, and no fault."""
+
+    kind = "source_level"
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return tuple(replace(p, lower=-MOST_LOST, upper=np.inf) for p in super().parameters(model, conditions, place))
 
 
 def nominal_values(

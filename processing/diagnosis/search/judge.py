@@ -55,7 +55,7 @@ class Judgement:
 
     def kept(self, solved: Solution, any_cause: bool) -> Solution:
         """What is applied: a solution that holds, if there is anything in it; else nothing."""
-        holds = self.refused is None and (any_cause or bool(solved.base.size))
+        holds = self.refused is None and (any_cause or any(c.place for c in solved.base.candidates))
         return solved if holds else solved.undone
 
 

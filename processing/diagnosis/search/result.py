@@ -239,6 +239,7 @@ class CaptureReport(_Part):
     dark_fraction: float = 0.0
     steep_fraction: float = 0.0
     cut_off: tuple[int, ...] = ()
+    source_percent: float | None = None
     tests_before: dict[str, float]
     tests_after: dict[str, float]
     wavelength_nm: float | None = None
@@ -309,6 +310,7 @@ class Diagnosis(_Part):
     simulated: bool
     correction: Correction | None = None
     wiring: str | None = None
+    branch: str | None = None
     left_out: tuple[NotMeasured, ...] = ()
     noise: NoiseReport | None = None
 

@@ -33,6 +33,7 @@ class Inversion:
     null : (N - R, N) orthonormal rows that see only what W cannot explain: the residual, without forming the fit.
     condition_number : largest over smallest singular value, of what is determined.
     basis : (K, R) what the instrument can determine; R = K unless it is a partial polarimeter.
+    spent : numbers that all pixels together were fitted with (levels of the source), over the pixels.
     """
 
     w: NDArray[np.float64]
@@ -40,9 +41,12 @@ class Inversion:
     null: NDArray[np.float64]
     condition_number: float
     basis: NDArray[np.float64]
+    spent: float = 0.0
 
     @classmethod
-    def of(cls, w: NDArray[np.float64], what: str = "", basis: NDArray[np.float64] | None = None) -> Inversion:
+    def of(
+        cls, w: NDArray[np.float64], what: str = "", basis: NDArray[np.float64] | None = None, spent: float = 0.0
+    ) -> Inversion:
         """Invert a measurement matrix (N, 16); `basis` (16, R) is what the instrument can determine, default all.
 
         Raises
@@ -58,7 +62,7 @@ class Inversion:
         u, size, _ = np.linalg.svd(seen, full_matrices=True)
         pinv = basis @ np.linalg.pinv(seen)
         null = np.array(u[:, basis.shape[1] :].T, dtype=float)
-        return cls(w, np.asarray(pinv, dtype=float), null, float(size[0] / size[-1]), basis)
+        return cls(w, np.asarray(pinv, dtype=float), null, float(size[0] / size[-1]), basis, spent)
 
     @property
     def rank(self) -> int:
@@ -69,6 +73,11 @@ class Inversion:
     def degrees_of_freedom(self) -> int:
         """States minus unknowns."""
         return int(self.null.shape[0])
+
+    @property
+    def free(self) -> float:
+        """Degrees of freedom of the residual of a pixel."""
+        return self.degrees_of_freedom - self.spent
 
     @property
     def unit_covariance(self) -> NDArray[np.float64]:

@@ -75,7 +75,7 @@ class MuellerSolver:
         return out
 
     def _range(self, frames: NDArray[Any], start: int, stop: int, out: dict[str, NDArray[Any]]) -> None:
-        n, dof = self.inversion.w.shape[0], self.inversion.degrees_of_freedom
+        n, dof, free = self.inversion.w.shape[0], self.inversion.degrees_of_freedom, self.inversion.free
         square = self.first_square
         tile = np.empty((*frames.shape[:2], TILE), np.float32)
         product = np.empty((len(self.stack), TILE), np.float32)
@@ -88,13 +88,13 @@ class MuellerSolver:
             rss = np.einsum("np,np->p", result[16:square], result[16:square])
             out["residual_rms"][a:b] = np.sqrt(rss / n)
             if self.noise is None:
-                sigma = np.sqrt(rss / dof) if dof else np.full(b - a, np.nan, np.float32)
+                sigma = np.sqrt(rss / free) if dof else np.full(b - a, np.nan, np.float32)
                 out["mueller_errors"][:, a:b] = self.unit_sigma[:, None] * sigma
                 continue
             variance = self._variance(part, gain, result[square:], self.noise)
             np.sqrt(variance[:16], out=out["mueller_errors"][:, a:b])
             if dof:
-                out["reduced_chi_square"][a:b] = rss / variance[16]
+                out["reduced_chi_square"][a:b] = rss / variance[16] * (dof / free)
 
     def _variance(
         self,
@@ -139,7 +139,7 @@ def solve_with_the_sound(
         y = signal.reshape(n, -1).T.astype(float)
         m = np.einsum("pin,pn->pi", solve, y)
         residual = (y - m @ solver.inversion.w.T) * keep
-        free = np.maximum(keep.sum(axis=1) - rank, 0)
+        free = np.maximum(keep.sum(axis=1) - rank - solver.inversion.spent, 0)
         rss = np.sum(residual**2, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             if solver.noise is None:

@@ -91,7 +91,12 @@ class WeightedSolver:
             chi_square = np.einsum("np,np->p", weight, residual**2)
             squares = np.einsum("np,np->p", weight > 0, residual**2)
             rank = self.inversion.rank
-            expected = kept - rank + self._add_black(covariance, weight.reshape(-1, channels, b - a), gain)
+            expected = (
+                kept
+                - rank
+                - self.inversion.spent
+                + self._add_black(covariance, weight.reshape(-1, channels, b - a), gain)
+            )
             step, covariance = self._in_elements(step, covariance)
             found["mueller"][:, a:b] += step
             with np.errstate(divide="ignore", invalid="ignore"):

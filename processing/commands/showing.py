@@ -1,0 +1,37 @@
+"""`process show`: what the values of an instrument file do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    app.command("show")(show_command)
+
+
+def show_command(
+    instrument: Annotated[Path, typer.Argument(help="Instrument file, as `diagnose --write` makes it.")],
+    wavelength_nm: Annotated[
+        float | None, typer.Option(help="Wavelength at which the change of M is taken; default: the file's first.")
+    ] = None,
+) -> None:
+    """List what `diagnose` found: values, standard errors, the captures they hold for, and their change of M."""
+    from processing.instrument.influence import influences
+    from processing.instrument.model import InstrumentModel
+
+    model = InstrumentModel.load(instrument)
+    found = influences(model, wavelength_nm)
+    if not found:
+        typer.echo(f"{instrument}: no value of `diagnose`. Write some: diagnose CAPTURE --write NEW.yaml")
+    for one in found:
+        change = "its change of M depends on the capture"
+        if one.change is not None:
+            change = f"changes M/m00 of air by {one.change:.2g} rms{', each standard error' if one.fitted else ''}"
+        typer.echo(f"{one.name}: {one.value}")
+        typer.echo(f"  {one.scope}; {change}")
+    for error in model.systematic:
+        typer.echo(f"still uncertain: M/m00 by {error.rms_over_m00:.2g} rms, in {len(error.directions)} directions")

@@ -1,0 +1,146 @@
+"""What each value that `diagnose` wrote into an instrument file does to a Mueller matrix."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from processing.arrays import Array
+from processing.effect import EffectError
+from processing.instrument.applied_effects import changes_of, instrument_effects
+from processing.instrument.changes import Conditions
+from processing.instrument.determined import determined_basis
+from processing.instrument.effects.base import CountsEffect
+from processing.instrument.elements import Dispersive, number
+from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
+from processing.instrument.nominal import KIND
+
+#: States at which an effect is looked at where no capture is given: enough for all unknowns, without regularity.
+STATES = 61
+
+
+@dataclass(frozen=True)
+class Influence:
+    """One line about a file.
+
+    Attributes
+    ----------
+    name, value : what it is, and its number with its standard error.
+    scope : which captures it holds for.
+    change : rms over the elements of M/m00 of air by which it changes M; None where that depends on the capture.
+    fitted : a value of the train; `change` is that of one standard error of it.
+    """
+
+    name: str
+    value: str
+    scope: str
+    change: float | None
+    fitted: bool = False
+
+
+def influences(
+    model: InstrumentModel, wavelength_nm: float | None = None, conditions: Conditions | None = None
+) -> list[Influence]:
+    """All values that `diagnose` wrote, in the order of the file.
+
+    Parameters
+    ----------
+    wavelength_nm : at which the change of M is taken; default: the first of the file.
+    conditions : states of a capture; default: states of no regularity.
+
+    Raises
+    ------
+    WavelengthError : the file has no values at this wavelength.
+    """
+    nm = wavelength_nm or (model.wavelengths_nm or (0.0,))[0]
+    at = model.at(nm)
+    where = conditions or _some_states(at, STATES)
+    out = []
+    for name, stderr in model.stderr.items():
+        step = at.stderr.get(name, 0.0)
+        shift = AppliedEffect(
+            kind=KIND, element=name, parameters={"shift": EffectParameter(value=number(step), unit="")}
+        )
+        change = _change(at, (*at.effects, shift), at.effects, where)
+        value = _numbers(model.value_of(name), stderr)
+        out.append(Influence(name, value, "later captures, all wavelengths", change, fitted=True))
+    for effect in model.effects:
+        out.append(Influence(_name(effect), _values(effect), _scope(effect), _change_by(at, effect, nm, where)))
+    return out
+
+
+def _change_by(model: InstrumentModel, effect: AppliedEffect, nm: float, where: Conditions) -> float | None:
+    elsewhere = effect.wavelength_nm is not None and abs(effect.wavelength_nm - nm) >= 0.5
+    if elsewhere or isinstance(instrument_effects().get(effect.kind), CountsEffect):
+        return None
+    here = effect.model_copy(update={"scope": "instrument"})
+    others = tuple(e for e in model.effects if e != effect and e.scope == "instrument")
+    return _change(model, (*others, here), others, where)
+
+
+def _change(
+    model: InstrumentModel, first: Sequence[AppliedEffect], second: Sequence[AppliedEffect], where: Conditions
+) -> float | None:
+    """Rms over the elements of M/m00 of air by which two lists of effects differ."""
+    basis = determined_basis(model)
+    try:
+        rows = [_rows(model, tuple(effects), where) for effects in (first, second)]
+    except (EffectError, ValueError):
+        # A value for each state of another capture.
+        return None
+    air = np.eye(4).reshape(16)
+    if model.projects_source:
+        signal = [w @ air for w in rows]
+        level = np.sum(signal[0] * signal[1], axis=1) / np.sum(signal[1] ** 2, axis=1)
+        rows[1] = rows[1] * level[:, None, None]
+    new, old = (w.reshape(-1, 16) @ basis for w in rows)
+    moved = basis @ (np.linalg.pinv(old) @ (new @ basis.T @ air)) - basis @ (basis.T @ air)
+    scale = float((basis @ basis.T @ air)[0])
+    moved = moved - moved[0] * (basis @ basis.T @ air) / scale
+    return float(np.sqrt(np.sum(moved**2) / max(basis.shape[1] - 1, 1)) / scale)
+
+
+def _rows(model: InstrumentModel, effects: tuple[AppliedEffect, ...], where: Conditions) -> Array:
+    other = model.model_copy(update={"effects": effects})
+    changes = changes_of(other, where)
+    return other.rows(where.angles_deg, changes)
+
+
+def _some_states(model: InstrumentModel, states: int) -> Conditions:
+    random = np.random.default_rng(0)
+    angles = {axis: random.uniform(0, 360, states) for axis in model.axes or ("none",)}
+    return Conditions.of(angles, tuple(c.name for c in model.channels))
+
+
+def _name(effect: AppliedEffect) -> str:
+    at = "" if effect.wavelength_nm is None else f" at {effect.wavelength_nm:g} nm"
+    return effect.kind + (f"[{effect.element}]" if effect.element else "") + at
+
+
+def _values(effect: AppliedEffect) -> str:
+    def one(name: str, p: EffectParameter) -> str:
+        return f"{name} {p.told}" + ("" if p.unit in ("1", "") else f" {p.unit}")
+
+    return ", ".join(one(name, p) for name, p in effect.parameters.items())
+
+
+def _scope(effect: AppliedEffect) -> str:
+    wavelengths = "all wavelengths" if effect.wavelength_nm is None else "this wavelength"
+    if effect.scope == "instrument":
+        return f"later captures, {wavelengths}"
+    return f"{' and '.join(effect.captures)} alone, {wavelengths}"
+
+
+def _numbers(value: Dispersive | None, stderr: Dispersive) -> str:
+    def at(of: Dispersive | None, nm: float) -> float:
+        return of.get(nm, 0.0) if isinstance(of, dict) else of or 0.0
+
+    given = sorted({nm for of in (value, stderr) if isinstance(of, dict) for nm in of})
+    told = [
+        (EffectParameter(value=at(value, nm), stderr=at(stderr, nm), unit="").told, f" at {nm:g} nm") for nm in given
+    ]
+    if not given:
+        told = [(EffectParameter(value=at(value, 0.0), stderr=at(stderr, 0.0), unit="").told, "")]
+    return ", ".join(number + where for number, where in told)
