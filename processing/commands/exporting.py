@@ -30,9 +30,15 @@ def export_command(
     from processing.export import export
     from processing.export.figure import FIGURES
     from processing.reflectance.tables import is_table
-    from processing.storage.product import is_product
+    from processing.storage.product import Product, is_product
 
-    inputs = files_of(sources, lambda path: is_product(path) or (to not in FIGURES and is_table(path)), "products")
+    def takes(path: Path) -> bool:
+        if not is_product(path):
+            return to not in FIGURES and is_table(path)
+        with Product(path) as product:
+            return set(plane or ()) <= set(product.names)
+
+    inputs = files_of(sources, takes, f"products with {', '.join(plane)}" if plane else "products")
     place = place_for(inputs, out)
 
     def make(source: Path, _: object) -> Made:

@@ -180,3 +180,14 @@ def test_colours_twice(synthetic_capture, process, tmp_path):
     for result in ("made", "unchanged"):
         code, out, _ = process("colours", tmp_path)
         assert (code, results(out)) == (0, [(result, "a.red.h5"), (result, "b.red.h5")])
+
+
+def test_of_a_folder_the_products_with_a_plane_are_exported(lab, process):
+    process("xi0", lab / "one_2.h5", "--no-figure")
+    code, out, _ = process("export", lab, "--to", "csv", "--plane", "xi0")
+    assert (code, [Path(line).name for line in out]) == (0, ["one_2.xi0.csv"])
+    code, _, err = process("export", lab, "--to", "csv", "--plane", "nothing")
+    assert (code, err) == (
+        2,
+        [f"error: {lab} holds no products with nothing. Give files, or the folder that they are in."],
+    )
