@@ -11,7 +11,7 @@ from drivers import genicam
 from drivers.acquisition_status import AcquisitionStatus
 from drivers.aravis_library import interface_of
 from drivers.camera import CameraSettings
-from drivers.errors import CameraError, SettingRefused
+from drivers.errors import CameraError, CameraLost, SettingRefused
 from drivers.exposure_and_gain import RATE_CONTROL, ExposureAndGain
 from drivers.genicam import Features
 from drivers.neutral_features import NeutralFeatures
@@ -195,10 +195,7 @@ class Setup:
         if settings.pixel_format is not None:
             self._set_pixel_format(settings.pixel_format)
         self._clear_offsets()
-        self._set_both("Binning", settings.binning)
-        self._set_both("Decimation", settings.decimation)
-        self._set_reversed("ReverseX", settings.reverse_x)
-        self._set_reversed("ReverseY", settings.reverse_y)
+        self._set_factors(settings)
         self._set_region(settings)
         for name, value in self._config.features.items():
             features.set_value(name, value)
@@ -218,6 +215,15 @@ class Setup:
                 f"{fmt.name} holds {fmt.bits} bits",
             )
 
+    def _set_factors(self, settings: CameraSettings) -> None:
+        for what, factor in (("Binning", settings.binning), ("Decimation", settings.decimation)):
+            if factor is None:
+                self._leave_out_none(what)
+            else:
+                self._set_both(what, factor)
+        self._set_reversed("ReverseX", settings.reverse_x)
+        self._set_reversed("ReverseY", settings.reverse_y)
+
     def _set_pixel_format(self, name: str) -> None:
         if name in self._features.choices("PixelFormat"):
             # Before the camera is changed: one that it sends and that is not known here cannot be taken.
@@ -231,6 +237,18 @@ class Setup:
             return
         for name in names:
             self._features.set_number((name,), factor)
+
+    def _leave_out_none(self, what: str) -> None:
+        """Undo a binning or decimation that another program left; one that stays is read back and recorded."""
+        for axis in ("Horizontal", "Vertical"):
+            name = f"{what}{axis}"
+            if name not in self._config.features and self._features.number((name,)) not in (None, 1.0):
+                try:
+                    self._features.set_number((name,), 1)
+                except CameraLost:
+                    raise
+                except CameraError:
+                    return
 
     def _factor(self, what: str) -> int | None:
         """Binning or decimation as it is, whoever set it; None where the camera has none."""
@@ -318,7 +336,9 @@ class Setup:
         if features.find(("ExposureMode",)) is not None:
             features.set_choice("ExposureMode", "Timed")
         if features.find(("TriggerSelector",)) is not None:
-            features.set_choice("TriggerSelector", "FrameStart")
+            # Before SFNC 2 some cameras call it ExposureStart.
+            old = {"FrameStart", "ExposureStart"} & set(features.choices("TriggerSelector")) == {"ExposureStart"}
+            features.set_choice("TriggerSelector", "ExposureStart" if old else "FrameStart")
         features.set_choice("TriggerSource", self._config.trigger_line if self.hardware else "Software")
         edge = "TriggerActivation"
         if self.hardware and edge not in self._config.features and features.find((edge,)) is not None:

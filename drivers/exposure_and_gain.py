@@ -225,7 +225,7 @@ class ExposureAndGain:
         if not known or (self.converter_bits() or 0) >= fmt.bits:
             return
         try:
-            self._features.set_choice(name, known[min(enough) if enough else max(known)])
+            self._features.set_value(name, known[min(enough) if enough else max(known)])
         except CameraLost:
             raise
         except CameraError:

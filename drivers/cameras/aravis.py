@@ -83,7 +83,7 @@ class AravisCamera(Camera):
         # Exposure under way: sent at these host times, not collected yet.
         self._outstanding = False
         self._sent_unix_s = 0.0
-        self._sent_s = 0.0
+        self._sent_s = self._heard_s = 0.0
         # How long after the trigger a whole frame came that cannot be of this exposure.
         self._early_s: float | None = None
         self._last_id: int | None = None
@@ -225,6 +225,8 @@ class AravisCamera(Camera):
         self._early_s = None
         if not self._setup.hardware:
             self._features.command("TriggerSoftware")
+            # A command that is lost is sent again after up to a second, and the camera begins when it hears it.
+            self._heard_s = self._clock.now_s()
 
     def _wait_armed(self) -> None:
         """Wait until the camera heeds a trigger: one that comes too early is ignored."""
@@ -244,7 +246,7 @@ class AravisCamera(Camera):
         if self._setup.hardware:
             self._wait_for_hardware_trigger(stream)
             return
-        end_s = self._sent_s + self._setup.light_s
+        end_s = self._heard_s + self._setup.light_s
         self._sleep_until(end_s - max(_EARLY * self._setup.exposure_s, _EARLY_S))
         while (arrival := stream.take(0)) is not None:
             if self._is_ours(arrival):

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator, Sequence
 
-from drivers.genicam import BLACK_LEVEL, GAIN_DB, GAIN_RAW
+from drivers.genicam import BLACK_LEVEL, GAIN_DB, GAIN_RAW, gain_unit
 from simulators.camera.event_messages import EVENTS, Moment
 from simulators.camera.exposure import ExposureInfo
 from simulators.camera.played.formula import Number
@@ -13,6 +14,8 @@ from simulators.camera.played.node_tree import REGISTERS, NodeError, NodeTree
 from simulators.camera.played.power_up import EXPOSURES, follow, tell, tell_flag
 
 START, STOP, TRIGGER = "AcquisitionStart", "AcquisitionStop", "TriggerSoftware"
+#: Commands that bring the settings of the chosen set back.
+LOADS = ("UserSetLoad", "ConfigFileLoad")
 # Each by one of its names; a camera without them cannot be triggered by a program.
 _NEEDED = (
     *(("Width",), ("Height",), ("PixelFormat",), EXPOSURES),
@@ -33,6 +36,8 @@ class Features:
         Powered up.
     sensor : tuple of int
         Width and height in pixels.
+    complete : bool
+        False plays a camera whose features do not suffice for a capture.
 
     Raises
     ------
@@ -40,10 +45,10 @@ class Features:
         A feature that is needed is not there or cannot be played.
     """
 
-    def __init__(self, nodes: NodeTree, sensor: tuple[int, int]) -> None:
+    def __init__(self, nodes: NodeTree, sensor: tuple[int, int], *, complete: bool = True) -> None:
         self._nodes, self._sensor = nodes, sensor
         self._exposing, self._armed = False, True
-        for names in _NEEDED:
+        for names in _NEEDED if complete else ():
             self._require(names)
         if "PayloadSize" not in nodes:
             raise nodes.error("PayloadSize", "is missing, and a capture needs it")
@@ -89,6 +94,19 @@ class Features:
             return False
         return self._nodes.value(name) == int(self._nodes.node(name).findtext("OnValue") or 1)
 
+    def number(self, name: str) -> float | None:
+        """A number, or None where the camera has it not."""
+        with self._frame_start():
+            return float(self._nodes.value(name)) if self._has(name) else None
+
+    def entry(self, name: str) -> str | None:
+        """The chosen entry of an enumeration; "Off" or "On" of a flag; None where the camera has it not."""
+        if not self._has(name):
+            return None
+        if self._nodes.node(name).tag == "Enumeration":
+            return self._nodes.chosen(name)
+        return "On" if self._flag(name) else "Off"
+
     # --- what it is set to -------------------------------------------------------------------------------
 
     def info(self, frame_id: int) -> ExposureInfo:
@@ -96,7 +114,7 @@ class Features:
         number = self._number
         return ExposureInfo(
             exposure_s=number(EXPOSURES, 0) * 1e-6,
-            gain_db=float(number((*GAIN_DB, *GAIN_RAW), 0)),
+            gain_db=self._gain_db(),
             black_level=float(number(BLACK_LEVEL, 0)),
             frame_id=frame_id,
             width=int(number(("Width",), 0)),
@@ -109,12 +127,21 @@ class Features:
             reverse_y=self._flag("ReverseY"),
         )
 
+    def _gain_db(self) -> float:
+        """Decibels of a Gain in decibels or as a factor; the number of any other gain."""
+        name = self._first((*GAIN_DB, *GAIN_RAW))
+        value = 0.0 if name is None else float(self._nodes.value(name))
+        factor = name is not None and gain_unit(self._nodes.node(name).findtext("Unit") or "") == "factor"
+        return 20 * math.log10(max(value, 1e-3)) if factor else value
+
     def pixel_format(self) -> tuple[int, str]:
         """Code and name of the pixel format."""
         return int(self._nodes.value("PixelFormat")), self._nodes.chosen("PixelFormat")
 
     def trigger_source(self) -> str | None:
         """What starts a frame; None where nothing has to."""
+        if not (self._has("TriggerMode") and self._has("TriggerSource")):
+            return None
         with self._frame_start():
             if self._nodes.chosen("TriggerMode") == "Off":
                 return None

@@ -31,7 +31,9 @@ from simulators.camera.frame_packets import (
 from simulators.camera.played.bootstrap import boot
 from simulators.camera.played.control_channel import ControlChannel
 from simulators.camera.played.description_file import read_description
-from simulators.camera.played.features import START, STOP, TRIGGER, Features
+from simulators.camera.played.features import LOADS, START, STOP, TRIGGER, Features
+from simulators.camera.played.formula import Number
+from simulators.camera.played.image_settings import delay_s, exposed, processed
 from simulators.camera.played.node_tree import REGISTERS, NodeError, NodeTree
 from simulators.camera.played.power_up import power_up
 from simulators.camera.played.register import RegisterMemory
@@ -43,6 +45,8 @@ _MOST_XML_BYTES = 1 << 24
 _KEPT_FRAMES = 4
 # Between two frames of a camera that runs without triggers.
 _FREE_RUN_S = 0.05
+# Registers of the link, which a user set does not hold: who controls, heartbeat, streams, and where the XML stands.
+_LINK = ((0x000, 0x100), (0x200, 0x240), (0x600, 0x604), (0x900, 0xA04), (0xB00, 0xB20), (0xD00, 0xD20))
 
 
 class PlayedCamera(SimulatedCamera):
@@ -54,6 +58,8 @@ class PlayedCamera(SimulatedCamera):
         As of `GigeCamera`.
     path : Path
         The description: XML, or the zip archive that holds it.
+    complete : bool
+        False plays a camera whose features do not suffice for a capture, so that a driver can refuse it.
 
     Raises
     ------
@@ -73,6 +79,7 @@ class PlayedCamera(SimulatedCamera):
         address: str = "127.0.0.1",
         wait_s: float = 60.0,
         elsewhere: bool = False,
+        complete: bool = True,
     ) -> None:
         super().__init__(address, elsewhere)
         self.serial = serial
@@ -80,9 +87,12 @@ class PlayedCamera(SimulatedCamera):
         self.lost_ratio = lost_ratio
         #: Triggers that came while the camera exposed.
         self.ignored_triggers = 0
+        #: When the last trigger came that was heeded, by the monotonic clock.
+        self.triggered_s = 0.0
         self._sensor = (width, height)
         self._source = pixel_source
         self._path = path
+        self._complete = complete
         self._wait_s = wait_s
         self._description = read_description(path)
         # Control answers in one thread, exposures run in another; both look at the registers.
@@ -110,7 +120,8 @@ class PlayedCamera(SimulatedCamera):
         self._nodes = NodeTree(root, self._memory, self._path)
         try:
             power_up(self._nodes, self._sensor, {**texts, "DeviceSerialNumber": self.serial})
-            self._features = Features(self._nodes, self._sensor)
+            self._features = Features(self._nodes, self._sensor, complete=self._complete)
+            self._default = self._memory.copy()
         except RecursionError as error:
             raise NodeError(f"{self._path}: its features refer to each other without an end") from error
         self._xml_at = self._free_address()
@@ -164,6 +175,21 @@ class PlayedCamera(SimulatedCamera):
         """Start an exposure from outside, as a pulse on the trigger line does."""
         self._trigger(by_program=False)
 
+    def leave(self, name: str, value: Number | str) -> None:
+        """Set a feature as another program left it: a number, an entry, or 0 and 1 for a flag.
+
+        Raises
+        ------
+        NodeError
+            It cannot be set.
+        """
+        with self._lock:
+            if isinstance(value, str):
+                self._nodes.choose(name, value)
+            else:
+                self._nodes.set_value(name, value)
+            self._features.follow()
+
     # --- what the control channel asks for ---------------------------------------------------------------
 
     def read(self, address: int, count: int) -> bytes:
@@ -183,6 +209,9 @@ class PlayedCamera(SimulatedCamera):
             try:
                 commands = self._features.heard(address, len(data))
                 self._features.follow()
+                if any(load in commands for load in LOADS):
+                    self._memory.restore(self._default, but=_LINK)
+                    self._features.follow()
                 if TRIGGER in commands:
                     self._trigger(by_program=True)
             except (NodeError, ArithmeticError, ValueError) as error:
@@ -234,7 +263,7 @@ class PlayedCamera(SimulatedCamera):
                 self.ignored_triggers += 1
                 self._tell("missed", 0)
                 return
-            self._triggered = True
+            self._triggered, self.triggered_s = True, time.monotonic()
             # Before the command is answered: whoever asks then is told that it exposes.
             self._features.show(exposing=True, armed=False)
             self._wake.notify_all()
@@ -269,15 +298,20 @@ class PlayedCamera(SimulatedCamera):
             return True
 
     def _expose(self) -> None:
-        start_s, time_ns = time.monotonic(), time.time_ns()
         with self._lock:
             run_number = self._run_number
-            info = self._features.info(self._frame_id)
             fmt = pixel_format_of(*self._features.pixel_format())
             self._features.show(exposing=True, armed=False)
+            wait_s = delay_s(self._features)
+            info = exposed(self._features, self._features.info(self._frame_id))
+            self._wake.wait_for(lambda: self._run_number != run_number, wait_s)
+            start_s, time_ns = time.monotonic(), time.time_ns()
             self._tell("started", info.frame_id)
         try:
-            data = fmt.encode(counts_of(self._source, info, fmt, self.bits)).tobytes()
+            counts = counts_of(self._source, info, fmt, self.bits)
+            with self._lock:
+                counts = processed(self._features, info, counts, fmt.bits)
+            data = fmt.encode(counts).tobytes()
             with self._wake:
                 left_s = start_s + info.exposure_s - time.monotonic()
                 self._wake.wait_for(lambda: self._run_number != run_number, max(0.0, left_s))

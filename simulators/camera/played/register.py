@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -34,6 +35,19 @@ class RegisterMemory:
             part = min(len(data), _PAGE - start)
             self._pages.setdefault(page, bytearray(_PAGE))[start : start + part] = data[:part]
             address, data = address + part, data[part:]
+
+    def copy(self) -> RegisterMemory:
+        """The same bytes, apart from these."""
+        other = RegisterMemory()
+        other._pages = {page: bytearray(content) for page, content in self._pages.items()}
+        return other
+
+    def restore(self, other: RegisterMemory, but: Iterable[tuple[int, int]] = ()) -> None:
+        """Take the bytes of another memory, except from each first address to before the last one of `but`."""
+        kept = [(first, self.read(first, last - first)) for first, last in but]
+        self._pages = other.copy()._pages
+        for first, data in kept:
+            self.write(first, data)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,234 @@
+"""A camera as another program left it: each setting is brought to where it does nothing, or the capture is refused."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.camera import CameraSettings
+from drivers.cameras import aravis
+from drivers.errors import SettingRefused
+from simulators.camera.exposure import ExposureInfo
+from simulators.camera.played.formula import Number
+from simulators.camera.played.played_camera import PlayedCamera
+from simulators.clock import patient_clock
+
+STYLE = Path(__file__).parent / "descriptions" / "in_the_style_of_makers.xml"
+SIZE = (64, 48)
+LIGHT = CameraSettings(exposure_s=5e-3, pixel_format="Mono12p")
+SEEN = ((np.arange(SIZE[0] * SIZE[1]) * 7) % 2000 + 100).astype(np.uint16).reshape(SIZE[::-1])
+
+
+class Left:
+    """Plays the description with further features, and opens the driver on it."""
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        self._path, self._stack = folder / "camera.xml", stack
+        self.text = STYLE.read_text()
+        self._next = 0x0080_0000
+        self.infos: list[ExposureInfo] = []
+
+    def add(self, name: str, node: str, access: str = "RW", kind: str = "IntReg", length: int = 4) -> None:
+        """Add a feature: `node` is its element, in which VALUE stands for the register behind it."""
+        self._next += 0x100
+        register = (
+            f'<{kind} Name="{name}At"><Address>{self._next:#x}</Address><Length>{length}</Length><AccessMode>{access}'
+            "</AccessMode><pPort>Device</pPort><Cachable>NoCache</Cachable>"
+            f"{'<Sign>Unsigned</Sign>' if kind == 'IntReg' else ''}<Endianess>BigEndian</Endianess></{kind}>"
+        )
+        node = node.replace("VALUE", f"<pValue>{name}At</pValue>")
+        self.text = self.text.replace("</Category>", f"<pFeature>{name}</pFeature></Category>", 1)
+        self.text = self.text.replace("</RegisterDescription>", f"{node}{register}</RegisterDescription>")
+
+    def choice(self, name: str, *entries: str, access: str = "RW") -> None:
+        listed = "".join(f'<EnumEntry Name="{entry}"><Value>{k}</Value></EnumEntry>' for k, entry in enumerate(entries))
+        self.add(name, f'<Enumeration Name="{name}">{listed}VALUE</Enumeration>', access)
+
+    def flag(self, name: str) -> None:
+        self.add(name, f'<Boolean Name="{name}">VALUE<OnValue>1</OnValue><OffValue>0</OffValue></Boolean>')
+
+    def play(self, **left: Number | str) -> PlayedCamera:
+        self._path.write_text(self.text)
+        camera = self._stack.enter_context(PlayedCamera("LEFT-1", *SIZE, self._show, self._path))
+        for name, value in left.items():
+            camera.leave(name, value)
+        return camera
+
+    def open(self, **config: object) -> aravis.AravisCamera:
+        settings = aravis.Config(device="127.0.0.1", **config)  # type: ignore[arg-type]
+        return self._stack.enter_context(aravis.open("camera", settings, patient_clock()))
+
+    def _show(self, info: ExposureInfo) -> NDArray[np.uint16]:
+        self.infos.append(info)
+        return SEEN
+
+
+@pytest.fixture
+def left(tmp_path: Path) -> Iterator[Left]:
+    with ExitStack() as stack:
+        yield Left(tmp_path, stack)
+
+
+@pytest.mark.parametrize("access", ["RW", "RO"])
+def test_the_bench_rests_until_a_delayed_exposure_has_ended(left: Left, access: str) -> None:
+    old = "<Min>16</Min><Max>1000</Max></Float>"
+    assert old in left.text
+    left.text = left.text.replace(old, "<Min>16</Min><Max>1000000</Max></Float>")
+    where, named = left.text.split('<FloatReg Name="TriggerDelayReg">')
+    left.text = where + '<FloatReg Name="TriggerDelayReg">' + named.replace("RW", access, 1)
+    simulated = left.play()
+    with simulated._nodes.assuming("TriggerSelector", "FrameStart"):
+        simulated.leave("TriggerDelay", 150_000.0)
+    camera = left.open()
+    if access == "RO":
+        with pytest.raises(SettingRefused, match="TriggerDelay is 150000"):
+            camera.configure(LIGHT)
+        return
+    camera.configure(LIGHT)
+    exposure = camera.trigger()
+    exposure.wait_exposed()
+    assert time.monotonic() >= simulated.triggered_s + 5e-3
+    np.testing.assert_array_equal(exposure.frame().pixels, SEEN)
+    assert float(camera.node_map()["TriggerDelay"]) == 16.0
+
+
+def test_a_delay_that_is_wanted_is_waited_for(left: Left) -> None:
+    left.text = left.text.replace("<Min>16</Min><Max>1000</Max></Float>", "<Min>16</Min><Max>1000000</Max></Float>")
+    simulated = left.play()
+    camera = left.open(features={"TriggerSelector": "FrameStart", "TriggerDelay": 150_000})
+    camera.configure(LIGHT)
+    exposure = camera.trigger()
+    exposure.wait_exposed()
+    assert time.monotonic() >= simulated.triggered_s + 0.155
+    np.testing.assert_array_equal(exposure.frame().pixels, SEEN)
+
+
+@pytest.mark.parametrize(
+    ("name", "entries"),
+    [
+        ("BalanceWhiteAuto", ("Continuous", "Once", "Off")),
+        ("TestPattern", ("Increment", "Off")),
+        ("TestImageSelector", ("TestImage1", "Off")),
+        ("SequencerMode", ("On", "Off")),
+        ("EdgeFilter", ("Sharpen1", "Off")),
+    ],
+)
+def test_a_mode_that_spoils_frames_is_off_or_the_capture_is_refused(
+    left: Left, name: str, entries: tuple[str, ...]
+) -> None:
+    left.choice(name, *entries)
+    left.play(**{name: entries[0]})
+    camera = left.open()
+    camera.configure(LIGHT)
+    for frame in camera.capture(3):
+        np.testing.assert_array_equal(frame.pixels, SEEN)
+    assert {info.exposure_s for info in left.infos} == {5e-3}
+    assert camera.node_map()[name] == "Off"
+
+
+@pytest.mark.parametrize("name", ["BalanceWhiteAuto", "TestPattern", "SequencerMode"])
+def test_one_that_cannot_be_set_is_named(left: Left, name: str) -> None:
+    left.choice(name, "Other", "Off", access="RO")
+    left.play(**{name: "Other"})
+    with pytest.raises(SettingRefused, match=f"{name} is Other and could not be set to Off"):
+        left.open().configure(LIGHT)
+
+
+def test_a_digital_shift_is_undone(left: Left) -> None:
+    left.add("DigitalShift", '<Integer Name="DigitalShift">VALUE<Min>0</Min><Max>4</Max></Integer>')
+    left.play(DigitalShift=2)
+    camera = left.open()
+    camera.configure(LIGHT)
+    np.testing.assert_array_equal(camera.capture()[0].pixels, SEEN)
+
+
+@pytest.mark.parametrize(("unit", "said"), [("x", None), ("", "factor"), ("dB", None), ("", "dB")])
+def test_six_decibels_are_six_decibels_in_any_unit(left: Left, unit: str, said: str | None) -> None:
+    low, high = ("0", "24") if "dB" in (unit, said) else ("1", "16")
+    new = f"<Min>{low}</Min><Max>{high}</Max>" + (f"<Unit>{unit}</Unit>" if unit else "")
+    left.text = left.text.replace("<Min>0</Min><Max>24</Max><Unit>dB</Unit>", new)
+    simulated = left.play()
+    back = left.open(gain_unit=said).configure(LIGHT.model_copy(update={"gain_db": 6.0}))
+    assert back.gain_db == pytest.approx(6.0, abs=1e-3)
+    assert simulated._nodes.value("Gain") == pytest.approx(6.0 if "dB" in (unit, said) else 1.9953, abs=1e-3)
+
+
+def test_a_gain_without_a_unit_is_refused(left: Left) -> None:
+    left.text = left.text.replace("<Unit>dB</Unit>", "")
+    left.play()
+    with pytest.raises(SettingRefused, match="gain_unit: factor"):
+        left.open().configure(LIGHT.model_copy(update={"gain_db": 6.0}))
+
+
+def test_the_frame_rate_is_lowered_for_an_exposure_that_it_limits(left: Left) -> None:
+    # Lucid: 44.6 ms by default, 199.8 ms at 5 frames a second.
+    left.flag("AcquisitionFrameRateEnable")
+    left.add(
+        "AcquisitionFrameRate",
+        '<Float Name="AcquisitionFrameRate">VALUE<Min>0.5</Min><Max>22</Max><Unit>Hz</Unit></Float>',
+        kind="FloatReg",
+        length=8,
+    )
+    left.text = left.text.replace(
+        "<pMax>ExposureMost</pMax><Unit>us</Unit></Float>",
+        '<pMax>ExposureByRate</pMax><Unit>us</Unit></Float><SwissKnife Name="ExposureByRate"><pVariable Name="ON">'
+        'AcquisitionFrameRateEnableAt</pVariable><pVariable Name="RATE">AcquisitionFrameRateAt</pVariable>'
+        "<Formula>(ON=1)?(1000000/RATE-200):44600</Formula></SwissKnife>",
+    )
+    left.play(AcquisitionFrameRate=22.0)
+    camera = left.open()
+    assert camera.configure(LIGHT).exposure_s == 5e-3
+    # In the midst of a capture, as a bracket does.
+    for exposure_s in (0.2, 0.01, 0.25):
+        back = camera.configure(LIGHT.model_copy(update={"exposure_s": exposure_s}))
+        assert back.exposure_s == pytest.approx(exposure_s, rel=1e-3)
+        camera.capture()
+        assert left.infos[-1].exposure_s == pytest.approx(exposure_s, rel=1e-3)
+    with pytest.raises(SettingRefused, match="its limits are"):
+        camera.configure(LIGHT.model_copy(update={"exposure_s": 3.0}))
+
+
+@pytest.mark.parametrize("choosable", [True, False])
+def test_the_converter_has_the_bits_of_the_format_or_counts_end_where_it_ends(left: Left, choosable: bool) -> None:
+    left.choice("AdcBitDepth", "Bit8", "Bit10", "Bit12", access="RW" if choosable else "RO")
+    left.play(AdcBitDepth="Bit10")
+    camera = left.open()
+    camera.configure(LIGHT)
+    (frame,) = camera.capture()
+    assert (camera.top_of_counts.step, camera.full_scale) == ((1, 4095) if choosable else (4, 4092))
+    np.testing.assert_array_equal(frame.pixels, SEEN if choosable else SEEN // 4 * 4)
+
+
+@pytest.mark.parametrize("loads", ["UserSetLoad", "UserSetSave"])
+def test_a_feature_of_unknown_meaning_is_at_its_default_or_named(left: Left, loads: str) -> None:
+    left.choice("UserSetSelector", "Default", "UserSet1")
+    left.add(loads, f'<Command Name="{loads}">VALUE<CommandValue>1</CommandValue></Command>')
+    left.choice("ShotMixing", "Plain", "Mixed")
+    left.play(ShotMixing="Mixed", UserSetSelector="UserSet1")
+    camera = left.open()
+    camera.configure(LIGHT)
+    if loads == "UserSetLoad":
+        assert (camera.node_map()["ShotMixing"], camera.warnings()) == ("Plain", [])
+    else:
+        (text,) = camera.warnings()
+        assert "no default settings" in text
+        assert "ShotMixing" in text
+
+
+def test_a_load_that_changes_nothing_is_seen(left: Left) -> None:
+    left.choice("UserSetSelector", "Default")
+    left.add("UserSetLoad", '<Command Name="UserSetLoad">VALUE<CommandValue>1</CommandValue></Command>')
+    left.choice("ShotMixing", "Plain", "Mixed")
+    simulated = left.play(ShotMixing="Mixed")
+    simulated._features.heard = lambda *_: []  # type: ignore[method-assign]
+    camera = left.open()
+    camera.configure(LIGHT)
+    (text,) = camera.warnings()
+    assert "changed nothing" in text
+    assert "ShotMixing" in text
