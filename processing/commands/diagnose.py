@@ -19,7 +19,10 @@ app = application("diagnose", "Compare captures with an instrument model and fin
 @one_blas_thread()
 def diagnose_command(
     captures: Annotated[list[Path], typer.Argument(help="Captures of one instrument, at one wavelength or several.")],
-    instrument: Annotated[Path, typer.Option(help="Instrument file that the intensities are compared with.")],
+    instrument: Annotated[
+        Path | None,
+        typer.Option(help="Instrument file to compare with; default: the model in the first capture."),
+    ] = None,
     write: Annotated[
         Path | None, typer.Option(help="New file with the effects found: instrument, or material.")
     ] = None,
@@ -47,9 +50,9 @@ def diagnose_command(
     from processing.commands.loaded_late.diagnose_summary import show, write_result
     from processing.commands.progress_bar import progress_line
     from processing.diagnosis.instrument.run import diagnose_captures
-    from processing.instrument.model import InstrumentModel
+    from processing.storage.capture import full_model
 
-    model = InstrumentModel.load(instrument)
+    model = full_model(captures[0], instrument)
     with progress_line("diagnose", verbose) as say:
         judged, problem = diagnose_captures(captures, model, say)
     show(judged.diagnosis, verbose, written=write is not None)

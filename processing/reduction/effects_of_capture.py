@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.instrument.applied_effects import changes_of
+from processing.instrument.applied_effects import changes_of, instrument_effects
 from processing.instrument.changes import Changes, Conditions, elapsed, field_terms
 from processing.instrument.model import InstrumentModel
+from processing.instrument.nominal import KIND
 from processing.reduction.sample_states import states_of_sample
 from processing.storage.capture import Capture
 
@@ -77,6 +78,14 @@ def capture_changes(capture: Capture, model: InstrumentModel, states: NDArray[np
     top, run = full_scale(capture, seen), capture.run_of_states[seen]
     conditions = Conditions(angles, len(seen), channels, when, top, run)
     return changes_of(model, conditions, capture.name).of_states(np.searchsorted(seen, states))
+
+
+def references(capture: Capture, model: InstrumentModel) -> dict[str, str]:
+    """Fact `reference` of a product: at which moment it holds, where effects of the capture depend on time."""
+    own = [e for e in model.effects if e.scope == "instrument" or capture.name in e.captures]
+    moments = {e.kind: instrument_effects()[e.kind].reference for e in own if e.kind != KIND}
+    told = [f"{moment} ({kind})" for kind, moment in moments.items() if moment is not None]
+    return {"reference": "; ".join(told)} if told else {}
 
 
 def extra_retardance(changes: Changes, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -26,6 +26,7 @@ from processing.reduction.effects_of_capture import (
     capture_changes,
     counts_correction,
     extra_retardance,
+    references,
     with_extra,
 )
 from processing.reduction.facts import mueller_facts
@@ -269,7 +270,7 @@ def reduce_mueller(
             product.discard()
             raise CaptureError(f"{capture.path}: {error}{_without_numbers(capture, states)}") from error
         facts["warnings"] += cut_off
-        facts |= _further_facts(choice, sent)
+        facts |= _further_facts(choice, sent) | references(capture, model)
         if levels is not None:
             facts["source"] = levels.told
         product.seal(facts)

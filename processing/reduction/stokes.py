@@ -15,7 +15,7 @@ from processing.instrument.model import InstrumentModel
 from processing.polarization.magnitude import directions, interval
 from processing.reduction.counts_to_signal import Correction
 from processing.reduction.cut_off import without_cut_off
-from processing.reduction.effects_of_capture import CountsCorrection, capture_changes, counts_correction
+from processing.reduction.effects_of_capture import CountsCorrection, capture_changes, counts_correction, references
 from processing.reduction.facts import in_words
 from processing.reduction.instrument_of_capture import require_one_colour
 from processing.reduction.left_out import LeftOut
@@ -154,6 +154,7 @@ def reduce_stokes(
     rows, columns = channels.shape[1:]
     facts = _facts(found, analyzers, noise, correction, method, len(states))
     facts["warnings"] += cut_off
+    facts |= references(capture, model)
     with ProductWriter(out, "stokes", capture.header, (rows, columns), planes, steps, overwrite) as product:
         product.array("measurement_matrix", model_rows, "", "W (channel, 16): intensity = W . vec(M), row-major")
         correlation = neighbour_correlation(layout, method, tuple(map(tuple, np.linalg.pinv(analyzers).tolist())))

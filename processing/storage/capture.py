@@ -336,3 +336,19 @@ def _open(path: Path) -> h5py.File:
         raise CaptureError(f"{path}: no such file. Check the path; `acquire` prints it at the end of a run.")
     hint = "Nothing was changed. If a run was interrupted, its states are in the .partial file beside it."
     return open_h5(path, CaptureError, hint)
+
+
+def full_model(path: Path, instrument: Path | None) -> InstrumentModel:
+    """The instrument at all wavelengths that it has: of its file, without one as a capture holds it.
+
+    Raises
+    ------
+    CaptureError : the capture holds no model.
+    """
+    if instrument is not None:
+        return InstrumentModel.load(instrument)
+    with Capture(path) as capture:
+        text = capture.header.instrument_yaml
+    if not text:
+        raise CaptureError(f"{path} holds no instrument model. Give one with --instrument FILE.")
+    return parse_yaml(text, InstrumentModel, source=f"{path}: instrument model")

@@ -87,7 +87,7 @@ def test_drift_of_the_source_counts_for_its_capture_alone(rgb950: InstrumentMode
     values = dict.fromkeys(names, 0.0) | {names[0]: 0.08}
     applied = effect("source_drift", place or None, ("test (capture.h5)",), **values)
     real = rgb950.model_copy(update={"effects": (applied,)})
-    rows = rgb950.rows(ANGLES, changes_of(real, conditions, "test (capture.h5)"))
+    rows = rgb950.rows(ANGLES, changes_of(real, conditions, "capture"))
     truth = smooth_scene()
     signal = np.einsum("nck,kxy->ncxy", rows, truth.reshape(16, *SHAPE))
     path = capture_of(synthetic_capture, signal)
@@ -209,3 +209,23 @@ def test_air_states_are_not_mixed_with_the_sample(rgb950: InstrumentModel, synth
     image = reduced(path, rgb950)
     assert image.facts["states"] == 40
     assert error(image, truth) < 1e-5
+
+
+def test_the_product_says_at_which_moment_it_holds(rgb950, synthetic_capture):
+    rows = rgb950.rows(ANGLES).reshape(-1, 16)
+    signal = np.tensordot(rows, smooth_scene().reshape(16, *SHAPE), axes=1)[:, None]
+    path = capture_of(synthetic_capture, signal)
+    out = path.with_suffix(".m.h5")
+    with Capture(path) as capture:
+        drift = (
+            effect("image_drift", captures=(capture.name,), x=1.0, y=0.5),
+            effect("image_drift", captures=("b",), x=9.0, y=0),
+        )
+        facts = reduce_mueller(
+            capture, rgb950.model_copy(update={"effects": drift[:1]}), out, (Step("reduce", {}),), overwrite=True
+        )
+        assert "in the middle of the capture (image_drift)" in facts["reference"]
+        facts = reduce_mueller(
+            capture, rgb950.model_copy(update={"effects": drift[1:]}), out, (Step("reduce", {}),), overwrite=True
+        )
+        assert "reference" not in facts

@@ -14,7 +14,7 @@ from processing.errors import ProcessError
 
 def diagnose_reflectance(
     captures: Sequence[Path],
-    instrument: Path,
+    instrument: Path | None,
     reflectance: Path | None,
     geometry: Path | None,
     write: Path | None,
@@ -30,13 +30,13 @@ def diagnose_reflectance(
     from processing.diagnosis.surface.run import diagnose_object
     from processing.diagnosis.surface.write import targets, write_surface
     from processing.geometry.viewing import ViewingGeometry
-    from processing.instrument.model import InstrumentModel
     from processing.reflectance.base import load_reflectance
+    from processing.storage.capture import full_model
 
     for target in targets(write) if write is not None else ():
         require_new(target)
     model, material, view = (
-        InstrumentModel.load(instrument),
+        full_model(captures[0], instrument),
         load_reflectance(reflectance),
         ViewingGeometry.load(geometry),
     )

@@ -24,6 +24,8 @@ class InstrumentEffect(Effect, ABC):
     """
 
     belongs_to: ClassVar[Belongs] = "wavelength"
+    #: What of the product stands as it was at one moment of the capture, and which; None: nothing depends on time.
+    reference: ClassVar[str | None] = None
 
     @abstractmethod
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:

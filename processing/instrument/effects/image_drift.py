@@ -19,6 +19,7 @@ class ImageDrift(ImageShift, OfOneCapture):
     """Pixels from the first to the last state, x to the right and y down."""
 
     belongs_to = "capture"
+    reference = "the image stands where it was in the middle of the capture"
 
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if conditions.states > 1 else ()

@@ -20,6 +20,8 @@ from processing.instrument.model import InstrumentModel, Retarder
 class RetardanceDrift(OpticsEffect, OfOneCapture):
     """Degrees from the first to the last state, and the bends of its course, which are zero at both."""
 
+    reference = "the retardance of the file is that of the first state"
+
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return tuple(e.name for e in model.elements() if isinstance(e, Retarder)) if conditions.states > 4 else ()
 

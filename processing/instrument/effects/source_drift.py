@@ -18,6 +18,8 @@ from processing.instrument.model import InstrumentModel
 class SourceDrift(SourceEffect, OfOneCapture):
     """Relative change of the source from the first to the last state, and its departure from a straight line."""
 
+    reference = "m00 is that for the source in the middle of the capture"
+
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if conditions.states > 1 else ()
 

@@ -20,6 +20,8 @@ from processing.instrument.model import InstrumentModel
 class SourceJump(SourceEffect, OfOneCapture):
     """Relative change of the source in each later run, against the first one that took states of the sample."""
 
+    reference = "m00 is that for the source in the first run"
+
     def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
         return ("",) if np.unique(conditions.run).size > 1 else ()
 
