@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import traceback
+from pathlib import Path
+
+from drivers.errors import DeviceError
+from processing.errors import ProcessError
+
 
 class AcquisitionError(Exception):
     """A run cannot start or go on; the message says what was asked, what came back and what to do."""
@@ -17,6 +23,24 @@ class PlanRefused(AcquisitionError):
 
 class RunFailed(AcquisitionError):
     """A run ended early; the partial file holds every state that was done."""
+
+
+class Unforeseen(RunFailed):
+    """An error that nobody foresaw ended a run: the program has a fault. Holds the traceback as text."""
+
+    def __init__(self, error: BaseException) -> None:
+        lines = traceback.extract_tb(error.__traceback__)
+        where = f" ({Path(lines[-1].filename).name}, line {lines[-1].lineno})" if lines else ""
+        super().__init__(
+            f"an unforeseen error ended the run: {type(error).__name__}: {error}{where}. The light was shut and the "
+            "axes stopped; the same command, or --resume, goes on. Please report the traceback in the log."
+        )
+        self.trace = "".join(traceback.format_exception(error))
+
+
+def as_known(error: Exception) -> Exception:
+    """The error itself where it is one that a run may end with, else an `Unforeseen` that holds it."""
+    return error if isinstance(error, AcquisitionError | DeviceError | ProcessError) else Unforeseen(error)
 
 
 class InterlockOpened(RunFailed):

@@ -23,7 +23,7 @@ def take_capture(
 ) -> Path:
     """Check everything, take the capture, seal it; Ctrl-C ends it after the state that is being taken.
 
-    The guard of `acquire` (docs/acquisition.md) does not stand beside it.
+    The guard of `acquire` (docs/safety.md) watches from the first light on.
 
     Parameters
     ----------

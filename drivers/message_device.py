@@ -17,7 +17,7 @@ from pathlib import Path
 
 from drivers.clock import REAL, Clock
 from drivers.errors import PermissionRefused, PortBusy, PortLost, PortNotFound
-from drivers.serial_link import end_the_holder, line_framer, port_holders
+from drivers.serial_link import HELD, end_the_holder, held_descriptor, line_framer, port_holders
 
 # _IOW(91, 10, __u32), milliseconds; the kernel takes no less than 100.
 _SET_TIMEOUT = 0x40045B0A
@@ -44,11 +44,15 @@ class MessageDevice:
         # One exchange at a time.
         self.lock = threading.RLock()
         asked = f"open {port}"
+        self._is_held = port.startswith(HELD)
         others = [who for pid, who in port_holders(port) if pid != os.getpid() and who != f"{held_by} (pid {pid})"]
         if others:
             raise PortBusy(asked, f"it is in use by {', '.join(others)}", f"{end_the_holder(port)}; nothing was sent")
         try:
-            self._file = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_CLOEXEC)
+            if self._is_held:
+                self._file = held_descriptor(port)
+            else:
+                self._file = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_CLOEXEC)
         except PermissionError as error:
             raise PermissionRefused(asked, "this user may not", "Add a udev rule for the instrument") from error
         except OSError as error:
@@ -96,9 +100,13 @@ class MessageDevice:
             if not self._receive(0):
                 return
 
+    def fileno(self) -> int:
+        """The descriptor of the open device file."""
+        return self._file
+
     def close(self) -> None:
         """Give the device back. Closing twice is harmless."""
-        if self._file >= 0:
+        if self._file >= 0 and not self._is_held:
             os.close(self._file)
         self._file = -1
 

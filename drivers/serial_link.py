@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import io
 import os
 import select
+import struct
 import termios
 import threading
 import time
@@ -61,6 +63,60 @@ class Transcript:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+class HeldPort:
+    """A port that another process opened and handed over as a descriptor; it stays open when this is closed.
+
+    A driver opens it under the address ``fd://NUMBER/dev/...``: the guard of `acquire` then needs neither the port's
+    name nor the consent of the process that holds it.
+    """
+
+    rts = True
+
+    def __init__(self, port: str) -> None:
+        self._file = held_descriptor(port)
+
+    def fileno(self) -> int:
+        """The descriptor."""
+        return self._file
+
+    @property
+    def in_waiting(self) -> int:
+        """Bytes that wait to be read."""
+        return int(struct.unpack("i", fcntl.ioctl(self._file, termios.FIONREAD, b"\0\0\0\0"))[0])
+
+    def read(self, size: int) -> bytes:
+        """At most `size` bytes, after READ_SLICE_S at most."""
+        if not select.select([self._file], [], [], READ_SLICE_S)[0]:
+            return b""
+        with contextlib.suppress(BlockingIOError):
+            return os.read(self._file, size)
+        return b""
+
+    def write(self, data: bytes) -> None:
+        """Send all bytes. Raises SerialTimeoutException if the device takes none for WRITE_S."""
+        while data:
+            if not select.select([], [self._file], [], WRITE_S)[1]:
+                raise serial.SerialTimeoutException(f"it takes nothing for {WRITE_S:g} s")
+            with contextlib.suppress(BlockingIOError):
+                data = data[os.write(self._file, data) :]
+
+    def reset_input_buffer(self) -> None:
+        """Drop what waits to be read."""
+        termios.tcflush(self._file, termios.TCIFLUSH)
+
+    def close(self) -> None:
+        """Nothing: whoever received the descriptor closes it."""
+
+
+#: Start of the address of a port that was handed over.
+HELD = "fd://"
+
+
+def held_descriptor(port: str) -> int:
+    """The descriptor in an address ``fd://NUMBER/dev/...``."""
+    return int(port.removeprefix(HELD).partition("/")[0])
 
 
 class SerialLink:
@@ -166,6 +222,10 @@ class SerialLink:
             if error.errno not in (errno.ENOTTY, errno.EINVAL):
                 raise
 
+    def fileno(self) -> int:
+        """The descriptor of the open port."""
+        return int(self._serial.fileno())
+
     def close(self) -> None:
         """Give the port back."""
         # pyserial leaves a socket open whose other end has gone.
@@ -190,6 +250,8 @@ class SerialLink:
 
 def _open_port(port: str, baudrate: int, held_by: str | None, xonxoff: bool, rtscts: bool, two_stop_bits: bool) -> Any:
     asked = f"open port {port}"
+    if port.startswith(HELD):
+        return HeldPort(port)
     if "://" not in port:
         if not Path(port).exists():
             raise PortNotFound(asked, "there is no such port", _ports_hint())
@@ -356,6 +418,13 @@ class LineRegistry:
                 self._lines[key] = (line, users - 1)
             else:
                 line.close()
+
+    def descriptors(self) -> dict[str, int]:
+        """Descriptors of the open device files, by path; of a network port there is none."""
+        with self._lock:
+            # What several axes share is an object of its own around the link.
+            links = {key: getattr(line, "link", line) for key, (line, _) in self._lines.items() if "://" not in key}
+        return {key: link.fileno() for key, link in links.items() if hasattr(link, "fileno")}
 
     def close(self) -> None:
         """Close every line that is still open."""

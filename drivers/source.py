@@ -72,6 +72,14 @@ class LightSource(ABC):
     def close(self) -> None:
         """Release the device; the light stays as it is."""
 
+    def feed(self) -> None:  # noqa: B027 - most devices need nothing
+        """Tell a device that shuts the light without a heartbeat that all is well; other devices need nothing.
+
+        Raises
+        ------
+        DeviceError
+        """
+
     def select(self, wavelength_nm: float) -> None:
         """Choose the wavelength in nm; light that was on is on again at the new one.
 

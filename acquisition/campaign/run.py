@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -21,16 +20,15 @@ from acquisition.capture.job import prepare as prepare_job
 from acquisition.capture.machine_checks import check_machine
 from acquisition.capture.operator import Operator
 from acquisition.capture.writer import PARTIAL, bytes_needed, check_space, seal_whole
-from acquisition.errors import AcquisitionError, Differs, InterlockOpened, PlanRefused, Stopped
+from acquisition.errors import AcquisitionError, Differs, InterlockOpened, PlanRefused, Stopped, Unforeseen, as_known
 from acquisition.rig.config import RigConfig
 from acquisition.rig.continuous_rotation import states_deg, unwound
 from acquisition.rig.folded_angles import folded
-from acquisition.rig.guarded import guarded
+from acquisition.rig.guarded import GUARD_LOG
 from acquisition.rig.interlocks import LOOK_S
 from acquisition.rig.rig import Rig
 from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
-from drivers.errors import DeviceError
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture import Capture, CaptureError
 
@@ -90,6 +88,10 @@ def check_all(jobs: Sequence[tuple[CampaignCapture, Job]], rig: Rig, folder: Pat
     return planned, checks
 
 
+def _trace(error: Exception) -> dict[str, str]:
+    return {"traceback": error.trace} if isinstance(error, Unforeseen) else {}
+
+
 class CampaignRun:
     """Takes what is missing of a campaign, capture by capture.
 
@@ -116,7 +118,6 @@ class CampaignRun:
         self.observers = observers
         self.home = home
         self._rig: Rig | None = None
-        self._guard = ExitStack()
 
     def run(self, jobs: Sequence[tuple[CampaignCapture, Job]]) -> bool:
         """True if every capture is complete at the end, False if a stop was asked for.
@@ -143,10 +144,14 @@ class CampaignRun:
         except KeyboardInterrupt:
             self.folder.log("campaign stopped at once")
             raise
-        except (AcquisitionError, DeviceError) as error:
-            # The guard calls somebody.
-            self._guard.__exit__(type(error), error, error.__traceback__)
-            raise
+        except Exception as error:
+            known = as_known(error)
+            if self._rig is not None:
+                self._rig.call_for_help(known)
+            self.folder.log("campaign failed", error=str(known), **_trace(known))
+            if known is error:
+                raise
+            raise known from error
         finally:
             self._close_rig()
 
@@ -157,6 +162,7 @@ class CampaignRun:
                 return None
             done = self._states_done(capture)
             try:
+                ended = False
                 rig = self._open_rig()
                 selects = rig.source is not None and rig.source.selects_wavelength
                 changed = self.operator.prepare(capture.plan, source_selects=selects)
@@ -164,21 +170,30 @@ class CampaignRun:
                 self.folder.record(capture.name, status="running", reference=capture.reference)
                 self._wait_for_door(rig, capture)
                 result = self._take_once(capture, job, rig)
+                ended = True
             except Stopped:
                 return None
-            except (AcquisitionError, DeviceError) as error:
+            except Exception as unknown:
+                error, ended = as_known(unknown), True
                 # A capture that got further was worth going on with: only tries without progress are counted.
                 failures = failures + 1 if self._states_done(capture) <= done else 1
-                self.folder.log("capture failed", capture=capture.name, error=str(error), tries=failures)
+                self.folder.log(
+                    "capture failed", capture=capture.name, error=str(error), tries=failures, **_trace(error)
+                )
                 self.folder.record(capture.name, status="failed", error=str(error))
                 # An interlock is nothing to try again: whether the run goes on by itself is for the plan to say.
                 if failures > self.campaign.retries or isinstance(error, InterlockOpened | Differs):
-                    raise
-                self._close_rig()
+                    if error is unknown:
+                        raise
+                    raise error from unknown
+                self._close_rig(will_retry=True)
                 for observer in self.observers:
                     observer.warning(f"{error}; going on in {self.campaign.retry_wait_s:g} s")
                 self._pause(self.campaign.retry_wait_s)
                 continue
+            finally:
+                if not ended and self.folder.index.get(capture.name, {}).get("status") == "running":
+                    self.folder.record(capture.name, status="stopped")
             self.folder.log(
                 "capture ended", capture=capture.name, status=result.status, states=result.states_done,
                 saturated_fraction=result.saturated_fraction, ledger=result.ledger, messages=result.messages,
@@ -253,15 +268,16 @@ class CampaignRun:
             self._rig = rig
             # A device may have been changed between two tries.
             require_same_campaign(self.folder.folder, with_devices({}, rig))
-            self._guard.enter_context(guarded(self.config, self.folder.folder))
+            rig.start_guard(self.folder.folder / GUARD_LOG)
         return self._rig
 
-    def _close_rig(self) -> None:
-        self._guard.close()
+    def _close_rig(self, *, will_retry: bool = False) -> None:
         rig, self._rig = self._rig, None
-        failure = rig.close() if rig is not None else None
+        failure = rig.close(will_retry=will_retry) if rig is not None else None
         if failure is not None:
             self.folder.log("closing the rig failed", error=str(failure))
+            for observer in self.observers:
+                observer.warning(f"closing the rig failed: {failure}")
 
     def _pause(self, seconds: float) -> None:
         # Real time: the pause is for people and devices.

@@ -12,8 +12,8 @@ from acquisition.capture.header import now
 from acquisition.capture.identity import identity_of, places
 from acquisition.capture.job import Job
 from acquisition.capture.runner import CaptureRunner
+from acquisition.errors import Unforeseen
 from acquisition.rig.rig import Rig
-from drivers.errors import DeviceError
 
 
 def begin_record(job: Job, rig: Rig, number: int) -> dict[str, Any]:
@@ -55,8 +55,10 @@ def end_record(
     }
     if failure is not None:
         record["failure"] = str(failure) or type(failure).__name__
+        if isinstance(failure, Unforeseen):
+            record["traceback"] = failure.trace
     try:
         record["stream"] = asdict(rig.require_camera().statistics())
-    except DeviceError as error:
+    except Exception as error:  # noqa: BLE001 - the record is written whatever the camera does
         record["stream"] = {"failure": str(error)}
     return record

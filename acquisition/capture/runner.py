@@ -117,6 +117,7 @@ class CaptureRunner:
         self._here: dict[str, float] = {}
         self._at: int | None = None
         self._light: bool | None = None
+        self._light_losses = rig.light_losses()
         self._retakes: dict[int, int] = {}
         self._pending: deque[int] = deque()
         self._saturation_limit = saturation_limit
@@ -181,10 +182,14 @@ class CaptureRunner:
     def find_exposure(self, instrument: InstrumentModel, sample: str, auto: AutoExposure) -> None:
         """Probe the brightest states and take the exposure that they ask for. Moves the axes, lights the sample."""
         self.tell("looking for the exposure")
+        losses = -1
         with self.ledger.time("probing"):
-            found_s = find_exposure(
-                self.rig, self.table, self.poses_deg, instrument, sample, auto, self.observers, self.warn
-            )
+            while losses != self.rig.light_losses():
+                # What was seen while the light was shut from outside does not count.
+                losses = self.rig.light_losses()
+                found_s = find_exposure(
+                    self.rig, self.table, self.poses_deg, instrument, sample, auto, self.observers, self.warn
+                )
         self._light = None
         self._scale_exposure(found_s / auto.start_s)
 
@@ -272,7 +277,7 @@ class CaptureRunner:
         readout_s = max(0.0, self.rig.clock.now_s() - start_s - light_s)
         self.ledger.readout_s += readout_s
         self.ledger.unavoidable_s += light_s + readout_s
-        if self._clock_jumped():
+        if self._light_was_lost() or self._clock_jumped():
             self.warn(f"state {state} is taken again")
             self._pending.appendleft(state)
             return None
@@ -330,8 +335,8 @@ class CaptureRunner:
         """Measure nothing while the disc takes nothing: the light is shut, and no further move begins."""
         if self.writer.is_settled():
             return
-        self.warn("the disc takes no data: the light is shut until it does")
         self._set_light(False)
+        self.warn("the disc takes no data: the light is shut until it does")
         self.writer.settle()
 
     def _report(self, exposed: _Exposed, frame: Frame) -> StateReport:
@@ -349,6 +354,12 @@ class CaptureRunner:
         )
 
     # --- what can be wrong with it -----------------------------------------------------------------------
+
+    def _light_was_lost(self) -> bool:
+        """Tell of a light that was shut from outside since it was last switched."""
+        for text in self.rig.guard_news():
+            self.warn(text)
+        return self.rig.light_losses() != self._light_losses
 
     def _clock_jumped(self) -> bool:
         """Tell of a clock that was set or a machine that slept since the last look."""
@@ -411,8 +422,10 @@ class CaptureRunner:
 
     def _set_light(self, on: bool) -> None:
         source = self.rig.source
-        if source is None or self._light == on:
+        losses = self.rig.light_losses()
+        if source is None or (self._light == on and losses == self._light_losses):
             return
+        self._light_losses = losses
         with self.ledger.time("shutter"):
             source.set_light(on)
         self._light = on

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +20,13 @@ from acquisition.capture.records import begin_record, end_record
 from acquisition.capture.runner import CaptureRunner, TooBright
 from acquisition.capture.writer import CaptureWriter, as_partial
 from acquisition.cleanup import run_all
-from acquisition.errors import AcquisitionError, Stopped
+from acquisition.errors import AcquisitionError, Stopped, as_known
 from acquisition.rig.continuous_rotation import turns_to, unwound
 from acquisition.rig.folded_angles import folded
 from acquisition.rig.interlocks import LightSoFar, light_so_far
 from acquisition.rig.rig import Rig
 from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
-from drivers.errors import DeviceError
 from processing.instrument.model import InstrumentModel
 from processing.reduction.lit_darks import LitDarks, seen_so_far
 from processing.storage.capture import Capture
@@ -165,11 +165,11 @@ def _run(
     if earlier is not None:
         _begin_segment(job, rig, runner, earlier)
     writer.on_failure = stop.fail
-    for text in rig.require_camera().warnings():
-        runner.warn(f"the camera is not in a known state: {text}")
-    for observer in watchers:
-        observer.run_started(title_of(job.plan), job.table, len(pending), job.instrument.mosaic)
     try:
+        for text in rig.require_camera().warnings():
+            runner.warn(f"the camera is not in a known state: {text}")
+        for observer in watchers:
+            observer.run_started(title_of(job.plan), job.table, len(pending), job.instrument.mosaic)
         with stop.failing_here():
             _go_to_start(job, rig, runner, first)
             whole = _take_states(job, runner, pending)
@@ -180,18 +180,19 @@ def _run(
             _park(rig, runner)
     except (KeyboardInterrupt, Stopped) as interrupt:
         status, failure = "aborted", interrupt
-    except (AcquisitionError, DeviceError) as error:
+    except Exception as error:  # noqa: BLE001 - every end has its record
+        failure = as_known(error)
+        if failure is not error:
+            failure.__cause__ = error
+    except BaseException as error:  # noqa: BLE001 - it is raised again once the end has its record
         failure = error
-    except BaseException:
-        writer.abandon()
-        raise
-    finally:
-        light = run_all([("shut off the light", _shut(rig))])
-        if light is not None:
-            runner.warn(f"the light could not be shut off: {light}")
+    light = run_all([("shut off the light", _shut(rig))])
+    if light is not None:
+        runner.warn(f"the light could not be shut off: {light}")
     closing, path = _end_segment(runner, rig, status, failure)
-    for observer in watchers:
-        observer.run_ended(status, closing)
+    told = run_all([("tell of the end", partial(observer.run_ended, status, closing)) for observer in watchers])
+    if told is not None and failure is None:
+        raise as_known(told)
     if failure is not None:
         failure.add_note(f"States done so far are in {path}. Go on with: acquire --resume {path}")
         raise failure

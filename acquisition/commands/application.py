@@ -94,10 +94,11 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     Exit codes: 0 done, 1 the run failed, 2 bad input, 130 interrupted.
     """
-    from acquisition.errors import AcquisitionError, Differs, PlanRefused, Stopped
+    from acquisition.errors import AcquisitionError, Differs, PlanRefused, Stopped, Unforeseen, as_known
     from drivers.errors import DeviceError
     from processing.errors import ProcessError
 
+    _say_alarms()
     try:
         app(args=None if argv is None else list(argv))
     except (PlanRefused, Differs, ProcessError) as error:
@@ -108,6 +109,32 @@ def main(argv: Sequence[str] | None = None) -> None:
         _report(error, 1)
     except KeyboardInterrupt as error:
         _report(error, INTERRUPTED, "stopped at once; every axis was sent a stop")
+    except Exception as error:  # noqa: BLE001 - the last boundary: a user reads a line, the traceback goes to a file
+        known = as_known(error)
+        if isinstance(known, Unforeseen):
+            known.add_note(_keep_trace(known.trace))
+        _report(known, 1)
+
+
+def _say_alarms() -> None:
+    from acquisition.rig import alarms
+
+    for alarm in alarms.unacknowledged():
+        text = f"ALARM since {alarm.time}, rig {alarm.rig}: {alarm.text}. Acknowledge with: {alarms.ACKNOWLEDGE}"
+        typer.echo(text, err=True)
+
+
+def _keep_trace(trace: str) -> str:
+    """Write a traceback to a file in memory; returns a line that says where."""
+    from acquisition.rig import alarms
+
+    path = alarms.folder() / f"traceback-{os.getpid()}.txt"
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        path.write_text(trace, encoding="utf-8")
+    except OSError as error:
+        return f"The traceback could not be kept ({error})."
+    return f"The traceback is in {path}."
 
 
 def _report(error: BaseException, code: int, text: str | None = None) -> NoReturn:

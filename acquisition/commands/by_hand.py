@@ -1,4 +1,4 @@
-"""The rig by hand: `acquire init`, `doctor`, `home`, `move`, `stop` and `snap`."""
+"""The rig by hand: `acquire init`, `doctor`, `home`, `move`, `stop`, `snap` and `acknowledge`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    for command in (init, doctor, home, stop, snap):
+    for command in (init, doctor, home, stop, snap, acknowledge):
         app.command()(command)
     # So that -30 is an angle and not an option.
     app.command(context_settings={"ignore_unknown_options": True})(move)
@@ -123,7 +123,8 @@ def move(
 
 def stop(rig: RigFile = None) -> None:
     """Stop every axis, and an acquire that measures on this rig, as Ctrl-C twice would."""
-    from acquisition.rig.stop_axes import has_own_emulators, stop_axes
+    from acquisition.rig.config import has_own_emulators
+    from acquisition.rig.stop_axes import stop_axes
 
     config = _load(rig)
     if has_own_emulators(config):
@@ -147,6 +148,17 @@ def snap(
     config = _load(rig)
     with StopRequest(patience=1):
         typer.echo(take_frame(config, exposure, out, light, sample, wavelength))
+
+
+def acknowledge() -> None:
+    """End the alarms that the guard repeats, once somebody has looked at the rig."""
+    from acquisition.rig import alarms
+
+    given = alarms.unacknowledged()
+    for alarm in given:
+        typer.echo(f"{alarm.time}, rig {alarm.rig}: {alarm.text}")
+        alarms.acknowledge(alarm)
+    typer.echo(f"{len(given)} acknowledged" if given else "there is no alarm")
 
 
 def _load(rig: Path | None) -> RigConfig:

@@ -24,10 +24,11 @@ from acquisition.capture.job import Job, Result, check_with_devices, job_of, pre
 from acquisition.capture.machine_checks import check_machine
 from acquisition.capture.operator import Operator
 from acquisition.capture.plan import MeasurementPlan
+from acquisition.capture.synced import make_folder
 from acquisition.capture.writer import PARTIAL, seal_whole
 from acquisition.commands.defaults import CONFIGS, DEFAULT_RIG, INTERRUPTED
 from acquisition.rig.config import RigConfig, load_rig
-from acquisition.rig.guarded import guarded
+from acquisition.rig.guarded import GUARD_LOG
 from acquisition.rig.own_rigs import note_rig, own_rigs
 from acquisition.rig.rig import Rig
 from acquisition.screen.notify import notifying
@@ -90,10 +91,11 @@ def run(options: Options, stop: StopRequest) -> int:
             return INTERRUPTED
         take = session.resume if resuming else session.take
         told = RunFile(path.parent, job.rig.simulated)
+        make_folder(path.parent)
+        rig.start_guard(path.parent / GUARD_LOG)
         with (
             nullcontext(path) if resuming else free_name(path) as path,
             notifying(job.rig.notify, path, job.rig.simulated) as notifier,
-            guarded(job.rig, path.parent),
             live_page(options.live, job.rig, stop, console) as page,
             told,
         ):

@@ -11,8 +11,11 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from acquisition.rig.sections import AxisEntry, RigSections
 from acquisition.rig.soundness import Mistake, find_mistakes
+from drivers.clock import REAL, Clock
 from processing.yaml_file import ConfigError, load_yaml
 from processing.yaml_words import mistakes_of, names_in, words_of
+from simulators.clock import patient_clock
+from simulators.rig.model import SCHEME
 
 
 class RigConfig(RigSections):
@@ -42,6 +45,16 @@ class RigConfig(RigSections):
         if self.simulator is not None and not self.simulated:
             object.__setattr__(self, "simulated", True)
         return self
+
+
+def clock_of(config: RigConfig) -> Clock:
+    """The clock of a rig: real devices keep real time, emulators may be kept from running."""
+    return patient_clock() if config.simulated else REAL
+
+
+def has_own_emulators(config: RigConfig) -> bool:
+    """True for a rig whose axes exist only inside the command that opened it."""
+    return any(entry.port.startswith(SCHEME) for entry in config.axes.values())
 
 
 def _readable(data: dict[str, Any]) -> RigConfig:

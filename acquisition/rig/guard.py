@@ -1,9 +1,11 @@
-"""The guard: a process beside `acquire` that shuts the light and stops the axes when `acquire` dies or is frozen.
+"""The guard: a process that shuts the light and stops the axes when `acquire` dies, freezes or fails to do so.
 
-`python -m acquisition.rig.guard` is started by `acquire` (acquisition/rig/guarded.py) and listens at its standard
-input: first a line of JSON that says what to guard, then a short line ten times a second. The end of the input without
-the word `rest` means that `acquire` was killed; silence means that it was stopped or hangs. A frozen `acquire` still
-holds the ports and knows nothing of what happens to its axes: it is killed first, which loses no state that is done.
+`acquire` starts ``python -m acquisition.rig.guard`` (acquisition/rig/guarded.py) with one end of a pair of sockets. It
+hands over the descriptors of the open ports first: the guard writes to a port although the dying process still holds
+it. Then lines of JSON go both ways, among them a beat ten times a second that the guard sends back.
+
+The guard acts in a fixed order: light, axes, words. It opens no file on the disc of the captures: its journal goes
+through a pipe to a process of its own, which may hang.
 """
 
 from __future__ import annotations
@@ -14,56 +16,86 @@ import json
 import os
 import select
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
+from acquisition.rig import alarms
 from acquisition.rig.config import RigConfig
 from acquisition.rig.stop_axes import stop_axes
 from drivers.errors import DeviceError
 from drivers.registry import open_source
-from drivers.serial_link import LineRegistry
+from drivers.serial_link import HELD, LineRegistry
+from drivers.source import LightSource
 from processing.yaml_file import parse_yaml
 
-#: Silence after which `acquire` counts as frozen: if it was stopped, and if it could run but does not.
-STOPPED_S = 1.0
-SILENT_S = 10.0
-#: How often it is looked for.
+#: Silence of `acquire` after which the guard shuts the light, and after which it takes over and kills `acquire`.
+#: A process that was stopped says nothing for certain; one that could run may only be kept waiting.
+STOPPED_SHUT_S, STOPPED_KILL_S = 0.3, 1.0
+SILENT_SHUT_S, SILENT_KILL_S = 1.5, 10.0
+#: How often the guard looks.
 LOOK_S = 0.05
-#: A look that came later than this was held up itself, as then was `acquire`: no more of it counts as silence.
+#: A look that comes later than this was held up itself, as `acquire` probably was: no more of it counts as silence.
 LATE_S = 0.2
-#: Tries to shut the light before somebody is called, and in all: one that dies holds its ports a moment longer, on a
-#: machine with no time to spare for seconds, and a lamp that burns on is worth every further try.
+#: Tries to shut the light before the alarm, and in quick succession; further tries follow at the alarm's pace.
 CALL_S = 2.0
 TRY_S = 60.0
-#: How often the log says that all is well.
+#: Pause before axes that did not obey are sent another stop.
+AGAIN_S = 1.0
+#: How often the journal says that all is well.
 HEARTBEAT_S = 60.0
-#: Words that `acquire` sends instead of a beat.
-REST = "rest"
-FAILED = "failed "
+#: An alarm that could not be written down ends after this time.
+LONGEST_S = 86_400.0
+#: Most ports that `acquire` hands over.
+MOST_PORTS = 64
+#: What the guard says of axes that obey.
+AT_REST = "axes at rest"
+#: What the journal keeps in memory while its disc takes nothing.
+JOURNAL_BYTES = 1 << 20
 
 
 class Journal:
-    """A log in JSON lines; without a path it goes to standard error."""
+    """A log in JSON lines, appended to its file, if it has one, by a process of its own."""
 
     def __init__(self, path: Path | None) -> None:
-        self._path = path
+        self._waiting = b""
         self._lock = threading.Lock()
+        self._appending: subprocess.Popen[bytes] | None = None
+        if path is not None:
+            with contextlib.suppress(OSError):
+                self._appending = subprocess.Popen(
+                    ["tee", "-a", str(path)],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,
+                    start_new_session=True,
+                )
+                os.set_blocking(self._pipe(), False)
 
     def note(self, event: str, **details: Any) -> None:
         """Add a line; a log that cannot be written holds up nothing."""
         when = datetime.datetime.now().astimezone().isoformat(timespec="milliseconds")
-        text = json.dumps({"time": when, "event": event} | details) + "\n"
+        with self._lock:
+            self._waiting = (self._waiting + json.dumps({"time": when, "event": event} | details).encode() + b"\n")[
+                -JOURNAL_BYTES:
+            ]
+        self.flush()
+
+    def flush(self) -> None:
+        """Pass on what waits, as far as it is taken now."""
         with self._lock, contextlib.suppress(OSError):
-            if self._path is None:
-                sys.stderr.write(text)
-            else:
-                with self._path.open("a", encoding="utf-8") as file:
-                    file.write(text)
+            if self._appending is not None and self._waiting:
+                self._waiting = self._waiting[os.write(self._pipe(), self._waiting) :]
+
+    def _pipe(self) -> int:
+        assert self._appending is not None
+        assert self._appending.stdin is not None
+        return self._appending.stdin.fileno()
 
 
 class Guard:
@@ -71,125 +103,307 @@ class Guard:
 
     Parameters
     ----------
-    config : the rig that is open there.
+    config : the rig that is open there; its ports are addresses of descriptors where they were handed over.
     pid : of the `acquire` that is watched.
     journal : where everything is noted.
-    alert : command that is run with a message as its last argument when somebody should come.
+    own : the same rig with the ports as the rig file has them, for tries after `acquire` has ended.
     """
 
-    def __init__(self, config: RigConfig, pid: int, journal: Journal, alert: tuple[str, ...]) -> None:
-        self.config, self.pid, self.journal, self.alert = config, pid, journal, alert
+    def __init__(self, config: RigConfig, pid: int, journal: Journal, own: RigConfig | None = None) -> None:
+        self.config, self.pid, self.journal = config, pid, journal
+        self.own = own or config
         # Nobody waits for them; they are kept because a handle that is dropped complains.
         self.alerts: list[subprocess.Popen[bytes]] = []
+        self._cutoff_lines = LineRegistry()
+        self._cutoff: LightSource | None = None
+        self._light_problem = self._axes_problem = ""
+        self._light_lock = threading.Lock()
+        self._has_shut = False
 
-    def watch(self, beats: int) -> bool:
-        """Listen until `acquire` ends; True if it ended in order, and False once everything was shut in its place.
+    def open_cutoff(self) -> None:
+        """Let light pass the rig's second shutter or relay, if it has one. Raises DeviceError."""
+        if self.config.cutoff is not None:
+            self._cutoff = open_source(self.config.cutoff, self._cutoff_lines)
+            self._cutoff.set_light(True)
 
-        Parameters
-        ----------
-        beats : descriptor to read from.
-        """
-        silent_s, beat, rest = 0.0, "begin", b""
+    def watch(self, line: socket.socket) -> bool:
+        """Listen until `acquire` ends; True if it ended in order, and False once everything was shut in its place."""
+        silent_s, beat, rest = 0.0, 0, b""
         noted_s = before_s = time.monotonic()
         self.journal.note("guard watches", pid=self.pid, rig=self.config.name)
+        self._say(line, watching=True)
         while True:
-            heard = select.select([beats], [], [], LOOK_S)[0]
+            heard = select.select([line], [], [], LOOK_S)[0]
             now_s = time.monotonic()
             silent_s = 0.0 if heard else silent_s + min(now_s - before_s, LATE_S)
             before_s = now_s
             if heard:
-                data = os.read(beats, 1 << 16)
+                data = _received(line)
                 if not data:
                     return self._act("acquire died", beat)
+                self._has_shut = False
                 *lines, rest = (rest + data).split(b"\n")
-                for line in lines:
-                    beat = line.decode(errors="replace")
-                    if beat.startswith(FAILED):
-                        self._call(beat.removeprefix(FAILED))
-                    elif beat == REST:
-                        self.journal.note("guard rests")
+                for text in lines:
+                    message = json.loads(text)
+                    if "beat" in message:
+                        beat = message["beat"]
+                        self._say(line, beat=beat)
+                    elif "failed" in message:
+                        self.call(message["failed"])
+                    elif "take_over" in message:
+                        return self._act(message["take_over"], beat)
+                    else:
+                        self._rest()
                         return True
-            elif silent_s > SILENT_S or (silent_s > STOPPED_S and _is_stopped(self.pid)):
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(self.pid, signal.SIGKILL)
+            elif silent_s > STOPPED_SHUT_S and self._is_lost(line, silent_s):
                 return self._act("acquire was frozen and has been killed", beat)
+            self._feed()
             if now_s - noted_s > HEARTBEAT_S:
                 noted_s = now_s
                 self.journal.note("heartbeat", last=beat)
+            self.journal.flush()
 
-    def _act(self, why: str, beat: str) -> bool:
-        self.journal.note(why, last=beat)
-        with ThreadPoolExecutor(1) as beside:
-            light = beside.submit(self._shut_light)
-            axes = self._stop_axes()
-        self._call(f"{why}. The guard: {light.result()}, {axes}. Go on with --resume, or the same campaign")
+    def _is_lost(self, line: socket.socket, silent_s: float) -> bool:
+        """Shut the light of an `acquire` that is silent; True once it has been killed for that."""
+        stopped = is_stopped(self.pid)
+        if silent_s > (STOPPED_KILL_S if stopped else SILENT_KILL_S):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self.pid, signal.SIGKILL)
+            return True
+        if not self._has_shut and silent_s > (STOPPED_SHUT_S if stopped else SILENT_SHUT_S):
+            # It may come back: only the light does not wait for that.
+            self._has_shut = self._try_light() is None
+            if self._has_shut:
+                self.journal.note("light shut", why="acquire is silent")
+                self._say(line, shut="the guard heard nothing from acquire")
         return False
 
-    def _shut_light(self) -> str:
+    def _say(self, line: socket.socket, **message: Any) -> None:
+        with contextlib.suppress(OSError):
+            line.send(json.dumps(message).encode() + b"\n", socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+
+    def _feed(self) -> None:
+        if self._cutoff is not None:
+            with contextlib.suppress(DeviceError):
+                self._cutoff.feed()
+
+    def _rest(self) -> None:
+        if self._cutoff is not None:
+            with contextlib.suppress(DeviceError):
+                self._cutoff.set_light(False)
+        self.journal.note("guard rests")
+
+    def _act(self, why: str, beat: int) -> bool:
+        with ThreadPoolExecutor(2) as threads:
+            light = threads.submit(self._shut_light)
+            axes = threads.submit(self._stop_axes)
+            self.journal.note(why, last=beat)
+            wait([light], CALL_S)
+            alarm = None
+            while not (light.done() and axes.done()):
+                problem = self._axes_problem if light.done() else f"THE LIGHT IS NOT SHUT: {self._light_problem}"
+                if alarm is None and problem:
+                    alarm = Alarm(self, f"{why}. {problem}. The guard tries again")
+                if alarm is not None:
+                    alarm.repeat()
+                self.journal.flush()
+                time.sleep(LOOK_S)
+        said = "light shut" if light.result() is None else f"LIGHT NOT SHUT: {light.result()}"
         if self.config.source is None:
-            return "this rig has no source to shut"
-        begin_s, called = time.monotonic(), False
-        while True:
-            try:
-                with LineRegistry() as lines:
-                    open_source(self.config.source, lines).set_light(False)
-                self.journal.note("light shut")
-                return "light shut"
-            except DeviceError as error:
-                tried_s = time.monotonic() - begin_s
-                if tried_s > TRY_S:
-                    self.journal.note("LIGHT NOT SHUT", error=str(error))
-                    return "LIGHT NOT SHUT"
-                if tried_s > CALL_S and not called:
-                    called = True
-                    self._call(f"The light could not be shut yet: {error}. The guard tries on")
+            said = "this rig has no source to shut"
+        text = f"{why}. The guard: {said}, {axes.result()}. Go on with --resume, or the same campaign"
+        if alarm is None and light.result() is None and axes.result() == AT_REST:
+            self.call(text)
+            return False
+        if alarm is not None and alarm.is_acknowledged():
+            self.call(text)
+            self.journal.note("alarm acknowledged")
+            return False
+        alarm = Alarm(self, text)
+        is_dark = light.result() is None
+        while not alarm.is_acknowledged():
+            # A lamp that burns on is worth every further try.
+            if alarm.repeat() and not is_dark and self._try_light() is None:
+                is_dark = True
+                self.journal.note("light shut", why="tried again with the alarm")
+                alarm = Alarm(self, f"{text}. The light has been shut since")
+            self.journal.flush()
             time.sleep(LOOK_S)
+        self.journal.note("alarm acknowledged")
+        return False
+
+    # --- light -------------------------------------------------------------------------------------------
+
+    def _try_light(self) -> str | None:
+        """Shut the light once; None, or why it is not shut."""
+        problems = []
+        with self._light_lock:
+            if self._cutoff is not None:
+                try:
+                    self._cutoff.set_light(False)
+                except Exception as error:  # noqa: BLE001 - the source comes next, whatever this was
+                    problems.append(str(error))
+            # The port that was handed over, then the port by its name: one of the two may be gone.
+            for config in (self.config, self.own) if self.own is not self.config else (self.config,):
+                if config.source is None:
+                    break
+                try:
+                    with LineRegistry() as lines:
+                        open_source(config.source, lines).set_light(False)
+                    return None
+                except Exception as error:  # noqa: BLE001 - whatever it was, the light is tried again
+                    problems.append(str(error))
+        self._light_problem = "; ".join(problems)
+        return self._light_problem or None
+
+    def _shut_light(self) -> str | None:
+        """Try for TRY_S; None once the light is shut, or what came back last."""
+        begin_s = time.monotonic()
+        while (problem := self._try_light()) is not None:
+            if time.monotonic() - begin_s > TRY_S:
+                self.journal.note("LIGHT NOT SHUT", error=problem)
+                return problem
+            time.sleep(LOOK_S)
+        self.journal.note("light shut")
+        return None
+
+    # --- axes --------------------------------------------------------------------------------------------
 
     def _stop_axes(self) -> str:
-        try:
-            stopped = stop_axes(self.config, lambda text: self.journal.note("axis", told=text), let_go=(self.pid,))
-        except DeviceError as error:
-            self.journal.note("AXES NOT STOPPED", error=str(error))
-            return "AXES NOT STOPPED"
-        told = "axes at rest" if stopped else "AXES NOT AT REST"
-        self.journal.note(told)
-        return told
+        """Stop every axis, again and again for TRY_S where one does not obey; what became of it."""
+        begin_s = time.monotonic()
+        while True:
+            try:
+                if stop_axes(self.config, lambda text: self.journal.note("axis", told=text), let_go=(self.pid,)):
+                    self.journal.note(AT_REST)
+                    return AT_REST
+                told = "AXES NOT AT REST"
+            except Exception as error:  # noqa: BLE001 - whatever it is, the light and the alarm do not wait for it
+                told = f"AXES NOT STOPPED: {error}"
+            self.journal.note(told)
+            self._axes_problem = told
+            if time.monotonic() - begin_s > TRY_S:
+                return told
+            time.sleep(AGAIN_S)
 
-    def _call(self, message: str) -> None:
-        if not self.alert:
+    # --- words -------------------------------------------------------------------------------------------
+
+    def call(self, message: str) -> None:
+        """Run the rig's alert command, once."""
+        if not self.config.alert:
             return
         try:
             self.alerts.append(
-                subprocess.Popen([*self.alert, message], stdin=subprocess.DEVNULL, start_new_session=True)
+                subprocess.Popen([*self.config.alert, message], stdin=subprocess.DEVNULL, start_new_session=True)
             )
             self.journal.note("alert", message=message)
         except OSError as error:
             self.journal.note("ALERT FAILED", error=str(error), message=message)
 
 
-def _is_stopped(pid: int) -> bool:
-    """Whether a process was stopped by a signal or a tracer, and not only kept waiting by a busy machine."""
+class Alarm:
+    """An alarm at the console and by the rig's command, again and again until somebody acknowledges it."""
+
+    def __init__(self, guard: Guard, text: str) -> None:
+        self._guard = guard
+        self._text = f"{text}. Acknowledge with: {alarms.ACKNOWLEDGE}"
+        self._path: Path | None = None
+        try:
+            self._path = alarms.give_alarm(guard.config.name, text)
+        except OSError as error:
+            guard.journal.note("ALARM NOT WRITTEN DOWN", error=str(error))
+        self._next_s = self._begin_s = time.monotonic()
+
+    def repeat(self) -> bool:
+        """Give the alarm if it is due; True if it was."""
+        if time.monotonic() < self._next_s or self.is_acknowledged():
+            return False
+        self._next_s = time.monotonic() + self._guard.config.alert_every_s
+        self._guard.call(self._text)
+        _print(f"ALARM: {self._text}")
+        return True
+
+    def is_acknowledged(self) -> bool:
+        """Whether its file is gone; what could not be written down counts as acknowledged after a day."""
+        if self._path is None:
+            return time.monotonic() - self._begin_s > LONGEST_S
+        return not self._path.exists()
+
+
+def _print(text: str) -> None:
+    """A line at the console, in a thread: a terminal that is held takes nothing."""
+
+    def write() -> None:
+        with contextlib.suppress(OSError):
+            os.write(2, f"\n{text}\n".encode())
+
+    threading.Thread(target=write, daemon=True).start()
+
+
+def _received(line: socket.socket) -> bytes:
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "Tt"
+        return line.recv(1 << 16)
+    except OSError:
+        return b""
+
+
+def is_stopped(pid: int) -> bool:
+    """Whether a process was stopped or killed, and is not only kept waiting by a busy machine.
+
+    A killed one keeps its ports and its line, as a zombie, while one of its threads waits for a disc in the kernel.
+    """
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "TtZX"
     except OSError:
         return False
 
 
+def with_held_ports(config: RigConfig, held: dict[str, int]) -> RigConfig:
+    """The rig with the address of a descriptor in place of each port that was handed over.
+
+    Parameters
+    ----------
+    held : real path of a device file to the descriptor here.
+    """
+
+    def at(entry: Any) -> Any:
+        if entry is None:
+            return None
+        changes: dict[str, Any] = {}
+        port = getattr(entry, "port", None)
+        if port is not None and os.path.realpath(port) in held:
+            changes["port"] = f"{HELD}{held[os.path.realpath(port)]}{port}"
+        # A filter wheel's shutter has a port of its own.
+        if getattr(entry, "shutter", None) is not None:
+            changes["shutter"] = at(entry.shutter)
+        return entry.model_copy(update=changes)
+
+    axes = {name: at(entry) for name, entry in config.axes.items()}
+    return config.model_copy(update={"axes": axes, "source": at(config.source)})
+
+
 def main() -> None:
-    """Guard what the first line at standard input says."""
+    """Guard what the first line of the socket says."""
     # Ctrl-C at the terminal is for acquire, which ends in order; the guard outlives it.
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
+    line = socket.socket(fileno=int(sys.argv[1]))
+    _, descriptors, _, _ = socket.recv_fds(line, 1, MOST_PORTS)
     first = bytearray()
     while not first.endswith(b"\n"):
-        byte = os.read(0, 1)
+        byte = line.recv(1)
         if not byte:
             return
         first += byte
-    what = json.loads(first)
-    config = parse_yaml(what["rig"], RigConfig, source="rig")
-    journal = Journal(Path(what["log"]) if what["log"] else None)
-    sys.exit(0 if Guard(config, what["pid"], journal, config.alert).watch(0) else 1)
+    hello = json.loads(first)
+    own = parse_yaml(hello["rig"], RigConfig, source="rig")
+    journal = Journal(Path(hello["log"]) if hello["log"] else None)
+    if hello["before"]:
+        journal.note("guard restarted", before=hello["before"])
+    held = dict(zip(hello["ports"], descriptors, strict=False))
+    guard = Guard(with_held_ports(own, held), hello["pid"], journal, own)
+    guard.open_cutoff()
+    sys.exit(0 if guard.watch(line) else 1)
 
 
 if __name__ == "__main__":

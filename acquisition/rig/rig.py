@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import threading
+import time
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
 from typing import Any, Self
 
 from acquisition.cleanup import Step, run_all
 from acquisition.errors import AcquisitionError
-from acquisition.rig.config import RigConfig
+from acquisition.rig.alarms import ACKNOWLEDGE
+from acquisition.rig.config import RigConfig, clock_of, has_own_emulators
+from acquisition.rig.guard import TRY_S
+from acquisition.rig.guarded import BEAT_S, Guarding, WatchedSource
 from acquisition.rig.way import Pose, concerned, find_homing_obstacle, find_obstacle, find_way
 from drivers.camera import Camera, CameraSettings
-from drivers.clock import REAL, Clock
+from drivers.clock import Clock
 from drivers.errors import DeviceError, LimitError, MotionFailed
 from drivers.motion import Limits, Motion, MotionAxis, Position
 from drivers.registry import open_axis, open_camera, open_source
@@ -20,7 +29,6 @@ from drivers.serial_link import LineRegistry
 from drivers.source import LightSource
 from drivers.sources.manual import Ask, ManualSource
 from processing.instrument.model import InstrumentModel
-from simulators.clock import patient_clock
 from simulators.rig.model import SCHEME
 from simulators.rig.rig import SimulatedRig
 
@@ -30,11 +38,6 @@ log = logging.getLogger(__name__)
 SHORTEST_LOOK_S = 0.002
 #: Longest wait for moves that were started and given up.
 REST_WITHIN_S = 60.0
-
-
-def clock_of(config: RigConfig) -> Clock:
-    """The clock of a rig: real devices keep real time, emulators may be kept from running."""
-    return patient_clock() if config.simulated else REAL
 
 
 @contextmanager
@@ -76,7 +79,7 @@ class Rig:
         self.config = config
         self.axes: dict[str, MotionAxis] = {}
         self.camera: Camera | None = None
-        self.source: LightSource | None = None
+        self.source: WatchedSource | None = None
         self.simulation: SimulatedRig | None = None
         self._asked: CameraSettings | None = None
         self._read_back = CameraSettings()
@@ -84,6 +87,9 @@ class Rig:
         self._ask = ask
         self.clock: Clock = clock_of(config)
         self._lines = LineRegistry(config.wire_log, self.clock)
+        self._guarding: Guarding | None = None
+        self._stop_failed: str | None = None
+        self._guard_news: deque[str] = deque(maxlen=100)
 
     def __enter__(self) -> Self:
         try:
@@ -94,6 +100,8 @@ class Rig:
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, Exception):
+            self.call_for_help(error)
         failure = self.close()
         if failure is not None:
             if error is None:
@@ -151,8 +159,8 @@ class Rig:
             source.ask = self._ask
             if self.simulation is not None:
                 self.simulation.uncovered = source.is_on
-        self.source = source
-        return source
+        self.source = WatchedSource(source, self._require_guard)
+        return self.source
 
     def open_camera(self) -> Camera:
         """Open the camera; exposes nothing."""
@@ -177,6 +185,82 @@ class Rig:
         if getattr(entry, "shutter", None) is not None:
             changes["shutter"] = self._at_port(entry.shutter)
         return entry.model_copy(update=changes)
+
+    # --- the guard ---------------------------------------------------------------------------------------
+
+    def start_guard(self, journal: Path | None = None) -> None:
+        """Have the rig watched from outside, if that is not done yet.
+
+        Emulators that end with this process need no guard. Without this call the guard begins with the first light.
+
+        Parameters
+        ----------
+        journal : the file that the guard appends to, or None.
+        """
+        if self._guarding is None and not has_own_emulators(self.config):
+            self._guarding = Guarding(
+                self.config, journal, self._lines.descriptors(), self._shut_at_once, self._guard_news.append
+            )
+
+    def _require_guard(self) -> None:
+        self.start_guard()
+        if self._guarding is not None:
+            self._guarding.require()
+
+    def _shut_at_once(self) -> None:
+        if self.source is not None and self.source.is_lit and not isinstance(self.source.inner, ManualSource):
+            self.source.set_light(False)
+
+    def light_losses(self) -> int:
+        """How often the light was shut from outside so far: what was exposed meanwhile does not count."""
+        return 0 if self._guarding is None else self._guarding.losses
+
+    def guard_news(self) -> list[str]:
+        """What the guard's watch has had to say since the last call."""
+        return [self._guard_news.popleft() for _ in range(len(self._guard_news))]
+
+    def call_for_help(self, error: Exception) -> None:
+        """Have the guard run the rig's alert command with an error, once."""
+        if self._guarding is not None:
+            self._guarding.say_failed(str(error))
+
+    def _end_guard(self, will_retry: bool) -> None:
+        """Let the guard rest, or give it a light or an axis that does not obey. Raises AcquisitionError."""
+        guarding, self._guarding = self._guarding, None
+        if guarding is None:
+            return
+        disobeyed = self.source.disobeyed if self.source is not None else None
+        if will_retry:
+            if disobeyed is not None:
+                guarding.say_failed(f"THE LIGHT IS NOT SHUT, it is tried again for {TRY_S:g} s: {disobeyed}")
+                with contextlib.suppress(AcquisitionError):
+                    self.insist_on_dark()
+                assert self.source is not None
+                disobeyed = self.source.disobeyed
+            # The next try opens the axes anew.
+            self._stop_failed = None
+        failed = [text for text in (disobeyed, self._stop_failed) if text is not None]
+        text = f"acquire could not make the rig safe: {'; '.join(failed)}" if failed else None
+        if not guarding.end(text):
+            self.insist_on_dark()
+        elif text is not None:
+            raise AcquisitionError(
+                f"{text}. THE LIGHT MAY BE ON, AN AXIS MAY MOVE. The guard tries again and gives the alarm until "
+                f"somebody acknowledges it: {ACKNOWLEDGE}"
+            )
+
+    def insist_on_dark(self) -> None:
+        """Try for a minute to shut a light that did not obey. Raises AcquisitionError."""
+        end_s = time.monotonic() + TRY_S
+        while self.source is not None and self.source.disobeyed is not None:
+            try:
+                self.source.set_light(False)
+            except Exception as error:
+                if time.monotonic() > end_s:
+                    raise AcquisitionError(
+                        f"THE LIGHT IS NOT SHUT after {TRY_S:g} s of tries: {error}. Switch it off by hand."
+                    ) from error
+                time.sleep(BEAT_S)
 
     # --- motion ------------------------------------------------------------------------------------------
 
@@ -341,8 +425,21 @@ class Rig:
         return min(max(off_s / 2, SHORTEST_LOOK_S), longest_s)
 
     def stop(self) -> Exception | None:
-        """Send a stop to every axis, whatever the others answer; returns the first failure."""
-        return run_all([(f"stop axis {name}", axis.stop) for name, axis in self.axes.items()])
+        """Shut the light that this program has lit and stop every axis, whatever they answer; the first failure.
+
+        Light first: the axes are sent their stop meanwhile, but no later than an answer of the light takes.
+        """
+        shut = threading.Thread(target=run_all, args=([("shut off the light", self._shut_at_once)],), daemon=True)
+        try:
+            shut.start()
+        except RuntimeError:
+            # No thread to be had: one after the other, then.
+            shut.run()
+        failure = run_all([(f"stop axis {name}", axis.stop) for name, axis in self.axes.items()])
+        with contextlib.suppress(RuntimeError):
+            shut.join()
+        self._stop_failed = None if failure is None else str(failure)
+        return failure
 
     @property
     def time_scale(self) -> float:
@@ -382,9 +479,14 @@ class Rig:
                 devices[name]["port"] = port
         return devices
 
-    def close(self) -> Exception | None:
-        """Release every device; moves and stops nothing. Returns the first failure."""
-        steps: list[Step] = []
+    def close(self, *, will_retry: bool = False) -> Exception | None:
+        """Release every device; moves and stops nothing. Returns the first failure.
+
+        Parameters
+        ----------
+        will_retry : this program opens the rig again and tries itself what did not obey.
+        """
+        steps: list[Step] = [("end the guard", partial(self._end_guard, will_retry))]
         if self.camera is not None:
             steps.append(("close the camera", self.camera.close))
         if self.source is not None:

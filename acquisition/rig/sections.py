@@ -42,6 +42,11 @@ class RigSections(Part):
     axes: dict[str, AxisEntry]
     camera: CameraEntry
     source: SourceEntry | None = None
+    cutoff: SourceEntry | None = Field(
+        default=None,
+        description="second shutter or relay in the light, best one that shuts by itself without a heartbeat; the "
+        "guard of `acquire` holds it, and light passes it only while the guard watches",
+    )
     detector: Detector
     modes: dict[str, ModeConfig] = Field(min_length=1)
     wavelengths_nm: tuple[Annotated[float, Field(gt=0)], ...] = Field(min_length=1)
@@ -66,6 +71,7 @@ class RigSections(Part):
     alert: tuple[str, ...] = Field(
         default=(), description="command that is run, with a message as its last argument, when a run fails or dies"
     )
+    alert_every_s: float = Field(default=60.0, ge=1, description="time between two alerts of an alarm")
     notify: NotifyConfig | None = Field(default=None, description="who hears of an end, a failure, an interlock")
     wire_log: Path | None = Field(default=None, description="folder for a transcript of every byte on serial lines")
     forbidden: tuple[ForbiddenPose, ...] = ()

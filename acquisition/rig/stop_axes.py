@@ -15,13 +15,11 @@ from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from acquisition.rig.config import RigConfig
-from acquisition.rig.rig import clock_of
+from acquisition.rig.config import RigConfig, clock_of
 from drivers.errors import CommandRejected, DeviceError, PortBusy
 from drivers.motion import AxisConfig, MotionAxis
 from drivers.registry import open_axis
 from drivers.serial_link import LineRegistry, port_holders
-from simulators.rig.model import SCHEME
 
 #: Longest wait for a running `acquire` to seal its file and let go of the ports.
 LET_GO_S = 15.0
@@ -49,11 +47,6 @@ def stop_axes(config: RigConfig, tell: Tell, let_go: Collection[int] = ()) -> bo
     with LineRegistry(clock=clock_of(config)) as registry, ThreadPoolExecutor(max(1, len(lines))) as threads:
         stopped = threads.map(lambda port: _stop_line(port, lines[port], registry, told, tell), lines)
         return all(list(stopped))
-
-
-def has_own_emulators(config: RigConfig) -> bool:
-    """True for a rig whose axes exist only inside the command that opened it."""
-    return any(entry.port.startswith(SCHEME) for entry in config.axes.values())
 
 
 def _tell_running(ports: list[str], tell: Tell) -> set[int]:

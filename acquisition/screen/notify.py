@@ -16,9 +16,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from acquisition.errors import AcquisitionError
+from acquisition.errors import as_known
 from acquisition.screen.observer import Observer
-from drivers.errors import DeviceError
 
 log = logging.getLogger(__name__)
 
@@ -105,8 +104,8 @@ def notifying(config: NotifyConfig | None, what: Path, simulated: bool) -> Itera
     notifier = Notifier(config, what, simulated)
     try:
         yield notifier
-    except (AcquisitionError, DeviceError, OSError) as error:
-        notifier.tell("failure", str(error), pid=os.getpid())
+    except Exception as error:
+        notifier.tell("failure", str(as_known(error)), pid=os.getpid())
         raise
     finally:
         notifier.settle()

@@ -3,21 +3,25 @@
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
+from acquisition.rig import alarms
 from acquisition.rig.config import load_rig
-from acquisition.rig.guard import Guard, Journal
+from acquisition.rig.guard import Guard, Journal, with_held_ports
+from acquisition.rig.rig import Rig
+from processing.storage.capture import Capture
+from processing.yaml_file import dump_yaml
 from simulators.rig.served_rig import serve
+from simulators.serial.reply_faults import parse_fault
 
 
 @pytest.fixture
-def served(quick_rig, tmp_path):
+def served(quick_rig, tmp_path, monkeypatch):
     """A rig whose emulators live in this process, so that they outlast the program that is killed."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     told = tmp_path / "told.txt"
     hook = tmp_path / "hook.sh"
     hook.write_text(f'#!/bin/sh\necho "$1" >> {told}\n')
@@ -30,7 +34,7 @@ def served(quick_rig, tmp_path):
         "arm": {"kind": "smc100", "port": "sim:arm", "address": 1, "limits_deg": [0, 180]} | patient,
     }
     source = {"kind": "sc10", "port": "sim:shutter", "blade_s": 60} | patient
-    top = {"settle_s": 0.0, "alert": [str(hook)], "axes": axes, "source": source}
+    top = {"settle_s": 0.0, "alert": [str(hook)], "alert_every_s": 1, "axes": axes, "source": source}
     rig = quick_rig("behind.yaml", clock_speed=4, top=top)
     with serve(rig, tmp_path / "served.yaml", "red_sphere") as simulation:
         yield simulation, tmp_path / "served.yaml", told
@@ -74,33 +78,99 @@ def test_killed_or_frozen_the_light_is_shut_and_the_axes_stop(kind, spawn, parti
     assert "guard rests" in journal.read_text()
 
 
-def test_a_guard_tells_of_a_failure_and_rests(tmp_path, served):
-    """Beats, a failure and the word to rest: nothing is shut and no port is opened."""
-    _, rig, told = served
-    guard = subprocess.Popen([sys.executable, "-m", "acquisition.rig.guard"], stdin=subprocess.PIPE, text=True)
-    log = tmp_path / "guard.jsonl"
-    first = {"rig": rig.read_text(), "pid": os.getpid(), "log": str(log)}
-    guard.communicate(json.dumps(first) + "\nbeat 1\nfailed a device broke\nrest\n")
-    assert guard.returncode == 0
-    _until(lambda: told.exists() and "a device broke" in told.read_text())
-    assert [json.loads(line)["event"] for line in log.read_text().splitlines()] == [
-        "guard watches", "alert", "guard rests",
-    ]  # fmt: skip
+@pytest.fixture
+def open_rig(served):
+    """The served rig, open in this process, with a guard that watches it."""
+    simulation, rig, told = served
+    with Rig(load_rig(rig), with_camera=False) as live:
+        live.start_guard(rig.parent / "guard.jsonl")
+        yield live, simulation, told
 
 
-def test_the_light_is_shut_however_late_its_port_is_free(served):
-    """What dies slowly holds the port for longer than anybody should wait before calling for help."""
+def _guard_of(rig):
+    return rig._guarding._guard.pid
+
+
+def test_no_light_before_a_guard_watches_and_the_light_goes_off_with_the_guard(open_rig):
+    rig, simulation, _ = open_rig
+    rig.source.set_light(True)
+    assert "guard watches" in (served_journal := Path(rig._guarding._journal)).read_text(), served_journal
+    assert _lit(simulation)
+    for number, kind in enumerate((signal.SIGKILL, signal.SIGSTOP), start=1):
+        before = _guard_of(rig)
+        os.kill(before, kind)
+        _until(lambda: not _lit(simulation))
+        _until(lambda number=number: rig.light_losses() >= number)
+        if kind == signal.SIGSTOP:
+            os.kill(before, signal.SIGCONT)
+        rig.source.set_light(True)
+        assert _lit(simulation)
+    news = " ".join(rig.guard_news())
+    assert "killed by signal 9" in news
+    assert "stopped or silent" in news
+
+
+def test_a_capture_survives_its_guard(spawn, partial_of, served, intact, tmp_path):
+    rig = served[1]
+    child = spawn("--omega", 35, "--rig", rig, "--out", tmp_path / "out")
+    partial_of(tmp_path / "out", child, states=5)
+    (guard,) = _guards_of(child.pid)
+    os.kill(guard, signal.SIGKILL)
+    _, err = child.communicate()
+    assert child.returncode == 0, err
+    assert "the guard was lost (it was killed by signal 9)" in err
+    (path,) = (tmp_path / "out").glob("*.h5")
+    assert intact(path) == 44
+    with Capture(path) as capture:
+        assert any("the guard was lost" in text for text in capture.closing["messages"])
+    assert "guard restarted" in (tmp_path / "out" / "guard.jsonl").read_text()
+
+
+def _guards_of(pid):
+    children = Path(f"/proc/{pid}/task").glob("*/children")
+    pids = {int(number) for file in children for number in file.read_text().split()}
+    return [number for number in pids if b"acquisition.rig.guard" in Path(f"/proc/{number}/cmdline").read_bytes()]
+
+
+@pytest.mark.parametrize("fault", ["silent", "garbled"])
+def test_a_light_that_acquire_cannot_shut_is_shut_by_the_guard(spawn, partial_of, served, tmp_path, fault):
+    """The shutter's line answers with noise or nothing; when it is well again the guard shuts the light."""
     simulation, rig, told = served
     config = load_rig(rig)
-    with open(config.source.port, "rb") as port:
-        holder = subprocess.Popen(["sleep", "600"], stdin=port)
-    guard = Guard(config, holder.pid, Journal(None), config.alert)
-    with ThreadPoolExecutor(1) as beside:
-        light = beside.submit(guard._shut_light)
-        _until(lambda: told.exists() and "could not be shut yet" in told.read_text())
-        assert not light.done()
-        holder.kill()
-        holder.wait()
-        assert light.result() == "light shut"
-    assert [alert.wait() for alert in guard.alerts] == [0]
+    rig.write_text(dump_yaml(config.model_copy(update={"source": config.source.model_copy(update={"reply_s": 1.0})})))
+    child = spawn("--omega", 35, "--rig", rig, "--out", tmp_path / "out")
+    partial_of(tmp_path / "out", child, states=5)
+    _until(lambda: _lit(simulation), child)
+    shutter = simulation.emulators["shutter"]
+    shutter.faults.add(parse_fault(fault))
+    child.send_signal(signal.SIGINT)
+    child.send_signal(signal.SIGTERM)
+    _, err = child.communicate()
+    assert child.returncode != 0
+    assert alarms.ACKNOWLEDGE in err
+    # The alarm repeats, and stays when the line is well and the light is off.
+    _until(lambda: told.exists() and told.read_text().count("THE LIGHT IS NOT SHUT") >= 2)
+    shutter.faults.clear()
+    _until(lambda: not _lit(simulation))
+    (alarm,) = alarms.unacknowledged()
+    alarms.acknowledge(alarm)
+    _until(lambda: "alarm acknowledged" in (tmp_path / "out" / "guard.jsonl").read_text())
+
+
+def test_a_guard_writes_to_a_port_that_somebody_holds(open_rig):
+    """What dies slowly, or waits in the kernel, holds its ports: the guard has them already."""
+    rig, simulation, _ = open_rig
+    rig.source.set_light(True)
+    held = with_held_ports(rig.config, rig._lines.descriptors())
+    assert Guard(held, os.getpid(), Journal(None))._try_light() is None
     assert not _lit(simulation)
+
+
+def test_acknowledge_is_a_command(acquire, monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    path = alarms.give_alarm("bench", "THE LIGHT IS NOT SHUT")
+    code, out, err = acquire("acknowledge")
+    assert code == 0
+    assert "ALARM since" in err
+    assert "rig bench: THE LIGHT IS NOT SHUT" in out
+    assert not path.exists()

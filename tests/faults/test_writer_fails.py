@@ -67,8 +67,9 @@ def test_a_disc_that_takes_nothing_shuts_the_light_and_ends_the_run(run_with, in
         error, path = run_with(lambda rig, *_: rigs.append(rig), plan=SHORT, observers=(Told(),))
     assert "the disc has not taken a state for 1 s" in str(error)
     told = [number for number, entry in enumerate(lit) if "the disc takes no data" in str(entry)]
-    # The light is shut right after it was told, not at the end of the run.
-    assert lit[told[0] + 1] == "set"
+    # The light comes before the words, not at the end of the run.
+    assert lit[told[0] - 1] == "set"
+    assert lit[told[0]][1] == 0
     assert not rigs[0].simulation.light()
     blocked.set()
     _let_go(path)

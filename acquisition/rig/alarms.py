@@ -1,0 +1,58 @@
+"""Alarms that repeat until somebody acknowledges them; each is a small file in memory, so that any program sees it."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import json
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+#: What to type; every alarm ends with it.
+ACKNOWLEDGE = "acquire acknowledge"
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """An alarm that nobody has acknowledged yet."""
+
+    path: Path
+    rig: str
+    time: str
+    text: str
+
+
+def folder() -> Path:
+    """Where the alarms of this user are; /run is memory, and so is most systems' folder for temporary files."""
+    for runtime in (os.environ.get("XDG_RUNTIME_DIR"), f"/run/user/{os.getuid()}"):
+        if runtime and os.access(runtime, os.W_OK):
+            return Path(runtime) / "umov"
+    return Path(tempfile.gettempdir()) / f"umov-{os.getuid()}"
+
+
+def give_alarm(rig: str, text: str) -> Path:
+    """Write an alarm down, or replace the one of this process; it is over when the file is gone. Raises OSError."""
+    path = folder() / f"alarm-{os.getpid()}.json"
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    now = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
+    new = path.with_suffix(".new")
+    new.write_text(json.dumps({"rig": rig, "time": now, "text": text}), encoding="utf-8")
+    new.rename(path)
+    return path
+
+
+def unacknowledged() -> list[Alarm]:
+    """The alarms that nobody has acknowledged, the oldest first."""
+    found = []
+    for path in folder().glob("alarm-*.json"):
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+            content = json.loads(path.read_text(encoding="utf-8"))
+            found.append(Alarm(path, str(content["rig"]), str(content["time"]), str(content["text"])))
+    return sorted(found, key=lambda alarm: alarm.time)
+
+
+def acknowledge(alarm: Alarm) -> None:
+    """Somebody has seen it: the guard that repeats it notes so and ends."""
+    alarm.path.unlink(missing_ok=True)
