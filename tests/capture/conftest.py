@@ -91,6 +91,12 @@ class RecordedRig:
     def note(self, *what: object) -> None:
         self.events.append((round(self.clock.now_s(), 6), *what))
 
+    def light_losses(self) -> int:
+        return 0
+
+    def guard_news(self) -> list[str]:
+        return []
+
     def require_camera(self) -> Any:
         return self.camera
 
