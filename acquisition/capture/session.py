@@ -166,10 +166,7 @@ def _run(
         _begin_segment(job, rig, runner, earlier)
     writer.on_failure = stop.fail
     try:
-        for text in rig.require_camera().warnings():
-            runner.warn(f"the camera is not in a known state: {text}")
-        for observer in watchers:
-            observer.run_started(title_of(job.plan), job.table, len(pending), job.instrument.mosaic)
+        _announce(job, rig, runner, len(pending))
         with stop.failing_here():
             _go_to_start(job, rig, runner, first)
             whole = _take_states(job, runner, pending)
@@ -197,6 +194,13 @@ def _run(
         failure.add_note(f"States done so far are in {path}. Go on with: acquire --resume {path}")
         raise failure
     return _result(path, status, job, runner)
+
+
+def _announce(job: Job, rig: Rig, runner: CaptureRunner, pending: int) -> None:
+    for text in rig.require_camera().warnings():
+        runner.warn(f"the camera is not in a known state: {text}")
+    for observer in runner.observers:
+        observer.run_started(title_of(job.plan), job.table, pending, job.instrument.mosaic)
 
 
 def _take_states(job: Job, runner: CaptureRunner, pending: Sequence[int]) -> bool:
