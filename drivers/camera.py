@@ -241,6 +241,11 @@ class Camera(ABC):
         return self._settings
 
     @property
+    def configured(self) -> CameraSettings | None:
+        """The settings as last read back; None before the first `configure`."""
+        return self._settings
+
+    @property
     @abstractmethod
     def bits(self) -> int:
         """Real bits of a pixel."""

@@ -21,7 +21,8 @@ from pathlib import Path
 
 from acquisition.bluesky_devices.axis_and_camera import AxisDevice, CameraDevice
 from acquisition.bluesky_devices.capture_device import CaptureDevice
-from acquisition.capture.plan import MeasurementPlan
+from acquisition.bluesky_devices.settings import InterlockDevice, SettingDevice
+from acquisition.capture.plan import ARM, MeasurementPlan
 from acquisition.rig.config import load_rig
 from acquisition.rig.rig import Rig
 
@@ -34,10 +35,19 @@ class Bench:
         self.turn = threading.Lock()
         self.axes = {name: AxisDevice(name, rig, self.turn) for name in rig.axes}
         self.camera = CameraDevice("camera", rig, self.turn)
+        self.exposure = SettingDevice(
+            "exposure_s",
+            rig,
+            self.turn,
+            get=lambda: self.camera.exposure_s,
+            change=self.camera.change_exposure,
+            unit="s",
+        )
+        self.interlock = InterlockDevice("interlock", rig, self.turn)
 
     def capture(self, plan: MeasurementPlan, folder: Path | str, name: str = "capture") -> CaptureDevice:
         """A device that takes captures by a plan. Raises PlanRefused."""
-        return CaptureDevice(name, self.rig, self.turn, plan, folder, self.home)
+        return CaptureDevice(name, self.rig, self.turn, plan, folder, home=self.home, arm=self.axes.get(ARM))
 
 
 @contextmanager
@@ -52,4 +62,8 @@ def open_bench(rig_file: Path | str, home: bool = False) -> Iterator[Bench]:
     with Rig(config) as rig:
         if (home or config.home_at_start) and (missing := rig.unhomed()):
             rig.home(missing)
-        yield Bench(rig, home)
+        bench = Bench(rig, home)
+        try:
+            yield bench
+        finally:
+            bench.interlock.close()

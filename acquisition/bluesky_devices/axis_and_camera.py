@@ -10,6 +10,7 @@ import numpy as np
 from acquisition.bluesky_devices.device import Device, Readings, data_key, readings
 from acquisition.bluesky_devices.frames_in_files import FRAME, Documents, asset_documents, in_file, write_frame
 from acquisition.bluesky_devices.status import Status, in_background
+from acquisition.errors import AcquisitionError
 
 
 class AxisDevice(Device):
@@ -25,12 +26,20 @@ class AxisDevice(Device):
         """Angle as read back, degrees."""
         return self.rig.axes[self.name].read_position().deg
 
+    #: Where a plan has sent it since the rig was opened.
+    target_deg: float | None = None
+
+    def _configuration(self) -> dict[str, tuple[Any, str]]:
+        who = self.rig.axes[self.name].describe()
+        return {"serial_number": (who.serial_number, ""), "model": (who.model, "")}
+
     def set(self, value: float) -> Status:
         """Go to an angle, degrees. The status fails if it is forbidden, out of limits, or not reached."""
 
         def move() -> None:
             with self.turn:
                 self.rig.move({self.name: float(value)})
+                self.target_deg = float(value)
 
         return in_background(move)
 
@@ -52,7 +61,7 @@ class CameraDevice(Device):
 
     Attributes
     ----------
-    exposure_s : of the next frames; change it between plans.
+    exposure_s : of the next frames; a plan sets it by `Bench.exposure`, or by `configure`.
     sample : what an emulated rig shows.
     folder : where frames are put, each in a file of its own that documents point to, as Tiled and everybody else who
         takes no images in events wants it; None: the events hold the frames.
@@ -65,6 +74,30 @@ class CameraDevice(Device):
     exposure_s = 0.02
     sample = "red_sphere"
     tells_frames = True
+
+    def _configuration(self) -> dict[str, tuple[Any, str]]:
+        camera = self.rig.require_camera()
+        who = camera.describe()
+        told = {
+            "exposure_s": (self.exposure_s, "s"),
+            "serial_number": (who.serial_number, ""),
+            "model": (who.model, ""),
+        }
+        gain_db = None if camera.configured is None else camera.configured.gain_db
+        return told | ({} if gain_db is None else {"gain_db": (gain_db, "dB")})
+
+    def configure(self, values: dict[str, float]) -> tuple[Readings, Readings]:
+        """Change the exposure (`exposure_s`); returns the configuration before and after."""
+        before = self.read_configuration()
+        if unknown := values.keys() - {"exposure_s"}:
+            raise AcquisitionError(f"{self.name} has no setting {', '.join(sorted(unknown))}, only exposure_s.")
+        with self.turn:
+            self.change_exposure(values.get("exposure_s", self.exposure_s))
+        return before, self.read_configuration()
+
+    def change_exposure(self, exposure_s: float) -> None:
+        """Set the exposure of the next frames, as the camera takes it."""
+        self.exposure_s = self.rig.set_exposure(exposure_s, 1).exposure_s or exposure_s
 
     def stage(self) -> list[Device]:
         """Set the exposure, let light through."""

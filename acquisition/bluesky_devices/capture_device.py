@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from acquisition.bluesky_devices.axis_and_camera import AxisDevice
 from acquisition.bluesky_devices.device import Device, Readings, data_key, readings
 from acquisition.bluesky_devices.frames_in_files import Documents, asset_documents, in_file
+from acquisition.bluesky_devices.settings import SettingDevice
 from acquisition.bluesky_devices.status import Status, in_background
 from acquisition.capture import session
 from acquisition.capture.checks import refuse_failed
@@ -32,20 +35,31 @@ class CaptureDevice(Device):
 
     If the RunEngine pauses, the state that is being taken is finished and the light is shut; when it resumes, the same
     file is gone on with, as `acquire --resume` does. `read` gives the file, and angles and columns of its states;
-    the frames stay in the file, which a stream document points to.
+    the frames stay in the file, which a stream document points to. Once a plan has moved the arm, Omega is where the
+    arm was sent: a scan of the arm takes a capture at each of its angles. Until then it is that of `plan`.
 
     Parameters
     ----------
     plan : of every capture that this device takes.
     folder : for the files, which are named as `acquire` names them.
     home : home axes without a reference before the first move of a capture.
+    arm : the arm of the rig; None for a rig without.
     """
 
     def __init__(
-        self, name: str, rig: Rig, turn: threading.Lock, plan: MeasurementPlan, folder: Path | str, home: bool
+        self,
+        name: str,
+        rig: Rig,
+        turn: threading.Lock,
+        plan: MeasurementPlan,
+        folder: Path | str,
+        *,
+        home: bool,
+        arm: AxisDevice | None,
     ) -> None:
         super().__init__(name, rig, turn)
         self.plan, self.folder = plan, Path(folder)
+        self._arm = arm
         self._home = home
         self._job = prepare(plan, rig.config)
         self._stop = StopRequest()
@@ -63,6 +77,8 @@ class CaptureDevice(Device):
     def _take(self) -> None:
         with self.turn:
             half = self._half
+            if half is None and self._arm is not None and self._arm.target_deg is not None:
+                self._change(omega_deg=self._arm.target_deg)
             if half is not None:
                 result = self._run(session.resume, job_of(half, self.rig.config, self.plan), half)
             else:
@@ -73,6 +89,53 @@ class CaptureDevice(Device):
             self._documents = list(self._asset_documents(result.path))
         else:
             self._half = result.path
+
+    def _change(self, **values: Any) -> None:
+        """Take the next captures with other values of the plan. Raises PlanRefused, ValidationError."""
+        plan = MeasurementPlan.model_validate(self.plan.model_dump() | values)
+        if plan != self.plan:
+            self._job = prepare(plan, self.rig.config)
+            self.plan = plan
+
+    def setting(self, key: Literal["exposure_s", "wavelength_nm"]) -> SettingDevice:
+        """A number of the plan as a device that a plan of bluesky can move."""
+        unit = {"exposure_s": "s", "wavelength_nm": "nm"}[key]
+        return SettingDevice(
+            f"{self.name}_plan_{key}",
+            self.rig,
+            self.turn,
+            get=lambda: self._number(key),
+            change=lambda value: self._change(**{key: value}),
+            unit=unit,
+        )
+
+    def _number(self, key: str) -> float:
+        value = getattr(self.plan, key)
+        return float(value) if isinstance(value, int | float) else math.nan
+
+    def configure(self, values: dict[str, Any]) -> tuple[Readings, Readings]:
+        """Change values of the plan, such as `wavelength_nm`; returns the configuration before and after.
+
+        Raises
+        ------
+        PlanRefused, ValidationError
+            The rig cannot do it, or the plan has no such value.
+        """
+        before = self.read_configuration()
+        with self.turn:
+            self._change(**values)
+        return before, self.read_configuration()
+
+    def _configuration(self) -> dict[str, tuple[Any, str]]:
+        who = self.rig.require_camera().describe()
+        told: dict[str, tuple[Any, str]] = {
+            "mode": (self.plan.mode, ""),
+            "sample": (self.plan.sample.name or self.plan.sample.kind, ""),
+            "wavelength_nm": (self.plan.wavelength_nm, "nm"),
+            "camera_serial_number": (who.serial_number, ""),
+        }
+        exposure_s = self._number("exposure_s")
+        return told | ({} if math.isnan(exposure_s) else {"plan_exposure_s": (exposure_s, "s")})
 
     def _run(self, run: Callable[..., Result], job: Job, path: Path) -> Result:
         refuse_failed(check_with_devices(job, self.rig, path.parent))

@@ -12,7 +12,7 @@ Readings = dict[str, dict[str, Any]]
 
 
 class Device:
-    """What all have: a name, no parent, and nothing to configure but what `read` tells."""
+    """What all have: a name, no parent, and a configuration that may be empty."""
 
     parent = None
 
@@ -22,13 +22,24 @@ class Device:
         #: Held while something moves or is exposed: one thing at a time, as the rig's checks assume.
         self.turn = turn
 
-    def read_configuration(self) -> Readings:
-        """Nothing that changes seldom."""
+    def _configuration(self) -> dict[str, tuple[Any, str]]:
+        """What changes seldom: value and unit by name."""
         return {}
 
+    def read_configuration(self) -> Readings:
+        """What changes seldom, such as a serial number."""
+        return readings({f"{self.name}_{key}": value for key, (value, _) in self._configuration().items()})
+
     def describe_configuration(self) -> Readings:
-        """Nothing that changes seldom."""
-        return {}
+        """Type and unit of each."""
+        return {
+            f"{self.name}_{key}": data_key("configuration", (), unit) | _type_of(value)
+            for key, (value, unit) in self._configuration().items()
+        }
+
+
+def _type_of(value: Any) -> dict[str, str]:
+    return {"dtype": "string"} if isinstance(value, str) else {}
 
 
 def readings(values: dict[str, Any]) -> Readings:

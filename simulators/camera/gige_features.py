@@ -131,7 +131,7 @@ def description(table: NodeMap, width: int, height: int) -> str:
         _integer("GevSCPD", PACKET_DELAY, 0, 1_000_000),
         _payload_size(table),
     ]
-    names = re.findall(r'<\w+ Name="(\w+)" NameSpace="Standard">', "".join(features))
+    names = re.findall(r'<(?!EnumEntry)\w+ Name="(\w+)" NameSpace="Standard">', "".join(features))
     listed = "".join(f"<pFeature>{name}</pFeature>" for name in names)
     return (
         f'<?xml version="1.0" encoding="utf-8"?>\n<RegisterDescription'

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from drivers.aravis_library import list_cameras, load_aravis
 from drivers.camera import CameraSettings
 from drivers.cameras import aravis
 from processing.yaml_file import ConfigError
@@ -135,6 +136,12 @@ def test_a_pulse_on_the_line_exposes_and_a_program_s_trigger_does_not(stack: Exi
     simulated.fire()
     camera.capture()
     assert len(shown.infos) == 2
+
+
+def test_a_camera_is_found_by_asking_everybody(stack: ExitStack) -> None:
+    played(stack)
+    aravis_module, _ = load_aravis()
+    assert "PLAYED1" in [camera["serial_number"] for camera in list_cameras(aravis_module)]
 
 
 def test_a_description_is_served_as_it_is_packed_or_not(stack: ExitStack, tmp_path: Path) -> None:

@@ -14,9 +14,11 @@ import numpy as np
 import pytest
 from bluesky import RunEngine
 from bluesky import plan_stubs as bps
-from bluesky.plans import count, scan
-from bluesky.protocols import Movable, Pausable, Readable, Triggerable
+from bluesky.plans import count, grid_scan, list_scan, scan
+from bluesky.protocols import Configurable, Movable, Pausable, Readable, Subscribable, Triggerable
+from bluesky.suspenders import SuspendBoolHigh
 from bluesky.utils import FailedStatus, RunEngineInterrupted
+from event_model import DocumentNames, schema_validators
 
 from acquisition.bluesky_devices import open_bench
 from acquisition.bluesky_devices.capture_device import COLUMNS
@@ -25,6 +27,8 @@ from processing.storage.capture import Capture
 
 PLAN = MeasurementPlan(omega_deg=35.0)
 BLACK_LEVEL = 64
+#: Few states, for plans that take several captures.
+SHORT = MeasurementPlan(omega_deg=35.0, darks=1, states={"kind": "rotating_retarders", "states": 20, "step_deg": 9.0})
 
 
 @pytest.fixture
@@ -229,3 +233,98 @@ def _paused(run, device, folder) -> None:
     with Capture(half) as capture:
         assert capture.status == "aborted"
         assert 5 <= len(capture.done) < capture.planned_states
+
+
+def _omegas(documents):
+    for event in _events(documents):
+        with Capture(event["capture_file"]) as capture:
+            told = {float(deg) for deg in np.round(capture.angles_deg["arm"], 2)}
+            yield round(event["arm"], 2), capture.header.omega_deg, told
+
+
+def test_a_scan_of_omega_takes_each_capture_where_the_arm_stands(bench, engine, tmp_path):
+    run, documents = engine
+    device = bench.capture(SHORT, tmp_path / "captures")
+    arm, psg = bench.axes["arm"], bench.axes["psg"]
+    for plan, angles in (
+        (scan([device], arm, 60, 120, 2), [60, 120]),
+        (list_scan([device], arm, [70.0, 50.0]), [70, 50]),
+        (grid_scan([device], arm, 40, 80, 2, psg, 0, 10, 2), [40, 40, 80, 80]),
+    ):
+        documents.clear()
+        run(plan)
+        assert list(_omegas(documents)) == [(angle, angle, {angle}) for angle in angles]
+
+
+def test_without_a_move_of_the_arm_omega_is_that_of_the_plan(bench, engine, tmp_path):
+    run, documents = engine
+    run(count([bench.capture(SHORT, tmp_path / "captures"), bench.axes["arm"]]))
+    assert [omega for _, omega, _ in _omegas(documents)] == [SHORT.omega_deg]
+
+
+def test_documents_hold_the_configuration_and_pass_the_schemas_of_event_model(bench, engine, tmp_path):
+    run, documents = engine
+    device = bench.capture(SHORT, tmp_path / "captures")
+    run(scan([bench.camera, device], device.setting("exposure_s"), 0.01, 0.02, 2))
+    for name, document in documents:
+        schema_validators[DocumentNames[name]].validate(document)
+    descriptor = next(document for name, document in documents if name == "descriptor")
+    camera = descriptor["configuration"]["camera"]["data"]
+    assert camera["camera_exposure_s"] == 0.02
+    assert camera["camera_serial_number"] == bench.rig.camera.describe().serial_number
+    assert descriptor["configuration"]["capture"]["data"]["capture_wavelength_nm"] == 662
+    exposures = []
+    for event in _events(documents):
+        with Capture(event["capture_file"]) as capture:
+            exposures.append((event["capture_exposure_s"][0], capture.column("exposure_s")[0]))
+    assert exposures == [pytest.approx((0.01, 0.01)), pytest.approx((0.02, 0.02))]
+
+
+def test_a_plan_sets_exposure_and_wavelength(bench, engine, tmp_path):
+    run, documents = engine
+    bench.camera.tells_frames = False
+    run(scan([bench.camera], bench.exposure, 0.01, 0.04, 2))
+    first, second = (event["camera_mean"] - BLACK_LEVEL for event in _events(documents))
+    assert second == pytest.approx(4 * first, rel=0.1)
+    device = bench.capture(SHORT, tmp_path / "captures")
+    assert isinstance(device, Configurable)
+
+    def at_the_other_wavelength():
+        yield from bps.configure(device, {"wavelength_nm": 451})
+        yield from count([device])
+
+    run(at_the_other_wavelength())
+    with Capture(_events(documents)[-1]["capture_file"]) as capture:
+        assert capture.header.wavelength_nm == 451
+
+
+def test_an_open_interlock_suspends_a_plan_until_it_is_closed(bench, engine, monkeypatch):
+    run, documents = engine
+    assert isinstance(bench.interlock, Subscribable)
+    door = {"open": False}
+    monkeypatch.setattr(bench.rig.source, "interlock_open", lambda: door["open"])
+    run.install_suspender(SuspendBoolHigh(bench.interlock))
+    bench.camera.tells_frames = False
+    opened, closed = [], []
+
+    def opens_and_closes(name, document):
+        # What comes again after a suspension must not open it again.
+        if name == "event" and document["seq_num"] == 2 and not opened:
+            door["open"] = True
+            opened.append(time.monotonic())
+
+            def close():
+                closed.append(time.monotonic())
+                door["open"] = False
+
+            threading.Timer(2.0, close).start()
+
+    times = []
+    run.subscribe(opens_and_closes)
+    run.subscribe(lambda *_: times.append(time.monotonic()), "event")
+    run(count([bench.camera], num=5, delay=0.5))
+    # What was under way is taken again.
+    assert {document["seq_num"] for name, document in documents if name == "event"} == {1, 2, 3, 4, 5}
+    # Nothing is taken from the moment at which it is seen until the door is shut.
+    assert not [moment for moment in times if opened[0] + 1.0 < moment < closed[0]]
+    run.clear_suspenders()

@@ -6,6 +6,7 @@ Numbers of commands and registers are those that Aravis and Wireshark's dissecto
 from __future__ import annotations
 
 import contextlib
+import select
 import socket
 import struct
 import threading
@@ -47,12 +48,28 @@ class Device(Protocol):
         """Nobody controls the camera any more."""
 
 
+def _broadcast_sockets(address: str) -> list[socket.socket]:
+    """Sockets that hear what is sent to all, and to all of the subnet; fewer where another program has them alone."""
+    found = []
+    for everybody in ("255.255.255.255", address.split(".")[0] + ".255.255.255"):
+        heard = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        heard.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            heard.bind((everybody, PORT))
+        except OSError:
+            heard.close()
+        else:
+            found.append(heard)
+    return found
+
+
 class ControlChannel:
     """Answers at one address from `open` to `close`, in a thread of its own."""
 
     def __init__(self, device: Device) -> None:
         self._device = device
         self._socket: socket.socket | None = None
+        self._heard: list[socket.socket] = []
         self._thread: threading.Thread | None = None
         self._controller: _Address | None = None
         self._heard_s = 0.0
@@ -65,7 +82,8 @@ class ControlChannel:
         except OSError:
             self._socket.close()
             raise
-        self._socket.settimeout(_SLICE_S)
+        # A program that looks for cameras asks everybody, and that arrives at other addresses than the camera's own.
+        self._heard = [self._socket, *_broadcast_sockets(address)]
         self._controller = None
         self._thread = threading.Thread(target=self._serve, args=(self._socket,), name=f"camera {address}", daemon=True)
         self._thread.start()
@@ -75,21 +93,19 @@ class ControlChannel:
         channel, self._socket = self._socket, None
         if channel is not None and self._thread is not None:
             self._thread.join()
-            channel.close()
+            for heard in self._heard:
+                heard.close()
 
     def _serve(self, channel: socket.socket) -> None:
         while self._socket is channel:
             self._let_go_of_the_silent()
-            try:
-                packet, sender = channel.recvfrom(2048)
-            except TimeoutError:
-                continue
-            except OSError:
-                # The port of somebody who is gone; the next packet is another's.
-                continue
-            # A packet that is too short for what it says is nobody's command.
-            with contextlib.suppress(struct.error, OSError):
-                self._answer(channel, packet, sender)
+            for heard in select.select(self._heard, [], [], _SLICE_S)[0]:
+                # The port of somebody who is gone; the next packet is another's. A packet that is too short for what it
+                # says is nobody's command.
+                with contextlib.suppress(struct.error, OSError):
+                    packet, sender = heard.recvfrom(2048)
+                    if heard is channel or packet[2:4] == struct.pack(">H", _DISCOVERY):
+                        self._answer(channel, packet, sender)
 
     def _let_go_of_the_silent(self) -> None:
         (allowed_ms,) = struct.unpack(">I", self._device.read(HEARTBEAT_MS, 4))
