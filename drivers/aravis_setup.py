@@ -408,6 +408,16 @@ class Setup:
             trigger="hardware" if self.hardware else "software",
         )
 
+    def applied(self) -> CameraSettings:
+        """What decides how bright a frame is and which way it lies, as the camera has it now; a few registers."""
+        return CameraSettings(
+            exposure_s=self.light.exposure_s() or None,
+            gain_db=self.light.gain_db(),
+            black_level=self._features.number(genicam.BLACK_LEVEL),
+            reverse_x=self._features.optional_flag("ReverseX"),
+            reverse_y=self._features.optional_flag("ReverseY"),
+        )
+
     def _refused(self, what: str, came_back: str) -> SettingRefused:
         return SettingRefused(
             f"camera {self._name}, {what}", came_back, "Change the setting in the plan or the rig file"

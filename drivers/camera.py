@@ -294,6 +294,11 @@ class Camera(ABC):
         log.info("camera %s is set to %s", self.name, self._settings.model_dump(exclude_none=True))
         return self._settings
 
+    def applied(self) -> CameraSettings:
+        """Exposure, gain, black level and mirroring as the camera has them now; None where it does not tell."""
+        self._require_open()
+        return self._do_applied()
+
     # --- frames ------------------------------------------------------------------------------------------
 
     def trigger(self) -> Exposure:
@@ -408,6 +413,9 @@ class Camera(ABC):
     def _converter_bits(self) -> int | None:
         """Bits of the converter; None where the camera does not tell them."""
         return None
+
+    def _do_applied(self) -> CameraSettings:
+        return CameraSettings()
 
     @abstractmethod
     def _do_configure(self, settings: CameraSettings) -> CameraSettings: ...

@@ -46,11 +46,14 @@ class Motion:
         Target in user degrees; None for homing.
     expected_s, allowed_s : float
         Duration computed from distance, speed and acceleration, and the deadline.
+    start : Position or None
+        Where a move begins, as read before it; None for homing.
     """
 
     def __init__(self, axis: MotionAxis, target_deg: float | None, expected_s: float, allowed_s: float) -> None:
         self.axis = axis
         self.target_deg = target_deg
+        self.start: Position | None = None
         self.expected_s = expected_s
         self.allowed_s = allowed_s
         self._start_s = axis.clock.now_s()
@@ -299,7 +302,7 @@ class MotionAxis(ABC):
             start = self.read_position()
             expected_s = self.move_time_s(target_deg - start.deg)
             motion = Motion(self, target_deg, expected_s, SLACK * expected_s + self.config.margin_s)
-            motion._last = start
+            motion._last = motion.start = start
             self._begin(motion, self._to_device_deg(target_deg) * self.counts_per_deg)
         return motion
 

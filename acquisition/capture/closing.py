@@ -25,6 +25,7 @@ def closing_record(records: Sequence[dict[str, Any]], last: dict[str, Any]) -> d
     closing["ledger"] = summed([end["ledger"] for end in ends])
     closing["messages"] = [text for end in ends for text in end["messages"]]
     closing["messages_dropped"] = sum(end["messages_dropped"] for end in ends)
+    closing["evidence"] = [finding for end in ends for finding in end.get("evidence", [])]
     closing["interlocks"] = [event for end in ends for event in end["interlocks"]]
     return closing
 

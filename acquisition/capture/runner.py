@@ -26,11 +26,13 @@ from acquisition.rig.interlocks import Interlocks
 from acquisition.rig.rig import Rig
 from acquisition.screen.observer import Observer, StateReport
 from acquisition.stop_request import StopRequest
-from drivers.camera import Exposure, Frame
+from drivers.camera import CameraSettings, Exposure, Frame
 from drivers.errors import FrameLost
-from drivers.motion import Position
+from drivers.motion import Motion, Position
+from processing.arrays import Array
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import StateTable
+from processing.reduction.frame_evidence import Finding, FrameEvidence
 from processing.reduction.lit_darks import LitDarks
 from processing.storage.capture_schema import Detector
 
@@ -38,6 +40,8 @@ log = logging.getLogger(__name__)
 
 #: Factor on the exposure after a saturated state.
 DARKER = 0.6
+#: Settings that are read back with each frame, and by how much they may differ: of the exposure a part of it.
+APPLIED = {"exposure_s": 0.002, "gain_db": 0.02, "black_level": 0.5, "reverse_x": 0.5, "reverse_y": 0.5}
 #: A pixel below this part of full scale, above the black level, counts as near-black.
 NEAR_BLACK = 0.01
 
@@ -57,6 +61,7 @@ class _Exposed:
     exposure_s: float
     temperature_c: float
     clock_ahead_s: float
+    settings: CameraSettings
 
 
 @dataclass
@@ -87,6 +92,7 @@ class CaptureRunner:
     saturation_limit : fraction of saturated pixels from which a state raises TooBright; None never.
     mosaic : True for a polarization sensor.
     lit_darks : comparison of darks and lights that has seen the states of earlier runs; None for a new one.
+    rows : of the measurement matrix (states, 16) for the mean of a frame; None where that is not known.
     turns : whole turns that the axes add to the angles of `table`, where they reach its states only so.
     """
 
@@ -103,6 +109,7 @@ class CaptureRunner:
         mosaic: bool = False,
         lit_darks: LitDarks | None = None,
         turns: Mapping[str, int] | None = None,
+        rows: Array | None = None,
     ) -> None:
         self.rig = rig
         self.table = table
@@ -125,6 +132,8 @@ class CaptureRunner:
         self._lit_darks = lit_darks or LitDarks(detector.black_level_counts, mosaic=mosaic, lights=lights)
         self._repeated = RepeatedState(detector.black_level_counts)
         self._wall_clock = WallClock()
+        self.evidence = FrameEvidence(detector.black_level_counts, rows)
+        self._rested: dict[str, Position] = {}
 
     def run(self, pending: Iterable[int]) -> bool:
         """Take these states; True if all are done, False if a stop was asked for.
@@ -139,6 +148,7 @@ class CaptureRunner:
         self._pending = deque(pending)
         self._here.clear()
         self._at = None
+        self._rested.clear()
         self._retakes.clear()
         exposed: _Exposed | None = None
         try:
@@ -197,6 +207,7 @@ class CaptureRunner:
         """Forget the states taken and go on with a shorter exposure."""
         self.warn(f"{why}; beginning again at {DARKER:g} of the exposure")
         self.writer.forget()
+        self.evidence.forget()
         self.ledger.states = 0
         self._scale_exposure(DARKER)
 
@@ -233,6 +244,7 @@ class CaptureRunner:
         # The longest move first: the others start while it is under way.
         changed = dict(sorted(changed.items(), key=lambda item: -self._move_s(*item)))
         motions = self.rig.start_moves(changed)
+        self._require_rested(state, motions)
         longest_s = max((motion.expected_s for motion in motions.values()), default=0.0) / self.rig.time_scale
         if before is not None:
             self._collect(before)
@@ -291,12 +303,14 @@ class CaptureRunner:
             self._discard(state, f"{blocked} in state {state}")
             return None
         where = {axis: positions[axis] for axis in targets}
-        return _Exposed(state, exposure, where, retake, exposure_s, temperature, self._wall_clock.ahead_s)
+        self._rested = where
+        return _Exposed(state, exposure, where, retake, exposure_s, temperature, self._wall_clock.ahead_s, settings)
 
     def _collect(self, exposed: _Exposed) -> None:
         with self.ledger.time("transfer"):
             try:
                 frame = exposed.exposure.frame()
+                self._require_as_reported(exposed, frame)
             except FrameLost as error:
                 self._again(exposed.state, error)
                 return
@@ -312,6 +326,13 @@ class CaptureRunner:
             self._discard(exposed.state, blocked)
             return
         self._check_light(report)
+        light = report.role not in ("dark", "flat")
+        self._tell_findings(
+            self.evidence.look(
+                exposed.state, frame.pixels, number=frame.frame_id, camera_ns=frame.camera_time_ns,
+                exposure_s=exposed.exposure_s, light=light,
+            )
+        )  # fmt: skip
         columns = {
             "exposure_s": exposed.exposure_s,
             "host_time_s": frame.host_time_s - exposed.clock_ahead_s,
@@ -391,6 +412,53 @@ class CaptureRunner:
             self.warn(
                 f"{unlit}: is the source on at this wavelength, its shutter open, the lens free? The capture goes on"
             )
+
+    def judge_frames(self) -> None:
+        """Report what the frames of the run together say against the camera."""
+        self._tell_findings(self.evidence.judge())
+
+    def _tell_findings(self, findings: Sequence[Finding]) -> None:
+        for finding in findings:
+            self.warn(f"false frame: {finding.text}")
+
+    def _require_as_reported(self, exposed: _Exposed, frame: Frame) -> None:
+        """Refuse a frame that came before, or that the camera took with other settings than it was set to.
+
+        Raises
+        ------
+        FrameLost
+        """
+        asked = f"camera, frame of state {exposed.state}"
+        again = self.evidence.repeats(frame.pixels)
+        if again is not None:
+            raise FrameLost(asked, again, "Switch the camera off and on")
+        applied, was = self.rig.require_camera().applied(), exposed.settings
+        changed = [
+            f"{name} {now:g} instead of {set_to:g}"
+            for name, step in APPLIED.items()
+            if (now := getattr(applied, name)) is not None
+            and (set_to := getattr(was, name)) is not None
+            and abs(now - set_to) > step * (set_to if name == "exposure_s" else 1.0)
+        ]
+        if changed:
+            self.rig.forget_exposure()
+            raise FrameLost(
+                asked, f"the camera has {', '.join(changed)}: something changed its settings", "End other programs"
+            )
+
+    def _require_rested(self, state: int, motions: Mapping[str, Motion]) -> None:
+        """Refuse to go on with an axis that has moved, or lost its count, since the state before. Raises RunFailed."""
+        for axis, motion in motions.items():
+            before, start = self._rested.get(axis), motion.start
+            if before is None or start is None:
+                continue
+            off = start.deg - before.deg
+            if abs(off) > self.rig.axes[axis].config.tolerance_deg:
+                raise RunFailed(
+                    f"state {state}: axis {axis} rested at {before.deg:.4f} deg in the state before and reads "
+                    f"{start.deg:.4f} deg before its next move: its controller restarted, or something turned it. Home "
+                    f"it (acquire home {axis}), then go on with --resume."
+                )
 
     def _again(self, state: int, error: FrameLost) -> None:
         tries = self._retakes.get(state, 0) + 1

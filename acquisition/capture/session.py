@@ -27,6 +27,8 @@ from acquisition.rig.interlocks import LightSoFar, light_so_far
 from acquisition.rig.rig import Rig
 from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
+from processing.arrays import Array
+from processing.instrument.applied_effects import changes_at
 from processing.instrument.model import InstrumentModel
 from processing.reduction.lit_darks import LitDarks, seen_so_far
 from processing.storage.capture import Capture
@@ -158,6 +160,7 @@ def _run(
         saturation_limit=1 - auto.percentile / 100 if isinstance(auto, AutoExposure) else None,
         mosaic=job.instrument.mosaic is not None,
         lit_darks=None if earlier is None else earlier.darks,
+        rows=_rows(job),
         turns={} if earlier is None else turns_to(job.table, rig, first, rig.where_once_homed(), {}),
     )
     status: Status = "failed"
@@ -186,6 +189,9 @@ def _run(
     light = run_all([("shut off the light", _shut(rig))])
     if light is not None:
         runner.warn(f"the light could not be shut off: {light}")
+    judged = run_all([("judge the frames", runner.judge_frames)])
+    if judged is not None:
+        runner.warn(f"the frames could not be compared: {judged}")
     closing, path = _end_segment(runner, rig, status, failure)
     told = run_all([("tell of the end", partial(observer.run_ended, status, closing)) for observer in watchers])
     if told is not None and failure is None:
@@ -201,6 +207,14 @@ def _announce(job: Job, rig: Rig, runner: CaptureRunner, pending: int) -> None:
         runner.warn(f"the camera is not in a known state: {text}")
     for observer in runner.observers:
         observer.run_started(title_of(job.plan), job.table, pending, job.instrument.mosaic)
+
+
+def _rows(job: Job) -> Array | None:
+    """Rows of the measurement matrix (states, 16) for the mean of a frame; None where angles are not numbers."""
+    angles = {axis: job.table.angles_deg[axis] for axis in job.instrument.axes}
+    if not angles:
+        return None
+    return np.asarray(job.instrument.rows(angles, changes_at(job.instrument, angles)).mean(axis=1))
 
 
 def _take_states(job: Job, runner: CaptureRunner, pending: Sequence[int]) -> bool:

@@ -458,6 +458,10 @@ class Rig:
             self._asked = asked
         return self._read_back
 
+    def forget_exposure(self) -> None:
+        """Set the exposure anew with the next frame: the camera has another one than it was set to."""
+        self._asked = None
+
     def require_camera(self) -> Camera:
         """The camera; AcquisitionError if the rig was opened without."""
         if self.camera is None:

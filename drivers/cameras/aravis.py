@@ -154,6 +154,9 @@ class AravisCamera(Camera):
             self._setup.set_light(settings, stopped=False)
         return self._setup.read_back(settings.frame_average)
 
+    def _do_applied(self) -> CameraSettings:
+        return self._setup.applied()
+
     # --- stream ------------------------------------------------------------------------------------------
 
     def _start(self) -> None:

@@ -208,6 +208,10 @@ class MMCoreCamera(Camera):
                 trigger="software",
             )
 
+    def _do_applied(self) -> CameraSettings:
+        with self._asking("read the exposure"):
+            return CameraSettings(exposure_s=1e-3 * float(self._core.getExposure(self._config.device)))
+
     def _property(self, name: str) -> str:
         with self._asking(f"read {name}"):
             found = self._core.hasProperty(self._config.device, name)

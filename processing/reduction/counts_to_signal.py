@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from processing.reduction.black import Black
 from processing.reduction.effects_of_capture import CountsCorrection
 from processing.reduction.flat import Flat
+from processing.reduction.frame_evidence import evidence_of
 from processing.reduction.lit_darks import leaked_light, seen_so_far
 from processing.storage.capture import Capture, CaptureError
 from processing.storage.pixel_mask import Mask
@@ -78,6 +79,7 @@ class Correction:
             )
         if dark_from is None:
             warnings += _of_light(capture)
+            warnings += evidence_of(capture)
         runs = np.unique(capture.run_of_states[_light(capture)]).size
         if runs > 1:
             warnings.append(

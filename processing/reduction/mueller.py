@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +49,7 @@ from processing.storage.product import Plane, ProductWriter, Step
 if TYPE_CHECKING:
     from processing.reduction.solvers.weighted import WeightedSolver
 
-    Solver = MuellerSolver | WeightedSolver | FieldSolver
+    Solver: TypeAlias = MuellerSolver | WeightedSolver | FieldSolver
 
 #: Called with (rows done, rows in all).
 Progress = Callable[[int, int], None]

@@ -118,6 +118,11 @@ class Capture(OpenH5):
     def _rows_agree(self, state: int, rows: slice, counts: NDArray[Any]) -> bool:
         return self._sums is None or np.array_equal(row_crc32(counts), self._sums[state, :, rows])
 
+    def row_sums(self) -> Iterator[NDArray[np.uint32]]:
+        """Checksums of the rows of each state done, of its first channel; nothing where there are none."""
+        if self._sums is not None:
+            yield from self._sums[:, 0]
+
     def damaged_states(self) -> list[int]:
         """States done, by their number in the plan, that differ from their checksums; reads every frame."""
         return [

@@ -81,7 +81,10 @@ class RecordedRig:
         self.axes = {name: RecordedAxis(self, name) for name in ("psg", "psa")}
         self.config = SimpleNamespace(settle_s=0.25, retakes=2, interlocks=())
         self.camera = SimpleNamespace(
-            full_scale=FULL_SCALE, trigger=self._trigger, temperature_c=lambda: self.temperature_c
+            full_scale=FULL_SCALE,
+            trigger=self._trigger,
+            temperature_c=lambda: self.temperature_c,
+            applied=CameraSettings,
         )
         self.source: Any = SimpleNamespace(
             set_light=lambda on: self.note("light", on), interlock_open=lambda: self.door_open
@@ -110,7 +113,10 @@ class RecordedRig:
 
     def start_moves(self, targets_deg: Mapping[str, float]) -> dict[str, Any]:
         self.note("start", dict(targets_deg), list(targets_deg))
-        return {name: SimpleNamespace(expected_s=MOVE_S, target_deg=target) for name, target in targets_deg.items()}
+        return {
+            name: SimpleNamespace(expected_s=MOVE_S, target_deg=target, start=None)
+            for name, target in targets_deg.items()
+        }
 
     def wait(self, motions: Mapping[str, Any]) -> dict[str, Position]:
         if motions:

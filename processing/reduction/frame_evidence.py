@@ -1,0 +1,313 @@
+"""What the frames of a capture say against a camera that reports something false.
+
+A frame with noise never comes twice, and neither does a frame number or a time of the camera's clock. The brightness
+of a rotation is linear in the sixteen elements of the mean Mueller matrix, and so is each place of the picture. A state
+that the others contradict by one factor, or that agrees with them once it is mirrored, has a cause outside the plan.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.arrays import Array
+from processing.storage.capture import Capture
+
+#: Every so many-th row is compared; noise makes each row unlike any other.
+ROWS_APART = 8
+#: Part of the rows of a frame that may be those of the frame before.
+EQUAL_ROWS = 0.05
+#: Rows compared from which on chance makes no frame like another.
+FEWEST_ROWS = 4
+#: States more than unknowns before a fit says anything.
+SPARE = 4
+#: [F ratio] What one factor must explain over what it leaves; undeclared effects leave up to several percent.
+DECISIVE = 50.0
+#: Least change of brightness that is reported; a lamp drifts by less between two states.
+LEAST_CHANGE = 0.03
+#: Part of the residual that mirroring must leave at most, and least residual over the signal that is looked at.
+MIRRORED_LEAVES, LEAST_PATTERN = 0.25, 0.01
+#: States of one capture that are named.
+MOST_FOUND = 5
+#: Blocks a side into which a picture is averaged.
+BLOCKS = 16
+
+Kind = Literal["identical", "number", "time", "settings", "brightness", "picture"]
+#: Ways to mirror a picture (blocks, blocks), in words.
+MIRRORS: dict[str, Callable[[Array], Array]] = {
+    "mirrored left to right": lambda b: b[..., ::-1],
+    "upside down": lambda b: b[..., ::-1, :],
+    "turned by 180 degrees": lambda b: b[..., ::-1, ::-1],
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that a frame says against what was reported of it.
+
+    Attributes
+    ----------
+    state : number in the plan, of the first state that it concerns.
+    """
+
+    state: int
+    kind: Kind
+    text: str
+
+
+class FrameEvidence:
+    """Compares frames as they come, and all of them at the end of a run.
+
+    Parameters
+    ----------
+    black : counts without light, as declared.
+    rows : of the measurement matrix (states, 16) for the mean of a frame, in the order of the plan; None where the
+        instrument is not known.
+    """
+
+    def __init__(self, black: float, rows: Array | None) -> None:
+        self._black, self._rows = black, rows
+        self._seen: dict[int, int] = {}
+        self._before: NDArray[np.generic] | None = None
+        # State, number and time of the frame before.
+        self._last = (0, 0, 0)
+        self._blocks: dict[int, Array] = {}
+        self.found: list[Finding] = []
+
+    def repeats(self, pixels: NDArray[np.generic]) -> str | None:
+        """Why a frame is one that came before, in words; None for a new one. Frames of one value are not judged."""
+        rows = np.ascontiguousarray(pixels[::ROWS_APART])
+        uniform = len(rows) < FEWEST_ROWS or rows.min() == rows.max()
+        before, self._before = self._before, rows
+        if uniform:
+            return None
+        earlier = self._seen.setdefault(zlib.crc32(rows.tobytes()), len(self._seen))
+        if earlier != len(self._seen) - 1:
+            return "the frame is the same, pixel by pixel, as an earlier one: the camera or its driver is frozen"
+        if before is None or before.shape != rows.shape:
+            return None
+        equal = np.mean((before == rows).all(axis=1) & (rows.min(axis=1) != rows.max(axis=1)))
+        if equal > EQUAL_ROWS:
+            return f"{100 * equal:.0f} % of the frame's rows are those of the frame before: it did not arrive whole"
+        return None
+
+    def look(
+        self, state: int, pixels: NDArray[np.generic], *, number: int, camera_ns: int, exposure_s: float, light: bool
+    ) -> list[Finding]:
+        """What is new to report of a frame that is kept.
+
+        Parameters
+        ----------
+        number, camera_ns : of the frame, as the camera reports them; 0 where it has no clock.
+        light : whether it is a light state.
+        """
+        found = []
+        before, last_number, last_ns = self._last
+        if number and number == last_number:
+            text = (
+                f"state {state} has the frame number {number} of state {before}: the camera does not count its frames"
+            )
+            found.append(Finding(state, "number", text))
+        if camera_ns and last_ns and camera_ns <= last_ns:
+            text = (
+                f"state {state}: the camera's clock stands or runs back, its time is not after that of state {before}"
+            )
+            found.append(Finding(state, "time", text))
+        self._last = state, number, camera_ns
+        if light and self._rows is not None:
+            means = cv2.resize(np.asarray(pixels, dtype=np.float32), (BLOCKS, BLOCKS), interpolation=cv2.INTER_AREA)
+            self._blocks[state] = (means.astype(float) - self._black) / exposure_s
+        self.found += found
+        return found
+
+    def forget(self) -> None:
+        """The states taken so far are taken again."""
+        self._blocks.clear()
+
+    def judge(self) -> list[Finding]:
+        """What all light states of the run together say; new findings alone."""
+        if self._rows is None:
+            return []
+        states = np.array(sorted(self._blocks), dtype=int)
+        rows = self._rows[states]
+        if not len(states) or not np.isfinite(rows).all():
+            return []
+        blocks = np.array([self._blocks[state] for state in states])
+        found = mirrored_pictures(states, rows, blocks)
+        found = found or brightness_steps(states, rows, blocks.mean(axis=(1, 2)))
+        self.found += found
+        return found
+
+
+def brightness_steps(states: NDArray[np.int64], rows: Array, light: Array) -> list[Finding]:
+    """States that are brighter or darker by one factor than the others say, alone or from one on.
+
+    Parameters
+    ----------
+    states : (N,) numbers in the plan, ascending.
+    rows : (N, 16) of the measurement matrix.
+    light : (N,) mean light of the frames.
+    """
+    found: list[Finding] = []
+    keep = np.ones(len(states), dtype=bool)
+    light = np.array(light, dtype=float)
+    while len(found) < MOST_FOUND:
+        n, spare, outside = _outside(rows[keep])
+        if spare < SPARE:
+            break
+        index, y = np.flatnonzero(keep), light[keep]
+        left = outside @ y
+        rss = float(left @ left)
+        # One state by itself: what it is over what the others say.
+        free = np.clip(np.diag(outside), 1e-9, None)
+        alone = np.where(free > 0.1, left**2 / free, 0.0)
+        k = int(np.argmax(alone))
+        expected = y[k] - left[k] / free[k]
+        best = (rss - float(alone[k]), k, False, y[k] / expected if expected > 0 else np.inf)
+        # From one on: what comes before is known but for what comes after, times a factor.
+        for s in range(2, n - 1):
+            before, after = outside[:, :s] @ y[:s], outside[:, s:] @ y[s:]
+            norm = float(after @ after)
+            gamma = -float(before @ after) / norm if norm > 0 else 1.0
+            step = float(np.square(before + gamma * after).sum())
+            # The part that has the fewer states is the one that is named.
+            if gamma > 0.05 and step < best[0]:
+                best = (step, s, True, 1 / gamma)
+        remaining, k, onwards, factor = best
+        if remaining >= rss or rss - remaining < DECISIVE * max(remaining, 1e-12 * float(y @ y)) / max(spare - 1, 1):
+            break
+        if abs(factor - 1) < LEAST_CHANGE or (onwards and _drifts(outside, y, remaining)):
+            break
+        state = int(states[index[k]])
+        where = f"from state {state} on" if onwards else f"state {state} alone"
+        found.append(
+            Finding(
+                state,
+                "brightness",
+                f"{where}: the light is {factor:.3g} times what the other states say, and nothing in the plan changes "
+                "it: exposure, gain or lamp were not as reported",
+            )
+        )
+        if onwards:
+            light[index[k:]] /= factor
+        else:
+            keep[index[k]] = False
+    return found
+
+
+def _outside(rows: Array) -> tuple[int, int, Array]:
+    """Number of states, how many more they are than unknowns, and the projection (N, N) out of what rows explain."""
+    u, s, _ = np.linalg.svd(rows, full_matrices=False)
+    u = u[:, s > 1e-8 * s[0]]
+    return len(rows), len(rows) - u.shape[1], np.eye(len(rows)) - u @ u.T
+
+
+def _drifts(outside: Array, y: Array, step: float) -> bool:
+    """Whether light that drifts evenly explains as much as a step."""
+    ramp = outside @ (y * np.linspace(-1, 1, len(y)))
+    left = outside @ y
+    norm = float(ramp @ ramp)
+    return norm > 0 and float(left @ left) - float(left @ ramp) ** 2 / norm <= 2 * step
+
+
+def mirrored_pictures(states: NDArray[np.int64], rows: Array, blocks: Array) -> list[Finding]:
+    """A state, or all from one on, whose picture (N, blocks, blocks) agrees with the others once it is mirrored."""
+    n, spare, outside = _outside(rows)
+    if spare < SPARE:
+        return []
+    flat = blocks.reshape(n, -1)
+    left = outside @ flat
+    rss, power = float(np.square(left).sum()), float(np.square(flat).sum())
+    if rss < (LEAST_PATTERN**2) * power * spare / n**2:
+        return []
+    best: tuple[float, int, bool, str] = (rss, 0, False, "")
+    for words, mirror in MIRRORS.items():
+        change = mirror(blocks).reshape(n, -1) - flat
+        # Adds the states one after another, from the last: all from one on.
+        onwards = left.copy()
+        for k in range(n - 1, 0, -1):
+            alone = float(np.square(left + np.outer(outside[:, k], change[k])).sum())
+            onwards += np.outer(outside[:, k], change[k])
+            from_here = float(np.square(onwards).sum())
+            best = min(best, (alone, k, False, words), (from_here, k, k < n - 1, words))
+        best = min(best, (float(np.square(left + np.outer(outside[:, 0], change[0])).sum()), 0, False, words))
+    remaining, k, is_onwards, words = best
+    if remaining > MIRRORED_LEAVES * rss:
+        return []
+    state = int(states[k])
+    where = f"from state {state} on" if is_onwards else f"state {state} alone"
+    return [Finding(state, "picture", f"{where}: the picture is {words} against the other states: the camera changed")]
+
+
+def evidence_of(capture: Capture) -> tuple[str, ...]:
+    """What speaks against the frames of a capture, in words: what its runs reported, and what its columns say."""
+    told = capture.closing.get("evidence")
+    reported = [entry for entry in told if isinstance(entry, dict)] if isinstance(told, list) else []
+    texts = [str(entry.get("text", "")) for entry in reported]
+    kinds = {(entry.get("kind"), entry.get("state")) for entry in reported}
+    found = [*_identical(capture), *_numbers_again(capture), *_steps(capture)]
+    return tuple(dict.fromkeys([*texts, *(f.text for f in found if (f.kind, f.state) not in kinds)]))
+
+
+def _identical(capture: Capture) -> list[Finding]:
+    first: dict[bytes, int] = {}
+    again: dict[int, list[int]] = {}
+    for k, sums in enumerate(capture.row_sums()):
+        # A frame of one value, as one that is saturated everywhere, has equal rows.
+        if len(sums) > 1 and np.any(sums != sums[0]):
+            earlier = first.setdefault(sums.tobytes(), k)
+            if earlier != k:
+                again.setdefault(earlier, []).append(int(capture.done[k]))
+    return [
+        Finding(
+            states[0],
+            "identical",
+            f"{len(states)} states have the frame of state {capture.done[earlier]}, pixel by pixel, the first of them "
+            f"state {states[0]}: the camera was frozen, and what is made of them is wrong. Take the capture again",
+        )
+        for earlier, states in again.items()
+    ]
+
+
+def _numbers_again(capture: Capture) -> list[Finding]:
+    """Frame numbers and times of the camera's clock that two states of one run share."""
+    found: list[Finding] = []
+    columns: tuple[tuple[Kind, str, str], ...] = (
+        ("number", "frame_id", "frame number"),
+        ("time", "camera_time_ns", "time of the camera's clock"),
+    )
+    for kind, name, what in columns:
+        values = capture.column(name)
+        for run in np.unique(capture.run_of_states):
+            mine = np.flatnonzero((capture.run_of_states == run) & (values != 0))
+            again = mine[1:][values[mine[1:]] == values[mine[:-1]]]
+            if again.size:
+                state = int(capture.done[again[0]])
+                text = f"{again.size} states have the {what} of the state before, the first of them state {state}"
+                found.append(Finding(state, kind, text))
+    return found
+
+
+def _steps(capture: Capture) -> list[Finding]:
+    """Steps of the brightness in each run, by the mean of each frame that `acquire` noted."""
+    model, found = capture.instrument, []
+    if model is None or not model.axes:
+        return []
+    for run in np.unique(capture.run_of_states):
+        light = [role not in ("dark", "flat") for role in capture.role]
+        chosen = np.flatnonzero(np.array(light) & (capture.run_of_states == run))
+        monitor = capture.column("monitor")[chosen].astype(float)
+        if not len(chosen) or not np.isfinite(monitor).all() or not set(model.axes) <= capture.angles_deg.keys():
+            continue
+        angles = {axis: capture.angles_deg[axis][chosen] for axis in model.axes}
+        if not all(np.isfinite(column).all() for column in angles.values()):
+            continue
+        rows = model.model_copy(update={"effects": ()}).rows(angles).mean(axis=1)
+        found += brightness_steps(capture.done[chosen], rows, monitor)
+    return found
