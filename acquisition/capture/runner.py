@@ -134,6 +134,7 @@ class CaptureRunner:
         self._wall_clock = WallClock()
         self.evidence = FrameEvidence(detector.black_level_counts, rows)
         self._rested: dict[str, Position] = {}
+        self._began_with: CameraSettings | None = None
 
     def run(self, pending: Iterable[int]) -> bool:
         """Take these states; True if all are done, False if a stop was asked for.
@@ -432,7 +433,10 @@ class CaptureRunner:
         again = self.evidence.repeats(frame.pixels)
         if again is not None:
             raise FrameLost(asked, again, "Switch the camera off and on")
-        applied, was = self.rig.require_camera().applied(), exposed.settings
+        applied = self.rig.require_camera().applied()
+        # The exposure is that of the state; all else as at the first frame, not as another program left it meanwhile.
+        self._began_with = self._began_with or exposed.settings
+        was = self._began_with.model_copy(update={"exposure_s": exposed.settings.exposure_s})
         changed = [
             f"{name} {now:g} instead of {set_to:g}"
             for name, step in APPLIED.items()

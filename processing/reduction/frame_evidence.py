@@ -123,6 +123,8 @@ class FrameEvidence:
         if light and self._rows is not None:
             means = cv2.resize(np.asarray(pixels, dtype=np.float32), (BLOCKS, BLOCKS), interpolation=cv2.INTER_AREA)
             self._blocks[state] = (means.astype(float) - self._black) / exposure_s
+        # A clock that stands does so in every state from then on.
+        found = [finding for finding in found if finding.kind not in {earlier.kind for earlier in self.found}]
         self.found += found
         return found
 
