@@ -163,7 +163,7 @@ def take(kind: str, seed: int, folder: Path) -> tuple[bool, bool, bool, bool]:
     """One capture: ended with an error, took a state again, has a message, and its reduction has a warning."""
     draw = random.Random(f"{kind} {seed}")
     sample = draw.choice(["red_sphere", "red_flat"])
-    simulator = {"rows": 64, "columns": 80, "clock_speed": 50, "ports": PORTS, "seed": seed + 1}
+    simulator = {"rows": 64, "columns": 80, "clock_speed": 50, "camera_wait_s": 600, "ports": PORTS, "seed": seed + 1}
     rig_file = write_rig(folder / "rig.yaml", simulator, settle_s=0.0, backlash_deg={}, park_deg={})
     config = load_rig(rig_file)
     plan = MeasurementPlan().with_changes(sample={"name": sample}, darks=DARKS, exposure_s=draw.choice([0.01, 0.02]))

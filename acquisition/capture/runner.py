@@ -189,6 +189,7 @@ class CaptureRunner:
         self.tell("moving " + ", ".join(f"{axis} to {angle:g}" for axis, angle in targets.items()))
         with self.ledger.time(why):
             self.rig.go(targets, self.poses_deg, ARM)
+        self._rested = {}
 
     def find_exposure(self, instrument: InstrumentModel, sample: str, auto: AutoExposure) -> None:
         """Probe the brightest states and take the exposure that they ask for. Moves the axes, lights the sample."""

@@ -73,7 +73,7 @@ class FrameEvidence:
 
     def __init__(self, black: float, rows: Array | None) -> None:
         self._black, self._rows = black, rows
-        self._seen: dict[int, int] = {}
+        self._seen: set[int] = set()
         self._before: NDArray[np.generic] | None = None
         # State, number and time of the frame before.
         self._last = (0, 0, 0)
@@ -87,9 +87,10 @@ class FrameEvidence:
         before, self._before = self._before, rows
         if uniform:
             return None
-        earlier = self._seen.setdefault(zlib.crc32(rows.tobytes()), len(self._seen))
-        if earlier != len(self._seen) - 1:
+        digest = zlib.crc32(rows.tobytes())
+        if digest in self._seen:
             return "the frame is the same, pixel by pixel, as an earlier one: the camera or its driver is frozen"
+        self._seen.add(digest)
         if before is None or before.shape != rows.shape:
             return None
         equal = np.mean((before == rows).all(axis=1) & (rows.min(axis=1) != rows.max(axis=1)))

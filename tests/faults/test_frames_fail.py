@@ -1,9 +1,18 @@
 """Promises 8, 9 and 11: lost frames, a camera that vanishes, an interlock that opens."""
 
 import threading
+from dataclasses import replace
+
+import h5py
+import pytest
 
 from acquisition.screen.observer import Observer
+from processing.commands.application import main
+from processing.diagnosis.captured.read_capture import read_capture
+from processing.reduction.counts_to_signal import Correction
 from processing.storage.capture import Capture
+from processing.storage.checksums import state_crc32, summed_values
+from processing.storage.product import Product
 from simulators.clock import patient_clock
 
 
@@ -178,3 +187,85 @@ def test_exposures_that_nobody_asked_for_never_enter_a_capture(run_with, intact)
     assert intact(path) == 44
     with Capture(path) as capture:
         assert capture.closing["stream"]["stale_discarded"] >= 5
+
+
+# --- a camera that says something false (promise 29) --------------------------------------------------------
+
+
+def altered(first, alter):
+    """An action that has the camera hand out something else from a state on: `alter` of a frame and the one before."""
+    now = {"state": -1, "before": None}
+
+    def act(rig, state, retake):
+        now["state"] = state
+        camera = rig.require_camera()
+        if now["before"] is None and "take" not in now:
+            now["take"] = camera._do_frame
+
+            def taken():
+                frame = now["take"]()
+                if now["state"] >= first and now["before"] is not None:
+                    frame = replace(frame, **alter(frame, now["before"]))
+                now["before"] = frame
+                return frame
+
+            camera._do_frame = taken
+
+    return act
+
+
+def brighter(factor):
+    return lambda frame, before: {"pixels": (64 + factor * (frame.pixels.astype(float) - 64)).astype("u2")}
+
+
+def test_a_frozen_camera_gives_no_complete_capture(run_with, intact):
+    error, path = run_with(altered(20, lambda frame, before: {"pixels": before.pixels}), stamp=False)
+    assert "the camera or its driver is frozen" in str(error)
+    with Capture(path) as capture:
+        assert capture.status == "failed"
+        assert len(capture.done) == 20
+
+
+def test_a_gain_that_changes_is_known_to_reduce_and_to_diagnose(run_with, tmp_path):
+    """In the product of a reduction, and in what a diagnosis reports of the capture."""
+    error, path = run_with(altered(20, brighter(1.1)), stamp=False)
+    assert error is None
+    with Capture(path) as capture:
+        (text,) = [text for text in capture.closing["messages"] if "false frame" in text]
+        assert "from state 20 on: the light is 1.1 times" in text
+        assert [(found["kind"], found["state"]) for found in capture.closing["evidence"]] == [("brightness", 20)]
+        assert text.partition("false frame: ")[2] in read_capture(capture, capture.instrument).evidence
+    product = tmp_path / "product.h5"
+    with pytest.raises(SystemExit) as end:
+        main(["reduce", str(path), "--out", str(product), "--no-figure"])
+    assert end.value.code == 0
+    with Product(product) as made:
+        assert any("from state 20 on: the light is 1.1 times" in line for line in made.facts["warnings"])
+
+
+def test_frames_that_were_frozen_are_found_in_the_file_itself(run_with):
+    """A capture of an older version has no record of it; its checksums are right, and its frames are not."""
+    error, path = run_with(stamp=False)
+    assert error is None
+    with h5py.File(path, "r+") as h5:
+        frames, sums = h5["entry/instrument/detector/data"], h5["entry/instrument/detector/row_crc32"]
+        columns = summed_values(h5["entry"])
+        for state in range(30, 44):
+            frames[state], sums[state] = frames[29], sums[29]
+            values = {name: column[state] for name, column in columns.items()}
+            h5["entry/states/crc32"][state] = state_crc32(sums[state], values)
+    with Capture(path) as capture:
+        assert not capture.damaged_states()
+        (text,) = [text for text in Correction.of(capture).warnings if "pixel by pixel" in text]
+        assert "14 states have the frame of state 29" in text
+        assert text in read_capture(capture, capture.instrument).evidence
+
+
+@pytest.mark.parametrize("role", ["sample", "air"])
+def test_sound_captures_have_no_evidence_against_them(run_with, role):
+    plan = {} if role == "sample" else {"sample": {"kind": "air", "name": "air"}, "omega_deg": 180.0}
+    error, path = run_with(plan=plan, stamp=False)
+    assert error is None
+    with Capture(path) as capture:
+        assert capture.closing["evidence"] == []
+        assert read_capture(capture, capture.instrument).evidence == ()

@@ -46,13 +46,7 @@ def show(d: Diagnosis, details: bool = False, written: bool = False) -> None:
     kind = "residual" if d.noise_floor_percent is None else "residual beyond noise"
     _say(short, f"{kind} {d.error_before.told} -> {d.error_after.told} of the mean signal{noise}")
     for c in d.captures:
-        one = short.get(c.name, "capture")
-        line = f"  {one}  {c.name}" + (f", {c.wavelength_nm:g} nm" if c.wavelength_nm else "")
-        if short and c.error_before is not None and c.error_after is not None:
-            line += f": {c.error_before.told} -> {c.error_after.told}"
-        if c.source_percent is not None:
-            line += f"; level of the source projected out, it varies by {c.source_percent:.2g} %"
-        typer.echo(line)
+        _name_capture(short, c)
     for head, text in (("first of all", d.wiring), ("not determined", d.branch)):
         if text is not None:
             _say(short, f"{head}: {text}")
@@ -116,6 +110,18 @@ def _answer(effect: FoundEffect) -> str:
     return (
         f"{effect.answer}, probability over 0.999" if sure else f"{effect.answer}, probability {effect.probability:.3f}"
     )
+
+
+def _name_capture(short: Mapping[str, str], c: CaptureReport) -> None:
+    one = short.get(c.name, "capture")
+    line = f"  {one}  {c.name}" + (f", {c.wavelength_nm:g} nm" if c.wavelength_nm else "")
+    if short and c.error_before is not None and c.error_after is not None:
+        line += f": {c.error_before.told} -> {c.error_after.told}"
+    if c.source_percent is not None:
+        line += f"; level of the source projected out, it varies by {c.source_percent:.2g} %"
+    typer.echo(line)
+    for text in c.evidence:
+        _say(short, f"     false frames: {text}")
 
 
 def _show_uncertainty(d: Diagnosis) -> None:

@@ -91,6 +91,7 @@ class CaptureData:
     steep : (rows, columns) True where a pixel is left out because it lies at a sharp edge; None: nowhere.
     cut_off : numbers of states that do not count because their counts are cut off at zero.
     shared : what pixels have of their noise in common; slope and floor are those of wide patterns.
+    evidence : what speaks against its frames, as a camera that was frozen, in sentences.
     noise_told : what patterns of the noise are not declared, in sentences; white_told : how its variance differs, which
         holds while `noise_factors` are not one.
     left_out : frames, hits and pixels that are no measurement of the sample.
@@ -128,6 +129,7 @@ class CaptureData:
     left_out: LeftOut = field(default_factory=LeftOut)
     shared: SharedNoise = field(default_factory=SharedNoise)
     noise_told: tuple[str, ...] = ()
+    evidence: tuple[str, ...] = ()
     white_told: str | None = None
 
     @property

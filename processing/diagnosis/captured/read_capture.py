@@ -18,6 +18,7 @@ from processing.instrument.changes import Conditions, elapsed, elapsed_error
 from processing.instrument.model import InstrumentModel
 from processing.reduction.black import Black
 from processing.reduction.counts_to_signal import Correction
+from processing.reduction.frame_evidence import evidence_of
 from processing.reduction.mueller import angles_of, measurement_matrix, relative_exposure
 from processing.reduction.noise import NoiseModel
 from processing.reduction.sample_states import sample_states
@@ -65,6 +66,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
         clipped=frames.clipped,
         clipped_states=frames.clipped_states,
         usable=np.asarray(np.isfinite(raw).all(axis=(0, 1)) & ~frames.zero[~cut_off].any(axis=0)),
+        evidence=evidence_of(capture),
         simulated=capture.simulated,
         wavelength_nm=capture.header.wavelength_nm,
         binned=side,

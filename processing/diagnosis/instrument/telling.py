@@ -303,6 +303,7 @@ def capture_report(
         sample=sample,
         simulated=data.simulated,
         noise=data.noise_source,
+        evidence=data.evidence,
         binned=data.binned,
         clipped_fraction=float(np.mean(data.clipped)),
         dark_fraction=data.dark_fraction,

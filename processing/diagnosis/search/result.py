@@ -227,13 +227,15 @@ class Correction(_Part):
 class CaptureReport(_Part):
     """One capture: what is known of it, and how far its residual is from noise, before and after.
 
-    `error_before`, `error_after`: on held-out data, of this capture alone.
+    `error_before`, `error_after`: on held-out data, of this capture alone. `evidence`: what speaks against its frames,
+    in sentences.
     """
 
     name: str
     sample: str
     simulated: bool
     noise: str
+    evidence: tuple[str, ...] = ()
     binned: int
     clipped_fraction: float
     dark_fraction: float = 0.0
