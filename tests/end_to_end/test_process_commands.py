@@ -269,13 +269,12 @@ def test_camera_of_a_capture_without_repeats(measured: Measured, instrument: Pat
     assert "no dark states" in err
 
 
-def test_states_without_angle_or_exposure(measured: Measured, instrument: Path, process: Run) -> None:
+def test_states_without_exposure_are_refused(measured: Measured, instrument: Path, process: Run) -> None:
     options = ["--wavelength-nm", 662, "--instrument", instrument, "--overwrite"]
     measured.states.write_text(measured.states.read_text().replace(",0.01,f3", ",0,f3"), encoding="utf-8")
-    assert process("import", "--states", measured.states, *options)[0] == 0
-    code, _, err = process("reduce", measured.folder / "states.h5")
+    code, _, err = process("import", "--states", measured.states, *options)
     assert code == 2
-    assert "exposure_s" in err
+    assert "column exposure_s: 0 is not above 0" in err
 
 
 def test_xi0_reduces_first_and_reuses_the_product(
