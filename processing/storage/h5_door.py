@@ -61,7 +61,12 @@ def _require_own(h5: h5py.File) -> None:
             return f"{one_line(name)} lies in another file"
         return f"more than {MOST_LINKS:,} parts" if count > MOST_LINKS else None
 
-    if (found := h5.visititems_links(look)) is not None:
+    try:
+        found = h5.visititems_links(look)
+    except SystemError as why:
+        # How h5py passes on what HDF5 says of damage below its callback.
+        raise ValueError(str(why.__cause__ or why)) from why
+    if found is not None:
         raise ValueError(found)
 
 
