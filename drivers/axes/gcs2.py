@@ -34,7 +34,7 @@ NOT_REFERENCED, STOPPED = 5, 10
 MOVING = "\x05"
 _HEX = re.compile(r"[0-9A-Fa-f]{1,8}")
 _CODE = re.compile(r"-?\d{1,5}")
-_IDENTITY = re.compile(r"[^,]+,[^,]+,[^,]+,[^,]+")
+_IDENTITY = re.compile(r".*[A-Za-z]{3}.*")
 
 
 class Config(AxisConfig):
@@ -82,6 +82,20 @@ def _bytes(command: str) -> bytes:
     return f"{command}\n".encode("ascii") if command >= " " else command.encode("ascii")
 
 
+def read_identity(text: str) -> tuple[str, str, str, str]:
+    """Maker, model, serial number and firmware of an answer to ``*IDN?``; empty where it does not tell them.
+
+    Most controllers separate the four by commas; an E-861 answers
+    ``(c)2013 Physik Instrumente(PI) Karlsruhe, E-861 Version 7.2.0``.
+    """
+    parts = [part.strip() for part in text.split(",")]
+    if len(parts) == 4:
+        return parts[0], parts[1], parts[2], parts[3]
+    model = re.search(r"\b[A-Z]-\d{3}[\w.]*", text)
+    firmware = re.search(r"version\s+(\S+)", text, re.IGNORECASE)
+    return text.strip(), model[0] if model else "", "", firmware[1] if firmware else ""
+
+
 class GCS2Axis(MotionAxis):
     """One axis of a controller."""
 
@@ -90,10 +104,14 @@ class GCS2Axis(MotionAxis):
         self.config: Config = config
         self._line, self._lines = line, lines
         self._answer = re.compile(rf"{config.axis}=([+-]?\d+\.?\d*(?:[eE][+-]?\d+)?)")
-        maker, model, serial_number, firmware = (part.strip() for part in line.ask("*IDN?", _IDENTITY).split(","))
+        maker, model, serial_number, firmware = read_identity(line.ask("*IDN?", _IDENTITY))
         asked = f"axis {name} on {config.port} axis {config.axis}"
         if "PHYSIK INSTRUMENTE" not in maker.upper():
             raise WrongDevice(asked, f"{maker} {model} answers", "Correct `port` in the rig file")
+        if config.serial_number is not None and not serial_number:
+            raise WrongDevice(
+                asked, f"{model or maker} tells no serial number", "Take serial_number out of the rig file"
+            )
         if config.serial_number not in (None, serial_number):
             raise WrongDevice(asked, f"{model} has serial number {serial_number}", "Correct it in the rig file")
         self.speed_deg_s, self.acceleration_deg_s2 = self._constant("VEL?"), self._constant("ACC?")

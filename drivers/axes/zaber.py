@@ -192,13 +192,20 @@ class ZaberLine:
             return [reply for reply in replies if reply.summed or self._sends_no_checksums(reply.address)]
 
     def _sends_no_checksums(self, address: int) -> bool:
-        """True if the device itself says so, twice; its replies are believed without from then on."""
+        """True if the device itself says so, twice; its replies are believed without from then on.
+
+        An old firmware that sends none does not know the setting: its rejection comes without a checksum as well.
+        """
         if address not in self._unsummed:
             self._unsummed.add(address)
             settings = [self._exchange(address, 0, "get comm.checksum")[0] for _ in range(2)]
-            if not all(reply is not None and reply.accepted and reply.data == "0" for reply in settings):
+            if not all(reply is not None and _says_no_checksums(reply) for reply in settings):
                 self._unsummed.discard(address)
         return address in self._unsummed
+
+
+def _says_no_checksums(reply: Reply) -> bool:
+    return reply.data == "0" if reply.accepted else reply.data == "BADCOMMAND" and not reply.summed
 
 
 class ZaberAxis(MotionAxis):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from drivers.sources.sc10 import Config
 from simulators.clock import Clock
 from simulators.serial.emulator import Emulator
@@ -29,6 +31,8 @@ class SC10Emulator(Emulator):
         self._changed_s = -1e9
         # Where a blade that sticks stays.
         self._held: bool | None = None
+        # Times in milliseconds, repeats, trigger and speed of the line: kept, and without effect here.
+        self._numbers = {"open": 1000, "shut": 1000, "rep": 1, "trig": 0, "baud": 0, "xto": 0}
         self._buffer = bytearray()
 
     def is_open(self) -> bool:
@@ -83,6 +87,8 @@ class SC10Emulator(Emulator):
                 return str(int(self.interlock_tripped))
             case "mode?":
                 return str(self._mode)
+            case "open?" | "shut?" | "rep?" | "trig?" | "baud?" | "xto?":
+                return str(self._numbers[command.lower().rstrip("?")])
             case "ens":
                 if not self.interlock_tripped:
                     self._enabled = not self._enabled
@@ -91,6 +97,10 @@ class SC10Emulator(Emulator):
             case "mode=1" | "mode=2" | "mode=3" | "mode=4" | "mode=5":
                 self._mode = int(command[-1])
                 return ""
+        setting = re.fullmatch(r"(open|shut|rep|trig|baud|xto)=(\d+)", command.lower())
+        if setting is not None:
+            self._numbers[setting[1]] = int(setting[2])
+            return ""
         return "Command error CMD_NOT_DEFINED"
 
     def _do_make_foreign(self, reply: bytes) -> bytes:

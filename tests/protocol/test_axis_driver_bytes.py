@@ -342,6 +342,33 @@ def test_zaber_replies_without_checksum_count_where_the_device_says_that_it_send
         line.close()
 
 
+def test_a_zaber_that_knows_no_checksum_at_all_is_found() -> None:
+    with scripted(
+        (b"/" + summed("0 0 01 get system.serial") + b"\n", b"@01 0 01 OK IDLE -- 4711\r\n"),
+        (b"/" + summed("1 0 02 get comm.checksum") + b"\n", b"@01 0 02 RJ IDLE -- BADCOMMAND\r\n"),
+        (b"/" + summed("1 0 03 get comm.checksum") + b"\n", b"@01 0 03 RJ IDLE -- BADCOMMAND\r\n"),
+        (b"/" + summed("1 1 04 get pos") + b"\n", b"@01 1 04 OK IDLE -- -77\r\n"),
+    ) as path:
+        line = zaber.ZaberLine(zaber.Config(port=path, reply_s=0.2), patient_clock(), None)
+        assert [reply.data for reply in line.ask_all("get system.serial")] == ["4711"]
+        assert line.ask(1, 1, "get pos", repeat=False).data == "-77"
+        line.close()
+
+
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        # The first is what public recordings of an E-861 have.
+        ("(c)2013 Physik Instrumente(PI) Karlsruhe, E-861 Version 7.2.0", ("E-861", "", "7.2.0")),
+        ("Physik Instrumente, C-863.11, 0115012345, 1.2.1.0", ("C-863.11", "0115012345", "1.2.1.0")),
+        ("PHYSIK INSTRUMENTE C-867 VERSION 1.0", ("C-867", "", "1.0")),
+        ("(c)2015 Physik Instrumente (PI) GmbH", ("", "", "")),
+    ],
+)
+def test_what_a_pi_controller_says_of_itself(said: str, told: tuple[str, str, str]) -> None:
+    assert gcs2.read_identity(said)[1:] == told
+
+
 def test_a_zaber_reply_that_lost_its_checksum_is_not_believed() -> None:
     with scripted(
         (b"/" + summed("0 0 01 get system.serial") + b"\n", b"@01 0 01 OK IDLE -- 47\r\n"),
