@@ -168,6 +168,7 @@ def _run(
     if earlier is not None:
         _begin_segment(job, rig, runner, earlier)
     writer.on_failure = stop.fail
+    writer.on_blocked = partial(rig.lose_light, "the disc takes no data: the light is shut until it does")
     try:
         _announce(job, rig, runner, len(pending))
         with stop.failing_here():

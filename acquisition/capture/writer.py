@@ -38,6 +38,9 @@ THREAD = "capture writer"
 #: How long the disc may take for one state before nothing is measured any more, and before the run is ended.
 PATIENCE_S = 1.5
 DEAD_S = 30.0
+#: How long any call may take before the light is shut; one that changes no byte is tried all the time.
+DARK_S = 1.2
+PROBE_S = 0.3
 #: How often it is looked at.
 LOOK_S = 0.2
 #: Layout, notes and journals besides the frames, and the columns of a state, generously.
@@ -87,6 +90,7 @@ class CaptureWriter:
     Attributes
     ----------
     on_failure : called from the writing thread with what `put` would raise.
+    on_blocked : called from a thread of its own, once each time the disc has taken nothing for DARK_S.
     segment : number of the segment that the states written now belong to.
 
     Parameters
@@ -101,6 +105,8 @@ class CaptureWriter:
         self.file = StateFile(path)
         self.segment = 0
         self.on_failure: Callable[[AcquisitionError], None] | None = None
+        self.on_blocked: Callable[[], None] | None = None
+        self._probed_s = clock.now_s()
         self._change = threading.Condition()
         self._record: StateRecord | None = None
         self._since_s = 0.0
@@ -108,7 +114,8 @@ class CaptureWriter:
         self._ending = False
         self._thread = threading.Thread(target=self._work, name=THREAD, daemon=True)
         self._thread.start()
-        threading.Thread(target=self._watch, name=f"{THREAD}, watch", daemon=True).start()
+        for name, work in (("watch", self._watch), ("probe", self._probe)):
+            threading.Thread(target=work, name=f"{THREAD}, {name}", daemon=True).start()
 
     @classmethod
     def create(
@@ -253,11 +260,25 @@ class CaptureWriter:
                 raise self._failure(self._error) from self._error
         return True
 
+    def _probe(self) -> None:
+        """Touch the file again and again: a disc that hangs is noticed in a long exposure too."""
+        while not self._ending and self._error is None:
+            with contextlib.suppress(OSError):
+                os.utime(self.path)
+            self._probed_s = self._clock.now_s()
+            with self._change:
+                self._change.wait(PROBE_S)
+
     def _watch(self) -> None:
         """Tell of a disc that blocks although nobody hands over a state, as in a long exposure."""
+        is_blocked = False
         with self._change:
             while not self._ending and self._error is None:
                 self._change.wait(LOOK_S)
+                now_s = self._clock.now_s()
+                since_s = min(self._probed_s + PROBE_S, now_s if self._record is None else self._since_s)
+                if is_blocked != (is_blocked := now_s - since_s > DARK_S) and is_blocked and self.on_blocked:
+                    self.on_blocked()
                 if self._record is not None and self._clock.now_s() - self._since_s > DEAD_S:
                     if self.on_failure is not None:
                         self.on_failure(self._blocked(DEAD_S))

@@ -89,6 +89,7 @@ class Rig:
         self._lines = LineRegistry(config.wire_log, self.clock)
         self._guarding: Guarding | None = None
         self._stop_failed: str | None = None
+        self._own_losses = 0
         self._guard_news: deque[str] = deque(maxlen=100)
 
     def __enter__(self) -> Self:
@@ -213,7 +214,16 @@ class Rig:
 
     def light_losses(self) -> int:
         """How often the light was shut from outside so far: what was exposed meanwhile does not count."""
-        return 0 if self._guarding is None else self._guarding.losses
+        return self._own_losses + (0 if self._guarding is None else self._guarding.losses)
+
+    def lose_light(self, why: str) -> None:
+        """Shut the light from any thread; what is exposed meanwhile does not count."""
+        self._own_losses += 1
+        try:
+            self._shut_at_once()
+        except Exception as error:  # noqa: BLE001 - the end of the run tries again, and the words must come
+            why = f"{why}. THE LIGHT IS NOT SHUT: {error}"
+        self._guard_news.append(why)
 
     def guard_news(self) -> list[str]:
         """What the guard's watch has had to say since the last call."""

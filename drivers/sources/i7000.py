@@ -1,0 +1,130 @@
+"""Relay modules of the ICP DAS I-7000 series (I-7060, I-7067) as a light switch that opens without a heartbeat.
+
+DCON protocol, 9600 8N1, ASCII, replies end in CR: ``#AA1cDD`` switches output `c`, ``$AA6`` reads the outputs,
+``~**`` is the heartbeat and has no reply, ``~AA3EVV`` sets the host watchdog in tenths of a second, ``~AA0`` reads its
+status and ``~AA1`` clears it (I-7000 DIO Manual, sections 2.17 to 2.23; not yet tried on the real box). While the
+watchdog has run out the outputs stand at their safe value, which is off as delivered, and each switching command is
+answered with ``!`` and ignored.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from drivers.clock import Clock
+from drivers.errors import CommandRejected, DeviceError, ReplyError, ReplyTimeout, WrongDevice
+from drivers.serial_link import LineRegistry, SerialLink, Transcript, line_framer
+from drivers.source import LightSource
+
+BAUDRATE = 9600
+
+
+class Config(BaseModel):
+    """Relay module in a rig file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["i7000"] = "i7000"
+    port: str = Field(description="device path, /dev/serial/by-id path or socket://host:port")
+    address: int = Field(default=1, ge=0, le=255, description="address of the module on its line")
+    output: int = Field(default=0, ge=0, le=7, description="relay that lets light pass, counted from 0")
+    watchdog_s: float | None = Field(
+        default=1.0, ge=0.2, le=25.5, description="the module opens the relay after this time without a heartbeat"
+    )
+    held_by: str | None = Field(default=None, description="program that may hold the port too: its simulator")
+    reply_s: float = Field(default=1.0, gt=0, description="longest wait for a reply")
+
+
+class RelayModule(LightSource):
+    """Light passes while the relay is closed."""
+
+    def __init__(self, config: Config, link: SerialLink, lines: LineRegistry) -> None:
+        self.config = config
+        self._link, self._lines = link, lines
+        self._name = f"relay module {config.address:02X} on {config.port}"
+        self._model = self._ask("$", "M")
+        if not self._model.startswith(("7060", "7067")):
+            raise WrongDevice(
+                f"identify the {self._name}", f"it answers {self._model!r}", "Correct `source` or `cutoff`"
+            )
+
+    def set_light(self, on: bool) -> None:
+        """Close or open the relay, read back; closing it starts the watchdog."""
+        if on:
+            if self.config.watchdog_s is not None:
+                self._ask("~", f"31{round(10 * self.config.watchdog_s):02X}")
+            self._ask("~", "1")
+            self.feed()
+        reply = self._exchange("#", f"1{self.config.output}0{int(on)}")
+        if reply == "!" and on:
+            raise CommandRejected(f"{self._name}, close the relay", "its watchdog has run out", "Look at the line")
+        if self.is_on() != on:
+            state = "open" if on else "closed"
+            raise DeviceError(
+                f"{self._name}, {'close' if on else 'open'} the relay", f"it reads as {state}", "Look at it"
+            )
+
+    def feed(self) -> None:
+        """Send the heartbeat, which has no reply."""
+        with self._link.lock:
+            self._link.write(b"~**\r")
+
+    def is_on(self) -> bool:
+        """True while the relay is closed."""
+        reply = self._ask("$", "6", addressed=False)
+        try:
+            return bool(int(reply[:2], 16) >> self.config.output & 1)
+        except ValueError:
+            raise self._disturbed("read the outputs", reply) from None
+
+    def interlock_open(self) -> bool:
+        """False: it has no interlock that could be read."""
+        return False
+
+    def describe(self) -> dict[str, str]:
+        """Kind, model and port."""
+        return {"kind": self.config.kind, "model": self._model, "port": self.config.port}
+
+    def close(self) -> None:
+        """Give the port back; the relay opens when the watchdog runs out."""
+        self._lines.release(self.config.port)
+
+    def _ask(self, lead: str, command: str, *, addressed: bool = True) -> str:
+        """What a reply ``!AA...`` holds; an unusable reply is asked for once more."""
+        start = f"!{self.config.address:02X}" if addressed else "!"
+        for last in (False, True):
+            try:
+                reply = self._exchange(lead, command)
+                if reply.startswith(start):
+                    return reply.removeprefix(start)
+                raise self._disturbed(f"{lead}{command}", reply)
+            except (ReplyError, ReplyTimeout):
+                if last:
+                    raise
+                self._link.purge()
+        raise AssertionError
+
+    def _exchange(self, lead: str, command: str) -> str:
+        with self._link.lock:
+            self._link.write(f"{lead}{self.config.address:02X}{command}\r".encode("ascii"))
+            frame = self._link.read_frame(self._link.clock.now_s() + self.config.reply_s)
+        if frame is None:
+            asked = f"{self._name}, {lead}{command}"
+            raise ReplyTimeout(asked, f"no reply in {self.config.reply_s:g} s", "Check power, cable and address")
+        return frame.decode("ascii", "replace").strip()
+
+    def _disturbed(self, asked: str, reply: str) -> ReplyError:
+        return ReplyError(f"{self._name}, {asked}", f"{reply!r}", "The line is disturbed: check cable and baud rate")
+
+
+def open(config: Config, lines: LineRegistry) -> RelayModule:
+    """Open the module; asks who it is and changes nothing."""
+    with lines.taken(config.port, SerialLink, partial(_link, config, lines.clock)) as link:
+        return RelayModule(config, link, lines)
+
+
+def _link(config: Config, clock: Clock, transcript: Transcript | None) -> SerialLink:
+    return SerialLink(config.port, BAUDRATE, line_framer, transcript=transcript, clock=clock, held_by=config.held_by)
