@@ -151,7 +151,9 @@ def served(work: Path, *, cutoff: bool) -> Iterator[tuple[SimulatedRig, Path]]:
     hook = work / "hook.sh"
     hook.write_text(f'#!/bin/sh\necho "$1" >> {work / "told.txt"}\n')
     hook.chmod(0o755)
-    rig = write_rig(work / "rig.yaml", {"rows": 64, "columns": 80, "clock_speed": 1}, alert=[str(hook)])
+    rig = write_rig(
+        work / "rig.yaml", {"rows": 64, "columns": 80, "clock_speed": 1, "camera_wait_s": 600}, alert=[str(hook)]
+    )
     with serve(rig, work / "served.yaml", "red_sphere") as simulation:
         if cutoff:
             from simulators.clock import Clock, patient_clock
