@@ -17,6 +17,7 @@ import numpy as np
 from acquisition.campaign.identity import IDENTITY
 from acquisition.campaign.plan import Campaign, CampaignCapture
 from acquisition.capture.synced import make_folder, sync
+from acquisition.cleanup import on_disc
 from acquisition.errors import AcquisitionError
 from processing.doors import read_json, read_text
 from processing.errors import ProcessError
@@ -77,14 +78,18 @@ class CampaignFolder:
         line = {"time": datetime.datetime.now().astimezone().isoformat(timespec="milliseconds"), "event": event}
         text = json.dumps(line | details, default=str) + "\n"
         path = self.folder / LOG
-        with self._room_for(path), open(open_plain(path, os.O_RDWR | os.O_APPEND), "ab+") as file:
-            # A line that was cut off by a full disc must not spoil the next.
-            end = file.seek(0, os.SEEK_END)
-            if end and file.seek(end - 1) is not None and file.read(1) != b"\n":
-                text = "\n" + text
-            file.write(text.encode())
-            file.flush()
-            os.fsync(file.fileno())
+
+        def append() -> None:
+            with open(open_plain(path, os.O_RDWR | os.O_APPEND), "ab+") as file:
+                # A line that was cut off by a full disc must not spoil the next.
+                end = file.seek(0, os.SEEK_END)
+                cut_off = end and file.seek(end - 1) is not None and file.read(1) != b"\n"
+                file.write(("\n" * bool(cut_off) + text).encode())
+                file.flush()
+                os.fsync(file.fileno())
+
+        with self._room_for(path):
+            on_disc(f"write {path}", append)
 
     def record(self, capture: str, **details: Any) -> None:
         """Write what became of a capture into the index, which is whole at any instant."""
@@ -93,7 +98,8 @@ class CampaignFolder:
 
     def _write_whole(self, path: Path, text: str) -> None:
         new = path.with_name(path.name + ".new")
-        with self._room_for(path):
+
+        def write() -> None:
             with open(open_plain(new, os.O_WRONLY), "w", encoding="utf-8") as file:
                 file.truncate(0)
                 file.write(text)
@@ -101,6 +107,9 @@ class CampaignFolder:
                 os.fsync(file.fileno())
             os.replace(new, path)
             sync(path.parent)
+
+        with self._room_for(path):
+            on_disc(f"write {path}", write)
 
     @contextmanager
     def _room_for(self, path: Path) -> Iterator[None]:

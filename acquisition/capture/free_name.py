@@ -6,10 +6,12 @@ import itertools
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
 from acquisition.capture.synced import make_folder
-from acquisition.capture.writer import NEW, PARTIAL
+from acquisition.capture.writer import NEW, PARTIAL, PATIENCE_S
+from acquisition.cleanup import on_disc
 from acquisition.errors import AcquisitionError
 
 
@@ -31,8 +33,8 @@ def free_name(path: Path) -> Iterator[Path]:
         yield free
     finally:
         # Not there any more once the capture has begun.
-        with suppress(OSError):
-            _with(free, NEW).unlink(missing_ok=True)
+        with suppress(OSError, AcquisitionError):
+            on_disc(f"remove {_with(free, NEW)}", partial(_with(free, NEW).unlink, missing_ok=True), PATIENCE_S)
 
 
 def _numbered(path: Path) -> Iterator[Path]:

@@ -19,7 +19,7 @@ from acquisition.capture.plan import ARM, AutoExposure
 from acquisition.capture.records import begin_record, end_record
 from acquisition.capture.runner import CaptureRunner, TooBright
 from acquisition.capture.writer import CaptureWriter, as_partial
-from acquisition.cleanup import run_all
+from acquisition.cleanup import on_disc, run_all
 from acquisition.errors import AcquisitionError, Stopped, as_known
 from acquisition.rig.continuous_rotation import turns_to, unwound
 from acquisition.rig.folded_angles import folded
@@ -292,12 +292,16 @@ def _end_segment(
     closing = closing_record([], end)
     try:
         writer.settle(in_haste=failure is not None)
-        records = writer.file.segment_records()
-        closing = closing_record(records, end)
-        # Half of what is left, so that there is room for the next.
-        writer.file.add_segment_record(end, part=0.5)
-        # A run that can go on keeps its partial name, but for the orderly end after one Ctrl-C.
-        return closing, writer.seal(status, closing, keep_partial=failure is not None)
+
+        def write() -> tuple[dict[str, Any], Path]:
+            records = writer.file.segment_records()
+            closing = closing_record(records, end)
+            # Half of what is left, so that there is room for the next.
+            writer.file.add_segment_record(end, part=0.5)
+            # A run that can go on keeps its partial name, but for the orderly end after one Ctrl-C.
+            return closing, writer.seal(status, closing, keep_partial=failure is not None)
+
+        return on_disc(f"seal {writer.path}", write)
     except (AcquisitionError, OSError) as error:
         writer.abandon()
         if failure is None:

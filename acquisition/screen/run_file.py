@@ -64,8 +64,6 @@ class RunFile(Observer):
         self._ended.set()
         self._changed.set()
         self._writing.join(timeout=1)
-        with contextlib.suppress(OSError):
-            self._path.unlink(missing_ok=True)
 
     def campaign_progress(self, number: int, total: int, name: str) -> None:
         self._show(campaign_done=number, campaign_total=total, capture=name)
@@ -111,6 +109,8 @@ class RunFile(Observer):
                     file.write(json.dumps(self._facts))
                 os.replace(new, self._path)
             self._ended.wait(EVERY_S)
+        with contextlib.suppress(OSError):
+            self._path.unlink(missing_ok=True)
 
 
 def begun_ticks(pid: int) -> int | None:
