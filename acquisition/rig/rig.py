@@ -200,8 +200,13 @@ class Rig:
         """
         if self._guarding is None and not has_own_emulators(self.config):
             self._guarding = Guarding(
-                self.config, journal, self._lines.descriptors(), self._shut_at_once, self._guard_news.append
+                self.config, journal, self._lines.descriptors(), self._shut_at_once, self._guard_says
             )
+
+    def _guard_says(self, text: str) -> None:
+        # At once: before the first state, and in a long exposure, nobody asks for the news.
+        log.warning("%s", text)
+        self._guard_news.append(text)
 
     def _require_guard(self) -> None:
         self.start_guard()
@@ -223,7 +228,7 @@ class Rig:
             self._shut_at_once()
         except Exception as error:  # noqa: BLE001 - the end of the run tries again, and the words must come
             why = f"{why}. THE LIGHT IS NOT SHUT: {error}"
-        self._guard_news.append(why)
+        self._guard_says(why)
 
     def guard_news(self) -> list[str]:
         """What the guard's watch has had to say since the last call."""

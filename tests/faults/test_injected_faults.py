@@ -1,0 +1,78 @@
+"""Promises 12 and 28: any call that leaves the program may fail, once or from then on, one or two kinds at a time.
+
+As SQLite's tests do, a counter runs through the calls of each kind. After each run the light is off, the states done are
+intact and at the angles that their pixels show, and the capture goes on.
+"""
+
+import os
+import random
+import threading
+
+import pytest
+
+from acquisition.capture.state_file import StateFile
+from acquisition.errors import AcquisitionError
+from drivers.cameras.aravis import AravisCamera
+from drivers.errors import DeviceError
+from drivers.serial_link import SerialLink
+
+SHORT = {"states": {"kind": "rotating_retarders", "states": 18, "step_deg": 20, "ratio": 4.91}, "darks": 1}
+#: Where a call leaves the program, what it may raise, and how often a run makes it, roughly.
+CALLS = {
+    "serial write": (SerialLink, "write", (MemoryError, KeyError), 200),
+    "serial read": (SerialLink, "read_frame", (MemoryError, ValueError), 200),
+    "camera trigger": (AravisCamera, "trigger", (MemoryError, ValueError), 10),
+    "camera temperature": (AravisCamera, "temperature_c", (KeyError,), 10),
+    "disc": (StateFile, "write_state", (MemoryError, OSError), 10),
+    "disc probe": (os, "utime", (OSError,), 3),
+    "thread": (threading.Thread, "start", (RuntimeError,), 6),
+}
+
+
+class Injected:
+    """Lets the calls of one kind fail from a number on, so many times; only while `armed`."""
+
+    def __init__(self, patch, kind, chance):
+        place, name, errors, calls = CALLS[kind]
+        self.armed = False
+        self._left, self._until = chance.randint(1, calls), chance.choice([1, 10**9])
+        self.holds_the_light = place is SerialLink and self._until > 1
+        self._error = chance.choice(errors)
+        call = getattr(place, name)
+
+        def fail(*arguments, **options):
+            if self.armed:
+                self._left -= 1
+                if self._left <= 0 and self._until > 0:
+                    self._until -= 1
+                    raise self._error("injected")
+            return call(*arguments, **options)
+
+        patch.setattr(place, name, fail)
+
+
+@pytest.mark.parametrize("kind", [*CALLS, "two at a time"])
+def test_after_any_failure_the_light_is_off_and_the_capture_goes_on(run_with, intact, monkeypatch, kind, runs):
+    chance = random.Random(kind)
+    for _ in range(2 * runs):
+        rigs, kinds = [], [kind] if kind in CALLS else chance.sample(list(CALLS), 2)
+        with monkeypatch.context() as patch:
+            injected = [Injected(patch, each, chance) for each in kinds]
+
+            def arm(rig, state, retake, injected=injected, rigs=rigs):
+                rigs.append(rig)
+                for each in injected:
+                    each.armed = True
+
+            error, path = run_with(arm, plan=SHORT)
+            for each in injected:
+                each.armed = False
+        assert error is None or isinstance(error, AcquisitionError | DeviceError), error
+        # A shutter whose line fails for good cannot be shut; the guard of a real rig has a line of its own.
+        if not any(each.holds_the_light for each in injected):
+            assert not rigs[0].simulation.light(), (kinds, error)
+        intact(path)
+        if error is not None:
+            error, path = run_with(resume=path, plan=SHORT)
+            assert error is None
+        assert intact(path) == 19
