@@ -1,6 +1,6 @@
 """Promises 12 and 28: any call that leaves the program may fail, once or from then on, one or two kinds at a time.
 
-As SQLite's tests do, a counter runs through the calls of each kind. After each run the light is off, the states done are
+As SQLite's tests do, a counter runs through the calls of each kind. After each run the light is off, states done are
 intact and at the angles that their pixels show, and the capture goes on.
 """
 
