@@ -117,6 +117,7 @@ class Run:
     def _starve(self, pid: int) -> None:
         """A hundredth of the time for each second: a machine that has next to none for it."""
         with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGSTOP)
             while not self._starved.wait(0.99):
                 os.kill(pid, signal.SIGCONT)
                 time.sleep(0.01)

@@ -39,8 +39,8 @@ THREAD = "capture writer"
 PATIENCE_S = 1.5
 DEAD_S = 30.0
 #: How long any call may take before the light is shut; one that changes no byte is tried all the time.
-DARK_S = 1.2
-PROBE_S = 0.3
+DARK_S = 1.0
+PROBE_S = 0.2
 #: How often it is looked at.
 LOOK_S = 0.2
 #: Layout, notes and journals besides the frames, and the columns of a state, generously.
