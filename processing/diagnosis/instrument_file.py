@@ -86,4 +86,6 @@ def write_instrument(path: Path, model: InstrumentModel, diagnosis: Diagnosis, n
             "else keep the result with `--json` and report it."
         ) from error
     holds = "see `effects`" if diagnosis.corrects else "nothing is corrected; `systematic` is how wrong M may be"
+    if diagnosis.corrects and diagnosis.correction is not None and diagnosis.correction.refused is not None:
+        holds = f"the fitted values of the train alone; effects are not applied: {diagnosis.correction.refused}"
     write_new_text(path, file_head(f"Written by `diagnose`: {diagnosis.verdict}, {holds}.", note) + text)

@@ -182,8 +182,11 @@ class InstrumentModel(Part):
 
     @property
     def projects_source(self) -> bool:
-        """Whether the level of the source in each state is projected out: two channels or more see one source."""
-        return len(self.channels) > 1 if self.free_source is None else self.free_source
+        """Whether the level of the source in each state is projected out: two channels or more see one source.
+
+        Where nothing turns all states are alike, and a level is a part of the throughput.
+        """
+        return len(self.channels) > 1 and bool(self.axes) if self.free_source is None else self.free_source
 
     @property
     def pitch(self) -> int:

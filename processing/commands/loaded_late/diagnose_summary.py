@@ -132,7 +132,8 @@ def _show_uncertainty(d: Diagnosis) -> None:
     if correction.mueller is not None:
         typer.echo(f"{correction.mueller.told}")
     if correction.refused is not None and not any(e.not_applied for e in d.effects):
-        typer.echo(f"nothing is applied, because {correction.refused}")
+        what = "but for the fitted train, nothing" if d.corrects else "nothing"
+        typer.echo(f"{what} is applied, because {correction.refused}")
     elif not d.corrects and not d.effects:
         typer.echo("nothing is corrected")
 

@@ -23,6 +23,8 @@ from processing.instrument.elements import number
 ALIKE = 1e-3
 #: [degree, fixed] Period of the azimuth of an element.
 HALF_TURN = 180.0
+#: [degree] Distances closer than this are the same.
+TIE = 1e-6
 #: [degree, fixed] Period of a retardance.
 WHOLE = 360.0
 #: [degree, fixed] After which a retarder has the opposite retardance, and a diattenuator the opposite diattenuation.
@@ -83,7 +85,10 @@ def _of_nominal_retardance(problem: InstrumentProblem, found: Mapping[Candidate,
         nominal = number(problem.model.value_of(candidate.place) or 0.0)
         same, opposite = (_near_zero(sign * (nominal + value[0]) - nominal) for sign in (1, -1))
         azimuth = azimuths.get(element)
-        if abs(opposite) < abs(same) and azimuth is not None and azimuth.wavelength_nm == candidate.wavelength_nm:
+        nearer = abs(same) - abs(opposite)
+        # A half-wave plate has both at one distance: then the smaller retardance is taken, and the azimuth decides.
+        turns = nearer > TIE or (nearer > -TIE and opposite < same)
+        if turns and azimuth is not None and azimuth.wavelength_nm == candidate.wavelength_nm:
             values[azimuth] = _turned(azimuth, values[azimuth], QUARTER_TURN)
             same = opposite
         values[candidate] = np.array([same])

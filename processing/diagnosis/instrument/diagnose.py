@@ -147,7 +147,7 @@ def _told(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring: 
         if verdict == "undetermined"
         else recommended(problem, kept.space, kept.fit, names.rivals, missing(unseen)),
         unexplained=_unexplained(used, names) if verdict in ("unexplained", "partly_explained") else None,
-        calibrated=calibrated(problem, found, solved),
+        calibrated=calibrated(problem, found, kept),
         ranking=ranking(found, solved.before),
         captures=tuple(
             capture_report(asked, k, kept, *of_one)

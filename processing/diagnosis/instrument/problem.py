@@ -281,6 +281,10 @@ class InstrumentProblem:
         """Channels of the detector."""
         return len(self.captures[capture].conditions.channels)
 
+    def ratios(self, capture: int) -> int:
+        """Ratios of channels that a state shows, where its level is projected out; 0 where it is not."""
+        return self.channels(capture) - 1 if self._free_source(capture) else 0
+
     def predicted(self, capture: int, changes: Changes) -> Array:
         """Intensities (N, channels) of a capture of a known sample, for a throughput of one and a steady source."""
         rows = self._columns_of_one_source(capture, changes) * self.moments[capture].sigma[:, None]

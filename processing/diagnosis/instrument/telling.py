@@ -29,7 +29,7 @@ from processing.diagnosis.search.result import (
     NotMeasured,
     Ranked,
 )
-from processing.diagnosis.search.rules import DECISIVE, DOUBTED, LIKELY, MOST_RANKED, NOISE_ERROR, SEEN, SURE
+from processing.diagnosis.search.rules import DECISIVE, DOUBTED, FAR_OFF, LIKELY, MOST_RANKED, NOISE_ERROR, SEEN, SURE
 from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.search.stored import by_wavelength, parameters_of, scope_of
@@ -198,7 +198,8 @@ def correction(
                 )
             )
     # Values that are merely nominal are nowhere near what is true.
-    known = judgement.refused is None or not any(c.place for c in solved.base.candidates)
+    nominal = any(c.place for c in solved.base.candidates)
+    known = judgement.refused is None or not nominal or (judgement.first is None and solved.before.rms < FAR_OFF)
     uncertain = systematic_error(problem, found, used) if known else None
     return Correction(
         effects=tuple(effects),

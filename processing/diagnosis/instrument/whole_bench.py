@@ -216,12 +216,15 @@ class WholeBench:
         if isinstance(effect, FieldEffect | Switch):
             return False
         captures = self.whole.captures
-        mine = [c for k, c in enumerate(captures) if candidate.acts(k, c.wavelength_nm)]
+        acting = [k for k, c in enumerate(captures) if candidate.acts(k, c.wavelength_nm)]
+        mine = [captures[k] for k in acting]
         if isinstance(effect, ImageShift):
             return all(min(c.signal.shape[2:]) > 2 * MARGIN + 2 for c in mine)
         if isinstance(effect, PointwiseEffect):
-            # With one number a pixel to test, a bend of the response and gains of the channels explain each other.
-            return any(free > 1 for free in self._free)
+            # With one number a pixel to test, a bend of the response and gains of the channels explain each other. So
+            # do, with one ratio a state, a bend and what leaks through the channels, unless the noise tells the light.
+            one_ratio = all(self.whole.ratios(k) == 1 for k in acting)
+            return any(free > 1 for free in self._free) and (self.whole.noise_known or not one_ratio)
         if isinstance(effect, ValuePerState) and not self.whole.noise_known:
             # A value for each intensity would be noise by another name.
             return len(self.whole.model.channels) > 1

@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from processing.diagnosis.search.rules import CHANCE_WORSE, LEAST_CHANGE
+from processing.diagnosis.search.rules import CHANCE_WORSE, FAR_OFF, LEAST_CHANGE
 from processing.instrument.model import AppliedEffect, EffectParameter, SystematicError
 
 Verdict = Literal["consistent", "explained", "partly_explained", "unexplained", "undetermined"]
@@ -325,8 +325,13 @@ class Diagnosis(_Part):
     @property
     def corrects(self) -> bool:
         """Whether an instrument file would measure otherwise with what was found."""
-        refused = self.correction is not None and self.correction.refused is not None
-        return bool(self.applied() or self.calibrated) and not refused
+        return bool(self.applied() or (self.calibrated and self.train_fits))
+
+    @property
+    def train_fits(self) -> bool:
+        """Whether the nominal values are fitted, so that they are used also where effects beside them are refused."""
+        fits = self.wiring is None and self.error_before.rms_percent < 100 * FAR_OFF
+        return fits or self.correction is None or self.correction.refused is None
 
     def systematic(self) -> tuple[SystematicError, ...]:
         """What an instrument file stores of the uncertainty, also where nothing is corrected; wiring comes first."""

@@ -1,0 +1,347 @@
+"""From a capture of a known sample to the Mueller matrix of another sample, for every instrument in configs/.
+
+Each instrument is wrong by what its file does not say. One capture of air is diagnosed, the file is written, and a
+capture of another sample is reduced with the nominal and with the written file. The references are no part of any fit:
+the emulated sample, or the ratio of the channels of measured data.
+
+    python benchmarks/instrument_chain.py          prints the table of docs/instrument-chain.md
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from processing.diagnosis.instrument.run import diagnose_captures
+from processing.diagnosis.instrument_file import WriteError, write_instrument
+from processing.instrument.model import InstrumentModel
+from processing.polarization import mueller
+from processing.public_data.conversion import tables_of
+from processing.public_data.sets import SHIPPED, find_files
+from processing.steps.reduction import Reduction
+from processing.storage.capture_schema import Detector
+from processing.storage.importing import ImportRequest, import_capture, read_sample
+from processing.storage.product import Product
+from processing.yaml_file import dump_yaml
+
+Array = NDArray[np.float64]
+
+INSTRUMENTS = Path(__file__).resolve().parents[1] / "configs/instruments"
+#: Another sample: a turned plate of 100 degrees behind a weak diattenuator, half of it depolarized.
+SAMPLE = 0.7 * mueller.retarder(0.4, 1.75) @ mueller.diattenuator(0.9, 1.0, 0.7) + 0.3 * mueller.IDEAL_DEPOLARIZER
+#: Where public measured data are that may not be in the tree.
+DATA = Path(os.environ.get("UMOV_DATA", INSTRUMENTS.parents[2] / "shared" / "data"))
+MEASURED_NM, KINDS = (1200, 1300, 1600, 1950), ("air", "plate")
+NOISE, COUNTS, BLACK, READ = 1e-3, 20_000.0, 100, 3.0
+
+
+@dataclass(frozen=True)
+class Bench:
+    """An instrument as it is: angles of its axes, and by how much values of its train differ from its file.
+
+    Attributes
+    ----------
+    flicker : standard deviation of the level of the source over the states.
+    """
+
+    angles_deg: dict[str, Array]
+    wrong: dict[str, float]
+    flicker: float = 0.0
+    nm: float = 662.0
+    leave_out: tuple[str, ...] = ()
+
+
+_N = np.arange
+BENCHES = {
+    "rgb950": Bench(
+        {"psg": 9.0 * _N(40), "psa": 4.91 * 9.0 * _N(40)},
+        {"psg_retarder.azimuth_deg": 0.6, "psa_retarder.retardance_deg": 1.5},
+    ),
+    "drr_5to1": Bench(
+        {"psg": 6.0 * _N(61), "psa": 30.0 * _N(61)}, {"psg_retarder.retardance_deg": 2.0, "analyzer.azimuth_deg": 0.4}
+    ),
+    "drr_single_detector": Bench(
+        {"psg": 6.0 * _N(61), "psa": 30.0 * _N(61)},
+        {"psg_retarder.azimuth_deg": 7.0, "psa_retarder.azimuth_deg": -4.0, "psa_retarder.retardance_deg": 6.0},
+    ),
+    "drr_imaging_630nm": Bench(
+        {
+            "psg": np.tile(np.repeat(22.5 * _N(8), 8), 2),
+            "psa": np.tile(22.5 * _N(8), 16),
+            "analyzer": np.repeat([0.0, 45.0], 64),
+        },
+        {"psg_retarder.azimuth_deg": 12.0, "psg_retarder.retardance_deg": -5.0, "psa_retarder.azimuth_deg": 5.0},
+        nm=630.0,
+    ),
+    "drr_wollaston": Bench(
+        {"psg": 4.0 * _N(46)},
+        {
+            "psg_retarder.azimuth_deg": 5.0,
+            "psa_retarder.azimuth_deg": -7.0,
+            "psa_retarder.retardance_deg": 4.0,
+            "wollaston_right.extinction": 0.01,
+            "right.gain": 0.04,
+        },
+        flicker=0.03,
+    ),
+    "dual_beam_charis": Bench(
+        {"hwp": np.repeat(11.25 * _N(8), 8), "image_rotator": np.tile(45 + 12.5 * _N(8), 8)},
+        {
+            "source_polarizer.azimuth_deg": 3.0,
+            "half_wave_plate.azimuth_deg": -2.0,
+            "half_wave_plate.retardance_deg": -9.0,
+            "image_rotator.retardance_deg": -60.0,
+        },
+        flicker=0.03,
+        leave_out=("image_rotator.depolarization", "half_wave_plate.depolarization"),
+    ),
+    "mosaic_polarimeter": Bench(
+        {"psg": 9.0 * _N(40)}, {"psg_retarder.azimuth_deg": 0.8, "psg_retarder.retardance_deg": 1.5}, flicker=0.03
+    ),
+    "polarization_camera_retarder": Bench(
+        {"psa": 9.0 * _N(40)}, {"psa_retarder.azimuth_deg": 0.8, "45.gain": 0.03}, flicker=0.03
+    ),
+    "linear_stokes": Bench({}, {"45.gain": 0.03, "90.gain": -0.02}),
+    "linear_mueller": Bench(
+        {"psg": np.repeat(20.0 * _N(9), 9), "psa": np.tile(20.0 * _N(9), 9)}, {"analyzer.azimuth_deg": 0.8}
+    ),
+    "rotating_analyzer": Bench({"psa": 10.0 * _N(36)}, {"analyzer.extinction": 0.02}),
+    "rotating_retarder_stokes": Bench({"psa": 10.0 * _N(36)}, {"psa_retarder.retardance_deg": 2.0}),
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """What became of another sample.
+
+    Attributes
+    ----------
+    nominal, train, written : rms difference from the reference, over the elements of M/m00 (S/S0) that the instrument
+        determines, reduced with the file as it was, with the fitted values of the train alone, and as it was written.
+    stated : rms of the standard errors in the product, noise and systematic.
+    reference : what it is compared with.
+    """
+
+    name: str
+    nominal: float
+    train: float
+    written: float
+    stated: float
+    verdict: str
+    reference: str
+
+    @property
+    def line(self) -> str:
+        """A line of the table."""
+        figures = f"{self.nominal:.4f} | {self.train:.4f} | {self.written:.4f} | {self.stated:.4f}"
+        return f"| {self.name} | {self.reference} | {figures} | {self.verdict.replace('_', ' ')} |"
+
+
+def emulated(name: str, folder: Path, seed: int = 1) -> Row:
+    """The chain of one instrument of configs/instruments on an emulated bench."""
+    bench, file = BENCHES[name], folder / f"{name}.yaml"
+    text = (INSTRUMENTS / f"{name}.yaml").read_text(encoding="utf-8")
+    for value in bench.leave_out:
+        text = "".join(line for line in text.splitlines(True) if value not in line)
+    file.write_text(text, encoding="utf-8")
+    nominal = InstrumentModel.load(file)
+    true = nominal.at(bench.nm)
+    for value, by in bench.wrong.items():
+        place, _, field = value.rpartition(".")
+        true = true.with_values({place: {field: float(true.value_of(value) or 0.0) + by}})  # type: ignore[arg-type]
+    random = np.random.default_rng(seed)
+    air, other = (_capture(true, bench, m, kind, file, random) for m, kind in ((np.eye(4), "air"), (SAMPLE, "unknown")))
+
+    def truth(product: dict[str, Array]) -> Array:
+        if "stokes" not in product:
+            return SAMPLE / SAMPLE[0, 0]
+        sent = SAMPLE @ true.generator_states({})[0]
+        return np.asarray(sent / sent[0])
+
+    return chain(name, air, other, file, truth, "the emulated sample")
+
+
+def chain(
+    name: str, air: Path, other: Path, file: Path, truth: Callable[[dict[str, Array]], Array], reference: str
+) -> Row:
+    """Diagnose a capture, write, and reduce another with both files."""
+    model = InstrumentModel.load(file)
+    found = diagnose_captures([air], model)[0].diagnosis
+    new = file.with_name(f"{file.stem}.new.yaml")
+    try:
+        write_instrument(new, model, found)
+    except WriteError:
+        new = file
+    train = file.with_name(f"{file.stem}.train.yaml")
+    train.write_text(dump_yaml(InstrumentModel.load(new).model_copy(update={"effects": (), "systematic": ()})))
+    errors = []
+    for k, used in enumerate((file, train, new)):
+        product = _product(Reduction(other, used).make(other.with_suffix(f".{k}.h5"), True))
+        values, stated = _relative(product)
+        wanted = truth(product).reshape(values.shape)
+        seen = np.isfinite(values) & (np.arange(values.size) > 0)
+        errors.append((_rms(values[seen] - wanted[seen]), _rms(stated[seen])))
+    (nominal, _), (alone, _), (written, stated) = errors
+    return Row(name, nominal, alone, written, stated, found.verdict, reference)
+
+
+def half_wave_plate(nm: int, files: Mapping[str, Path], folder: Path) -> Row:
+    """The chain on measured data: air, then a half-wave plate, against the ratio of the two channels."""
+    air, plate = (
+        next(t for t in tables_of("drr-wollaston-nir", files) if t.name == f"{kind}_{nm}nm") for kind in KINDS
+    )
+    file = folder / f"wollaston_{nm}.yaml"
+    file.write_text((INSTRUMENTS / "drr_wollaston.yaml").read_text(encoding="utf-8"), encoding="utf-8")
+    paths = []
+    for table in (air, plate):
+        request = ImportRequest(
+            states=table.write(folder)[0],
+            out=folder / f"{table.name}.h5",
+            wavelength_nm=nm,
+            instrument=file,
+            sample=read_sample(table.sample),
+        )
+        import_capture(request)
+        paths.append(request.out)
+    reference = ratio_of_channels(
+        *(np.array([row.split(",")[1:] for row in t.rows], dtype=float) for t in (air, plate))
+    )
+    flip = np.diag([1.0, 1.0, 1.0, -1.0])
+
+    def truth(product: dict[str, Array]) -> Array:
+        # Air leaves the sign of row and column 3 open.
+        m = product["mueller"] / product["mueller"][0, 0]
+        return min((reference, flip @ reference @ flip), key=lambda one: _rms(one - m))
+
+    return chain(f"drr_wollaston, measured at {nm} nm", *paths, file, truth, "the ratio of the channels")
+
+
+def ratio_of_channels(air: Array, plate: Array) -> Array:
+    """M/m00 of a plate from (left - right)/(left + right) alone, tables (N, 3) of angle in degrees, left and right.
+
+    A train of its own: two retarders, elliptical light, and azimuth, extinction and gain of the channels.
+    """
+    random = np.random.default_rng(0)
+
+    def rows(x: Array, theta_deg: Array) -> Array:
+        t = np.deg2rad(theta_deg)
+        sent = mueller.retarder(np.deg2rad(45.0), x[9]) @ mueller.polarizer(0.0, 0.0)[:, :1]
+        g = (mueller.retarder(t + x[0], x[1]) @ sent)[..., 0]
+        plate = mueller.retarder(5 * t + x[2], x[3])
+        a = np.stack(
+            [mueller.polarizer(x[4], x[6])[0] @ plate, x[8] * mueller.polarizer(x[5], x[7])[0] @ plate], axis=1
+        )
+        return np.asarray((a[..., :, None] * g[:, None, None, :]).reshape(len(t), 2, 16))
+
+    def misfit(x: Array) -> Array:
+        light = rows(x, air[:, 0]) @ np.eye(4).reshape(16)
+        return np.asarray((light @ [1, -1]) / light.sum(axis=1) - (air[:, 1:] @ [1, -1]) / air[:, 1:].sum(axis=1))
+
+    fits = []
+    for k in range(24):
+        azimuths = random.uniform(-np.pi / 2, np.pi / 2, 2)
+        crossed = np.pi / 2 * (k % 2)
+        start = [azimuths[0], 1.57, azimuths[1], 1.57, crossed, crossed + np.pi / 2, 0.002, 0.002, 1.0, 0.0]
+        low = [-9, 0.8, -9, 0.8, -9, -9, 0, 0, 0.5, -0.3]
+        fits.append(least_squares(misfit, start, bounds=(low, [9, 2.4, 9, 2.4, 9, 9, 0.1, 0.1, 2.0, 0.3])))
+    w = rows(min(fits, key=lambda fit: float(fit.cost)).x, plate[:, 0])
+    # left w_right m = right w_left m in every state, with the weight of its light.
+    across, weight = plate[:, 1:2] * w[:, 1] - plate[:, 2:] * w[:, 0], np.ones(len(w))
+    for _ in range(5):
+        m = np.linalg.svd(across / weight[:, None])[2][-1]
+        weight = w.sum(axis=1) @ m / m[0]
+    return np.asarray((m / m[0]).reshape(4, 4))
+
+
+def _capture(
+    model: InstrumentModel, bench: Bench, sample: Array, kind: str, file: Path, random: np.random.Generator
+) -> Path:
+    """An imported capture: fluxes, or frames of 48 x 48 pixels of a camera with a mosaic."""
+    states = max((len(a) for a in bench.angles_deg.values()), default=4)
+    angles = bench.angles_deg or {"": np.zeros(states)}
+    level = 1 + bench.flicker * random.standard_normal((states, 1))
+    light = np.broadcast_to(model.rows(angles), (states, len(model.channels), 16)) @ sample.reshape(16) * level
+    table = {f"{axis}_deg": a for axis, a in bench.angles_deg.items()}
+    stem = file.with_name(f"{file.stem}_{kind}")
+    stack = None
+    if model.mosaic is None:
+        counts = COUNTS * (light + NOISE * random.standard_normal(light.shape))
+        table |= {f"channel_{c.name}": counts[:, k] for k, c in enumerate(model.channels)}
+    else:
+        names = [c.name for c in model.channels]
+        frames = np.empty((states, 48, 48))
+        for (r, c), channel in np.ndenumerate(np.array(model.mosaic)):
+            frames[:, r::2, c::2] = light[:, names.index(channel)][:, None, None]
+        stack = str(stem.with_suffix(".npy"))
+        counts = random.poisson(COUNTS * frames) + random.normal(BLACK, READ, frames.shape)
+        np.save(stack, np.round(counts).astype(np.uint16))
+    lines = [",".join(["state", *table])]
+    lines += [",".join([str(n), *(repr(float(column[n])) for column in table.values())]) for n in range(states)]
+    stem.with_suffix(".csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    request = ImportRequest(
+        states=stem.with_suffix(".csv"),
+        stack=stack,
+        out=stem.with_suffix(".h5"),
+        wavelength_nm=bench.nm,
+        instrument=file,
+        sample=read_sample(kind),
+        detector=Detector(black_level_counts=BLACK, gain_e_per_count=1.0, read_noise_e=READ) if stack else Detector(),
+    )
+    import_capture(request)
+    return request.out
+
+
+def _product(path: Path) -> dict[str, Array]:
+    """Means over the pixels of the datasets of a product."""
+    with Product(path) as product:
+        names = {"mueller", "mueller_errors", "mueller_systematic", "s0", "s1", "s2", "s1_errors", "s2_errors"}
+        names |= {"stokes", "stokes_errors", "stokes_systematic", "s1_systematic", "s2_systematic"}
+        found = {name: np.asarray(product.get(name), dtype=float) for name in names & set(product.names)}
+    return {name: values.mean(axis=(-2, -1)) for name, values in found.items()}
+
+
+def _relative(product: dict[str, Array]) -> tuple[Array, Array]:
+    """M/m00, or S/S0, and its standard error."""
+    if "s0" in product:
+        product["stokes"] = np.array([product["s0"], product["s1"], product["s2"], np.nan])
+        for ending in ("errors", "systematic"):
+            if f"s1_{ending}" in product:
+                product[f"stokes_{ending}"] = np.array([0.0, product[f"s1_{ending}"], product[f"s2_{ending}"], np.nan])
+    kind = "stokes" if "stokes" in product else "mueller"
+    values, systematic = product[kind].ravel(), product.get(f"{kind}_systematic", np.zeros(1))
+    return values / values[0], np.hypot(product[f"{kind}_errors"], systematic).ravel() / values[0]
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def rows(folder: Path) -> Iterator[Row]:
+    """All lines of the table."""
+    for name in BENCHES:
+        yield emulated(name, folder)
+    files = find_files("drr-wollaston-nir", [SHIPPED, DATA])
+    for nm in MEASURED_NM if files is not None else ():
+        yield half_wave_plate(nm, files, folder)
+
+
+def main() -> None:
+    """Print the table."""
+    print(
+        "| instrument | reference | nominal file | fitted train alone | written file | stated error | verdict on air |"
+    )
+    print("|---|---|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as folder:
+        for row in rows(Path(folder)):
+            print(row.line, flush=True)
+
+
+if __name__ == "__main__":
+    main()
