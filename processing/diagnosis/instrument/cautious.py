@@ -8,13 +8,17 @@ moved along what is open, each direction the more the less is known of it, until
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.instrument.guard import slopes_of
+from processing.diagnosis.instrument.guard import predicted_changes, slopes_of
+from processing.diagnosis.instrument.outcome import Outcome
 from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import AS_GOOD_AS, CHANCE_WORSE
+from processing.diagnosis.search.rules import AS_GOOD_AS, CHANCE_WORSE, SURE
 from processing.diagnosis.search.solution import Solution
 
 #: [1] Weights of the change of M that are tried.
@@ -53,6 +57,36 @@ def cautious(problem: InstrumentProblem, found: Posterior, solved: Solution) -> 
         if worse[0] and not now[0] and here is None:
             here = values.copy()
     return here
+
+
+def in_part(used: Outcome, unfit: Sequence[Candidate]) -> Outcome:
+    """A correction without its least certain effects, where M may get worse with them and does not without.
+
+    `unfit` is left out already. The others take the values that they have without what is left out.
+    """
+    found, tried, without = used.found, used, list(unfit)
+    chance = {found.space.candidates[m]: p for g, p in enumerate(found.samples.probability) for m in found.members[g]}
+    while predicted_changes(tried.asked, found, tried.solved)[0].chance_worse > CHANCE_WORSE:
+        uncertain = [c for c in tried.solved.effects if chance[c] < SURE]
+        if not uncertain or len(uncertain) == len(tried.solved.effects):
+            return used
+        least = min(chance[c] for c in uncertain)
+        dropped = [c for c in uncertain if chance[c] == least]
+        without += dropped
+        tried = used.corrected_by(_values_without(found, dropped, tried.solved), without)
+    return tried
+
+
+def _values_without(found: Posterior, dropped: Sequence[Candidate], solved: Solution) -> Array:
+    """Values (K,) of a correction, as their covariance has them where those of some effects are zero."""
+    values, part = found.values.copy(), dict(zip(found.space.candidates, found.space.slices, strict=True))
+    for candidate, own in zip(solved.space.candidates, solved.space.slices, strict=True):
+        values[part[candidate]] = solved.fit.values[own]
+    gone = np.concatenate([np.r_[part[c]] for c in dropped])
+    across = found.covariance[:, gone]
+    values -= across @ np.linalg.pinv(across[gone], hermitian=True) @ values[gone]
+    values[gone] = 0.0
+    return values
 
 
 def less_far(mean: Array, covariance: Array, products: Array, weight: float) -> Array | None:

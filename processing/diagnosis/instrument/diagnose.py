@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from processing.diagnosis.instrument.cautious import cautious
+from processing.diagnosis.instrument.cautious import cautious, in_part
 from processing.diagnosis.instrument.empirical import empirical
 from processing.diagnosis.instrument.guard import (
     chances,
@@ -97,7 +97,7 @@ def _carefully(first: Outcome, names: Names) -> Outcome:
     without = unfit(first.asked, first.solved, names)
     used = first.corrected_by(first.found.values, without) if without else first
     careful = cautious(used.asked, used.found, used.solved)
-    return used if careful is None else used.corrected_by(careful, without)
+    return in_part(used if careful is None else used.corrected_by(careful, without), without)
 
 
 def _changes(used: Outcome, names: Names) -> tuple[PredictedChange, PredictedChange, dict[str, PredictedChange]]:
