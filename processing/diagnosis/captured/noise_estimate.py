@@ -16,6 +16,8 @@ COMPONENTS = 16
 PIXELS = 20_000
 #: [of the mean variance] Least variance without light.
 LEAST_FLOOR = 0.01
+#: [digits] Of the range of the signal, to which two signals are the same.
+DIGITS = 9
 #: [levels] Of the signal at which their scatter is told.
 LEVELS = 24
 
@@ -40,8 +42,10 @@ def estimated_noise(data: CaptureData) -> CaptureData:
     good = share > LEAST_SCATTER if rows > FEW_ROWS else share > 0.0
     square = rest[good] ** 2 / share[good, None]
     signal = (y - rest)[good]
-    edges = np.quantile(signal, np.linspace(0, 1, LEVELS + 1))
-    level = np.clip(np.searchsorted(edges, signal, side="right") - 1, 0, LEVELS - 1)
+    # Signals that rounding alone sets apart share a level, or it would hang on the processor's order of sums.
+    alike = np.round(signal / max(float(np.ptp(signal)), 1e-300), DIGITS)
+    edges = np.quantile(alike, np.linspace(0, 1, LEVELS + 1))
+    level = np.clip(np.searchsorted(edges, alike, side="right") - 1, 0, LEVELS - 1)
     count = np.bincount(level.reshape(-1), minlength=LEVELS)
     mean = np.bincount(level.reshape(-1), signal.reshape(-1), LEVELS) / np.maximum(count, 1)
     variance = np.bincount(level.reshape(-1), square.reshape(-1), LEVELS) / np.maximum(count, 1)
