@@ -37,7 +37,8 @@ def load_aravis() -> tuple[Any, Any]:
         raise CameraError(
             "import Aravis",
             str(error),
-            "Install Debian's python3-gi and gir1.2-aravis-0.8 and run ./lab again, which exposes gi to this Python",
+            "Install Debian's python3-gi and gir1.2-aravis-0.8 (apt install). Then run ./lab again, which exposes gi "
+            "to its Python; with pip, make the environment by `python3 -m venv --system-site-packages ENVIRONMENT`",
         ) from error
     return Aravis, GLib.Error
 
