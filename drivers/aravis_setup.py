@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
@@ -242,17 +243,34 @@ class Setup:
         """Undo a binning or decimation that another program left; one that stays is read back and recorded."""
         for axis in ("Horizontal", "Vertical"):
             name = f"{what}{axis}"
-            if name not in self._config.features and self._features.number((name,)) not in (None, 1.0):
+            if name not in self._config.features and self._one_factor(name) not in (None, 1.0):
                 try:
-                    self._features.set_number((name,), 1)
+                    if self._features.kind(name) == "choice":
+                        ones = [entry for entry in self._features.choices(name) if re.sub(r"\D", "", entry) == "1"]
+                        self._features.set_value(name, ones[0] if ones else "Off")
+                    else:
+                        self._features.set_number((name,), 1)
                 except CameraLost:
                     raise
                 except CameraError:
                     return
 
+    def _one_factor(self, name: str) -> float | None:
+        """Factor along one axis: a number, or an entry such as X2; None where the camera has none."""
+        if self._features.find((name,)) is None:
+            return None
+        if self._features.kind(name) != "choice":
+            factor = self._features.number((name,))
+        else:
+            digits = re.sub(r"\D", "", self._features.text((name,)))
+            factor = float(digits) if digits else 1.0
+        if factor is not None and factor < 1:
+            raise self._refused(f"read {name}", f"it is {factor:g}, which is no factor. Set it in `features`")
+        return factor
+
     def _factor(self, what: str) -> int | None:
         """Binning or decimation as it is, whoever set it; None where the camera has none."""
-        factors = [self._features.number((f"{what}{axis}",)) for axis in ("Horizontal", "Vertical")]
+        factors = [self._one_factor(f"{what}{axis}") for axis in ("Horizontal", "Vertical")]
         known = {round(factor) for factor in factors if factor is not None}
         if len(known) > 1:
             raise self._refused(

@@ -140,6 +140,17 @@ def test_one_that_cannot_be_set_is_named(left: Left, name: str) -> None:
         left.open().configure(LIGHT)
 
 
+def test_a_binning_by_words_is_undone(left: Left) -> None:
+    for axis in ("Horizontal", "Vertical"):
+        left.text = left.text.replace(f'Name="Binning{axis}"', f'Name="Other{axis}"')
+        left.text = left.text.replace(f"<pFeature>Binning{axis}</pFeature>", "")
+        left.choice(f"Binning{axis}", "X1", "X2", "X4")
+    left.play(BinningVertical="X4")
+    camera = left.open()
+    assert camera.configure(LIGHT).binning == 1
+    assert camera.node_map()["BinningVertical"] == "X1"
+
+
 def test_a_digital_shift_is_undone(left: Left) -> None:
     left.add("DigitalShift", '<Integer Name="DigitalShift">VALUE<Min>0</Min><Max>4</Max></Integer>')
     left.play(DigitalShift=2)
