@@ -84,7 +84,6 @@ def _states(part: SubFigure, demo: Demo) -> None:
     """Residual of each state of both captures, in means over blocks, so that photon noise does not hide it."""
     axes = part.subplots(1, 2)
     for axis, before, after, name in zip(axes, demo.judged.before, demo.judged.after, ("sphere", "air"), strict=True):
-        axis.axhline(1, color="0.6", lw=0.8, ls=":")
         axis.plot(block_rms(before), "o-", ms=2.8, lw=0.9, color=BEFORE, label="before")
         axis.plot(block_rms(after), "o-", ms=2.8, lw=0.9, color=AFTER, label="after")
         axis.set_title(f"residual, {name}", fontsize=9)

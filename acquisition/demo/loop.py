@@ -116,7 +116,7 @@ def run_demo(
 
     sphere = take(0, plan)
     air = take(1, plan.with_changes(omega_deg=180, sample=Sample(kind="air", name="air")))
-    declared = Path(rig.modes[plan.mode].instrument)
+    declared = Path(rig.modes[plan.mode].instrument).resolve()
     scene = Scene.load(rig.simulator.samples[SAMPLE])
 
     def reduce(instrument: Path | None = None) -> TrueError:
