@@ -61,7 +61,8 @@ def test_every_kind_can_be_asked_for(kind):
 def test_what_cannot_be_drawn_is_refused_with_its_reason(acquire, tmp_path):
     code, _, err = acquire("demo", "--only", "detector_offset", "--out", tmp_path)
     assert code == 2
-    assert err == "error: --only detector_offset: the dark states of the default plan measure it.\n"
+    # Alarms of other runs on this machine may come first.
+    assert err.splitlines()[-1] == "error: --only detector_offset: the dark states of the default plan measure it."
     with pytest.raises(ConfigError, match="there is no such fault, only psg_retardance"):
         draw_faults(1, 1, ["lamp"], 44)
     with pytest.raises(ConfigError, match="only 1 different faults"):
