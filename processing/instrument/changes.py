@@ -103,9 +103,10 @@ class Changes:
     diattenuation: defaultdict[str, Array] = field(default_factory=_zeros)
     depolarization: defaultdict[str, Array] = field(default_factory=_zeros)
     after: dict[str, Array] = field(default_factory=dict)
+    before: dict[str, Array] = field(default_factory=dict)
     field_retardance_rad: dict[str, Array] = field(default_factory=dict)
     gain: Array = field(init=False)
-    stray: float = 0.0
+    stray: Array | float = 0.0
     mixing: Array | None = None
     lag: float = 0.0
     response: defaultdict[str, Array] = field(default_factory=_zeros)
@@ -134,6 +135,9 @@ class Changes:
             run=c.run[chosen],
         )
         out.gain, out.shift_px = self.gain[chosen], self.shift_px[chosen]
+        out.stray = among(np.asarray(self.stray))
+        out.after = {key: among(x) if np.ndim(x) == 3 else x for key, x in self.after.items()}
+        out.before = {key: among(x) if np.ndim(x) == 3 else x for key, x in self.before.items()}
         for name in ("azimuth_rad", "retardance_rad", "response"):
             of_all = getattr(self, name)
             setattr(out, name, defaultdict(of_all.default_factory, {key: among(x) for key, x in of_all.items()}))
@@ -153,3 +157,7 @@ class Changes:
     def follow(self, element: str, mueller: Array) -> None:
         """Put a Mueller matrix behind an element."""
         self.after[element] = mueller @ self.after[element] if element in self.after else mueller
+
+    def precede(self, element: str, mueller: Array) -> None:
+        """Put a Mueller matrix before an element."""
+        self.before[element] = self.before[element] @ mueller if element in self.before else mueller

@@ -336,14 +336,16 @@ def _matrices(element: Element, angles_deg: Mapping[str, ArrayLike], states: int
         matrix = element.mueller(azimuth, changes)
         if changes.built is not None and key is not None:
             changes.built[key] = matrix
+    if element.name in changes.before:
+        matrix = matrix @ changes.before[element.name]
     return changes.after[element.name] @ matrix if element.name in changes.after else matrix
 
 
 def _detected(w: Array, changes: Changes) -> Array:
-    if changes.stray:
+    if np.any(changes.stray):
         # Light that no element modulates: the same for every state, as strong as the fraction of the mean signal.
         w = w.copy()
-        w[..., 0] += changes.stray * float(np.mean(w[..., 0]))
+        w[..., 0] += np.reshape(changes.stray, (-1, 1)) * float(np.mean(w[..., 0]))
     if changes.mixing is not None:
         w = np.einsum("ck,nkj->ncj", changes.mixing, w)
     w = w * changes.gain[..., None]

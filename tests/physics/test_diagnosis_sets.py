@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.special import betaln
 
-from processing.diagnosis.instrument.source_patterns import chance_of_pattern, patterned
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.descent import descend
@@ -151,52 +150,6 @@ def test_two_that_say_the_same_share_the_mean(average):
     found = average(sets, likely_set(sets), 1500)
     assert found.probability[:2] == pytest.approx(0.5, abs=0.15)
     assert found.mean[:2] == pytest.approx(0.5, abs=0.15)
-
-
-def chance(values, information):
-    """That random values follow one pattern as far as these do, as the data alone have them."""
-    return chance_of_pattern([patterned(values, information, np.linalg.pinv(information, rtol=1e-9, hermitian=True))])
-
-
-def test_values_of_a_jump_beside_a_drift_are_not_random():
-    k = np.arange(40)
-    information = np.eye(40) * 1e4
-    assert chance(np.where(k > 15, 0.5, -0.3) - 0.08 * k + 0.002 * k**2, information) < 1e-6
-    assert chance(np.where(k > 15, 0.5, -0.3) - 0.02 * k, information) < 1e-6
-    assert chance(np.cos(0.7 * k), information) < 1e-6
-    assert chance(np.random.default_rng(2).standard_normal(40), information) > 0.1
-
-
-def test_random_values_are_seldom_held_by_one_pattern():
-    """Of a hundred, seen in 24 of 40 directions, hardly one has a chance below a hundredth; a lamp that jumps has."""
-    random = np.random.default_rng(3)
-    told = np.linalg.qr(random.standard_normal((40, 40)))[0][:, :24]
-    information = 1e4 * (told * random.uniform(0.2, 1, 24)) @ told.T
-    chances = np.array([chance(random.standard_normal(40), information) for _ in range(100)])
-    assert np.mean(chances < 0.01) <= 0.02
-    assert np.mean(chances < 0.5) > 0.02
-    k = np.arange(40)
-    assert chance(np.where(k > 22, 0.8, -0.6) - 0.05 * k + 0.3 * random.standard_normal(40), information) < 0.01
-
-
-def test_random_values_that_drift_too_are_random():
-    """A lamp that flickers and warms up: an even drift is in the list, and values for each state take it up."""
-    k, random = np.arange(40), np.random.default_rng(2)
-    values = random.standard_normal(40) + 0.1 * (k - 19.5)
-    assert chance(values, 1e4 * np.eye(40)) > 0.1
-
-
-def test_random_gains_that_are_known_up_to_a_common_factor_are_random():
-    """A factor that all gains share is taken up by the throughput: a constant is seen as the gains themselves."""
-    gains = 0.003 * np.random.default_rng(4).standard_normal(40)
-    factor = (1 + gains) / np.linalg.norm(1 + gains)
-    assert chance(gains, 1e8 * (np.eye(40) - np.outer(factor, factor))) > 0.1
-
-
-def test_noise_of_values_that_shrink_to_their_prior_shrinks_with_them():
-    values, information = np.zeros(40), np.diag(np.repeat([1.0, 0.0], 20))
-    assert patterned(values, information, 0.5 * np.eye(40)).noise == pytest.approx(20 * 0.5**2)
-    assert patterned(values, information, 1e6 * np.eye(40)).noise == pytest.approx(20)
 
 
 def test_a_descent_stays_where_the_model_has_numbers():

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from processing.diagnosis.instrument.cautious import cautious, in_part
 from processing.diagnosis.instrument.empirical import empirical
 from processing.diagnosis.instrument.guard import (
     chances,
@@ -14,7 +13,8 @@ from processing.diagnosis.instrument.guard import (
     predicted_change_of_each,
     predicted_changes,
 )
-from processing.diagnosis.instrument.names import Names, names_of, unfit
+from processing.diagnosis.instrument.in_part import in_part
+from processing.diagnosis.instrument.names import Names, names_of
 from processing.diagnosis.instrument.outcome import Outcome, left_of, outcome_of
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.recommend import recommended
@@ -71,7 +71,7 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
     say("testing what is left over")
     first = outcome_of(bench, found)
     names = names_of(first)
-    used = _carefully(first, names)
+    used = in_part(first)
     return _told(used, names, told_switches(used.asked, used.solved), wiring)
 
 
@@ -90,14 +90,6 @@ def _wired(problem: InstrumentProblem, say: Say, declared: InstrumentModel | Non
         return None, bench
     say(wiring.told)
     return wiring, WholeBench(wiring.problem, say)
-
-
-def _carefully(first: Outcome, names: Names) -> Outcome:
-    """The correction without what is unfit for one, and where M could get worse, by values that go less far."""
-    without = unfit(first.asked, first.solved, names)
-    used = first.corrected_by(first.found.values, without) if without else first
-    careful = cautious(used.asked, used.found, used.solved)
-    return in_part(used if careful is None else used.corrected_by(careful, without), without)
 
 
 def _changes(used: Outcome, names: Names) -> tuple[PredictedChange, PredictedChange, dict[str, PredictedChange]]:

@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from processing.diagnosis.instrument.doubts import (
-    AS_WELL,
-    BESIDE_PATTERN,
-    ELSE,
-    acts_on_unknown,
     doubts,
-    something_else,
     testable,
 )
 from processing.diagnosis.instrument.outcome import Outcome
-from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause, causes
-from processing.diagnosis.search.rules import DECISIVE, LIKELY
-from processing.diagnosis.search.solution import Solution
-from processing.instrument.effects.base import FieldEffect, ValuePerState
+from processing.diagnosis.search.rules import LIKELY
+from processing.instrument.effects.base import ValuePerState
 
 
 @dataclass(frozen=True)
@@ -61,21 +54,3 @@ def names_of(outcome: Outcome) -> Names:
     # What as many values as the data have took away may be any structure.
     left = outcome.left + sum(2 * c.log_odds * found.samples.best.unit for c in untold)
     return Names(named, untold, doubts(asked, found, solved, named, left))
-
-
-def unfit(problem: InstrumentProblem, solved: Solution, names: Names) -> list[Candidate]:
-    """What is not used where an unknown sample takes up a part of it, for it may be any structure or a part of such."""
-    # Values that are not random, or as many as the data have; and those of a source that were found beside them.
-    reasons = (*ELSE, *AS_WELL, BESIDE_PATTERN)
-    found = _candidates([*names.untold, *(cause for cause, reason in names.doubt.items() if reason in reasons)])
-    if names.untold or something_else(names.doubt, DECISIVE):
-        # Something is there that is not in the list: only what has a name of its own is no part of it.
-        own = set(_candidates([cause for cause in names.named if cause not in names.doubt]))
-        found += [
-            c for c in solved.effects if c not in own and not (isinstance(c.effect, FieldEffect) or c.state_chosen)
-        ]
-    return [c for c in dict.fromkeys(found) if acts_on_unknown(problem, c)]
-
-
-def _candidates(of: Sequence[Cause]) -> list[Candidate]:
-    return [c for cause in of for c in (*cause.candidates, *cause.alternatives)]

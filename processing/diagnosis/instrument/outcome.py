@@ -37,9 +37,9 @@ class Outcome:
     structure: bool
     left: float
 
-    def corrected_by(self, values: Array, unfit: Sequence[Candidate] = ()) -> Outcome:
-        """With other values of the posterior's space, and without what is unfit for a correction."""
-        solved = solution(self.bench, replace(self.found, values=values), unfit)
+    def corrected_by(self, values: Array, without: Sequence[Candidate]) -> Outcome:
+        """With other values of the posterior's space, and without some of its effects."""
+        solved = solution(self.bench, replace(self.found, values=values), without)
         return replace(self, solved=solved, after=residuals(self.asked, solved))
 
 

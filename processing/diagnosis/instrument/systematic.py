@@ -117,7 +117,7 @@ def _unseen(found: Posterior) -> Array:
         own = np.linalg.inv(s + np.eye(q.size))
         # Evidence for the group at its typical size, against none.
         gain = 0.5 * float(q @ own @ q - np.linalg.slogdet(np.eye(q.size) + s)[1])
-        chance = 1 / (1 + (1 - UNSEEN) / UNSEEN * np.exp(-np.clip(gain, -MOST_ODDS, MOST_ODDS)))
+        chance = 1 / (1 + (1 - UNSEEN) / UNSEEN * np.exp(group.price - np.clip(gain, -MOST_ODDS, MOST_ODDS)))
         scale = typical[group.index]
         out[np.ix_(group.index, group.index)] += chance * own * np.outer(scale, scale)
     return out

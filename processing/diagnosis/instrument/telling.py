@@ -135,7 +135,7 @@ def told_answer(cause: Cause, doubt: str | None) -> tuple[Answer, float]:
     probability = min(cause.probability, DOUBTED)
     if doubt != PART_OF_LEFT or cause.probability < SURE:
         return "unknown", min(probability, LIKELY)
-    return "one of" if cause.alternatives else "likely", probability
+    return "one of" if cause.alternatives else "unlisted" if cause.candidates[0].price else "likely", probability
 
 
 def told_switches(problem: InstrumentProblem, solved: Solution) -> list[FoundEffect]:

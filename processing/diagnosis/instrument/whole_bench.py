@@ -215,6 +215,10 @@ class WholeBench:
         effect = candidate.effect
         if isinstance(effect, FieldEffect | Switch):
             return False
+        if candidate.price and (
+            not self.whole.noise_known or self.whole.holds_out_states or len(set(self.whole.wavelengths_nm)) > 1
+        ):
+            return False
         captures = self.whole.captures
         acting = [k for k, c in enumerate(captures) if candidate.acts(k, c.wavelength_nm)]
         mine = [captures[k] for k in acting]

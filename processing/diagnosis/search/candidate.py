@@ -15,8 +15,7 @@ from processing.effect import Effect, Parameter
 from processing.errors import ProcessError
 from processing.instrument.applied_effects import instrument_effects
 from processing.instrument.changes import Changes, Conditions
-from processing.instrument.effects.base import FromAState, FromFileOnly, InstrumentEffect
-from processing.instrument.effects.source_flicker import SourceFlicker
+from processing.instrument.effects.base import FromAState, FromFileOnly, InstrumentEffect, SourceEffect, ValuePerState
 from processing.instrument.model import Belongs, InstrumentModel
 from processing.instrument.nominal import FIELDS, KIND, shift_nominal
 
@@ -36,6 +35,7 @@ class Candidate:
     starts: tuple[Array, ...] = field(default=(), compare=False)
     wavelength_nm: float | None = None
     curve: Curve | None = None
+    price: float = field(default=0.0, compare=False)
 
     def acts(self, capture: int, wavelength_nm: float) -> bool:
         """Whether it acts on a capture, by its number and wavelength."""
@@ -115,6 +115,8 @@ RETARDANCE_DEG = 200.0
 WINDOW_REACH_DEG = 40.0
 #: [1] The same below zero of an extinction or a depolarization: noise may take it there.
 BELOW_ZERO = 0.02
+#: [1] Size of the change of a level from state to state.
+LEVEL_SHARE = 0.02
 #: [1] How far below its nominal value a gain of a channel may be.
 MOST_LOST = 0.95
 
@@ -165,13 +167,21 @@ class NominalValue(InstrumentEffect):
         shift_nominal(changes, model, place, values[0])
 
 
-class SourceLevel(SourceFlicker):
+class SourceLevel(SourceEffect, ValuePerState):
     """The level of a source that several channels see, in each state of a capture: always there, and no fault."""
 
     kind = "source_level"
+    describes = "gain_per_state"
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        return ("",) if conditions.states > 1 else ()
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
-        return tuple(replace(p, lower=-MOST_LOST, upper=np.inf) for p in super().parameters(model, conditions, place))
+        states = range(conditions.states)
+        return tuple(Parameter(f"state_{k}", "1", -MOST_LOST, np.inf, LEVEL_SHARE) for k in states)
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        changes.gain = changes.gain * (1 + values)[:, None]
 
 
 def nominal_values(
@@ -211,7 +221,8 @@ def pool(
             for place in effect.places(model, condition):
                 if (effect.kind, place, number) not in found and fitted.isdisjoint(effect.shifts(model, place)):
                     parameters = effect.parameters(model, condition, place)
-                    candidate = Candidate(effect, place, parameters, number, effect.starts())
+                    price = effect.log_price(model, condition, place)
+                    candidate = Candidate(effect, place, parameters, number, effect.starts(), price=price)
                     found[effect.kind, place, number] = _over_wavelengths(candidate, belongs, wavelengths_nm)
     return tuple(c for each in found.values() for c in each)
 

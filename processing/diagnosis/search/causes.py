@@ -17,7 +17,7 @@ from processing.diagnosis.search.odds import probability_at
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import ALIKE, ALTERNATIVE, LIKELY, SHOWN, SURE
 
-Answer = Literal["sure", "likely", "one of", "unknown"]
+Answer = Literal["sure", "likely", "one of", "unlisted", "unknown"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +51,8 @@ class Cause:
             return "unknown"
         if self.alternatives:
             return "one of"
+        if self.candidates[0].price:
+            return "unlisted"
         return "sure" if self.probability >= SURE else "likely"
 
 

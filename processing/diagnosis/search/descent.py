@@ -37,7 +37,7 @@ def all_at_once(
     problem: Problem, space: Space, fixed: Sequence[Candidate], x: Array, noise: Noise, tau: float
 ) -> Array:
     """Values (K,) with every group there and `tau` typical sizes wide, but those that are one of many alternatives."""
-    chosen = [k for k, c in enumerate(space.candidates) if not c.state_chosen]
+    chosen = [k for k, c in enumerate(space.candidates) if not c.state_chosen and not c.price]
     part = Space(tuple(space.candidates[k] for k in chosen))
     positions = np.concatenate([np.r_[space.slices[k]] for k in chosen]).astype(int)
     always = np.concatenate([np.full(c.size, c in fixed) for c in part.candidates])

@@ -55,7 +55,7 @@ def climb(sets: Sets, state: State, never: NDArray[np.bool_] | None = None) -> S
 
 def everything(sets: Sets) -> State:
     """Every group at its typical size, but those of which one of many may be there."""
-    return State(np.where(sets.free & (sets.share == 1), 1.0, sets.empty().tau))
+    return State(np.where(sets.free & (sets.share == 1) & (sets.price == 0), 1.0, sets.empty().tau))
 
 
 def thinned(sets: Sets) -> State:

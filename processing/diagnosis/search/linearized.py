@@ -26,7 +26,8 @@ def grouped(space: Space, fixed: Sequence[Candidate]) -> tuple[tuple[tuple[int, 
         index = np.concatenate([np.r_[space.slices[k]] for k in mine]).astype(np.int64)
         always = space.candidates[mine[0]] in fixed
         curve = isinstance(space.candidates[mine[0]].effect, ResponseCurve)
-        groups.append(Group(index, float(families.count(family)), NOMINAL_TAU if always else None, curve))
+        price = space.candidates[mine[0]].price
+        groups.append(Group(index, float(families.count(family)), NOMINAL_TAU if always else None, curve, price))
     return tuple(tuple(m) for m in by_key.values()), groups
 
 

@@ -57,6 +57,7 @@ class Group:
     share: float = 1.0
     fixed_tau: float | None = None
     alone: bool = False
+    price: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -141,10 +142,11 @@ class Sets:
         self.form, self.groups, self.noise, self.beside = form, tuple(groups), noise, beside
         self.free = np.array([g.fixed_tau is None for g in groups], dtype=bool)
         self.share = np.array([g.share for g in groups])
+        self.price = np.array([g.price for g in groups])
         self.alone = np.array([g.alone for g in groups], dtype=bool)
         self.size = form.gradient.size
         # The alternatives of one group count once.
-        self.count = float(np.sum(1 / self.share[self.free])) if count is None else count
+        self.count = float(np.sum(np.exp(-self.price[self.free]) / self.share[self.free])) if count is None else count
         self.taus = TAU
         # Where what is left is the noise, what fits better would be taken for a smaller one.
         self.many = np.array([g.index.size >= MANY and noise.known for g in groups], dtype=bool)
@@ -185,14 +187,14 @@ class Sets:
         k, n = float(there.sum()) + self.beside, self.count
         count = betaln(1 + k, max(n - k, 0.0) + FEW_CAUSES * n) - betaln(1, (1 + FEW_CAUSES) * n)
         too_many = max(float((there & self.alone).sum()) - 1, 0.0)
-        return float(count - np.log(self.share[there]).sum()) + NEVER * too_many
+        return float(count - np.log(self.share[there]).sum() - self.price[there].sum()) + NEVER * too_many
 
     def prior_odds(self, there: NDArray[np.bool_]) -> Array:
         """Log odds (G,) of each group to be there, of the prior, given the others of a set."""
         others = self.beside + there.sum() - there
         rest = np.maximum((1 + FEW_CAUSES) * self.count - others - 1, FEWEST_ABSENT)
         beside = np.where(self.alone, (there & self.alone).sum() - (there & self.alone), 0.0)
-        return np.asarray(np.log((1 + others) / rest / self.share)) + NEVER * beside
+        return np.asarray(np.log((1 + others) / rest / self.share) - self.price) + NEVER * beside
 
     def fitted(self, state: State) -> Fitted:
         """Posterior of the parameters that are there."""

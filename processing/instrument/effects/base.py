@@ -43,6 +43,10 @@ class InstrumentEffect(Effect, ABC):
         """Values far from zero from which a fit starts as well."""
         return ()
 
+    def log_price(self, model: InstrumentModel, conditions: Conditions, place: str) -> float:
+        """Log odds by which it is rarer at this place than an effect of the list."""
+        return 0.0
+
     def shifts(self, model: InstrumentModel, place: str) -> tuple[str, ...]:
         """Values of the train ("element.field") that it shifts and does nothing else."""
         return ()

@@ -1,0 +1,133 @@
+"""What each number of the diagnosis is worth: benches with many faults, judged with it halved and doubled.
+
+    ./lab ablate                          every prior, price and cost
+    ./lab ablate TAKES_PART PRICE         these alone
+    ./lab ablate --seeds 1-8 --given joint
+
+A line for each number and factor: the error of M of a sample that nobody diagnosed over that with the number as it is
+(median), benches made worse, sure names that are right and wrong, and verdicts that change. A number that changes
+nothing has no reason to be one. Seeds below 1000 are for development.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import Any
+
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+#: Modules whose public numbers decide.
+MODULES = ("processing.diagnosis.search.rules", "processing.instrument.grammar")
+FACTORS = (0.5, 2.0)
+
+
+def numbers() -> dict[str, str]:
+    """Names of the numbers, each with its module."""
+    found = {}
+    for module in MODULES:
+        for name, value in vars(importlib.import_module(module)).items():
+            if name.isupper() and isinstance(value, int | float | np.ndarray) and not isinstance(value, bool):
+                found[name] = module
+    return found
+
+
+def change(name: str, factor: float) -> None:
+    """Change a number before any other module has read it."""
+    module = importlib.import_module(numbers()[name])
+    value = getattr(module, name)
+    changed = value * factor
+    setattr(module, name, max(1, round(changed)) if isinstance(value, int) else changed)
+
+
+def judged(folder: Path, seeds: Sequence[int], given: str) -> list[dict[str, Any]]:
+    """What became of each bench with the numbers as they are in this process."""
+    from simulators.blind.bench_run import judge_bench
+    from simulators.blind.real_bench import read_truth
+
+    out = []
+    for seed in seeds:
+        truth = next(iter(read_truth(folder, f"real_{seed:04d}")))
+        judgement, _ = judge_bench(folder, truth, ROOT / "configs", given)
+        sure = [c for c in judgement.causes if c.certainty == "sure"]
+        out.append(
+            {
+                "declared": judgement.declared,
+                "corrected": judgement.corrected,
+                "verdict": judgement.verdict,
+                "right": sum(c.right for c in sure),
+                "wrong": sum(not c.right for c in sure),
+            }
+        )
+    return out
+
+
+def in_a_process_of_its_own(
+    folder: Path, seeds: Sequence[int], given: str, name: str = "", factor: float = 1.0
+) -> list[dict[str, Any]]:
+    """The same in a new process, which reads the changed number."""
+    command = [sys.executable, __file__, name, "--child", str(folder), "--factor", str(factor), "--given", given]
+    done = subprocess.run(
+        [c for c in (*command, "--seeds", ",".join(map(str, seeds))) if c], capture_output=True, text=True, check=True
+    )
+    return list(json.loads(done.stdout.splitlines()[-1]))
+
+
+def row(now: Sequence[dict[str, Any]], plain: Sequence[dict[str, Any]]) -> str:
+    """One line of the table."""
+    ratio = np.median([a["corrected"] / max(b["corrected"], 1e-12) for a, b in zip(now, plain, strict=True)])
+    worse = sum(a["corrected"] > 1.02 * a["declared"] for a in now)
+    verdicts = sum(a["verdict"] != b["verdict"] for a, b in zip(now, plain, strict=True))
+    right, wrong = (sum(a[key] for a in now) for key in ("right", "wrong"))
+    return f"{ratio:8.2f} {worse:6d} {right:6d} {wrong:6d} {verdicts:9d}"
+
+
+def lines(names: Sequence[str], folder: Path, seeds: Sequence[int], given: str) -> Iterator[str]:
+    """The table, a line as soon as it is known."""
+    plain = in_a_process_of_its_own(folder, seeds, given)
+    yield f"{'number':28s} {'factor':>6s} {'M ratio':>8s} {'worse':>6s} {'right':>6s} {'wrong':>6s} {'verdicts':>9s}"
+    yield f"{'as they are':28s} {'':6s} {row(plain, plain)}"
+    for name in names:
+        for factor in FACTORS:
+            yield f"{name:28s} {factor:6g} {row(in_a_process_of_its_own(folder, seeds, given, name, factor), plain)}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", help="numbers to change; default: all")
+    parser.add_argument("--seeds", default="1-6", help="as 1-6,9")
+    parser.add_argument("--given", default="sphere", help="captures that are diagnosed: sphere or joint")
+    parser.add_argument("--pixels", type=int, default=32)
+    parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--factor", type=float, default=1.0, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    spans = [part.partition("-") for part in options.seeds.split(",")]
+    seeds = [n for first, _, last in spans for n in range(int(first), int(last or first) + 1)]
+    if unknown := set(options.names) - set(numbers()):
+        parser.error(f"no such number: {', '.join(sorted(unknown))}; there are: {', '.join(sorted(numbers()))}")
+    if options.child:
+        for name in options.names:
+            change(name, options.factor)
+        print(json.dumps(judged(options.child, seeds, options.given)))
+        return
+    from simulators.blind.real_bench import make_bench
+
+    folder = Path(mkdtemp(prefix="ablate_"))
+    for seed in seeds:
+        make_bench(folder, seed, ROOT / "configs", "real", options.pixels)
+    for line in lines(options.names or sorted(numbers()), folder, seeds, options.given):
+        print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()

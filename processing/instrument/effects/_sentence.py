@@ -1,0 +1,30 @@
+"""A sentence of the grammar as an effect; the place is its text."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from processing.arrays import Array
+from processing.effect import Parameter
+from processing.instrument import grammar
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.effects.base import OpticsEffect
+from processing.instrument.model import InstrumentModel
+
+
+class SentenceEffect(OpticsEffect):
+    """What can be wrong and has no name of its own."""
+
+    of_one_capture: bool
+
+    def places(self, model: InstrumentModel, conditions: Conditions) -> Sequence[str]:
+        return tuple(s.text for s in grammar.sentences(model, conditions) if s.of_one_capture == self.of_one_capture)
+
+    def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
+        return grammar.parsed(place).parameters(conditions)
+
+    def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
+        grammar.parsed(place).apply(changes, model, values)
+
+    def log_price(self, model: InstrumentModel, conditions: Conditions, place: str) -> float:
+        return next(s.price for s in grammar.sentences(model, conditions) if s.text == place)

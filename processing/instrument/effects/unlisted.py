@@ -1,0 +1,16 @@
+"""A fault of the instrument that has no name, as a sentence: a quantity of an element that follows an angle.
+
+Cause: not known; the sentence says where it is and what it follows.
+Mend: look at the element that the sentence names.
+"""
+
+from __future__ import annotations
+
+from processing.instrument.effects._sentence import SentenceEffect
+
+
+class Unlisted(SentenceEffect):
+    """Values in the unit of the quantity."""
+
+    belongs_to = "mechanics"
+    of_one_capture = False

@@ -1,0 +1,16 @@
+"""A fault of one capture that has no name, as a sentence: a quantity of an element that follows the time.
+
+Cause: not known; the sentence says where it is and what it follows.
+Mend: look at the element that the sentence names; take the capture again.
+"""
+
+from __future__ import annotations
+
+from processing.instrument.effects._sentence import SentenceEffect
+from processing.instrument.effects.base import OfOneCapture
+
+
+class UnlistedCourse(SentenceEffect, OfOneCapture):
+    """Values in the unit of the quantity."""
+
+    of_one_capture = True

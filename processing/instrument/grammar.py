@@ -1,0 +1,279 @@
+"""Sentences: what can be wrong with an instrument, as a site, a quantity, and a course over the states.
+
+A listed effect (`processing.instrument.effects`) is a sentence with a name, a cause and a remedy. The others are
+written here by rule, so that a fault without a name can be found, corrected and described. A quantity follows the own
+axis of an element or that of an element before it: light does not go back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from processing.arrays import Array
+from processing.effect import Parameter
+from processing.instrument.changes import Changes, Conditions
+from processing.instrument.elements import Element, Retarder
+from processing.instrument.model import InstrumentModel
+from processing.polarization import mueller
+
+#: [log odds] Price of a sentence without a name: one fault in some hundred is none of the list.
+PRICE = 6.0
+#: [log odds] Price of each period a turn beyond the second.
+OF_A_HARMONIC = 0.5
+#: [sizes] Bounds of every value.
+REACH = 20.0
+#: [degree] Turn of an element from which on harmonics of its angle are more than a slope.
+LEAST_TURN_DEG = 180.0
+#: [states] From which on a course over time is one.
+FEWEST_STATES = 7
+#: Courses over the time of one capture.
+TIMES = ("over time", "settling", "warming")
+#: Quantities that a plate that turns may have.
+OF_A_PLATE = (
+    "retardance at 45 degrees",
+    "circular retardance",
+    "diattenuation at 45 degrees",
+    "circular diattenuation",
+    "depolarization",
+)
+#: Quantities of the way between the trains.
+OF_THE_PATH = (
+    ("retardance at 0 degrees", "retardance at 45 degrees"),
+    ("circular retardance",),
+    ("diattenuation", "diattenuation at 45 degrees"),
+    ("depolarization",),
+)
+
+
+def _unit(i: int, j: int) -> Array:
+    out = np.zeros((4, 4))
+    out[i, j] = 1.0
+    return out
+
+
+#: Generators of a Mueller matrix in the frame of an element.
+GENERATORS: Mapping[str, Array] = {
+    "retardance at 45 degrees": _unit(3, 1) - _unit(1, 3),
+    "circular retardance": _unit(2, 1) - _unit(1, 2),
+    "diattenuation": _unit(0, 1) + _unit(1, 0),
+    "diattenuation at 45 degrees": _unit(0, 2) + _unit(2, 0),
+    "circular diattenuation": _unit(0, 3) + _unit(3, 0),
+    "depolarization": -np.diag([0.0, 1.0, 1.0, 1.0]),
+    "retardance at 0 degrees": _unit(2, 3) - _unit(3, 2),
+}
+#: [degree] or [1] or [pixel] Size of each quantity on a decent bench.
+SIZES: Mapping[str, tuple[str, float]] = {
+    "azimuth": ("degree", 0.3),
+    "retardance": ("degree", 0.6),
+    "retardance at 45 degrees": ("degree", 0.6),
+    "retardance at 0 degrees": ("degree", 0.6),
+    "circular retardance": ("degree", 0.4),
+    "diattenuation": ("1", 0.005),
+    "diattenuation at 45 degrees": ("1", 0.005),
+    "circular diattenuation": ("1", 0.005),
+    "depolarization": ("1", 0.003),
+    "gain": ("1", 0.005),
+    "stray": ("1", 0.003),
+    "lag": ("1", 0.005),
+}
+
+
+@dataclass(frozen=True)
+class Sentence:
+    """One thing that can be wrong: `quantities` of a `site`, each following `course`."""
+
+    site: str
+    quantities: tuple[str, ...]
+    course: str = ""
+    price: float = PRICE
+
+    @property
+    def text(self) -> str:
+        """The sentence; it is the place of the effect in files."""
+        what = " and ".join(self.quantities)
+        return f"{what} of {self.site}" + (f" {self.course}" if self.course else "")
+
+    @property
+    def of_one_capture(self) -> bool:
+        """Whether it follows the time of a capture, and would be another one in the next."""
+        return bool(self.course) and not self.course.startswith("by ")
+
+    def parameters(self, conditions: Conditions) -> tuple[Parameter, ...]:
+        """One for each quantity and each part of the course."""
+        names = _course_names(self.course)
+        out = []
+        for quantity in self.quantities:
+            unit, size = SIZES[quantity]
+            for name in names:
+                full = "_".join(x for x in (quantity.replace(" ", "_") if len(self.quantities) > 1 else "", name) if x)
+                out.append(Parameter(full or "value", unit, -REACH * size, REACH * size, size))
+        return tuple(out)
+
+    def apply(self, changes: Changes, model: InstrumentModel, values: Array) -> None:
+        """Add the sentence with these values to the changes."""
+        courses = course(self.course, changes.conditions)
+        parts = values.reshape(len(self.quantities), -1) @ courses
+        for quantity, part in zip(self.quantities, parts, strict=True):
+            _add(changes, model, self.site, quantity, part)
+
+
+def parsed(text: str) -> Sentence:
+    """The sentence of a text.
+
+    Raises
+    ------
+    KeyError : it is none.
+    """
+    what, _, rest = text.partition(" of ")
+    while what not in SIZES and not all(q in SIZES for q in what.split(" and ")):
+        more, separator, rest = rest.partition(" of ")
+        if not separator:
+            raise KeyError(text)
+        what = f"{what} of {more}"
+    site, _, name = rest.partition(" ")
+    return Sentence(site, tuple(what.split(" and ")), name)
+
+
+def _course_names(name: str) -> tuple[str, ...]:
+    return ("cos", "sin") if name.startswith(("by ", "beating")) else ("",)
+
+
+def course(name: str, conditions: Conditions) -> Array:
+    """Courses (k, N) over the states of one capture."""
+    n = conditions.states
+    k, t = np.arange(n), conditions.elapsed
+    if not name:
+        return np.ones((1, n))
+    if name.startswith("by "):
+        harmonic, axis = name[3:].split(" x ")
+        angle = int(harmonic) * np.deg2rad(conditions.angles_deg[axis])
+        return np.stack([np.cos(angle), np.sin(angle)])
+    if name == "over time":
+        return np.asarray(t[None])
+    if name == "settling":
+        return np.exp(-k / (n / 10))[None]
+    if name == "warming":
+        return (1 - np.exp(-k / (n / 2.7)))[None]
+    if name.startswith("beating "):
+        turn = 2 * np.pi * float(name.split()[1]) * k / n
+        return np.stack([np.cos(turn), np.sin(turn)])
+    if name.startswith("from state "):
+        return (k >= int(name[11:]))[None].astype(float)
+    raise KeyError(name)
+
+
+def _add(changes: Changes, model: InstrumentModel, site: str, quantity: str, part: Array) -> None:
+    unit, _ = SIZES[quantity]
+    value = np.deg2rad(part) if unit == "degree" else part
+    if quantity == "azimuth" and site == "sample":
+        for element in model.elements():
+            changes.azimuth_rad[element.name] = changes.azimuth_rad[element.name] + value
+    elif quantity == "azimuth":
+        changes.azimuth_rad[site] = changes.azimuth_rad[site] + value
+    elif quantity == "retardance":
+        changes.retardance_rad[site] = changes.retardance_rad[site] + value
+    elif quantity == "gain":
+        changes.gain = changes.gain * (1 + value)[:, None]
+    elif quantity == "stray":
+        changes.stray = changes.stray + value
+    elif quantity == "lag":
+        changes.lag += float(value[0])
+    else:
+        _bend(changes, model, site, quantity, value)
+
+
+def _bend(changes: Changes, model: InstrumentModel, site: str, quantity: str, value: Array) -> None:
+    """A Mueller matrix beside an element: behind it on the way to the sample, before it on the way from there."""
+    if site == "path":
+        element, angle, behind = model.generator[-1].name, np.zeros(value.shape), True
+        changes.follow(element, _exponential(value[:, None, None] * GENERATORS[quantity]))
+        return
+    element = site
+    found = next(e for e in model.elements() if e.name == element)
+    behind = any(e.name == element for e in model.generator)
+    angle = found.azimuth_rad(changes.conditions.angles_deg, changes.conditions.states)
+    turn, back = mueller.rotation(angle), mueller.rotation(-angle)
+    bent = turn @ _exponential(value[:, None, None] * GENERATORS[quantity]) @ back
+    (changes.follow if behind else changes.precede)(element, bent)
+
+
+def _exponential(a: Array) -> Array:
+    out = term = np.broadcast_to(np.eye(4), a.shape)
+    for k in (1, 2, 3, 4):
+        term = term @ a / k
+        out = out + term
+    return np.asarray(out)
+
+
+def sentences(model: InstrumentModel, conditions: Conditions) -> tuple[Sentence, ...]:
+    """All that can be said of an instrument in these conditions, beside what has a name."""
+    turning = [axis for axis in model.axes if _turns(conditions, axis)]
+    times = TIMES if conditions.states >= FEWEST_STATES else ()
+    out: list[Sentence] = []
+    passed: list[str] = []
+    for element in model.generator:
+        out += _of_element(element, turning, passed, times, front=True)
+    if len(model.generator) > 1:
+        out += _of_path(passed, times)
+    for element in model.analyzer:
+        out += _of_element(element, turning, passed, times, front=False)
+    out += _of_source_and_detector(conditions.states if times else 0, times)
+    return tuple(dict.fromkeys(out))
+
+
+def _turns(conditions: Conditions, axis: str) -> bool:
+    """Whether an axis turns so far that harmonics of its angle are more than a slope."""
+    angle = conditions.angles_deg.get(axis, np.zeros(1))
+    return np.unique(np.round(angle, 3)).size > 2 and float(np.ptp(angle)) > LEAST_TURN_DEG
+
+
+def _waves(site: str, quantities: tuple[str, ...], axes: Sequence[str], periods: Sequence[int]) -> Iterator[Sentence]:
+    for axis in axes:
+        for n in periods:
+            yield Sentence(site, quantities, f"by {n} x {axis}", PRICE + OF_A_HARMONIC * max(n - 2, 0))
+
+
+def _of_element(
+    element: Element, turning: Sequence[str], passed: list[str], times: Sequence[str], *, front: bool
+) -> Iterator[Sentence]:
+    """Of one element, which may follow the axes that light has `passed`; its own is then among them."""
+    name, earlier = element.name, tuple(passed)
+    own = [element.axis] if element.axis in turning and element.axis else []
+    passed += [axis for axis in own if axis not in passed]
+    if isinstance(element, Retarder):
+        yield from _waves(name, ("retardance",), own, (2, 3, 4))
+        yield from _waves(name, ("retardance",), earlier if not front else (), (1, 2))
+        yield from _waves(name, ("azimuth",), own, (3, 4))
+        yield from _waves("source", ("gain",), own, (3, 4))
+        yield from _waves(name, ("diattenuation",), own, (1, 2))
+        if own:
+            yield from (Sentence(name, (quantity,)) for quantity in OF_A_PLATE)
+            yield from (Sentence(name, (q,), time) for time in times[1:] for q in ("azimuth", "retardance"))
+    else:
+        yield from _waves(name, ("azimuth",), earlier if not front else (), (1, 2))
+        yield from (Sentence(name, (q,), time) for time in times for q in ("azimuth", "retardance at 45 degrees"))
+        if not front:
+            yield Sentence(name, ("retardance at 45 degrees",))
+
+
+def _of_path(passed: Sequence[str], times: Sequence[str]) -> Iterator[Sentence]:
+    """Of what lies between the trains, and of the sample."""
+    for quantities in OF_THE_PATH:
+        yield from _waves("path", quantities, passed, (1, 2))
+        yield from (Sentence("path", quantities, time) for time in times)
+    yield Sentence("path", ("diattenuation", "diattenuation at 45 degrees"))
+    yield from (Sentence("sample", ("azimuth",), time) for time in times)
+
+
+def _of_source_and_detector(states: int, times: Sequence[str]) -> Iterator[Sentence]:
+    yield from (Sentence("source", ("gain",), time) for time in times[1:])
+    choices = range(2, states - 1)
+    yield from (Sentence("source", ("gain",), f"from state {k}", PRICE + float(np.log(states))) for k in choices)
+    beats = np.arange(1.5, states / 2, 0.5)
+    yield from (Sentence("source", ("gain",), f"beating {n:g} times", PRICE + float(np.log(beats.size))) for n in beats)
+    yield from (Sentence("detector", ("stray",), time) for time in times)
+    if states:
+        yield Sentence("detector", ("lag",))
