@@ -165,7 +165,7 @@ def _names(text: str, capture: str | None, fault: TrueFault) -> bool:
     if found is None:
         return False
     kind, place = found["kind"], found["place"]
-    if capture is not None and fault.capture is not None and not capture.startswith(f"{fault.capture} "):
+    if capture is not None and fault.capture is not None and capture.partition(" ")[0] != fault.capture:
         return False
     if kind in TRUE_AS_WELL.get(fault.kind, ()):
         return True

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from processing.diagnosis.instrument.cautious import less_far
 from processing.diagnosis.instrument.doubts import OF_THE_SAMPLE, PART_OF_LEFT
 from processing.diagnosis.instrument.guard import chances, lasts, predicted_change_of_part
 from processing.diagnosis.search.guard import NOTHING, predicted_change
@@ -58,6 +59,16 @@ def test_an_alternative_stands_in_for_what_is_applied() -> None:
 def test_nothing_that_is_changed_makes_nothing_worse() -> None:
     assert predicted_change(np.zeros(0), np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))).chance_worse == 0
     assert predicted_change(np.array([1e-9]), np.array([1e-9]), np.eye(1), np.eye(1)).chance_worse == 0
+
+
+def test_what_is_open_is_used_to_leave_m_as_it_is() -> None:
+    # A sum that is known to 0.01; M follows the first value alone.
+    known, open_ = np.ones((2, 2)) / 4, np.array([[1.0, -1.0], [-1.0, 1.0]])
+    mean, products = np.array([0.05, 0.05]), np.diag([1.0, 0.0])
+    moved = less_far(mean, 0.01**2 * known + 0.3**2 * open_, products, 1e6)
+    assert moved is not None
+    np.testing.assert_allclose(moved, [0.0, 0.1], atol=1e-3)
+    assert less_far(mean, 0.01**2 * (known + open_), products, 1e6) is None
 
 
 def test_beside_a_sample_that_changed_nothing_is_kept_for_later_captures() -> None:

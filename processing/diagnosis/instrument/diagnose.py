@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from processing.diagnosis.instrument.cautious import cautious
 from processing.diagnosis.instrument.empirical import empirical
 from processing.diagnosis.instrument.guard import (
     chances,
@@ -71,7 +72,8 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
     say("testing what is left over")
     first = outcome_of(bench, found)
     names = names_of(first)
-    used = in_part(first)
+    careful = cautious(first.asked, first.found, first.solved)
+    used = in_part(first if careful is None else first.corrected_by(careful, ()))
     return _told(used, names, told_switches(used.asked, used.solved), wiring)
 
 

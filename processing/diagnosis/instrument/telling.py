@@ -116,7 +116,7 @@ def told_effects(
                 capture=None if candidate.capture is None else problem.captures[candidate.capture].name,
                 wavelength_nm=candidate.wavelength_nm,
                 removal_chance=1 - probability,
-                confident=doubt is None and cause.answer != "unknown",
+                confident=doubt is None and cause.answer not in ("unknown", "unlisted"),
                 probability=probability,
                 answer=answer,
                 residual_without=error(problem, solved, without),

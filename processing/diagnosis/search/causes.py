@@ -15,7 +15,7 @@ from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.odds import probability_at
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import ALIKE, ALTERNATIVE, LIKELY, SHOWN, SURE
+from processing.diagnosis.search.rules import ALIKE, LIKELY, SHOWN, SURE
 
 Answer = Literal["sure", "likely", "one of", "unlisted", "unknown"]
 
@@ -98,7 +98,7 @@ def least_odds(odds: float, left: float) -> float:
 
     `left` is the chi-square that nothing explains, in its unit.
     """
-    return max(odds - max(ALTERNATIVE, ALIKE * odds, 0.5 * left), 0.0)
+    return max(odds - max(float(np.log(SURE / (1 - SURE))), ALIKE * odds, 0.5 * left), 0.0)
 
 
 def _of_family(found: Posterior, k: int) -> list[int]:

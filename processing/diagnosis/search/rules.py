@@ -280,8 +280,8 @@ SURE = 0.99
 LIKELY = 0.9
 #: [probability] Most that is told of a cause that may be a part of what is left unexplained.
 DOUBTED = 0.95
-#: [log odds] By which an alternative may be worse in a cause's place and still be named with it: 1 to 1100.
-ALTERNATIVE = 4.6
+#: [log odds] By which another group, or set, may be worse in one's place and still be visited: 1 to 1100.
+ALTERNATIVE = 7.0
 #: [of what the cause explains] The same: no effect's model is exact.
 ALIKE = 1e-3
 #: [standard deviations] From which on a value is not zero; of several as many beyond what chance gives all of them.

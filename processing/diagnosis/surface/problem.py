@@ -117,7 +117,9 @@ class SurfaceProblem:
             out += [Candidate(effect, p, self._physical(effect, p)) for p in effect.places_on(self.shape)]
         for optics in instrument_effects().values():
             if isinstance(optics, OpticsEffect):
-                places = optics.places(self.model, conditions)
+                # Sentences without a name imitate smooth patterns over an object.
+                every = optics.places(self.model, conditions)
+                places = [p for p in every if not optics.log_price(self.model, conditions, p)]
                 out += [Candidate(optics, p, optics.parameters(self.model, conditions, p)) for p in places]
         return tuple(sorted(out, key=lambda candidate: candidate.kind))
 
