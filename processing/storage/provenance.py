@@ -114,14 +114,22 @@ def read_steps(entry: h5py.Group) -> tuple[Step, ...]:
     )
     return tuple(
         Step(
-            name=g["step"].asstr()[()],
-            arguments=json.loads(g["arguments_json"].asstr()[()]),
-            inputs=tuple(json.loads(g["inputs_json"].asstr()[()])),
-            program=g["program"].asstr()[()],
-            date=g["date"].asstr()[()],
+            name=_text(g, "step"),
+            arguments=json.loads(_text(g, "arguments_json")),
+            inputs=tuple(json.loads(_text(g, "inputs_json"))),
+            program=_text(g, "program"),
+            date=_text(g, "date"),
         )
         for g in groups
     )
+
+
+def _text(group: h5py.Group, name: str) -> str:
+    """One text of a group; ValueError where it is several, or none."""
+    text = group[name].asstr()[()]
+    if not isinstance(text, str):
+        raise ValueError(f"{group.name}/{name} is not one text")
+    return text
 
 
 def steps_text(steps: Sequence[Step]) -> str:
