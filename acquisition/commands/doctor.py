@@ -131,7 +131,7 @@ def _source(rig: Rig) -> str:
     state = "light on" if source.is_on() else "light off"
     who = source.describe()
     name = ", ".join(f"{key.replace('_', ' ')} {who[key]}" for key in who if key != "model")
-    if source.is_on() and not isinstance(source, ManualSource):
+    if source.is_on() and not isinstance(source.inner, ManualSource):
         raise AcquisitionError(f"{who['model']}, {name}: LIGHT LEFT ON. Every run ends with the light off: shut it")
     if source.interlock_open():
         raise AcquisitionError(f"{who['model']}, {name}: {state}, INTERLOCK OPEN. Close the door")

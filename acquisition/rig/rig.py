@@ -26,7 +26,6 @@ from drivers.errors import DeviceError, LimitError, MotionFailed
 from drivers.motion import Limits, Motion, MotionAxis, Position
 from drivers.registry import open_axis, open_camera, open_source
 from drivers.serial_link import LineRegistry
-from drivers.source import LightSource
 from drivers.sources.manual import Ask, ManualSource
 from processing.instrument.model import InstrumentModel
 from simulators.rig.model import SCHEME
@@ -150,7 +149,7 @@ class Rig:
         self.axes[name] = open_axis(name, entry, self._lines)
         return self.axes[name]
 
-    def open_source(self) -> LightSource:
+    def open_source(self) -> WatchedSource:
         """Open the light source; changes no light."""
         if self.config.source is None:
             raise AcquisitionError(f"rig {self.config.name!r} has no source")

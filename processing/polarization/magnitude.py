@@ -70,7 +70,8 @@ def interval(length: Array, along: Array, total: Array, square: Array) -> Interv
         unit = np.sqrt(square / total)
         components, share = total**2 / square, along / unit**2
         seen = length / unit
-        known = np.isfinite(seen) & np.isfinite(components) & np.isfinite(share)
+        # A length over a negative m00 is none.
+        known = np.isfinite(seen) & (seen >= 0) & np.isfinite(components) & np.isfinite(share)
         at = np.stack(
             [
                 np.interp(np.where(known, components, 1.0), COMPONENTS, np.arange(len(COMPONENTS))),
@@ -169,7 +170,7 @@ def sum_of_singular_values(observed: Array, unit: Array) -> Interval:
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         seen = observed / unit
-        known = np.isfinite(seen)
+        known = np.isfinite(seen) & (seen >= 0)
         at = [np.where(known, seen, 0.0) / (SUMS[1] - SUMS[0])]
         near = _near(_table()[1], np.stack(at))
         # Second order: noise shared by two singular values adds its square over their sum.

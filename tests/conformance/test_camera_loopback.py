@@ -90,7 +90,7 @@ def test_what_makes_counts_non_linear_is_switched_off(loopback: Loopback) -> Non
         {"binning": 9},
         {"gain_db": 99.0},
         {"black_level": -1.0},
-        {"pixel_format": "Mono14p"},
+        {"pixel_format": "RGB8Planar"},
     ],
 )
 def test_a_setting_out_of_limits_is_refused(loopback: Loopback, wrong: dict[str, float]) -> None:

@@ -46,9 +46,10 @@ def maps(product: Path, place: tuple[slice, slice]) -> dict[str, tuple[np.ndarra
     groups = [gradients.coherency, gradients.depolarization_index, gradients.diattenuation, gradients.polarizance]
     groups += [gradients.dominant, gradients.lu_chipman_quantities, lambda x: gradients.pairs(x, PAPER_PAIRS)]
     for group in groups:
-        for name, (value, gradient) in group(m).items():
-            errors = np.sqrt(np.stack([image.variance_of(g) for g in gradient.reshape(-1, *m.shape[:2], 16)]))
-            found[name] = value, errors.reshape(value.shape)
+        for name, derived in group(m).items():
+            gradients_of_each = derived.gradient.reshape(-1, *m.shape[:2], 16)
+            errors = np.sqrt(np.stack([image.variance_of(g) for g in gradients_of_each]))
+            found[name] = derived.value, errors.reshape(derived.value.shape)
     return found
 
 

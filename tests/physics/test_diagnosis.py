@@ -278,7 +278,7 @@ def assert_no_file_that_cannot_be_read(path, model, diagnosis):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(yaml_file, "MOST_BYTES", 1000)
-        with pytest.raises(WriteError, match="Diagnose fewer captures"):
+        with pytest.raises(WriteError, match="diagnose fewer captures"):
             write_instrument(path, model, diagnosis)
     assert not path.exists()
 

@@ -8,7 +8,7 @@ from noisy_images import nineteen_samples, noisy_image, seven_instruments
 
 from processing.maps.quantities import EXTRA, quantities_block
 from processing.polarization import mueller, triply_degenerate
-from processing.polarization.magnitude import ALONG, COMPONENTS, TABLE, interval
+from processing.polarization.magnitude import ALONG, COMPONENTS, TABLE, interval, sum_of_singular_values
 
 PIXELS = 300
 #: Three standard deviations of a part of PIXELS, below the limits of docs/error-bars.md.
@@ -75,6 +75,15 @@ def test_an_interval_of_a_length_covers_at_every_length(components: int, length:
     found = interval(seen, np.ones_like(seen), np.full_like(seen, components), np.full_like(seen, components))
     assert np.mean((found.low <= length) & (length <= found.high)) == pytest.approx(0.95, abs=0.017)
     assert np.mean(np.abs(found.value - length) <= found.error) == pytest.approx(0.69, abs=0.05)
+
+
+def test_over_an_intensity_below_zero_a_length_has_no_interval() -> None:
+    # Noise in the dark makes S0 or m00 negative. Whatever the other pixels show, such a pixel shows nothing.
+    observed, one = np.array([-40.0, -3.0, -1e-3, 0.0, 2.0]), np.ones(5)
+    lengths = interval(observed, one, 2 * one, 2 * one)
+    for bound in (*lengths, *sum_of_singular_values(observed, one)):
+        assert np.isnan(bound[:3]).all()
+        assert np.isfinite(bound[3:]).all()
 
 
 def test_the_table_of_intervals_is_what_its_program_makes() -> None:

@@ -206,9 +206,10 @@ def _look_and_probe(page: Page, address: str, capture: str) -> None:
     page.mouse.up()
     expect(page.locator("#pixel")).to_have_text(re.compile(r"\(\d+ pixels\)"))
     scale = page.locator("#frame .cbaxis")
-    expect(scale).to_contain_text("4000")
-    page.get_by_label("stretch").check()
+    # A capture opens stretched: its light ends well below the full scale.
     expect(scale).not_to_contain_text("4000")
+    page.get_by_label("stretch").uncheck()
+    expect(scale).to_contain_text("4000")
     page.get_by_role("button", name="Play").click()
     expect(page.get_by_role("button", name="Pause")).to_be_visible()
     page.get_by_role("button", name="Pause").click()
