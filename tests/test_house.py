@@ -2,6 +2,7 @@
 
 import ast
 import re
+import runpy
 import tomllib
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -60,7 +61,7 @@ def test_the_floors_on_the_page_are_those_of_the_contracts():
 def cited_outside(text: str) -> list[str]:
     """What a text cites that is not in the repository: papers of the workshop, pages of docs/ that are not there."""
     found = re.findall(r"shared/\w+\.(?:md|tex)|\b[Tt]raps? \d+", text)
-    for page, heading in re.findall(r"docs/([\w-]+\.md)(?:, \"([^\"]+)\")?", text):
+    for page, heading in re.findall(r"docs/([\w/-]+\.md)(?:, \"([^\"]+)\")?", text):
         file = ROOT / "docs" / page
         if not file.exists():
             found.append(f"docs/{page}")
@@ -89,14 +90,33 @@ def test_a_citation_that_leads_outside_is_seen():
 
 
 def test_a_page_that_speaks_of_the_paper_names_it():
-    pages = [page for page in (ROOT / "docs").glob("*.md") if re.search(r"\b[Tt]he paper\b", page.read_text("utf-8"))]
+    pages = [page for page in (ROOT / "docs").rglob("*.md") if re.search(r"\b[Tt]he paper\b", page.read_text("utf-8"))]
     assert pages
     assert [page.name for page in pages if "Jarecki" not in page.read_text("utf-8")] == []
 
 
 def test_every_page_of_the_docs_is_in_the_site():
-    named = set(re.findall(r"[\w-]+\.md", (ROOT / "mkdocs.yml").read_text(encoding="utf-8")))
-    assert named == {page.name for page in (ROOT / "docs").glob("*.md")}
+    named = set(re.findall(r"[\w/-]+\.md", (ROOT / "mkdocs.yml").read_text(encoding="utf-8")))
+    assert named == {str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md")}
+
+
+@pytest.mark.parametrize(
+    ("text", "mistake"),
+    [
+        ("# Title\n\n*Reference.* " + "word\n" * 31, "31 words"),
+        ("# Title\n\n*Reference.* " + ("word\n" * 19 + "end. Then ") * 9, "mean length"),
+        ("# Title\n\n*Reference.* A gap stands beside the text.", '"beside"'),
+        ("# Title\n\nA page without its purpose.", "purpose"),
+        ("# Title\n\n*Explanation.*" + "\nWord and word." * 900, "an explanation of"),
+        ("# Title\n\n*Reference.* A line.\n" + "word, " * 10 + "characters" * 10 + " end.", "longer than 120"),
+    ],
+)
+def test_what_a_page_does_against_the_language_is_seen(text, mistake):
+    prose = runpy.run_path(str(ROOT / ".ci/prose.py"))
+    found = prose["mistakes"]("docs/page.md", text)
+    assert any(mistake in line for line in found)
+    spared = "# " + "Title " * 40 + "\n\n*Reference.* One sentence.\n\n| " + "cell " * 40 + "|\n|---|\n"
+    assert not prose["mistakes"]("docs/page.md", spared)
 
 
 def _kinds_by_name(folder: Path) -> list[str]:
