@@ -2,7 +2,7 @@
 
 Prints the confusion matrix. GROUP is single, two, none or unlisted, to draw that kind of case alone; KIND is an effect,
 to draw it and another one in every case. Seeds below 1000
-are for development, 1000 for CI; which seeds a reported run had is in docs/closing-the-loop.md.
+are for development, 1000 for CI; which seeds a reported run had is in docs/studies/blind-suites.md.
 """
 
 from __future__ import annotations

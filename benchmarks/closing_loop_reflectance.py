@@ -1,4 +1,4 @@
-"""The paper's story with both instruments, for docs/closing-the-loop.md: numbers, and the figure.
+"""The paper's story with both instruments, for docs/studies/reflectance.md: numbers, and the figure.
 
     python benchmarks/closing_loop_reflectance.py --figure docs/images/closing_loop_reflectance.png
 

@@ -1,6 +1,6 @@
 """`./lab demo` on many seeds: a table of what was built in, what was found, and the error of M before and after.
 
-PYTHONPATH=. python benchmarks/demo_seeds.py [--first 1] [--last 20]    # rows of the table in docs/demo.md
+PYTHONPATH=. python benchmarks/demo_seeds.py [--first 1] [--last 20]    # rows of the table in docs/studies/demo.md
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Each instrument is wrong by what its file does not say. One capture of air is di
 capture of another sample is reduced with the nominal and with the written file. The references are no part of any fit:
 the emulated sample, or the ratio of the channels of measured data.
 
-    python benchmarks/instrument_chain.py          prints the table of docs/instrument-chain.md
+    python benchmarks/instrument_chain.py          prints the table of docs/studies/instrument-chain.md
 """
 
 from __future__ import annotations

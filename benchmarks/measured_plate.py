@@ -113,7 +113,7 @@ def report(wavelength_nm: int, kind: str) -> str:
 
 
 def main() -> None:
-    """Print the table of docs/closing-the-loop.md."""
+    """Print the table of docs/studies/measured-instruments.md."""
     print("nm | ellipticity | degrees, air and plate | residual, air and plate, % | retardance | diattenuation")
     for wavelength_nm in (1200, 1300, 1600, 1950):
         for kind in KINDS:

@@ -1,4 +1,4 @@
-"""Quantities of measured PTFE over all geometries: the tables of docs/ptfe.md, and its figure.
+"""Quantities of measured PTFE over all geometries: the tables of docs/studies/ptfe.md, and its figure.
 
 Run: .venv/bin/python benchmarks/ptfe_quantities.py ../shared/data/ptfe-mueller-brdf/PTFE.data.csv
 """

@@ -1,4 +1,4 @@
-"""Coherency eigenvalues, depolarization and reciprocity of measured PTFE: the numbers of docs/ptfe.md."""
+"""Coherency eigenvalues, depolarization and reciprocity of measured PTFE: the numbers of docs/studies/ptfe.md."""
 
 import runpy
 from pathlib import Path
@@ -23,7 +23,7 @@ FOUND = {
 
 @pytest.fixture(scope="module")
 def report() -> SimpleNamespace:
-    """The functions of the script that writes the tables of docs/ptfe.md."""
+    """The functions of the script that writes the tables of docs/studies/ptfe.md."""
     return SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[2] / "benchmarks/ptfe_quantities.py")))
 
 
