@@ -1,4 +1,4 @@
-"""The measured part of docs/studies/measured-instruments.md as one figure: `diagnose` on ../shared/data, before and after.
+"""The figure of docs/studies/measured-instruments.md: `diagnose` on ../shared/data, before and after.
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/closing_loop_measured.py --figure docs/images/closing_loop_measured.png
 

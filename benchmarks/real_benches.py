@@ -4,8 +4,8 @@
     OPENBLAS_NUM_THREADS=1 python benchmarks/real_benches.py DIR --seeds 1-20 --group outside --given joint sphere
 
 Every finished bench is kept as one JSON file in DIR/results: the same command goes on where it was stopped, `--again`
-diagnoses anew. Seeds below 1000 are for development; those of reported runs are in docs/studies/real-benches.md, and each
-serves once. Prints the table of docs/studies/real-benches.md; `--figure` draws the reliability diagram.
+diagnoses anew. Seeds below 1000 are for development; each other seed serves once. Prints the
+table of docs/studies/real-benches.md; `--figure` draws the reliability diagram.
 """
 
 from __future__ import annotations

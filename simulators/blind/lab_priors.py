@@ -1,8 +1,8 @@
 """What a bench in a lab has wrong, how often and how much: the distribution that real benches are drawn from.
 
 Sizes are what is left after an ordinary calibration of an ordinary bench, drawn evenly in the logarithm between the
-two numbers, with a random sign where the fault has one. Reasons stand beside them; the page docs/studies/real-benches.md has
-them as a table. `weight` is the relative chance that a bench has the fault at all.
+two numbers, with a random sign where the fault has one. docs/studies/real-benches.md has them with
+their reasons. `weight` is the relative chance that a bench has the fault at all.
 """
 
 from __future__ import annotations
