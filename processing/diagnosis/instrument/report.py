@@ -12,7 +12,7 @@ from processing.arrays import Array
 from processing.diagnosis.instrument.diagnose import Judged
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import add_response
-from processing.diagnosis.instrument.structure import harmonics_of
+from processing.diagnosis.instrument.structure import Residual, harmonics_of
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.range_of import rank_of
 from processing.diagnosis.search.rules import HARMONICS
@@ -82,7 +82,7 @@ def _effects(judged: Judged) -> list[list[str]]:
 
 def _ranking(judged: Judged) -> list[list[str]]:
     rows = [[r.candidate, f"{r.evidence:.0f}", f"{r.rms_percent:.4f}"] for r in judged.diagnosis.ranking]
-    return [["candidate, alone", "chi2 gain on held-out data", "rms left, %"], *rows] if rows else []
+    return [["candidate, alone", "chi2 gain on held-out data", "residual after, rms, %"], *rows] if rows else []
 
 
 def _capture(judged: Judged, problem: InstrumentProblem, k: int) -> dict[str, Any]:
@@ -90,24 +90,33 @@ def _capture(judged: Judged, problem: InstrumentProblem, k: int) -> dict[str, An
     return {
         "name": problem.captures[k].name,
         "figures": [
-            Picture(png(_pattern(judged, problem, k)), "Leading pattern of the residual, before and after"),
-            Picture(png(_states(judged, k)), "Residual of each state, before and after"),
+            Picture(png(_pattern(judged, problem, k)), "Leading pattern of the residual"),
+            Picture(png(_states(judged, k)), "Residual of each state"),
         ],
-        "change": _change(judged, problem, k),
+        "change": _change(judged, problem, k) if judged.diagnosis.effects else None,
     }
 
 
-def _pattern(judged: Judged, problem: InstrumentProblem, k: int) -> Figure:
-    """The leading pattern of the residual before: where, in which states, at which harmonics; and what remains of it.
+def _residuals(judged: Judged, k: int) -> dict[str, Residual]:
+    """Residuals of a capture by the name of their curve; one where no cause was found."""
+    if not judged.diagnosis.effects:
+        return {"residual": judged.before[k]}
+    after = "after" if judged.after is judged.explained else "with the causes (not applied)"
+    return {"before": judged.before[k], after: judged.explained[k]}
 
-    All is drawn of means over squares of pixels: the noise of single pixels would hide what is left.
+
+def _pattern(judged: Judged, problem: InstrumentProblem, k: int) -> Figure:
+    """The leading pattern of the residual before the correction, and its amplitude after it.
+
+    The panels show the image, the states and the harmonics. They use means over squares of pixels, because the noise of
+    single pixels hides the structure.
     """
     from matplotlib.figure import Figure
 
-    before, after = judged.before[k], judged.explained[k]
-    names = "before", _after(judged)
-    cells = [_cells(r.image) for r in (before, after)]
-    used = np.isfinite(cells[0]).all(axis=0) & np.isfinite(cells[1]).all(axis=0)
+    residuals = _residuals(judged, k)
+    names = tuple(residuals)
+    cells = [_cells(r.image) for r in residuals.values()]
+    used = np.isfinite(cells).all(axis=(0, 1))
     flat = [image[:, used] for image in cells]
     values, vectors = np.linalg.eigh(flat[0] @ flat[0].T)
     leading, share = vectors[:, -1], values[-1] / max(values.sum(), 1e-300)
@@ -121,9 +130,10 @@ def _pattern(judged: Judged, problem: InstrumentProblem, k: int) -> Figure:
     halves: Any = figure.subfigures(2, 1, height_ratios=[1.15, 1])
     upper, lower = halves
     wide = max(upper_end(np.abs(maps[0])), 1e-6)
-    axes = upper.subplots(1, 2)
+    axes = upper.subplots(1, len(names), squeeze=False)[0]
+    extent = _extent(judged.before[k].image)
     for axis, name, image in zip(axes, names, maps, strict=True):
-        shown = axis.imshow(image, vmin=-wide, vmax=wide, cmap=SIGNED, extent=_extent(before.image), aspect="equal")
+        shown = axis.imshow(image, vmin=-wide, vmax=wide, cmap=SIGNED, extent=extent, aspect="equal")
         axis.set_title(name)
         axis.set_xlabel("column, pixels")
         axis.set_ylabel("row, pixels")
@@ -136,13 +146,15 @@ def _pattern(judged: Judged, problem: InstrumentProblem, k: int) -> Figure:
     left.axhline(0, color="0.5", lw=0.8)
     left.set_xlabel("state (and channel)")
     left.set_ylabel("residual / noise of one intensity")
-    left.set_title(f"the pattern over the states: {100 * share:.0f} % of the residual before")
-    left.legend()
+    when = " before" if len(names) > 1 else ""
+    left.set_title(f"the pattern over the states: {100 * share:.0f} % of the residual{when}")
+    if len(names) > 1:
+        left.legend()
     channels = problem.captures[k].signal.shape[1]
     orders = np.arange(1, HARMONICS + 1)
     turned = {name: v for name, v in problem.captures[k].conditions.angles_deg.items() if np.ptp(v) > 0}
     for n, (axis_name, angles) in enumerate(turned.items()):
-        for line, name, alpha, shift in zip(states, names, (0.4, 1.0), (-0.2, 0.0), strict=True):
+        for line, name, alpha, shift in zip(states, names, (0.4, 1.0), (-0.2, 0.0), strict=False):
             # Of two channels the one that shows it best: in their mean a difference would be lost.
             parts = line.reshape(-1, channels)
             best = np.argmax(np.sum(states[0].reshape(-1, channels) ** 2, axis=0))
@@ -157,21 +169,16 @@ def _pattern(judged: Judged, problem: InstrumentProblem, k: int) -> Figure:
     return figure
 
 
-def _after(judged: Judged) -> str:
-    return "after" if judged.after is judged.explained else "with the causes (not applied)"
-
-
 def _states(judged: Judged, k: int) -> Figure:
-    """Residual of each state before and after, of means over squares of pixels."""
+    """Residual of each state, of means over squares of pixels."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 3.4), layout="constrained")
     axis = figure.subplots()
-    before = judged.before[k]
-    for residual, name in ((before, "before"), (judged.explained[k], _after(judged))):
+    for name, residual in _residuals(judged, k).items():
         rms = np.sqrt(np.nanmean(_cells(residual.image) ** 2, axis=(1, 2)))
         axis.plot(rms, "o-", ms=3, label=name)
-    side = _cell_side(before.image)
+    side = _cell_side(judged.before[k].image)
     if (noise := _noise_of_cells(judged.explained[k].image)) is not None:
         axis.axhline(noise, color="0.5", ls="--", label="noise")
     axis.set_xlabel("state (and channel)")

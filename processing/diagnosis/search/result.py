@@ -323,6 +323,13 @@ class Diagnosis(_Part):
         return self.correction.effects
 
     @property
+    def unobservable_in_short(self) -> tuple[str, ...]:
+        """The listed effects that these captures cannot show, and the number of the unlisted ones."""
+        listed = tuple(name for name in self.unobservable if not name.startswith("unlisted"))
+        unlisted = len(self.unobservable) - len(listed)
+        return (*listed, *([f"{unlisted} effects without a name"] if unlisted else ()))
+
+    @property
     def corrects(self) -> bool:
         """Whether an instrument file would measure otherwise with what was found."""
         return bool(self.applied() or (self.calibrated and self.train_fits))
