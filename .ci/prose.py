@@ -46,23 +46,11 @@ NOT_YET_REWRITTEN = (
     "docs/tutorial-first-capture.md",
     "docs/view.md",
     # Diagnosis, error bars, quantities, processing, reflectance, studies.
-    "docs/adding-a-quantity.md",
-    "docs/adding-a-reflectance-model.md",
-    "docs/adding-an-effect.md",
-    "docs/calibration.md",
-    "docs/conventions.md",
-    "docs/demo.md",
     "docs/error-bars.md",
-    "docs/geometry.md",
-    "docs/glossary.md",
-    "docs/measured-data.md",
     "docs/mosaic.md",
-    "docs/paper-study.md",
     "docs/processing.md",
     "docs/quantities.md",
     "docs/reflectance.md",
-    "docs/tutorial-close-the-loop.md",
-    "docs/xi0.md",
 )
 
 
