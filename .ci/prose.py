@@ -46,11 +46,7 @@ NOT_YET_REWRITTEN = (
     "docs/tutorial-first-capture.md",
     "docs/view.md",
     # Diagnosis, error bars, quantities, processing, reflectance, studies.
-    "docs/error-bars.md",
-    "docs/mosaic.md",
     "docs/processing.md",
-    "docs/quantities.md",
-    "docs/reflectance.md",
 )
 
 

@@ -1,7 +1,7 @@
 """Demosaicing methods against known truth: PSNR by channel, DoLP, AoLP, at edges and in smooth regions.
 
 Run: OPENBLAS_NUM_THREADS=1 .venv/bin/python benchmarks/mosaic_quality.py [--size 512] [--seed 1]
-The scenes are made here, with a seed; nothing of a method was tuned on the seeds that the table in docs/mosaic.md uses.
+The scenes are made here, with a seed; nothing of a method was tuned on the seeds that the table in docs/studies/mosaic.md uses.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def compare(size: int, seed: int, noise: float) -> dict[tuple[str, str], dict[st
 
 
 def main() -> None:
-    """Print the table of docs/mosaic.md."""
+    """Print the tables of docs/studies/mosaic.md."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--seed", type=int, default=1)

@@ -11,7 +11,7 @@ from processing.polarization import mueller, triply_degenerate
 from processing.polarization.magnitude import ALONG, COMPONENTS, TABLE, interval, sum_of_singular_values
 
 PIXELS = 300
-#: Three standard deviations of a part of PIXELS, below the limits of docs/error-bars.md.
+#: Three standard deviations of a part of PIXELS, below the limits of docs/studies/error-bars.md.
 LEAST_68, LEAST_95 = 0.64 - 3 * np.sqrt(0.68 * 0.32 / PIXELS), 0.93 - 3 * np.sqrt(0.95 * 0.05 / PIXELS)
 #: Of entropy and the sorted elements of the symmetric decomposition (docs/error-bars.md, "What does not hold").
 LOOSE = ("entropy", "symmetric_d1", "symmetric_d2", "symmetric_d3")

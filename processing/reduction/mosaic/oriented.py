@@ -4,7 +4,7 @@ The four channels are combinations of S0, S1, S2 and of what the four analyzers 
 Each is taken as a random field with a 1/f spectrum seen through lens and pixel; the best linear estimate of a
 channel from the raw pixels around is then one kernel for each of the four positions in the super-pixel. Where a first
 pass finds an edge, the fields are taken as smoother along it, and kernels for 16 directions stand ready. Constants
-pass every kernel unchanged. The priors below were set on scenes that the table in docs/mosaic.md does not use.
+pass every kernel unchanged. The priors below were set on scenes that docs/studies/mosaic.md does not use.
 """
 
 from __future__ import annotations
