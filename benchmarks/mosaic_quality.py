@@ -1,7 +1,7 @@
 """Demosaicing methods against known truth: PSNR by channel, DoLP, AoLP, at edges and in smooth regions.
 
 Run: OPENBLAS_NUM_THREADS=1 .venv/bin/python benchmarks/mosaic_quality.py [--size 512] [--seed 1]
-The scenes are made here, with a seed; nothing of a method was tuned on the seeds that the table in docs/studies/mosaic.md uses.
+The scenes are made here. No method was tuned on the seeds of docs/studies/mosaic.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Do the intervals of xi0 hold for poor states too? Coverage by Monte Carlo, the second table of docs/studies/error-bars.md.
+"""Do the intervals of xi0 hold for poor states too? Coverage by Monte Carlo: docs/studies/error-bars.md.
 
     python benchmarks/xi0_coverage.py [--pixels 4000]
 

@@ -12,7 +12,7 @@ from acquisition.rig.config import load_rig
 from processing.yaml_file import ConfigError
 
 SEEDS = range(1, 21) if os.environ.get("UMOV_SLOW") else (1, 2, 3)
-#: Defects of the diagnosis that the demo has found (docs/studies/demo.md); a run that passes takes its seed out of here.
+#: Defects of the diagnosis that the demo has found (docs/studies/demo.md); remove a seed whose run passes.
 KNOWN = {
     3: "both names are right, and the correction makes M worse",
     17: "a nonlinearity is named tone_curve, as sure",

@@ -73,8 +73,8 @@ def explained(data: Ptfe, model: np.ndarray) -> float:
     return float(1 - np.sum(left**2) / np.sum(polarized**2))
 
 
-#: Found on these data (docs/studies/reflectance.md): by the pixel's own dominant process, by the fitted model, and by Fresnel
-#: reflection at PTFE's refractive index 1.35.
+#: On these data (docs/studies/reflectance.md): the dominant process of the pixel, the fitted model, and Fresnel
+#: reflection at the refractive index of PTFE, 1.35.
 FOUND = {
     0.351: (0.825, 0.616, 0.457),
     0.532: (0.932, 0.742, 0.510),
