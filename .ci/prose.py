@@ -18,7 +18,7 @@ GENERATED = ("docs/effects.md",)
 #: Words that are neither names nor terms. "the left" and "left-aligned" are directions.
 IDIOM = re.compile(
     r"\b(told|tells?|(?<!the )left(?!-)|beside|in (its|their) place|what is there|as much does so"
-    r"|(go|goes|gone|going) on|held against|it (knows|doubts|says))\b",
+    r"|(go|goes|gone|going) on with|held against|it (knows|doubts|says))\b",
     re.IGNORECASE,
 )
 #: Pages that do not pass yet. Whoever rewrites a page deletes its line here in the same commit; the check asks for it.
@@ -27,24 +27,18 @@ NOT_YET_REWRITTEN = (
     "CHANGELOG.md",
     "CONTRIBUTING.md",
     "README.md",
-    "docs/acquisition.md",
     "docs/adding-a-driver.md",
     "docs/api.md",
     "docs/architecture.md",
     "docs/at-the-bench.md",
-    "docs/bad-input.md",
     "docs/bluesky.md",
     "docs/capture-format.md",
     "docs/decisions.md",
     "docs/devices.md",
     "docs/index.md",
     "docs/other-tools.md",
-    "docs/performance.md",
-    "docs/promises.md",
-    "docs/safety.md",
     "docs/testing.md",
     "docs/tutorial-first-capture.md",
-    "docs/view.md",
     # Diagnosis, error bars, quantities, processing, reflectance, studies.
     "docs/processing.md",
 )
