@@ -14,9 +14,11 @@ from starlette.responses import JSONResponse
 from processing.errors import ProcessError
 from processing.maps.extrapolation import EXTRAPOLATED
 from processing.maps.quantities import image_of
+from processing.reflectance.shared_noise import shared_variance
 from processing.reports.colours import period_deg
 from processing.storage.capture import Capture
-from processing.storage.product import Product
+from processing.storage.images import neighbour_correlation
+from processing.storage.product import COMPANIONS, Product
 from viewer.frames import chosen
 from viewer.library import Library, input_of
 from viewer.mosaic_probing import SuperPixelReducer
@@ -111,10 +113,10 @@ def _of_product(path: Path, query: Any, library: Library) -> dict[str, Any]:
 
 
 def _planes(product: Product, region: Region) -> list[dict[str, Any]]:
-    told = []
+    told, correlation = [], neighbour_correlation(product)
     for name in product.names:
         # The flags are told in words.
-        if name.endswith(("_errors", "_95", "covariance")) or name in ("mueller", "pixel_flags"):
+        if name.endswith((*COMPANIONS, "covariance")) or name in ("mueller", "pixel_flags"):
             continue
         values = product.get(name, region.rows)[..., region.columns]
         if values.size // region.pixels > 4:
@@ -125,8 +127,15 @@ def _planes(product: Product, region: Region) -> list[dict[str, Any]]:
         with np.errstate(invalid="ignore"):
             entry["value"] = finite(_mean(flat, period_deg(name, product.units(name))))
             if errors in product.names:
-                each = product.get(errors, region.rows)[..., region.columns].reshape(-1, region.pixels).astype(float)
-                entry["error"] = finite(np.sqrt(np.square(each).sum(axis=1)) / region.pixels)
+                each = product.get(errors, region.rows)[..., region.columns].astype(float)
+                each = each.reshape(-1, *each.shape[-2:])
+                whole = np.zeros(each.shape[1:], int)
+                # An error that is not known leaves that of the mean unknown.
+                total = [shared_variance(whole, one, correlation).sum() + 0 * one.sum() for one in each]
+                entry["error"] = finite(np.sqrt(total) / region.pixels)
+            if f"{name}_systematic" in product.names:
+                each = product.get(f"{name}_systematic", region.rows)[..., region.columns]
+                entry["systematic"] = finite(each.reshape(-1, region.pixels).mean(axis=1, dtype=float))
         told.append(entry)
     return told
 

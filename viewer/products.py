@@ -12,7 +12,7 @@ from starlette.responses import HTMLResponse, Response
 from processing.errors import ProcessError
 from processing.reports.colours import ALL, LIGHT, SIGNED, Scale, period_deg, scale_of, steps
 from processing.reports.fact_words import fact_words
-from processing.storage.product import LIT_ERRORS, Product
+from processing.storage.product import COMPANIONS, LIT_ERRORS, Product
 from processing.storage.provenance import steps_text
 from viewer.frames import others
 from viewer.library import made_from, made_into
@@ -58,7 +58,7 @@ def maps_of(opened: Product) -> list[dict[str, Any]]:
     found = []
     first = FIRST.get(opened.kind, opened.kind)
     for name in sorted(opened.names, key=lambda name: name != first):
-        if name.endswith(("_errors", "_95")) or name in ("mueller", "mueller_covariance"):
+        if name.endswith(COMPANIONS) or name in ("mueller", "mueller_covariance"):
             continue
         count = opened.get(name, slice(0, 1)).size // opened.shape[1]
         common: dict[str, Any] = {"name": name, "about": opened.long_name(name), "units": opened.units(name)}

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from processing.arrays import Array
 from processing.errors import ProcessError
@@ -28,13 +28,27 @@ class Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+class Uncertain(Part):
+    """A number with its standard uncertainty, as a file may state it."""
+
+    value: float
+    u: float
+
+
+#: A number, or one for each wavelength, each with its u or without; `InstrumentModel.stderr` then holds the u.
+Stated = Annotated[
+    Dispersive,
+    BeforeValidator(lambda value: value, json_schema_input_type=float | Uncertain | dict[float, float | Uncertain]),
+]
+
+
 class Element(Part):
     """One optical element, fixed or turned: azimuth = azimuth_deg + ratio * angle of `axis`."""
 
     name: str
-    azimuth_deg: Dispersive = 0.0
+    azimuth_deg: Stated = 0.0
     axis: str | None = None
-    ratio: float = 1.0
+    ratio: Annotated[float, BeforeValidator(lambda value: value, json_schema_input_type=float | Uncertain)] = 1.0
 
     @model_validator(mode="after")
     def _ratio_needs_axis(self) -> Self:
@@ -61,7 +75,7 @@ class Polarizer(Element):
     """Linear polarizer; `extinction` is the intensity leak T_min/T_max."""
 
     kind: Literal["polarizer"]
-    extinction: Dispersive = 0.0
+    extinction: Stated = 0.0
 
     def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
         extinction = number(self.extinction) + (changes.extinction[self.name] if changes else 0.0)
@@ -76,9 +90,9 @@ class Retarder(Element):
     """
 
     kind: Literal["retarder"]
-    retardance_deg: Dispersive
-    diattenuation: Dispersive = 0.0
-    depolarization: Dispersive = 0.0
+    retardance_deg: Stated
+    diattenuation: Stated = 0.0
+    depolarization: Stated = 0.0
 
     def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
         retardance = np.deg2rad(number(self.retardance_deg)) + (changes.retardance_rad[self.name] if changes else 0.0)
@@ -94,8 +108,8 @@ class Diattenuator(Element):
     """Linear diattenuator with intensity transmissions `t_max` along the azimuth and `t_min` across it."""
 
     kind: Literal["diattenuator"]
-    t_max: Dispersive = 1.0
-    t_min: Dispersive
+    t_max: Stated = 1.0
+    t_min: Stated
 
     def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
         return mueller.diattenuator(azimuth_rad, number(self.t_max), number(self.t_min))

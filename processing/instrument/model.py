@@ -18,7 +18,7 @@ from pydantic import Field, field_serializer, field_validator, model_validator
 from processing.arrays import Array
 from processing.instrument import direction_text
 from processing.instrument.changes import Changes
-from processing.instrument.elements import AnyElement, Part, number
+from processing.instrument.elements import AnyElement, Part, Stated, number
 from processing.instrument.elements import Dispersive as Dispersive
 from processing.instrument.elements import Element as Element
 from processing.instrument.elements import Polarizer as Polarizer
@@ -26,6 +26,8 @@ from processing.instrument.elements import Retarder as Retarder
 from processing.instrument.elements import WavelengthError as WavelengthError
 from processing.yaml_file import load_yaml
 
+#: Where a file has elements.
+_TRAINS = ("generator", "analyzer", "channels", "elements")
 #: What fitted values belong to: mounts and mechanics, the same in all captures; the detector, the same as long as its
 #: full scale is; optics that follow a smooth curve over the wavelengths; optics with a value at each wavelength that
 #: has nothing to do with the next one; one capture alone.
@@ -37,7 +39,7 @@ class Channel(Part):
 
     name: str
     elements: tuple[AnyElement, ...] = ()
-    gain: Dispersive = 1.0
+    gain: Stated = 1.0
 
     @field_validator("gain")
     @classmethod
@@ -104,6 +106,36 @@ class SystematicError(Part):
         return [direction_text.told(effect.model_dump() for effect in one) for one in directions]
 
 
+class Correlation(Part):
+    """Correlation of standard uncertainties, as `process calibrate --write` finds it.
+
+    Attributes
+    ----------
+    between : "element.field" of each of K values.
+    coefficients : K (K - 1) / 2, below the diagonal, row by row.
+    """
+
+    between: tuple[str, ...]
+    coefficients: tuple[float, ...]
+    wavelength_nm: float | None = None
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        count = len(self.between)
+        if len(self.coefficients) != count * (count - 1) // 2:
+            raise ValueError(f"{count} values have {count * (count - 1) // 2} correlation coefficients between them")
+        if np.linalg.eigvalsh(self.matrix)[0] < -1e-3:
+            raise ValueError("these correlations contradict each other: their matrix has a negative eigenvalue")
+        return self
+
+    @property
+    def matrix(self) -> Array:
+        """(K, K), symmetric, 1 on the diagonal."""
+        out = np.zeros((len(self.between),) * 2)
+        out[np.tril_indices(len(out), -1)] = self.coefficients
+        return np.asarray(out + out.T + np.eye(len(out)))
+
+
 class EffectParameter(Part):
     """A fitted value with its standard error (None: it has none, `note` says why); or one at each wavelength."""
 
@@ -136,8 +168,9 @@ class InstrumentModel(Part):
     `belongs_to` says of such values, and of kinds of effects, what they belong to where that is not the rule: a
     spectrograph sees one run of the axes at all wavelengths (`rotation_slip: mechanics`), the axis of an achromatic
     plate turns with the wavelength (`plate.azimuth_deg: dispersion`).
-    `stderr` holds standard errors of values that `diagnose` fitted, by the names that `calibrate` has.
-    `systematic` is what `diagnose` leaves uncertain; `process reduce` carries it into its error bars.
+    `stderr` holds standard uncertainties of values, by the names that `calibrate` has; a file may state them with the
+    values, as {value: ..., u: ...}. `correlations` are between them.
+    `systematic` is what `diagnose` leaves uncertain. `process reduce` carries both into its error bars.
     Where two channels or more see one source, its level in each state is projected out; `free_source: false` says
     that it has the same level in all states.
     """
@@ -157,6 +190,27 @@ class InstrumentModel(Part):
     stderr: dict[str, Dispersive] = Field(default={})
     effects: tuple[AppliedEffect, ...] = ()
     systematic: tuple[SystematicError, ...] = ()
+    correlations: tuple[Correlation, ...] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _take_uncertainties(cls, data: Any) -> Any:
+        if not isinstance(data, Mapping):
+            return data
+        found: dict[str, Any] = {}
+        plain = {key: _without_u(node, found) if key in _TRAINS else node for key, node in data.items()}
+        given = plain.get("stderr") or {}
+        if not found or not isinstance(given, Mapping):
+            return plain
+        return plain | {"stderr": {**given, **found}}
+
+    @field_validator("stderr")
+    @classmethod
+    def _are_sizes(cls, stderr: dict[str, Dispersive]) -> dict[str, Dispersive]:
+        for name, u in stderr.items():
+            if not min(u.values() if isinstance(u, dict) else [u], default=0.0) >= 0:
+                raise ValueError(f"the standard uncertainty of {name!r} must be 0 or more")
+        return stderr
 
     @model_validator(mode="after")
     def _names_are_unique(self) -> Self:
@@ -233,6 +287,7 @@ class InstrumentModel(Part):
             for s in resolved["systematic"]
             if holds(s)
         ]
+        resolved["correlations"] = [c for c in resolved["correlations"] if holds(c)]
         return InstrumentModel.model_validate(resolved | {"wavelengths_nm": (wavelength_nm,)})
 
     def nominal_at(self, wavelength_nm: float) -> InstrumentModel:
@@ -322,6 +377,27 @@ def condition_number(w: ArrayLike) -> float:
 def rank(w: ArrayLike) -> int:
     """Numerical rank of W (any leading shape, 16), relative tolerance 1e-8."""
     return int(np.linalg.matrix_rank(np.asarray(w, dtype=float).reshape(-1, 16), rtol=1e-8))
+
+
+def _without_u(node: Any, found: dict[str, Any]) -> Any:
+    """A train as a file has it, without standard uncertainties; those by "element.field" are put into `found`."""
+    if isinstance(node, list | tuple):
+        return [_without_u(part, found) for part in node]
+    if not isinstance(node, Mapping):
+        return node
+    plain = {}
+    for field, value in node.items():
+        plain[field] = _without_u(value, found) if field in _TRAINS else value
+        if field in _TRAINS or not isinstance(value, Mapping):
+            continue
+        if set(value) == {"value", "u"}:
+            plain[field], found[f"{node.get('name')}.{field}"] = value["value"], value["u"]
+            continue
+        at = {nm: one for nm, one in value.items() if isinstance(one, Mapping) and set(one) == {"value", "u"}}
+        if at:
+            plain[field] = {nm: at[nm]["value"] if nm in at else one for nm, one in value.items()}
+            found[f"{node.get('name')}.{field}"] = {nm: one["u"] for nm, one in at.items()}
+    return plain
 
 
 def _matrices(element: Element, angles_deg: Mapping[str, ArrayLike], states: int, changes: Changes | None) -> Array:

@@ -2,7 +2,8 @@
 
 First order holds for what is smooth over the errors. Magnitudes, angles of short vectors, retardance near 180 degrees
 and what divides by a weak factor are not; docs/quantities.md, "Standard errors", says what is done for each.
-`<name>_errors` is half the 68 % interval, `<name>_95` the lower and upper bound of the 95 % interval.
+`<name>_errors` is half the 68 % interval by noise, `<name>_systematic` the standard uncertainty by the instrument's,
+`<name>_95` the lower and upper bound of the 95 % interval by both.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from processing.polarization.magnitude import NORMAL_95, directions, interval, s
 from processing.polarization.propagation import Derived
 from processing.polarization.quantities import entropy
 from processing.polarization.scalar_files import scalar_quantities
+from processing.reduction.systematic import Systematic
+from processing.storage.images import MuellerImage
 
 Planes = dict[str, NDArray[Any]]
 
@@ -128,6 +131,50 @@ def set_angles(planes: Planes) -> None:
         half_68, half_95 = (np.rad2deg(h) / 2 for h in halves)
         value = planes[name]
         _put(planes, name, value, half_68, value - half_95, value + half_95)
+
+
+def moves_of(systematic: Systematic, image: MuellerImage) -> Array:
+    """What one standard uncertainty of each uncertain input of the instrument does to M: (D, 16, rows, columns)."""
+    # What a partial polarimeter does not determine is zero in the solution of least norm.
+    values = np.where(image.seen[:, None], image.values.reshape(16, -1), 0)
+    return np.stack(list(systematic.moves(values))).reshape(-1, 16, *image.mask.shape)
+
+
+def set_systematic(planes: Planes, derived: Mapping[str, Derived], moves: Array) -> Planes:
+    """Add `<name>_systematic` to each map, and widen its 95 % interval by it. All others are done.
+
+    Parameters
+    ----------
+    moves : (D, 16, pixels...), see `moves_of`.
+
+    Returns
+    -------
+    Of each map (..., pixels..., D), what each direction does to it, to first order.
+    """
+    names = [name for name in derived if name in planes]
+    size = int(np.prod(moves.shape[2:]))
+    gradients = [np.moveaxis(derived[name].gradient.reshape(-1, size, 16), 0, 1) for name in names]
+    each = np.ascontiguousarray(np.moveaxis(moves.reshape(len(moves), 16, size), 2, 0).swapaxes(1, 2), dtype=np.float32)
+    with np.errstate(invalid="ignore", over="ignore"):
+        moved = np.concatenate(gradients, axis=1).astype(np.float32) @ each
+    out, start = {}, 0
+    for name, gradient in zip(names, gradients, strict=True):
+        shape = np.shape(derived[name].value)
+        part = np.moveaxis(moved[:, start : start + gradient.shape[1]], 0, 1).reshape(*shape, len(moves))
+        start += gradient.shape[1]
+        out[name] = part
+        systematic = np.sqrt(np.square(part).sum(axis=-1))
+        planes[f"{name}_systematic"] = systematic
+        if f"{name}_95" in planes:
+            planes[f"{name}_95"] = widened(planes[name], planes[f"{name}_95"], systematic)
+    return out
+
+
+def widened(value: Array, bounds: Array, systematic: Array) -> NDArray[np.float32]:
+    """95 % interval (2, ...) by noise, widened by a systematic standard uncertainty; the end of a range stays."""
+    off = bounds - value
+    wide = value + np.sign(off) * np.hypot(off, NORMAL_95 * np.nan_to_num(systematic))
+    return np.where((bounds == 0) | ~np.isfinite(bounds), bounds, wide).astype(np.float32)
 
 
 def set_retardance(

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import BoolArray
-from processing.maps.intervals import set_angles, set_magnitudes
+from processing.maps.intervals import set_angles, set_magnitudes, set_systematic
 from processing.polarization import gradients
 from processing.polarization.quantities import POLARIZATIONS, NamedStokes
 from processing.storage.images import MuellerImage
@@ -43,7 +43,9 @@ def determined_maps(seen: BoolArray, pairs: Pairs) -> list[str]:
     return [name for name, elements in needed.items() if seen[0] and seen[elements].all()]
 
 
-def partial_block(image: MuellerImage, names: list[str], pairs: Pairs) -> dict[str, NDArray[Any]]:
+def partial_block(
+    image: MuellerImage, names: list[str], pairs: Pairs, moves: NDArray[np.float64] | None = None
+) -> dict[str, NDArray[Any]]:
     """The maps of these names with their errors, and `lit`, for an image or for some rows of it."""
     # What was not determined is not in any of them.
     m = np.where(image.seen.reshape(4, 4), image.matrices.astype(float), 0.0)
@@ -55,6 +57,8 @@ def partial_block(image: MuellerImage, names: list[str], pairs: Pairs) -> dict[s
             found[f"{name}_errors"] = np.sqrt(image.variance_of(derived[name].gradient)).astype(np.float32)
         set_magnitudes(found, derived, m, image)
         set_angles(found)
+        if moves is not None:
+            set_systematic(found, {name: derived[name] for name in names}, moves)
     found["lit"] = (image.values[0, 0] > LIT_ERRORS * np.nan_to_num(image.errors[0, 0])).astype(np.uint8)
     return found
 
@@ -69,7 +73,7 @@ def partial_facts(writer: ProductWriter, names: list[str]) -> dict[str, Any]:
         "warnings": ["of a partial polarimeter: maps that need other elements of M are not there"],
     }
     for name in names:
-        for part in (name, f"{name}_errors"):
+        for part in (name, *(f"{name}_{end}" for end in ("errors", "systematic") if f"{name}_{end}" in writer.planes)):
             known = writer.get(part)[lit]
             known = known[np.isfinite(known)]
             facts[f"median_{part.replace('_errors', '_error')}"] = float(np.median(known)) if known.size else None

@@ -16,6 +16,7 @@ from processing.maps.extrapolation import EXTRAPOLATED, ExtrapolatedImage
 from processing.maps.intervals import (
     SEEN,
     has_own_95,
+    moves_of,
     set_angles,
     set_any_dominant,
     set_depolarization_power,
@@ -24,6 +25,7 @@ from processing.maps.intervals import (
     set_magnitudes,
     set_retardance,
     set_symmetric,
+    set_systematic,
     widen_dominant,
 )
 from processing.maps.partial_quantities import Pairs, determined_maps, partial_block, partial_facts
@@ -37,6 +39,7 @@ from processing.polarization.propagation import Derived
 from processing.polarization.quantities import PAPER_PAIRS
 from processing.polarization.scalar_files import scalar_quantities
 from processing.reduction.mueller import Progress
+from processing.reduction.systematic import INPUTS, Systematic
 from processing.storage.images import MuellerImage, require_all_elements, seen_elements
 from processing.storage.product import LIT_ERRORS, Plane, Product, ProductError, ProductWriter, Step
 
@@ -169,24 +172,34 @@ def _maps(product: Product, extra: Sequence[str], pairs: Pairs) -> _Maps:
         )
     product.require("mueller", EXTRAPOLATED)
     sent = {} if extra else sent_back_planes(product)
+    systematic = Systematic.of_product(product) if product.kind == "mueller" else None
+    told = {} if systematic is None else {INPUTS: product.facts[INPUTS]}
     if sent:
         return _Maps(
-            with_errors(sent, lambda name: has_own_95(OF_MATRICES.get(name, name))),
-            lambda rows: sent_back_block(product, rows, sent),
-            lambda writer: sent_back_facts(writer, sent),
+            with_errors(sent, lambda name: has_own_95(OF_MATRICES.get(name, name)), systematic=systematic is not None),
+            lambda rows: sent_back_block(product, rows, sent, systematic),
+            lambda writer: sent_back_facts(writer, sent) | told,
         )
     maps = _planes(extra, pairs)
     partial = _determined(product, extra, pairs)
+
+    def block(rows: slice) -> dict[str, NDArray[Any]]:
+        image = image_of(product, rows)
+        if isinstance(image, ExtrapolatedImage):
+            return quantities_block(image, extra, pairs)
+        moves = None if systematic is None else moves_of(systematic, image)
+        return partial_block(image, partial, pairs, moves) if partial else quantities_block(image, extra, pairs, moves)
+
     if partial:
         return _Maps(
-            with_errors({name: maps[name] for name in [*partial, "lit"]}),
-            lambda rows: partial_block(MuellerImage.of(product, rows), partial, pairs),
-            lambda writer: partial_facts(writer, partial),
+            with_errors({name: maps[name] for name in [*partial, "lit"]}, systematic=systematic is not None),
+            block,
+            lambda writer: partial_facts(writer, partial) | told,
         )
     return _Maps(
-        with_errors(maps) | _NOISE,
-        lambda rows: quantities_block(image_of(product, rows), extra, pairs),
-        lambda writer: _facts(writer, maps),
+        with_errors(maps, systematic=systematic is not None) | _NOISE,
+        block,
+        lambda writer: _facts(writer, maps) | told,
     )
 
 
@@ -212,15 +225,23 @@ def _determined(product: Product, extra: Sequence[str], pairs: Pairs) -> list[st
     return names
 
 
-def with_errors(maps: Mapping[str, Plane], own_95: Callable[[str], bool] = has_own_95) -> dict[str, Plane]:
-    """The planes of maps, of their standard errors and, where +- 1.96 errors is not it, of their 95 % intervals."""
+def with_errors(
+    maps: Mapping[str, Plane], own_95: Callable[[str], bool] = has_own_95, *, systematic: bool = False
+) -> dict[str, Plane]:
+    """The planes of maps, of their standard errors and, where +- 1.96 errors is not it, of their 95 % intervals.
+
+    `systematic` : with what the instrument's uncertainty does to each.
+    """
     planes = dict(maps)
     for name, plane in maps.items():
         if plane.dtype is np.float32:
-            planes[f"{name}_errors"] = Plane(plane.leading, plane.units, f"half the 68 % interval of {name}")
+            planes[f"{name}_errors"] = Plane(plane.leading, plane.units, f"half the 68 % interval of {name}, by noise")
             if own_95(name):
                 title = f"lower and upper bound of the 95 % interval of {name}"
                 planes[f"{name}_95"] = Plane((2, *plane.leading), plane.units, title)
+            if systematic:
+                title = f"standard uncertainty of {name} by the instrument's; it does not average"
+                planes[f"{name}_systematic"] = Plane(plane.leading, plane.units, title)
     return planes
 
 
@@ -249,9 +270,19 @@ def _planes(extra: Sequence[str], pairs: Pairs) -> dict[str, Plane]:
 
 
 def quantities_block(
-    image: MuellerImage | ExtrapolatedImage, extra: Sequence[str], pairs: Pairs
+    image: MuellerImage | ExtrapolatedImage,
+    extra: Sequence[str],
+    pairs: Pairs,
+    moves: NDArray[np.float64] | None = None,
+    by_input: dict[str, NDArray[Any]] | None = None,
 ) -> dict[str, NDArray[Any]]:
-    """Planes of the product for an image, or for some rows of it."""
+    """Planes of the product for an image, or for some rows of it.
+
+    Parameters
+    ----------
+    moves : (D, 16, rows, columns), what each uncertain input of the instrument does to M; see `moves_of`.
+    by_input : filled with what each does to each map, (..., rows, columns, D).
+    """
     m = image.matrices.astype(float)
     # Where there is no light an eigenvalue solver only works on noise, slowly.
     lit = np.where((image.values[0, 0] > LIT_ERRORS * np.nan_to_num(image.errors[0, 0]))[..., None, None], m, np.nan)
@@ -275,6 +306,10 @@ def quantities_block(
         found["retardance_vector_covariance"] = _covariance(image, derived["retardance_vector_deg"].gradient)
         polar = lu_chipman(m)
         _set_intervals(found, derived, m, image, polar.depolarizer)
+        if moves is not None:
+            moved = set_systematic(found, derived, moves)
+            if by_input is not None:
+                by_input |= moved
     found["lit"] = np.isfinite(lit[..., 0, 0]).astype(np.uint8)
     found["lu_chipman_defined"] = polar.defined.astype(np.uint8)
     found["negative_determinant"] = polar.negative_determinant.astype(np.uint8)
@@ -366,6 +401,9 @@ def _facts(writer: ProductWriter, maps: Mapping[str, Plane]) -> dict[str, Any]:
     for name in names:
         facts[f"median_{name}"] = _median(writer.get(name)[known])
         facts[f"median_{name}_error"] = _median(writer.get(f"{name}_errors")[known])
+    if "entropy_systematic" in writer.planes:
+        facts["median_xi0_systematic"] = _median(writer.get("coherency_eigenvalues_systematic")[0][known])
+        facts |= {f"median_{name}_systematic": _median(writer.get(f"{name}_systematic")[known]) for name in names}
     for name in maps:
         if name.endswith("_defined") or name == "negative_determinant":
             facts[f"pixels_{name}"] = int(np.sum(writer.get(name)[known]))

@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.maps.partial_quantities import determined_maps, partial_block, partial_facts
-from processing.storage.images import MuellerImage
-from processing.storage.product import LIT_ERRORS, Plane, Product, ProductWriter
+from processing.reduction.sent_light import sent_rows
+from processing.reduction.systematic import Systematic
+from processing.storage.images import SMALLEST, MuellerImage
+from processing.storage.product import COMPANIONS, LIT_ERRORS, Plane, Product, ProductWriter
 
 _BACK = "of the light that the sample sends back"
 #: By the name that the same quantity of a matrix has: the name here, and what it is.
@@ -40,7 +42,9 @@ def sent_back_planes(product: Product) -> dict[str, Plane]:
     return {_NAMES[name][0]: _NAMES[name][1] for name in names if name in _NAMES} | {"lit": lit}
 
 
-def sent_back_block(product: Product, rows: slice, planes: dict[str, Plane]) -> dict[str, NDArray[Any]]:
+def sent_back_block(
+    product: Product, rows: slice, planes: dict[str, Plane], systematic: Systematic | None = None
+) -> dict[str, NDArray[Any]]:
     """These maps with their errors for some rows; noise taken off magnitudes, errors NaN where not determined."""
     image = MuellerImage.of(product, rows)
     stokes, errors = product.get("stokes", rows), product.get("stokes_errors", rows)
@@ -60,10 +64,16 @@ def sent_back_block(product: Product, rows: slice, planes: dict[str, Plane]) -> 
         dark=np.linalg.pinv(w) @ (image.w @ image.dark),
     )
     wanted = [name for name, (own, _) in _NAMES.items() if own in planes]
-    found = partial_block(column, wanted, {})
+    moves = None
+    if systematic is not None:
+        least = np.linalg.pinv(image.w, rcond=SMALLEST) @ image.fitted
+        moves = np.zeros((len(systematic.directions), 16, *image.mask.shape))
+        moved = np.stack(list(systematic.moves(least, sent_rows(image.w))))
+        moves[:, ::4] = moved.reshape(len(moved), 4, *image.mask.shape)
+    found = partial_block(column, wanted, {}, moves)
     out = {"lit": found["lit"]}
     for name in wanted:
-        for suffix in ("", "_errors", "_95"):
+        for suffix in ("", *COMPANIONS):
             if name + suffix in found:
                 out[_NAMES[name][0] + suffix] = found[name + suffix]
     return out

@@ -14,11 +14,13 @@ from scipy import ndimage
 from processing.errors import ProcessError
 from processing.geometry.viewing import ViewingGeometry
 from processing.maps.coherency_noise import coherency_noise
-from processing.polarization.cloude import coherency_eigenvalues
+from processing.maps.intervals import moves_of, widened
+from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
 from processing.polarization.eigenvalue_noise import corrected
 from processing.polarization.xi0 import Xi0Estimate, estimate
 from processing.reduction.mosaic.methods import REACH
 from processing.reduction.mueller import Progress
+from processing.reduction.systematic import INPUTS, Systematic
 from processing.reflectance.base import load_reflectance
 from processing.storage.capture_schema import CaptureHeader
 from processing.storage.images import MuellerImage, StokesImage, require_all_elements
@@ -78,14 +80,22 @@ def xi0_of_mueller(source: Path, out: Path, step: Step, overwrite: bool, progres
     with Product(source) as product:
         require_all_elements(product)
         steps = (*product.steps, step)
-        with ProductWriter(out, "xi0", product.header, product.shape, MUELLER_PLANES, steps, overwrite) as writer:
+        systematic = Systematic.of_product(product)
+        planes = MUELLER_PLANES | systematic_planes(systematic)
+        with ProductWriter(out, "xi0", product.header, product.shape, planes, steps, overwrite) as writer:
             for rows in product.row_blocks():
                 if rows.stop > writer.rows_done:
-                    writer.write(rows, **eigenvalue_block(MuellerImage.of(product, rows)))
+                    image = MuellerImage.of(product, rows)
+                    found = eigenvalue_block(image)
+                    if systematic is not None:
+                        set_xi0_systematic(found, _moved(systematic, image))
+                    writer.write(rows, **found)
                 if progress:
                     progress(rows.stop, product.shape[0])
             valid = writer.get("valid") > 0
             facts = _facts(writer.get("xi0"), writer.get("xi0_errors"), valid, "coherency eigenvalues")
+            if systematic is not None:
+                facts |= _systematic_facts(systematic, writer.get("xi0_systematic")[valid])
             for name in ("xi0_shift", "eigenvalue_spread", "eigenvalue_spread_noise"):
                 facts[f"median_{name}"] = _median(writer.get(name)[valid])
             writer.seal(facts)
@@ -114,6 +124,51 @@ def eigenvalue_block(image: MuellerImage) -> dict[str, NDArray[Any]]:
     }
 
 
+def systematic_planes(systematic: Systematic | None) -> dict[str, Plane]:
+    """Planes of what the instrument's uncertainty does to xi0; none where nothing is uncertain."""
+    if systematic is None:
+        return {}
+    title = "what one standard uncertainty of each uncertain input of the instrument does to xi0"
+    return {
+        "xi0_systematic": Plane((), "", "standard uncertainty of xi0 by the instrument's; it does not average"),
+        "xi0_directions": Plane((len(systematic.directions),), "", title),
+    }
+
+
+def set_xi0_systematic(planes: dict[str, NDArray[Any]], moved: NDArray[np.float64]) -> None:
+    """Add `systematic_planes` from what each direction does to xi0, (D, rows, columns); widen both intervals by it."""
+    systematic = np.sqrt(np.square(moved).sum(axis=0))
+    planes |= {"xi0_systematic": systematic, "xi0_directions": moved}
+    planes["xi0_95"] = widened(planes["xi0"], planes["xi0_95"], systematic)
+    planes["xi0_68"] = widened(planes["xi0"], planes["xi0_68"], systematic / NORMAL_95)
+
+
+def _moved(systematic: Systematic, image: MuellerImage) -> NDArray[np.float64]:
+    """What each direction does to the largest eigenvalue, (D, rows, columns), to first order."""
+    xi0, m0 = xi0_and_dominant(image.matrices)
+    slope = m0.reshape(*m0.shape[:2], 16).astype(float)
+    slope[..., 0] -= 4 * xi0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slope /= 4 * image.values[0, 0][..., None]
+        return np.asarray(np.einsum("xyi,dixy->dxy", slope, moves_of(systematic, image)))
+
+
+def _systematic_facts(systematic: Systematic, errors: NDArray[Any]) -> dict[str, Any]:
+    return {INPUTS: "; ".join(systematic.labels), "median_xi0_systematic": _median(errors)}
+
+
+def _refitted(
+    systematic: Systematic, fitted: NDArray[np.floating], xi0: NDArray[np.float64], m0: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """What each direction does to the two-coefficient estimate of intensities (K, rows, columns): (D, ...)."""
+    flat = fitted.reshape(len(fitted), -1)
+    moved = []
+    for direction in systematic.directions:
+        signal = flat + systematic.bent(direction, flat) if direction.counts is not None else flat
+        moved.append(estimate(signal.reshape(fitted.shape), None, direction.rows, m0).xi0 - xi0)
+    return np.stack(moved)
+
+
 def xi0_of_stokes(
     source: Path, geometry_file: Path, material_file: Path, out: Path, step: Step, overwrite: bool
 ) -> dict[str, Any]:
@@ -126,6 +181,7 @@ def xi0_of_stokes(
     with Product(source) as product:
         product.require("stokes")
         header, steps = product.header, (*product.steps, step)
+        systematic = Systematic.of_product(product)
     image = StokesImage.load(source)
     m0 = dominant_model(header, geometry_file, material_file, image.mask.shape)
     # Next to the outline, demosaicing mixes object and background.
@@ -135,7 +191,8 @@ def xi0_of_stokes(
     found = estimate_from_stokes(image, m0)
     facts = _facts(found.xi0, found.xi0_stderr, found.valid, "two coefficients of the Stokes image")
     text = "of the noise of pixels by distance in rows and columns"
-    with _two_coefficients(out, found, facts, header, steps, overwrite) as writer:
+    fitted = np.tensordot(image.analyzers, image.values.astype(float), axes=1)
+    with _two_coefficients(out, found, facts, header, steps, overwrite, systematic, fitted, m0) as writer:
         writer.array("neighbour_correlation", image.neighbour_correlation, "", text)
     return facts
 
@@ -152,16 +209,20 @@ def xi0_of_partial(
     ------
     ProcessError : the product determines combinations of elements only; see also `dominant_model`.
     """
-    image = MuellerImage.load(source)
+    with Product(source) as product:
+        product.require("mueller")
+        image, systematic = MuellerImage.of(product), Systematic.of_product(product)
     known = image.seen if image.sent is None else np.isfinite(image.sent).any(axis=(1, 2))
     if known.sum() < 2:
         raise ProcessError(f"{source} determines {image.facts['determined']}, and xi0 needs two numbers or more.")
     m0 = dominant_model(image.header, geometry_file, material_file, image.mask.shape)
     size = (-1, *image.mask.shape)
     fitted = np.where(image.mask.reshape(-1) & ~np.uint8(Mask.SATURATED), np.nan, image.fitted)
-    found = estimate(fitted.reshape(size), image.told_variance.reshape(size), image.w, m0)
+    fitted = fitted.reshape(size)
+    found = estimate(fitted, image.told_variance.reshape(size), image.w, m0)
     facts = _facts(found.xi0, found.xi0_stderr, found.valid, f"two coefficients of {image.facts['determined']}")
-    with _two_coefficients(out, found, facts, image.header, (*image.steps, step), overwrite):
+    steps = (*image.steps, step)
+    with _two_coefficients(out, found, facts, image.header, steps, overwrite, systematic, fitted, m0):
         pass
     return facts
 
@@ -174,8 +235,11 @@ def _two_coefficients(
     header: CaptureHeader,
     steps: tuple[Step, ...],
     overwrite: bool,
+    systematic: Systematic | None,
+    fitted: NDArray[np.floating],
+    m0: NDArray[np.float64],
 ) -> Iterator[ProductWriter]:
-    """Write an estimate; within the block arrays can be added. Completes the facts."""
+    """Write an estimate of intensities `fitted` by m0; within the block arrays can be added. Completes the facts."""
     planes: dict[str, NDArray[Any]] = {
         "xi0": found.xi0,
         "xi0_errors": found.xi0_stderr,
@@ -188,8 +252,12 @@ def _two_coefficients(
         "valid": found.valid.astype(np.uint8),
     }
     facts["unphysical_pixels"] = int(found.unphysical.sum())
+    if systematic is not None:
+        set_xi0_systematic(planes, _refitted(systematic, fitted, found.xi0, m0))
+        facts |= _systematic_facts(systematic, planes["xi0_systematic"][found.valid])
     rows, columns = found.xi0.shape
-    with ProductWriter(out, "xi0", header, (rows, columns), STOKES_PLANES, steps, overwrite) as writer:
+    every = STOKES_PLANES | systematic_planes(systematic)
+    with ProductWriter(out, "xi0", header, (rows, columns), every, steps, overwrite) as writer:
         yield writer
         writer.write(slice(0, rows), **planes)
         writer.seal(facts)

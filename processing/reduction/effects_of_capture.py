@@ -115,6 +115,10 @@ def counts_correction(changes: Changes | None, model: InstrumentModel) -> Counts
     return CountsCorrection(changes.conditions.full_scale, response, changes.shift_px, model.pitch)
 
 
+#: Features by which counts are corrected.
+FEATURES = ("one", "square", "cube", "fourth", "log", "log_square", "log_cube")
+
+
 def _feature(name: str, u: NDArray[np.float32]) -> NDArray[np.float32] | np.float32:
     if name == "one":
         return np.float32(1.0)

@@ -57,7 +57,7 @@ Progress = Callable[[int, int], None]
 BLOCK_PIXELS = 1 << 18
 
 CHI_SQUARE = Plane((), "", "squared residual over what the noise model expects; 1 if the model is complete")
-_LEFT = "what the diagnosis leaves uncertain"
+_LEFT = "what is uncertain in the instrument; it does not average"
 SYSTEMATIC = {
     "mueller_systematic": Plane(
         (4, 4), "count", f"systematic standard errors of mueller (of M/m00, times m00): {_LEFT}"
@@ -271,6 +271,7 @@ def reduce_mueller(
             raise CaptureError(f"{capture.path}: {error}{_without_numbers(capture, states)}") from error
         facts["warnings"] += cut_off
         facts |= _further_facts(choice, sent) | references(capture, model)
+        facts |= systematic.store(product) if systematic is not None else {}
         if levels is not None:
             facts["source"] = levels.told
         product.seal(facts)
@@ -313,11 +314,9 @@ def _systematic(
     inversion: Inversion,
     source: LeveledSource,
 ) -> Systematic | None:
-    if not model.systematic:
-        return None
-
-    def matrix(other: InstrumentModel) -> NDArray[np.float64]:
-        return source.leveled(measurement_matrix(capture, other, states, capture_changes(capture, other, states)))[0]
+    def matrix(other: InstrumentModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        w = source.leveled(measurement_matrix(capture, other, states, capture_changes(capture, other, states)))[0]
+        return w, w
 
     def counts(other: InstrumentModel) -> CountsCorrection | None:
         return counts_correction(capture_changes(capture, other, states), other)

@@ -55,7 +55,7 @@ PLANES = {
     "pixel_flags": Plane((), "", f"0 = good; bits: {Mask.meaning()}", np.uint8),
 }
 
-_LEFT = "what the diagnosis leaves uncertain"
+_LEFT = "what is uncertain in the instrument; it does not average"
 SYSTEMATIC = {
     "s1_systematic": Plane((), "count", f"systematic standard errors of s1 (of S1/S0, times S0): {_LEFT}"),
     "s2_systematic": Plane((), "count", f"systematic standard errors of s2 (of S2/S0, times S0): {_LEFT}"),
@@ -162,6 +162,7 @@ def reduce_stokes(
             "neighbour_correlation", correlation, "", "of the noise of S1, S2 by distance in rows and columns"
         )
         product.array("analyzers", analyzers, "", "rows (channel, 3): intensity = row . (S0, S1, S2)")
+        facts |= systematic.store(product) if systematic is not None else {}
         product.write(slice(0, rows), **found)
         product.seal(facts)
     return facts
@@ -226,8 +227,9 @@ def stokes(
 
 
 def _systematic(capture: Capture, model: InstrumentModel, states: NDArray[np.int64]) -> Systematic | None:
-    def rows(other: InstrumentModel) -> NDArray[np.float64]:
-        return channel_rows(capture, other, states, capture_changes(capture, other, states))[1][None]
+    def rows(other: InstrumentModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        whole, analyzers = channel_rows(capture, other, states, capture_changes(capture, other, states))
+        return whole[None], analyzers[None]
 
     def counts(other: InstrumentModel) -> CountsCorrection | None:
         return counts_correction(capture_changes(capture, other, states), other)

@@ -1,4 +1,8 @@
-"""Systematic standard errors of a Mueller or Stokes image, from what the instrument's diagnosis left uncertain."""
+"""What is uncertain in an instrument, as directions in which all pixels of a Mueller or Stokes image are wrong at once.
+
+Unlike noise it does not average over pixels or captures. One direction is one standard deviation of something
+independent: a value of the train whose standard uncertainty the instrument file states, or what its diagnosis left.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,13 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.instrument.model import InstrumentModel
-from processing.reduction.effects_of_capture import CountsCorrection
+from processing.instrument.uncertainty import value_directions
+from processing.reduction.effects_of_capture import FEATURES, CountsCorrection
+from processing.storage.images import SMALLEST
+from processing.storage.product import Product, ProductWriter
+
+#: Fact of a product: what its directions are.
+INPUTS = "uncertain_in_the_instrument"
 
 
 @dataclass(frozen=True)
@@ -19,11 +29,15 @@ class Direction:
 
     Attributes
     ----------
+    label : what is uncertain.
     turn : (K, K); the unknowns of a pixel move by `turn` times themselves.
-    counts : a correction of the counts that moves them further; None without.
+    rows : (L, 16), the measurement matrix with this error.
+    counts : a correction of the counts that moves the unknowns further; None without.
     """
 
+    label: str
     turn: Array
+    rows: Array
     counts: CountsCorrection | None
 
 
@@ -46,7 +60,7 @@ class Systematic:
     def of(
         cls,
         model: InstrumentModel,
-        matrix: Callable[[InstrumentModel], Array],
+        matrix: Callable[[InstrumentModel], tuple[Array, Array]],
         counts: Callable[[InstrumentModel], CountsCorrection | None],
         basis: Array,
     ) -> Systematic | None:
@@ -54,23 +68,77 @@ class Systematic:
 
         Parameters
         ----------
-        matrix : makes (states, channels, K), the measurement matrix of the capture, of a model and its effects.
+        matrix
+            Makes of a model and its effects the measurement matrix of the capture, (states, channels, 16), and the same
+            by the unknowns of a pixel, (states, channels, K).
         counts : makes of them what is corrected in the counts.
         basis : (K, R) what the instrument determines of the unknowns; they move inside of that alone.
         """
+        moved: list[tuple[str, InstrumentModel, CountsCorrection | None]] = [
+            (label, other, None) for label, other in value_directions(model)
+        ]
+        for error in model.systematic:
+            for effects in error.directions:
+                label = ", ".join(dict.fromkeys(" ".join(filter(None, (e.kind, e.element))) for e in effects))
+                bent = counts(model.model_copy(update={"effects": effects}))
+                other = model.model_copy(update={"effects": (*model.effects, *effects)})
+                moved.append((label, other, bent if bent is not None and bent.response else None))
+        if not moved:
+            return None
 
         def inverse(w: Array) -> Array:
             return np.asarray(basis @ np.linalg.pinv(w.reshape(-1, len(basis)) @ basis))
 
-        w = matrix(model)
+        w = matrix(model)[1]
         flat, out = w.reshape(-1, len(basis)), []
-        for error in model.systematic:
-            for effects in error.directions:
-                moved = matrix(model.model_copy(update={"effects": (*model.effects, *effects)}))
-                bent = counts(model.model_copy(update={"effects": effects}))
-                turn = inverse(moved) @ flat - basis @ basis.T
-                out.append(Direction(turn, bent if bent is not None and bent.response else None))
-        return cls(tuple(out), flat, inverse(w), w.shape[1]) if out else None
+        for label, other, bent in moved:
+            rows, own = matrix(other)
+            turn = inverse(own) @ flat - basis @ basis.T
+            out.append(Direction(label, turn, rows.reshape(-1, 16), bent))
+        return cls(tuple(out), flat, inverse(w), w.shape[1])
+
+    def store(self, product: ProductWriter) -> dict[str, str]:
+        """Put the directions into a product; returns the fact that names them."""
+        turns, rows = (np.stack([getattr(d, name) for d in self.directions]) for name in ("turn", "rows"))
+        text = "one standard uncertainty of each direction moves the unknowns of a pixel by this matrix times them"
+        product.array("systematic_turns", turns, "", text)
+        product.array("systematic_rows", rows, "", "measurement_matrix with one standard uncertainty of each direction")
+        bent = [d.counts for d in self.directions if d.counts is not None]
+        if bent:
+            each = [self._coefficients(d.counts) for d in self.directions]
+            text = f"corrections of each direction by state, channel and {', '.join(FEATURES)} of counts / full_scale"
+            product.array("systematic_counts", np.stack(each), "", text)
+            product.array("full_scale", np.array(bent[0].full_scale), "count", "counts above black")
+        return {INPUTS: "; ".join(d.label for d in self.directions)}
+
+    def _coefficients(self, counts: CountsCorrection | None) -> Array:
+        """(features, states, channels)."""
+        out = np.zeros((len(FEATURES), len(self.w) // self.channels, self.channels))
+        for name, value in counts.response.items() if counts is not None else ():
+            out[FEATURES.index(name)] = value
+        return out
+
+    @classmethod
+    def of_product(cls, product: Product) -> Systematic | None:
+        """The directions that a Mueller or Stokes product was stored with; None where its instrument has none."""
+        if not product.has_array("systematic_turns"):
+            return None
+        w = product.array("analyzers" if product.kind == "stokes" else "measurement_matrix")
+        turns, rows = product.array("systematic_turns"), product.array("systematic_rows")
+        labels = str(product.facts[INPUTS]).split("; ")
+        counts: list[CountsCorrection | None] = [None] * len(turns)
+        if product.has_array("systematic_counts"):
+            top, each = float(product.array("full_scale")), product.array("systematic_counts")
+            responses = [{f: c for f, c in zip(FEATURES, one, strict=True) if c.any()} for one in each]
+            counts = [CountsCorrection(top, one, np.zeros((1, 2))) if one else None for one in responses]
+        flat = w.reshape(-1, turns.shape[1])
+        directions = map(Direction, labels, turns, rows, counts)
+        return cls(tuple(directions), flat, np.linalg.pinv(flat, rcond=SMALLEST), w.shape[-2])
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """What is uncertain, one name for each direction."""
+        return tuple(d.label for d in self.directions)
 
     def moves(self, values: NDArray[np.floating], rows: Array | None = None) -> Iterator[Array]:
         """What each direction does to `rows` (J, K) times the unknowns (K, pixels), their first held: (J, pixels).
@@ -85,12 +153,17 @@ class Systematic:
         for direction in self.directions:
             moved = direction.turn @ m
             if direction.counts is not None:
-                signal = (self.w @ m).astype(np.float32).reshape(-1, self.channels, m.shape[1])
-                bent = signal.copy()
-                direction.counts.apply(bent)
-                moved += self.inverse @ (bent - signal).reshape(-1, m.shape[1])
+                moved += self.inverse @ self.bent(direction, self.w @ m)
             moved = rows @ moved
             yield moved - relative * moved[0]
+
+    def bent(self, direction: Direction, intensities: NDArray[np.floating]) -> Array:
+        """What a direction adds to intensities (L, pixels) in counts."""
+        signal = intensities.astype(np.float32).reshape(-1, self.channels, intensities.shape[1])
+        bent = signal.copy()
+        if direction.counts is not None:
+            direction.counts.apply(bent)
+        return np.asarray((bent - signal).reshape(intensities.shape), dtype=float)
 
     def errors(self, values: NDArray[np.floating], rows: Array | None = None) -> NDArray[np.float32]:
         """Standard errors (J, pixels) of what `moves` moves, in the unit of the values; that of the first is zero."""

@@ -11,7 +11,7 @@ from processing.polarization.quantities import PAPER_PAIRS
 from processing.polarization.scalar_files import scalar_quantities
 from processing.reports.colours import SIGNED, colours_of, upper_end
 from processing.reports.figure_style import CYCLIC, WORST_ORIENTATION_DEG, grid_figure, percentile, thin
-from processing.storage.product import Product
+from processing.storage.product import COMPANIONS, Product
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -70,7 +70,7 @@ def quantities_figure(product: Product, title: str) -> Figure:
         if name in product.names:
             panels.append((label(name.replace("_", " "), name), get(name), {"vmin": 0}))
     for name in product.names:
-        if name in PAPER_PAIRS or ("_to_" in name and not name.endswith(("_errors", "_95"))):
+        if name in PAPER_PAIRS or ("_to_" in name and not name.endswith(COMPANIONS)):
             text = name.replace("_", " ") + " over $m_{00}$"
             panels.append((label(text, name), get(name), {"cmap": "gray", "vmin": 0}))
     return grid_figure(panels, f"{title}\n($\\pm$: median standard error of a pixel)", product.simulated)
@@ -80,7 +80,7 @@ def _partial_figure(product: Product, title: str) -> Figure:
     lit = thin(product.get("lit")) > 0
     panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = []
     for name in product.names:
-        if name == "lit" or name.endswith(("_errors", "_95")):
+        if name == "lit" or name.endswith(COMPANIONS):
             continue
         shown = np.where(lit, thin(product.get(name)), np.nan)
         colours = colours_of(name, product.units(name))

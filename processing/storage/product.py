@@ -49,6 +49,8 @@ WORTH_SAVING = 0.2
 #: A pixel has light where its intensity is this many standard errors above zero; figures and summaries count those.
 LIT_ERRORS = 10.0
 
+#: Endings of datasets that say how wrong another one may be.
+COMPANIONS = ("_errors", "_95", "_systematic", "_directions")
 #: Datasets by the name that they had in earlier versions. NeXus keeps the ending `_mask` for the mask of one field.
 FORMER_NAMES = {"pixel_mask": "pixel_flags"}
 
@@ -108,7 +110,7 @@ class ProductWriter(OpenH5):
         self.path = path
         require_place(path, overwrite)
         self._partial = path.with_name(path.name + ".partial")
-        self._kind, self._header, self._shape, self._planes, self._steps = kind, header, shape, planes, tuple(steps)
+        self._kind, self._header, self._shape, self.planes, self._steps = kind, header, shape, planes, tuple(steps)
         #: Equal in two runs exactly if they would write the same values.
         self._signature = json.dumps(
             [kind, header.model_dump_json(), shape, sorted(planes), [s.made_of for s in steps]]
@@ -133,7 +135,7 @@ class ProductWriter(OpenH5):
 
     def _create(self) -> None:
         values = sum(
-            prod((*plane.leading, *self._shape)) * np.dtype(plane.dtype).itemsize for plane in self._planes.values()
+            prod((*plane.leading, *self._shape)) * np.dtype(plane.dtype).itemsize for plane in self.planes.values()
         )
         require_room(self._partial, values, ProductError)
         try:
@@ -163,16 +165,16 @@ class ProductWriter(OpenH5):
 
     def _lay_out_planes(self, entry: h5py.Group, create: Callable[..., h5py.Dataset]) -> None:
         data = add_group(entry, "data", "NXdata")
-        shapes = {name: (*plane.leading, *self._shape) for name, plane in self._planes.items()}
+        shapes = {name: (*plane.leading, *self._shape) for name, plane in self.planes.items()}
         dimensions = {
-            name: (*leading_dimensions(name, plane.leading), *PIXEL_AXES) for name, plane in self._planes.items()
+            name: (*leading_dimensions(name, plane.leading), *PIXEL_AXES) for name, plane in self.planes.items()
         }
         add_scales(data, {d: size for name in shapes for d, size in zip(dimensions[name], shapes[name], strict=True)})
-        for name, plane in self._planes.items():
+        for name, plane in self.planes.items():
             dataset = create(data, name, shapes[name], plane.dtype)
             dataset.attrs.update({"units": plane.units, "long_name": plane.long_name})
             attach(dataset, data, dimensions[name])
-        signal = next(iter(self._planes))
+        signal = next(iter(self.planes))
         default_plot(data, signal, dimensions[signal], self._header.title)
 
     def write(self, rows: slice, **blocks: NDArray[Any]) -> None:
@@ -221,7 +223,7 @@ class ProductWriter(OpenH5):
         if os.environ.get(COMPRESS_VARIABLE) == "0" or shutil.disk_usage(self._partial.parent).free < size:
             return None
         whole = self._h5["entry"]
-        every = {name: Packing.of(plane) for name, plane in whole["data"].items() if name in self._planes}
+        every = {name: Packing.of(plane) for name, plane in whole["data"].items() if name in self.planes}
         packings = {name: packing for name, packing in every.items() if packing.is_worth_it}
         saved = sum(whole["data"][name].nbytes * (1 - 1 / packing.ratio) for name, packing in packings.items())
         if saved < WORTH_SAVING * size:
@@ -234,7 +236,7 @@ class ProductWriter(OpenH5):
         with h5py.File(path, "w") as h5:
             self._lay_out(h5, create)
             entry = h5["entry"]
-            for name in self._planes:
+            for name in self.planes:
                 if name in packings:
                     pack(whole["data"][name], entry["data"][name], packings[name])
                 else:

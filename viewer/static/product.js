@@ -41,7 +41,9 @@ async function show(fresh) {
 
 const number = v => (v === null ? "-" : Number.isInteger(v) ? String(v) : Math.abs(v) >= 1e4 || Math.abs(v) < 1e-3 ? v.toExponential(3) : v.toFixed(4));
 // Without an error bar, where others of its kind have one, a value may be noise: it must not look certain.
-const withError = (v, errors, k) => number(v) + (!errors || v === null ? "" : ` ± ${errors[k] === null ? "?" : number(errors[k])}`);
+// Noise averages over a region; what the instrument's uncertainty does is the same in all of it.
+const withError = (v, plane, k) => number(v) + [["error", ""], ["systematic", " (instrument)"]].map(([part, told]) =>
+  !plane[part] || v === null ? "" : ` ± ${plane[part][k] === null ? "?" : number(plane[part][k])}${told}`).join("");
 
 async function probe(chosen) {
   region = chosen;
@@ -57,7 +59,7 @@ async function probe(chosen) {
       const line = document.createElement("tr"), head = document.createElement("th"), cell = document.createElement("td");
       head.textContent = plane.name.replaceAll("_", " ");
       head.title = plane.about;
-      cell.textContent = plane.value.map((v, k) => withError(v, plane.error, k)).join(",  ");
+      cell.textContent = plane.value.map((v, k) => withError(v, plane, k)).join(",  ");
       line.append(head, cell);
       return line;
     }));

@@ -1,0 +1,39 @@
+"""Standard uncertainties that an instrument file states of its values, as independent directions of one each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from processing.instrument.elements import number
+from processing.instrument.model import InstrumentModel
+
+
+def value_directions(model: InstrumentModel) -> Iterator[tuple[str, InstrumentModel]]:
+    """What is uncertain, and the model moved by one standard uncertainty of it; of a model at one wavelength.
+
+    Correlated values move together. What `systematic` holds, because `diagnose` fitted it, is left out here.
+    """
+    fitted = model.calibrate if model.systematic else ()
+    stated = {name: number(u) for name, u in model.stderr.items() if number(u) > 0 and name not in fitted}
+    together = [[name for name in c.between if name in stated] for c in model.correlations]
+    for name, u in stated.items():
+        if not any(name in group for group in together):
+            yield f"{name} (u = {u:.3g})", _moved(model, {name: u})
+    for correlation, names in zip(model.correlations, together, strict=True):
+        part = [correlation.between.index(name) for name in names]
+        sigma = np.array([stated[name] for name in names])
+        sizes, directions = np.linalg.eigh(sigma[:, None] * correlation.matrix[np.ix_(part, part)] * sigma)
+        for size, direction in zip(sizes, directions.T, strict=True):
+            if size > 0:
+                shift = dict(zip(names, (np.sqrt(size) * direction).tolist(), strict=True))
+                yield " & ".join(names), _moved(model, shift)
+
+
+def _moved(model: InstrumentModel, shifts: Mapping[str, float]) -> InstrumentModel:
+    values: dict[str, dict[str, float]] = {}
+    for name, shift in shifts.items():
+        place, _, field = name.rpartition(".")
+        values.setdefault(place, {})[field] = number(model.value_of(name) or 0.0) + shift
+    return model.with_values(values)

@@ -1,0 +1,150 @@
+"""Standard uncertainties that an instrument file states reach every number that follows, apart from the noise."""
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from processing.commands.application import app
+from processing.instrument.model import InstrumentModel
+from processing.instrument.states import rotating_retarders
+from processing.instrument.uncertainty import value_directions
+from processing.maps.quantities import quantities_of_mueller
+from processing.maps.xi0 import xi0_of_mueller
+from processing.polarization import mueller
+from processing.reduction.mueller import reduce_mueller
+from processing.storage.capture import Capture
+from processing.storage.product import Product, Step
+from processing.yaml_file import ConfigError, parse_yaml
+
+STEP = Step("test", {})
+ANGLES = dict(rotating_retarders(1.0, 40, 9.0, 4.91).angles_deg)
+#: As a file states them.
+U = {
+    "psg_retarder.retardance_deg": 0.3,
+    "psg_retarder.azimuth_deg": 0.1,
+    "psa_retarder.retardance_deg": 0.3,
+    "psa_retarder.azimuth_deg": 0.1,
+    "analyzer.azimuth_deg": 0.1,
+}
+SAMPLE = (
+    0.55 * mueller.diattenuator(0.4, 1.0, 0.6) @ mueller.retarder(0.9, np.deg2rad(40.0)) @ np.diag([1, 0.7, 0.6, 0.5])
+)
+COUNTS = 1_000_000.0
+TOLD = ("diattenuation_linear", "depolarization_index", "retardance_deg", "polarizance_linear")
+
+
+@pytest.fixture
+def stated(configs, tmp_path):
+    """The RGB950 with standard uncertainties of its values, as a text and as a model at 662 nm."""
+    text = (configs / "instruments/rgb950.yaml").read_text()
+    for name, u in U.items():
+        element, field = name.split(".")
+        at = text.index(field, text.index(f"name: {element}"))
+        end = text.index("}", at)
+        value = text[at:end].rpartition("662: ")[2].split(",")[0]
+        text = text[:at] + text[at:end].replace(f"662: {value}", f"662: {{value: {value}, u: {u}}}") + text[end:]
+    path = tmp_path / "stated.yaml"
+    path.write_text(text)
+    return path
+
+
+def drawn(model, random):
+    values = {}
+    for name, u in U.items():
+        element, _, field = name.rpartition(".")
+        values.setdefault(element, {})[field] = model.value_of(name) + u * random.normal()
+    return model.with_values(values)
+
+
+def products(synthetic_capture, tmp_path, model, truth, random, name="a"):
+    """Mueller image, quantities and xi0 of a sample that another instrument than the model's measured."""
+    light = COUNTS * truth.rows(ANGLES).reshape(-1, 16) @ SAMPLE.reshape(16)
+    frames = np.broadcast_to(light[:, None, None, None], (40, 1, 4, 4)).astype(np.float32)
+    if random is not None:
+        frames = random.poisson(frames).astype(np.float32)
+    detector = {"gain_e_per_count": 1.0, "read_noise_e": 1.0, "black_level_counts": 0.0}
+    path = synthetic_capture(frames, ANGLES, name=f"{name}.h5", detector=detector)
+    paths = [tmp_path / f"{name}.{kind}.h5" for kind in ("mueller", "quantities", "xi0")]
+    with Capture(path) as capture:
+        reduce_mueller(capture, model, paths[0], (STEP,))
+    quantities_of_mueller(paths[0], paths[1], STEP)
+    xi0_of_mueller(paths[0], paths[2], STEP, False, None)
+    return paths
+
+
+def read(paths):
+    found = {}
+    for path, names in zip(paths[1:], (TOLD, ("xi0",)), strict=True):
+        with Product(path) as product:
+            for name in names:
+                ends = product.get(f"{name}_95") if f"{name}_95" in product.names else None
+                systematic = product.get(f"{name}_systematic") if f"{name}_systematic" in product.names else 0.0
+                found[name] = (product.get(name), product.get(f"{name}_errors"), systematic, ends)
+    return found
+
+
+def test_a_file_states_them_with_the_values(stated, configs):
+    plain, model = (InstrumentModel.load(path) for path in (configs / "instruments/rgb950.yaml", stated))
+    assert model.at(662).stderr == U
+    assert model.at(451).stderr == {}
+    assert model.model_copy(update={"stderr": {}}) == plain
+    labels = [label for label, _ in value_directions(model.at(662))]
+    assert "psg_retarder.retardance_deg (u = 0.3)" in labels
+    assert len(labels) == len(U)
+    with pytest.raises(ConfigError, match=r"psg_retarder.retardance_deg.*0 or more"):
+        parse_yaml(stated.read_text().replace("u: 0.3", "u: -0.3"), InstrumentModel)
+
+
+def test_correlated_values_move_together(stated):
+    text = stated.read_text() + (
+        "correlations:\n  - between: [psg_retarder.azimuth_deg, analyzer.azimuth_deg]\n    coefficients: [0.96]\n"
+    )
+    model = parse_yaml(text, InstrumentModel).at(662)
+    moved = [other for label, other in value_directions(model) if "&" in label]
+    off = np.array([[other.value_of(n) - model.value_of(n) for n in model.correlations[0].between] for other in moved])
+    assert off.T @ off == pytest.approx(0.01 * np.array([[1, 0.96], [0.96, 1]]), abs=1e-9)
+
+
+def test_total_intervals_cover_drawn_instruments(stated, synthetic_capture, tmp_path):
+    """30 instruments drawn from the stated uncertainty; noise alone would cover few of them."""
+    random = np.random.default_rng(5)
+    model = InstrumentModel.load(stated).at(662)
+    exact = read(products(synthetic_capture, tmp_path, model, model, None, "exact"))
+    inside, alone, pulls = ({name: [] for name in (*TOLD, "xi0")} for _ in range(3))
+    for k in range(30):
+        found = read(products(synthetic_capture, tmp_path, model, drawn(model, random), random, f"r{k}"))
+        for name, (value, error, systematic, ends) in found.items():
+            off = value - exact[name][0].mean()
+            pulls[name].append(np.square(off / np.hypot(error, systematic)).mean())
+            inside[name].append(((value - off >= ends[0]) & (value - off <= ends[1])).mean())
+            alone[name].append((np.abs(off) < 1.96 * error).mean())
+    for name in pulls:
+        # 30 instruments: the rms of their pulls is known to 13 %, a coverage of 95 % to 4.
+        assert 0.7 < np.sqrt(np.mean(pulls[name])) < 1.4, name
+        assert np.mean(inside[name]) > 0.87, name
+    assert np.mean(alone["diattenuation_linear"]) < 0.7
+
+
+def test_calibrate_writes_what_it_does_not_know(synthetic_capture, configs, tmp_path):
+    """The written file alone makes a systematic error; a second calibration replaces it."""
+    random = np.random.default_rng(2)
+    plain = configs / "instruments/rgb950.yaml"
+    light = 2000 * InstrumentModel.load(plain).at(662).rows(ANGLES).reshape(-1, 16) @ np.eye(4).reshape(16)
+    frames = random.poisson(np.broadcast_to(light[:, None, None, None], (40, 1, 8, 8)) + 100).astype(np.uint16)
+    detector = {"black_level_counts": 100, "bits": 16}
+    air = synthetic_capture(frames, ANGLES, name="air.h5", sample={"kind": "air"}, detector=detector)
+    free, once, twice = "psg_retarder.retardance_deg,psa_retarder.azimuth_deg", tmp_path / "1.yaml", tmp_path / "2.yaml"
+    for start, written in ((plain, once), (once, twice)):
+        command = ["calibrate", str(air), "--instrument", str(start), "--free", free, "--write", str(written)]
+        assert CliRunner().invoke(app, command).exit_code == 0
+    model = InstrumentModel.load(once).at(662)
+    assert set(model.stderr) == set(free.split(","))
+    assert 0.005 < model.stderr["psg_retarder.retardance_deg"] < 0.5
+    assert abs(model.value_of("psg_retarder.retardance_deg") - 127.12) < 4 * model.stderr["psg_retarder.retardance_deg"]
+    again = InstrumentModel.load(twice)
+    assert again.at(662).stderr == model.stderr
+    assert len(again.correlations) == 1
+    paths = products(synthetic_capture, tmp_path, model, model, None)
+    with Product(paths[1]) as product:
+        assert "psg_retarder.retardance_deg" in product.facts["uncertain_in_the_instrument"]
+        assert (product.get("diattenuation_systematic") > 0).all()
