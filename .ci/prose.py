@@ -40,7 +40,6 @@ NOT_YET_REWRITTEN = (
     "docs/testing.md",
     "docs/tutorial-first-capture.md",
     # Diagnosis, error bars, quantities, processing, reflectance, studies.
-    "docs/processing.md",
 )
 
 
