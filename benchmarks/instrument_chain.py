@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,7 @@ from processing.diagnosis.instrument.run import diagnose_captures
 from processing.diagnosis.instrument_file import WriteError, write_instrument
 from processing.instrument.model import InstrumentModel
 from processing.polarization import mueller
-from processing.public_data.conversion import tables_of
+from processing.public_data.conversion import StateTable, mirror_means, tables_of
 from processing.public_data.sets import SHIPPED, find_files
 from processing.steps.reduction import Reduction
 from processing.storage.capture_schema import Detector
@@ -197,19 +197,6 @@ def half_wave_plate(nm: int, files: Mapping[str, Path], folder: Path) -> Row:
     air, plate = (
         next(t for t in tables_of("drr-wollaston-nir", files) if t.name == f"{kind}_{nm}nm") for kind in KINDS
     )
-    file = folder / f"wollaston_{nm}.yaml"
-    file.write_text((INSTRUMENTS / "drr_wollaston.yaml").read_text(encoding="utf-8"), encoding="utf-8")
-    paths = []
-    for table in (air, plate):
-        request = ImportRequest(
-            states=table.write(folder)[0],
-            out=folder / f"{table.name}.h5",
-            wavelength_nm=nm,
-            instrument=file,
-            sample=read_sample(table.sample),
-        )
-        import_capture(request)
-        paths.append(request.out)
     reference = ratio_of_channels(
         *(np.array([row.split(",")[1:] for row in t.rows], dtype=float) for t in (air, plate))
     )
@@ -220,7 +207,43 @@ def half_wave_plate(nm: int, files: Mapping[str, Path], folder: Path) -> Row:
         m = product["mueller"] / product["mueller"][0, 0]
         return min((reference, flip @ reference @ flip), key=lambda one: _rms(one - m))
 
-    return chain(f"drr_wollaston, measured at {nm} nm", *paths, file, truth, "the ratio of the channels")
+    return _measured("drr_wollaston", (air, plate), folder, truth, "the ratio of the channels")
+
+
+def mirror_frames(folder: Path) -> Row:
+    """The chain on measured data: a mirror with one turn of the analyzer, then with the next, as an unknown sample."""
+    table = mirror_means(SHIPPED / "drr-imaging-630nm/roi_stats_630nm.csv")
+    half = len(table.rows) // 2
+    first = replace(table, name="first_turn", rows=table.rows[:half])
+    second = replace(table, name="second_turn", sample="unknown", rows=table.rows[half:])
+    mirror = np.diag([1.0, 1.0, -1.0, -1.0])
+    return _measured("drr_imaging_630nm", (first, second), folder, lambda product: mirror, "a mirror")
+
+
+def _measured(
+    instrument: str,
+    tables: tuple[StateTable, StateTable],
+    folder: Path,
+    truth: Callable[[dict[str, Array]], Array],
+    reference: str,
+) -> Row:
+    """The chain on two captures of public data, the known sample first."""
+    nm = tables[0].wavelength_nm
+    file = folder / f"{instrument}_{nm:g}.yaml"
+    file.write_text((INSTRUMENTS / f"{instrument}.yaml").read_text(encoding="utf-8"), encoding="utf-8")
+    paths = []
+    for table in tables:
+        request = ImportRequest(
+            states=table.write(folder)[0],
+            out=folder / f"{table.name}.h5",
+            wavelength_nm=nm,
+            instrument=file,
+            sample=read_sample(table.sample),
+        )
+        import_capture(request)
+        paths.append(request.out)
+    first, second = paths
+    return chain(f"{instrument}, measured at {nm:g} nm", first, second, file, truth, reference)
 
 
 def ratio_of_channels(air: Array, plate: Array) -> Array:
@@ -327,6 +350,7 @@ def rows(folder: Path) -> Iterator[Row]:
     """All lines of the table."""
     for name in BENCHES:
         yield emulated(name, folder)
+    yield mirror_frames(folder)
     files = find_files("drr-wollaston-nir", [SHIPPED, DATA])
     for nm in MEASURED_NM if files is not None else ():
         yield half_wave_plate(nm, files, folder)

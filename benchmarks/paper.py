@@ -21,14 +21,18 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from paper_study.acquire import QUICK, SHOWN_DEG, Size, parts, take_captures
+from paper_study.figures import deviations
 from paper_study.page import write_page
 from paper_study.process import study_body, study_fault, study_sphere
 
 from processing.campaign.executors import executor
 
 
-def run(work: Path, out: Path, size: Size, pool: Executor) -> None:
-    """Take what is missing, process it and write the page; products of an earlier run are found again."""
+def run(work: Path, out: Path, size: Size, pool: Executor, figure: Path | None = None) -> None:
+    """Take what is missing, process it and write the page; products of an earlier run are found again.
+
+    `figure`: file for the deviations against Omega.
+    """
     seconds: dict[str, float] = {}
     begin = time.perf_counter()
 
@@ -52,6 +56,8 @@ def run(work: Path, out: Path, size: Size, pool: Executor) -> None:
     say("page")
     seconds["in all"] = time.perf_counter() - begin
     write_page(out, size, sphere, body, fault, seconds)
+    if figure is not None:
+        deviations(sphere).figure.savefig(figure, dpi=80)
     say(str(out))
 
 
@@ -60,6 +66,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--work", type=Path, help="folder for captures and products; default: one that is deleted")
     parser.add_argument("--out", type=Path, default=Path("paper.html"), help="the page")
+    parser.add_argument("--figure", type=Path, help="file for the figure of docs/paper-study.md (PNG)")
     parser.add_argument("--workers", type=int, default=2, help="processes that work on captures")
     angles = list(Size().omega_deg)
     parser.add_argument("--omega", type=float, nargs="+", default=angles, help="arm angles, 35 among them")
@@ -75,7 +82,7 @@ def main() -> None:
         size = QUICK
     out = given.out.resolve()
     with tempfile.TemporaryDirectory() as temporary, executor(1 if given.quick else given.workers) as pool:
-        run((given.work or Path(temporary)).resolve(), out, size, pool)
+        run((given.work or Path(temporary)).resolve(), out, size, pool, given.figure)
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ import ast
 import re
 import runpy
 import tomllib
+from fnmatch import fnmatch
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -68,6 +69,22 @@ def cited_outside(text: str) -> list[str]:
         elif heading and not re.search(rf"^#+ .*{re.escape(' '.join(heading.split()))}", file.read_text(), re.M):
             found.append(f'docs/{page}, "{heading}"')
     return found
+
+
+def test_every_picture_is_on_a_page_and_has_its_command():
+    images = ROOT / "docs/images"
+    there = {str(f.relative_to(images)) for ending in ("png", "svg") for f in images.rglob(f"*.{ending}")}
+    pages = "".join(f.read_text(encoding="utf-8") for f in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md")))
+    assert {name for name in there if f"images/{name})" not in pages} == set()
+    table = (ROOT / "docs/testing.md").read_text(encoding="utf-8").split("## Pictures")[1].split("## ")[0]
+    for names, command, run in (line.split("|")[1:4] for line in table.splitlines() if line.startswith("| `")):
+        for pattern in re.findall("`(.+?)`", names):
+            named = {name for name in there if fnmatch(name, pattern)}
+            assert named, pattern
+            there -= named
+        for file in re.findall(r"[\w/]+\.py", command + run):
+            assert list(ROOT.glob(f"tests/*/{file}")) or (ROOT / file).exists(), file
+    assert there == set()
 
 
 @pytest.mark.parametrize("folder", [*PACKAGES, "tests", "benchmarks", "configs", "docs"])

@@ -13,6 +13,7 @@ import logging
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -26,6 +27,8 @@ import pytest
 import serial
 import typer
 from markdown_it import MarkdownIt
+from PIL import Image
+from playwright.sync_api import sync_playwright
 from ruamel.yaml import YAML
 
 from acquisition.campaign.plan import Campaign
@@ -223,6 +226,35 @@ def serve(words: list[str]) -> None:
         finally:
             server.send_signal(signal.SIGINT)
     assert server.returncode in (0, 130), shlex.join(words)
+
+
+@pytest.mark.long
+def test_the_documented_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture) -> None:
+    """The example of closing-the-loop.md ends applied and right, with the rig's own size and seed."""
+    (block,) = (b for b in BLOCKS if b.page.stem == "closing-the-loop" and "report.html" in b.text)
+    shutil.copytree(ROOT / "configs", tmp_path / "configs")
+    monkeypatch.chdir(tmp_path)
+    change, *commands = block.text.replace("\\\n", " ").splitlines()
+    subprocess.run(["bash", "-ec", change], check=True)
+    for line in commands:
+        run(shlex.split(line))
+    out = capfd.readouterr().out
+    assert "SIMULATED data, RGB950: explained\n" in out
+    (cause,) = re.findall(r"^\d\. .*\n.*\n.*", out, re.M)
+    assert cause.startswith("1. beam_wander of psa_retarder (sure")
+    assert cause.endswith("   applied")
+    for name in ("x_cos", "y_sin"):
+        value, error = (float(text) for text in re.search(rf"{name} (\S+) ± (\S+)", cause).groups())
+        assert value == pytest.approx(0.2, abs=3 * error)
+        assert error < 0.01
+    if folder := os.environ.get("UMOV_SCREENSHOTS"):
+        path = Path(folder) / "diagnose_report.png"
+        with sync_playwright() as playwright:
+            browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+            page = browser.new_page(viewport={"width": 1000, "height": 900})
+            page.goto(f"file://{tmp_path}/report.html")
+            page.screenshot(path=path, full_page=True)
+        Image.open(path).convert("RGB").quantize(192).save(path, optimize=True)
 
 
 SLOW_BLOCKS = [

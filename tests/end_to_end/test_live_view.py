@@ -1,4 +1,7 @@
-"""`acquire --live`: the page shows a running capture in a real browser, and its stop button does what Ctrl-C does."""
+"""`acquire --live`: the page shows a running capture in a real browser, and its stop button does what Ctrl-C does.
+
+With UMOV_SCREENSHOTS=FOLDER the picture of README.md is written there.
+"""
 
 import base64
 import contextlib
@@ -110,7 +113,7 @@ def running(small_rig, configs, tmp_path):
 
     Yields process, address and folder.
     """
-    rig = small_rig(clock_speed=1.5, rows=64, columns=320)
+    rig = small_rig(clock_speed=1.5, rows=240, columns=320)
     plan = tmp_path / "long.yaml"
     text = (configs / "plans" / "drr.yaml").read_text()
     assert "states: 40" in text
@@ -172,11 +175,11 @@ def test_page_shows_the_capture_and_its_button_stops_it(running, browser):
     # Nothing came from elsewhere.
     resources = browser.evaluate("performance.getEntriesByType('resource').map(e => e.name).join(' ')")
     assert all(name.startswith("http://127.0.0.1:") for name in resources.split())
-    if path := os.environ.get("UMOV_SCREENSHOT"):
+    if shots := os.environ.get("UMOV_SCREENSHOTS"):
         browser.call("Emulation.setDeviceMetricsOverride", width=1080, height=760, deviceScaleFactor=1, mobile=False)
         browser.wait_for("document.getElementById('bar').value >= 25")
         time.sleep(1)
-        browser.screenshot(path)
+        browser.screenshot(Path(shots) / "live-view.png")
     # An answer that fails once must not take the button away.
     browser.evaluate("document.getElementById('stop').disabled = true")
     browser.wait_for("!document.getElementById('stop').disabled")

@@ -26,6 +26,7 @@ from simulators.blind.real_bench import (
     make_bench,
     read_truth,
 )
+from simulators.blind.reliability_diagram import draw
 from simulators.blind.suite import declared_bench, state_angles
 from simulators.blind.undeclared_captures import Scene, digitize, expose
 
@@ -234,7 +235,7 @@ def test_sentence_about_wiring_has_to_say_what_is_wrong():
     assert wiring_of({"wiring": None}, truth) == wiring_of({}, truth) == ()
 
 
-def test_table_counts_what_is_worse_and_what_is_sure_and_wrong():
+def test_table_counts_what_is_worse_and_what_is_sure_and_wrong(tmp_path):
     good = Judgement(
         "a", "real", "joint", "explained", 2.0, 4e-3, 1e-3, 0.9e-3, {"air": (3e-3, 1e-3)}, 0.95, 0.95, True
     )
@@ -248,3 +249,5 @@ def test_table_counts_what_is_worse_and_what_is_sure_and_wrong():
     (only,) = reliability([good, bad])
     assert (only.count, only.true) == (1, 0.0)
     assert not is_worse(1e-3, 1e-3)
+    draw([good, bad], tmp_path / "reliability.png")
+    assert (tmp_path / "reliability.png").stat().st_size > 5_000

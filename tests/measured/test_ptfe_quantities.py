@@ -4,6 +4,7 @@ import runpy
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -53,6 +54,14 @@ def test_eigenvalues_over_all_geometries(report: SimpleNamespace, table: np.ndar
     # None of this depends on the axes of the file.
     raw = np.concatenate([np.ones((1824, 1)), table[table[:, 0] == um][:, 6:]], axis=1).reshape(-1, 4, 4)
     np.testing.assert_allclose(coherency_eigenvalues(raw), xi, atol=1e-12)
+
+
+def test_the_picture_of_the_page(report: SimpleNamespace, table: np.ndarray, tmp_path: Path) -> None:
+    report.figure(table, tmp_path / "made.png")
+    page = Path(__file__).parents[2] / "docs/images/ptfe_quantities.png"
+    made, shown = (cv2.imread(str(path)).astype(int) for path in (tmp_path / "made.png", page))
+    # Fonts differ a little from one version of the drawing library to the next, curves do not.
+    assert np.abs(made - shown).mean() < 1
 
 
 @pytest.mark.parametrize("um", FOUND)

@@ -271,7 +271,8 @@ def _narrow_and_dark(page: Page, address: str, capture: str) -> None:
         assert fits(page), what
         background = page.evaluate("getComputedStyle(document.body).backgroundColor")
         assert max(int(part) for part in re.findall(r"\d+", background)) < 60
-        keep(page, f"narrow_{(what or 'browse').split('?')[0]}")
+        if what.startswith("capture"):
+            keep(page, "narrow_capture")
     page.keyboard.press("Tab")
     assert page.evaluate("document.activeElement.className") == "skip"
 

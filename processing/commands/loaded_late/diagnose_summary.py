@@ -152,7 +152,7 @@ def _show_details(short: Mapping[str, str], d: Diagnosis) -> None:
         for c in d.correction.combinations:
             _say(short, f"determined together: {_combination(c)}")
         for check in d.correction.checks:
-            _say(short, f"{check.name}: {check.before:.4g} -> {check.after:.4g}")
+            _say(short, f"{check.name}: {' -> '.join(check.shown)}")
     if d.unobservable:
         _say(short, f"cannot be seen with these captures: {', '.join(d.unobservable)}")
 

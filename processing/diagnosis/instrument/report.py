@@ -50,12 +50,15 @@ def write_report(path: Path, judged: Judged, problem: InstrumentProblem) -> None
 
 def _errors(judged: Judged) -> list[list[str]]:
     d = judged.diagnosis
-    floor = "not known" if d.noise_floor_percent is None else f"{d.noise_floor_percent:.4f}"
+    kind = "residual" if d.noise_floor_percent is None else "residual beyond noise"
+    floor = "not known" if d.noise_floor_percent is None else f"{d.noise_floor_percent:.4f} %"
     return [
-        ["", "rms, % of the mean signal", "chi2 / dof"],
-        ["before", f"{d.error_before.rms_percent:.4f}", f"{d.error_before.chi2_reduced:.4g}"],
-        ["after", f"{d.error_after.rms_percent:.4f}", f"{d.error_after.chi2_reduced:.4g}"],
-        ["noise", floor, "1"],
+        ["", kind, "rms of single intensities", "chi2 / dof"],
+        *(
+            [when, error.told, f"{error.rms_percent:.4f} %", f"{error.chi2_reduced:.4f}"]
+            for when, error in (("before", d.error_before), ("after", d.error_after))
+        ),
+        ["noise", "", floor, "1"],
     ]
 
 

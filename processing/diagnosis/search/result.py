@@ -161,6 +161,13 @@ class Check(_Part):
             return f"{self.name}: {100 * self.after:.2g} %, where {100 * CHANCE_WORSE:g} % is the limit"
         return f"{self.name}, from {self.before:.4g} to {self.after:.4g}"
 
+    @property
+    def shown(self) -> tuple[str, str]:
+        """The figures before and after; a chance has its limit instead of a value before."""
+        if self.is_chance:
+            return f"limit {100 * CHANCE_WORSE:g} %", f"{100 * self.after:.2g} %"
+        return f"{self.before:.4g}", f"{self.after:.4g}"
+
 
 class Combination(_Part):
     """Values that are known together: sum of weight times value; `open_by` moves each of them and is not determined.

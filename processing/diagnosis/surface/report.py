@@ -79,7 +79,7 @@ def _checks(d: SurfaceDiagnosis) -> list[list[str]]:
     rows = [["figure", "before", "after", ""]]
     for check in d.correction.checks:
         word = "holds" if check.holds else "gets worse"
-        rows.append([check.name, f"{check.before:.4g}", f"{check.after:.4g}", word])
+        rows.append([check.name, *check.shown, word])
     return rows
 
 
