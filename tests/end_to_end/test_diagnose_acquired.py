@@ -48,18 +48,10 @@ def test_a_rig_as_described_is_consistent(diagnosed, configs, tmp_path, capfd):
     assert "nothing is corrected" in (tmp_path / "new.yaml").read_text().splitlines()[0]
 
 
-@pytest.mark.parametrize(
-    ("fault", "kind", "name", "true"),
-    [
-        ({"kind": "angle_offset", "axis": "psg", "offset_deg": 0.5}, "psg_azimuth", "azimuth", 0.5),
-        # The rim of the sphere moves too: no derivative of the image tells what a shift does there.
-        ({"kind": "image_drift", "axis": "psa", "wedge_pixels": 0.4}, "beam_wander", "x_cos", 0.4),
-    ],
-)
-def test_an_undeclared_fault_is_found(diagnosed, fault, kind, name, true):
-    said = diagnosed([fault])
+def test_an_undeclared_fault_is_found(diagnosed):
+    said = diagnosed([{"kind": "angle_offset", "axis": "psg", "offset_deg": 0.5}])
     assert said["verdict"] == "explained"
     (effect,) = said["effects"]
-    assert effect["kind"] == kind
-    found = effect["parameters"][name]
-    assert found["value"] == pytest.approx(true, abs=3 * found["stderr"])
+    assert effect["kind"] == "psg_azimuth"
+    found = effect["parameters"]["azimuth"]
+    assert found["value"] == pytest.approx(0.5, abs=3 * found["stderr"])

@@ -1,7 +1,7 @@
 """Faults that a newcomer sets on the simulated rig and declares nowhere, by the commands of the documents.
 
-The rig has its 600 x 600 pixels and its default seed. UMOV_SLOW=1 runs all, each also beside a busy loop on every
-core: stamps of frames are late there. Without it only the example of docs/closing-the-loop.md runs.
+The rig has its 600 x 600 pixels and its default seed. Each runs also beside a busy loop on every core, where stamps of
+frames are late. A wedge of 0.2 pixel is the example of docs/closing-the-loop.md (test_docs_blocks.py).
 """
 
 import json

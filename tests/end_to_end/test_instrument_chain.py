@@ -18,6 +18,13 @@ def test_the_next_sample_is_measured_better_or_as_before(name, tmp_path):
 
 
 @pytest.mark.measured
+def test_a_measured_mirror_is_one(tmp_path):
+    row = chain.mirror_frames(tmp_path)
+    assert row.written <= 1.01 * min(row.nominal, row.train)
+    assert row.written < 3 * row.stated
+
+
+@pytest.mark.measured
 @pytest.mark.parametrize("nm", chain.MEASURED_NM)
 def test_a_measured_plate_is_nearer_to_the_ratio_of_its_channels(nm, public_files, tmp_path):
     row = chain.half_wave_plate(nm, public_files("drr-wollaston-nir"), tmp_path)
