@@ -37,27 +37,25 @@ SIDE, PERIOD_S, FLUX = 64, 1.0, 8e5
 EXPOSURE_S = 0.02
 HEAD = """# Effects
 
-Every effect that `diagnose` can find: what causes it, what to do about it, the line that builds it into the simulated
-rig, and the residual that it leaves. [The demo](demo.md) draws its faults from this list, and
-`configs/rigs/faulty.yaml` has them ready to switch on:
+*Reference.* Every effect that `diagnose` can find: its cause, its remedy, the line that builds it into the simulated
+rig, and its residual. `python benchmarks/effects_page.py` makes this page. [The demo](demo.md) draws its faults from
+this list, and `configs/rigs/faulty.yaml` has them ready to switch on:
 
 ```bash
 ./lab acquire --omega 35 --rig configs/rigs/faulty.yaml
 ```
 
-A picture shows what the declared model does not explain, without noise: on the left the mean residual of each state, in
-percent of the mean signal; on the right its rms over the states in each pixel of the sphere and of air, at
-35 and 180 degrees. A residual that is zero on one of them is a fault that this sample cannot show.
-
-This page is made by `python benchmarks/effects_page.py`.
+A picture shows the residual of the declared model, without noise. The plot gives its mean for each state, in percent of
+the mean signal. The maps give its rms over the states in each pixel of the sphere (35 degrees) and of air (180
+degrees). If a map is zero, this sample cannot show the fault.
 
 ## Of the instrument
 """
 SURFACE = """
 ## Of the surface
 
-`diagnose --reflectance` finds these. They are not switches of the rig: the scene and its material and geometry files
-hold them.
+`diagnose --reflectance` finds these. They are not switches of the rig: the scene, its material file and its geometry
+file hold them.
 """
 
 
@@ -107,11 +105,11 @@ def page() -> str:
         parts.append(effect.lines())
         fault = FAULTS.get(effect.kind)
         if fault is None:
-            parts.append("\nThe simulated rig has no fault of this kind.\n")
+            parts.append("\nThe simulated rig does not have it.\n")
             continue
         parts.append(f'\n```yaml title="in a rig file"\nsimulator:\n  effects:\n    - {flow(fault.example())}\n```\n')
         if fault.hidden:
-            parts.append(f"\n{wrapped(f'A capture of the default plan cannot show it: {fault.hidden}.')}\n")
+            parts.append(f"\n{wrapped(f'The default plan cannot show it: {fault.hidden}.')}\n")
         if effect.kind in pictured():
             parts.append(f"\n![Residual of {effect.kind}](images/effects/{effect.kind}.png)\n")
     parts.append(SURFACE)

@@ -248,7 +248,7 @@ FAULTS: Mapping[str, TypicalFault] = {
         4,
         "times the light",
         lambda d: {"kind": "source_level", "factor": d.size},
-        hidden="clipped counts are visible in the frames, and `process reduce` leaves them out",
+        hidden="clipped counts are visible in the frames, and `process reduce` excludes them",
     ),
     "image_drift": TypicalFault(
         0.3,

@@ -39,7 +39,7 @@ class Retardance(RetarderEffect):
 
 
 class Azimuth(RetarderEffect):
-    """The fast axis stands elsewhere than in the model."""
+    """The fast axis differs from the model."""
 
     belongs_to = "mechanics"
 

@@ -1,7 +1,7 @@
-"""The analyzer's polarizer stands elsewhere than the model says.
+"""The azimuth of the analyzer's polarizer differs from the model.
 
 Cause: the polarizer was turned in its cell, or the camera and analyzer were remounted together.
-With an unknown sample it cannot be told from an azimuth error of the analyzer's retarder.
+An unknown sample does not separate it from an azimuth error of the analyzer's retarder.
 Mend: calibrate on air; look through crossed polarizers and note the dark position.
 """
 

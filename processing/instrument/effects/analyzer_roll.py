@@ -1,7 +1,7 @@
-"""The whole analyzer, with the camera or without it, stands turned about the beam.
+"""The whole analyzer, with the camera or without it, is turned about the beam.
 
-Found against a known reflectance (`processing.reflectance.effects.analyzer_roll`), it acts here.
-Cause: camera body or analyzer unit put in askew.
+Found with a known reflectance (`processing.reflectance.effects.analyzer_roll`), it acts here.
+Cause: the camera body or the analyzer unit is mounted at an angle.
 Mend: level it against the source's polarizer with the arm at 180 degrees.
 """
 

@@ -1,7 +1,7 @@
 """The signal changes with the azimuth of a turning analyzer, once and twice per turn.
 
-Cause: once: dirt or wedge of the polarizer. Twice: what follows the analyzer (beam splitter, grating, detector) is
-sensitive to polarization, or the light that comes to it is.
+Cause: once: dirt or wedge of the polarizer. Twice: optics behind the analyzer (beam splitter, grating, detector) are
+sensitive to polarization, or the light that comes to it is polarized.
 Mend: put a depolarizer or a fixed polarizer behind the turning one; or turn the retarder instead of the polarizer.
 """
 

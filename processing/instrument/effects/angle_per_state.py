@@ -2,7 +2,7 @@
 
 Cause: poor repeatability, read-back taken while still moving, missed settling.
 Mend: read the position after the stage is idle, allow it to settle, calibrate with an encoder on the shaft.
-With one known sample, one channel and one throughput it can explain anything, so it is never named there.
+With one known sample, one channel and one throughput it can explain any residual, so it has no name there.
 """
 
 from __future__ import annotations

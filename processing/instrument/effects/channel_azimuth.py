@@ -1,4 +1,4 @@
-"""The polarizers of the channels do not stand at their nominal azimuths.
+"""The azimuths of the channels' polarizers differ from the nominal ones.
 
 Cause: lithography of the micropolarizers turned against the pixel grid, a Wollaston prism or a camera mounted askew.
 Mend: turn a polarizer before the camera and fit each channel's azimuth.

@@ -1,4 +1,4 @@
-"""The detector's answer is not proportional to the light: it bends towards the top of its range.
+"""The detector's response is not proportional to the light: it bends towards the top of its range.
 
 Cause: the well capacitance changes with charge, the amplifier saturates softly, a camera's "gamma" is on.
 Mend: measure signal against exposure time at constant light, stay below about 70 % of full well, correct the counts.

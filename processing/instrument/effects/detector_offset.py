@@ -1,7 +1,7 @@
-"""A constant is left in the counts after the dark was subtracted, or too much was subtracted.
+"""The counts contain a constant after the dark is subtracted, or too much is subtracted.
 
 Cause: no dark frames, dark frames at another exposure, gain or temperature, a black level that moved.
-Under an unknown sample it looks like depolarization and cannot be told from stray light of a uniform image.
+Under an unknown sample it looks like depolarization, and like stray light of a uniform image.
 Mend: take dark states with the same exposure before and after; fix the black level in the camera.
 """
 

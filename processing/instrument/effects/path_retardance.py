@@ -1,7 +1,7 @@
-"""Between generator and analyzer there is linear retardance that the model, or the stated sample, does not have.
+"""A linear retardance between generator and analyzer is missing in the model, or in the stated sample.
 
-Cause: a window, beam splitter or lens under stress; a mirror that is met at an angle; strain in the cell.
-An unknown sample takes it up altogether: it is seen with air, a mirror or another known sample only.
+Cause: a window, beam splitter or lens under stress; a mirror at an angle; strain in the cell. An unknown sample
+absorbs it: only air, a mirror or another known sample shows it.
 Mend: look between crossed polarizers for the strained part; put the element's Mueller matrix into the train.
 """
 

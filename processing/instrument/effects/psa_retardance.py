@@ -1,7 +1,7 @@
 """The retardance of the analyzer's retarder differs from the model.
 
 Cause: temperature (about 0.1 degree a kelvin for thick quartz), a wavelength that is not the nominal one, tilt, a
-catalogue value used in place of a calibrated one. It cannot be seen with an unknown sample.
+catalogue value instead of a calibrated one. An unknown sample hides it.
 Mend: calibrate on air (`process calibrate`) at the temperature of the measurement; check the source's wavelength.
 """
 

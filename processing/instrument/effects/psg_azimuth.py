@@ -1,4 +1,4 @@
-"""The fast axis of the generator's retarder stands elsewhere than the model says.
+"""The fast axis of the generator's retarder differs from the model.
 
 Cause: the mount's zero moved (homed anew, belt or set screw slipped between sessions), the element was taken out.
 Mend: home the axis, then calibrate its zero on air; mark the element's orientation in its cell.

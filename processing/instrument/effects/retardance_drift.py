@@ -1,4 +1,4 @@
-"""A retarder's retardance changes during the capture; at the first state it is as the model has it.
+"""A retarder's retardance changes during the capture; at the first state it is that of the model.
 
 Cause: the plate warms up (motor, lamp, room), a liquid-crystal cell or a stressed mount settles.
 Mend: let it settle before the first state, keep lamp and motor away from the plate, use an athermal pair.

@@ -1,6 +1,6 @@
 """A retarder's retardance changes as it turns, up and down once per turn.
 
-Cause: the beam meets a wedged plate, or one whose halves are cemented under a wedge, beside the axis of rotation; or
+Cause: the beam meets a wedged plate, or one with halves cemented under a wedge, off the axis of rotation. Or
 plate and beam are both tilted to the axis.
 Mend: centre the plate on the beam and set both along the axis; use a true zero-order plate, which tilt changes least.
 """

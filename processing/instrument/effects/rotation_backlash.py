@@ -1,6 +1,6 @@
-"""The axis stands behind its reading by a fixed angle whose sign follows the last direction of turning.
+"""The axis lags behind its reading by a fixed angle whose sign follows the last direction of turning.
 
-Cause: play in worm, gear or belt. It needs states that were reached from both sides; else it is an azimuth error.
+Cause: play in worm, gear or belt. It needs states that are reached from both sides; otherwise it is an azimuth error.
 Mend: approach every position from the same side (most controllers have a setting), or take the encoder on the shaft.
 """
 

@@ -1,4 +1,4 @@
-"""An axis stands a little beside its reading, in a way that repeats once and twice per turn.
+"""An axis differs from its reading by an error that repeats once and twice per turn.
 
 Cause: the encoder's scale or the worm wheel sits eccentric on the shaft (once), is oval or tilted (twice).
 Mend: map the error with a second encoder or on air, and write the correction into the controller or the model.

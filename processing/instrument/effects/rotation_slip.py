@@ -1,8 +1,8 @@
-"""From one state on, an axis stands off by a fixed angle.
+"""From one state on, an axis is off by a fixed angle.
 
-Cause: lost steps (stall, too much acceleration), a set screw that let go, somebody touched the mount.
+Cause: lost steps (stall, too much acceleration), a loose set screw, a person touched the mount.
 Mend: lower speed and acceleration, tighten, home and repeat the capture from that state.
-The state is searched for: its place is written AXIS@STATE, the first state that is off (counted from 0).
+The diagnosis finds the state: its place is AXIS@STATE, the first state that is off (counted from 0).
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Pixels are clipped at the top of the range in some states.
 
 Cause: too long an exposure for the brightest state, a glint.
-Mend: shorten the exposure or bracket it. What was clipped
-cannot be brought back: the correction leaves those pixels out.
+Mend: shorten the exposure or bracket it. Clipped counts cannot be recovered: the correction excludes those pixels.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The source has another level in every state.
+"""The level of the source differs from state to state.
 
 Cause: mode hopping or pump noise of the source, arc wander, an exposure short against the lamp's ripple, a shutter
 that does not repeat.

@@ -1,7 +1,7 @@
-"""The source stands at another level in each run that took states of one capture.
+"""The level of the source differs between the runs that took states of one capture.
 
-Cause: a capture that was interrupted and gone on with: the lamp was switched off between, or went on warming up.
-Mend: let the source warm up again before going on, or take the capture anew.
+Cause: a capture was interrupted and resumed: the lamp was off in between, or continued to warm up.
+Mend: let the source warm up again before you resume, or take the capture anew.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Light reaches the detector without passing the polarization optics, the same in every state.
 
 Cause: a reflection past the analyzer, room light, a leaking housing, veiling glare of the lens.
-A constant is within the column space of W: an unknown sample takes it up.
+A constant is within the column space of W: an unknown sample absorbs it.
 Mend: baffle; measure with the beam blocked before the generator and subtract that as dark.
 """
 

@@ -1,7 +1,7 @@
 """The stored counts are a power of the light: counts / full scale = (light / full scale)^(1 / gamma).
 
 Cause: a camera or file format with gamma correction (8-bit pictures usually have one), a "contrast" setting.
-Mend: turn gamma off, store raw counts; else invert the curve before anything else.
+Mend: turn gamma off, store raw counts; otherwise invert the curve first.
 """
 
 from __future__ import annotations

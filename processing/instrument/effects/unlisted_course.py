@@ -1,6 +1,6 @@
 """A fault of one capture that has no name, as a sentence: a quantity of an element that follows the time.
 
-Cause: not known; the sentence says where it is and what it follows.
+Cause: not known; the sentence gives its site and its course.
 Mend: look at the element that the sentence names; take the capture again.
 """
 

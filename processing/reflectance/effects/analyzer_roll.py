@@ -1,8 +1,8 @@
-"""The whole analyzer, with the camera or without it, stands turned about the beam.
+"""The whole analyzer, with the camera or without it, is turned about the beam.
 
-Cause: camera body or analyzer unit put in askew; the polarization camera's mount is not level.
-Mend: level it against the source's polarizer with the arm at 180 degrees, or on a sphere seen near Omega 0, whose
-pattern of polarization is symmetric about the horizontal line.
+Cause: the camera body or the analyzer unit is mounted at an angle; the polarization camera's mount is not level.
+Mend: level it against the source's polarizer with the arm at 180 degrees. Or use a sphere near Omega 0: its pattern of
+polarization is symmetric about the horizontal line.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The source's arm stands beside its reading.
+"""The angle of the source's arm differs from its reading.
 
 Cause: the arm was homed against another stop, its zero was never checked at 180 degrees.
 Mend: look straight through without sample and set the zero where the image of the source is centred.

@@ -1,4 +1,4 @@
-"""The polarization of the illumination is turned against the axes that the model takes.
+"""The polarization of the illumination is turned against the axes of the model.
 
 Cause: polarizer of the source not horizontal, arm or source rolled about the beam.
 Mend: level the source's polarizer against the camera's with the arm at 180 degrees.

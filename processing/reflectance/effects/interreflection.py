@@ -1,7 +1,7 @@
 """Some of the light met two facets, or the object and its support, before it reached the camera.
 
 Cause: rough or concave surfaces, a bright holder or table near the object.
-Mend: black cloth around the object, a thin pin as support; leave concave parts out of the fit.
+Mend: black cloth around the object, a thin pin as support; exclude concave parts from the fit.
 """
 
 from __future__ import annotations

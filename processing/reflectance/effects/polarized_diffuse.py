@@ -1,7 +1,7 @@
 """The surface also reflects diffusely with some polarization, which first-surface reflection alone does not have.
 
-Cause: light that entered, scattered and left again is partly polarized by the last refraction (paper, Sec. III-C).
-Mend: use a `polarized_diffuse` material in place of `first_surface`; fit its a and b at several geometries.
+Cause: light that enters, scatters and emerges is partly polarized by the last refraction (paper, Sec. III-C).
+Mend: use a `polarized_diffuse` material instead of `first_surface`; fit its a and b at several geometries.
 """
 
 from __future__ import annotations

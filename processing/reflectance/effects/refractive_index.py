@@ -1,4 +1,4 @@
-"""The surface's refractive index is not the one of the material file.
+"""The surface's refractive index differs from the material file.
 
 Cause: an index from a table for another batch, wavelength, paint or finish; an oxide or an oil film.
 Mend: fit it (`process fit-material`), or measure it on a polished piece with an ellipsometer.

@@ -1,4 +1,4 @@
-"""The object stands elsewhere in the image than the geometry says, so every normal is off.
+"""The place of the object in the image differs from the geometry, so every normal is wrong.
 
 Cause: sphere centre or mesh pose from another session, camera nudged, wrong pixel scale.
 Mend: register again on the outline (`process geometry`), put the object back on its pin.
