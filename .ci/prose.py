@@ -26,17 +26,11 @@ NOT_YET_REWRITTEN = (
     "CHANGELOG.md",
     "CONTRIBUTING.md",
     "README.md",
-    "docs/adding-a-driver.md",
     "docs/api.md",
     "docs/architecture.md",
-    "docs/at-the-bench.md",
     "docs/bluesky.md",
-    "docs/capture-format.md",
     "docs/decisions.md",
-    "docs/devices.md",
     "docs/index.md",
-    "docs/other-tools.md",
-    "docs/testing.md",
     "docs/tutorial-first-capture.md",
     # Diagnosis, error bars, quantities, processing, reflectance, studies.
 )
