@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from processing.commands.batch import Made, files_of, run_batch
+from processing.commands.recipe import keep_recipe, read_recipe
+
+
+class AngleUnit(StrEnum):
+    """Units of the angles of other labs."""
+
+    degrees = "degrees"
+    radians = "radians"
 
 
 def register(app: typer.Typer) -> None:
@@ -17,17 +26,32 @@ def register(app: typer.Typer) -> None:
 
 
 def import_command(
+    context: typer.Context,
+    wavelength_nm: Annotated[float, typer.Option(help="Wavelength of the measurement.")],
     states: Annotated[
-        Path,
+        Path | None,
         typer.Option(
             help="CSV: state, a column <axis>_deg for each axis; optional time_s, exposure_s, sigma, role, file, "
             "channel_<name>."
         ),
-    ],
-    wavelength_nm: Annotated[float, typer.Option(help="Wavelength of the measurement.")],
-    stack: Annotated[
-        str | None, typer.Option(help="All frames in one file: .npy, AxoStep's .rmmd, or HDF5 as FILE::/dataset.")
     ] = None,
+    columns: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=COLUMN",
+            help="Where the numbers of NAME (an axis, file, time_s ...) are: a column of the CSV, or an array such as "
+            "FILE.h5::/angles[0]. Repeat for each. Other columns are then ignored.",
+        ),
+    ] = None,
+    angles: Annotated[AngleUnit | None, typer.Option(help="Unit of the angles.")] = None,
+    stack: Annotated[
+        str | None,
+        typer.Option(
+            help="All frames: .npy, AxoStep's .rmmd, FILE.mat::NAME, HDF5 as FILE::/dataset, a folder, or a pattern "
+            "such as 'run/*.tif' (frame 2 before frame 10)."
+        ),
+    ] = None,
+    darks: Annotated[str | None, typer.Option(help="Dark frames, given as --stack.")] = None,
     instrument: Annotated[Path | None, typer.Option(help="Instrument file (YAML).")] = None,
     sample: Annotated[
         str, typer.Option(help="air, mirror, unknown, or a file with 16 numbers (row-major).")
@@ -42,20 +66,37 @@ def import_command(
     title: Annotated[str, typer.Option(help="Title to keep in the file.")] = "",
     out: Annotated[Path | None, typer.Option(help="Capture to write; default: states file's name with .h5.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a capture of that name.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print the states as understood, draw the frames, write no capture.")
+    ] = False,
+    recipe: Annotated[
+        Path | None,
+        typer.Option(
+            is_eager=True,
+            callback=read_recipe,
+            help="YAML file with the options of an earlier import; an option given here wins.",
+        ),
+    ] = None,
 ) -> None:
-    """Make a capture out of frames or fluxes measured elsewhere. One row of states.csv is one state."""
+    """Make a capture out of frames or fluxes measured elsewhere. One row of states.csv is one state.
+
+    The options are kept beside the capture in NAME.import.yaml, for `--recipe`.
+    """
+    from processing.commands.loaded_late.import_preview import show_understood
     from processing.commands.progress_bar import progress_bar
     from processing.storage.capture_schema import Detector
+    from processing.storage.foreign_arrays import ImportFailed
     from processing.storage.importing import ImportRequest, import_capture, read_sample
-    from processing.storage.state_csv import ImportFailed
 
     if gain_e_per_count is not None and gain_e_per_count <= 0:
         raise ImportFailed(f"--gain-e-per-count {gain_e_per_count:g}: must be above 0")
     if read_noise_e is not None and read_noise_e < 0:
         raise ImportFailed(f"--read-noise-e {read_noise_e:g}: must not be negative")
+    named = dict(_name_and_column(text) for text in columns or ())
+    first = states or Path(next((t.partition("::")[0] for t in named.values() if "::" in t), stack or "imported"))
     request = ImportRequest(
         states=states,
-        out=out or states.with_suffix(".h5"),
+        out=out or first.with_suffix(".h5"),
         wavelength_nm=wavelength_nm,
         stack=stack,
         instrument=instrument,
@@ -66,10 +107,25 @@ def import_command(
         omega_deg=omega_deg,
         title=title,
         overwrite=overwrite,
+        columns=named,
+        angles=angles.value if angles else None,
+        darks=darks,
     )
+    if dry_run:
+        show_understood(request)
+        return
     with progress_bar("importing", "states") as tick:
-        header = import_capture(request, tick, lambda text: typer.echo(f"warning: {text}", err=True))
+        header = import_capture(request, tick)
+    recipe_file = keep_recipe(context, request.out)
     typer.echo(f"{request.out}: {header.title}, {header.wavelength_nm:g} nm, sample {header.sample.kind}")
+    typer.echo(f"recipe: {recipe_file}")
+
+
+def _name_and_column(text: str) -> tuple[str, str]:
+    name, equals, column = text.partition("=")
+    if not (equals and name and column):
+        raise typer.BadParameter(f"{text!r}: write NAME=COLUMN, as psg='angle (deg)'", param_hint="--columns")
+    return name.strip(), column.strip()
 
 
 def colours_command(

@@ -1,28 +1,40 @@
-"""Numbers of another lab that are probably not in the units that are asked for: nothing later would notice."""
+"""Refuse numbers of another lab that are probably in another unit: no later step would notice."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
+from processing.storage.foreign_arrays import ImportFailed
 from processing.storage.state_csv import StatesFile
 
-#: An axis whose angles lie in a range of 2 pi or less, in steps of less than this, was hardly meant in degrees.
+#: An axis whose angles lie in a range of 2 pi or less, in steps below this, is hardly in degrees.
 STEP_DEG = 1.0
 #: No polarimeter of plates and polarizers works outside these wavelengths, far ultraviolet to terahertz.
 WAVELENGTHS_NM = (100.0, 3e6)
+#: Nanometres in other units of length.
+_UNITS = {"micrometres": 1e3, "metres": 1e9, "angstrom": 0.1}
 
 
-def doubtful_units(states: StatesFile, wavelength_nm: float) -> Iterator[str]:
-    """Say which axes look as if they were in radians, and whether the wavelength is hardly in nm."""
+def require_degrees(states: StatesFile) -> None:
+    """Raise ImportFailed where the angles of an axis are probably in radians."""
     for name, angles in states.angles_deg.items():
         known = np.unique(angles[np.isfinite(angles)])
         if known.size > 2 and known[-1] - known[0] <= 2 * np.pi and np.diff(known).max() < STEP_DEG:
-            yield (
-                f"axis {name} turns by {known[-1] - known[0]:.3g} degrees in all. Are its angles in radians? "
-                f"{states.path.name} gives degrees"
+            raise ImportFailed(
+                f"{states.path}: axis {name} turns by {known[-1] - known[0]:.3g} degrees in all, in steps below "
+                f"{STEP_DEG:g}. These angles are probably in radians. Add --angles radians, or --angles degrees"
             )
+
+
+def require_nm(wavelength_nm: float) -> None:
+    """Raise ImportFailed where a wavelength is probably in another unit than nanometres."""
     low, high = WAVELENGTHS_NM
-    if not low <= wavelength_nm <= high:
-        yield f"a wavelength of {wavelength_nm:g} nm. Is it in another unit?"
+    if low <= wavelength_nm <= high:
+        return
+    readings = [
+        f"in {unit} it is --wavelength-nm {wavelength_nm * nm:g}"
+        for unit, nm in _UNITS.items()
+        if low <= wavelength_nm * nm <= high
+    ]
+    hint = "; ".join(readings) or "give nanometres"
+    raise ImportFailed(f"--wavelength-nm {wavelength_nm:g}: outside {low:g} to {high:g} nm; {hint}")

@@ -1,18 +1,17 @@
-"""The doors for frames from elsewhere: pictures, and stacks in one .npy or HDF5 file."""
+"""The doors for frames from elsewhere: pictures, and stacks in one file."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.doors import MOST_PIXELS, one_line, require_file, require_picture
 from processing.storage.axostep import read_rmmd
-from processing.storage.h5_door import damage_as, open_h5, read_npy, require_dataset
-from processing.storage.state_csv import ImportFailed
+from processing.storage.foreign_arrays import ImportFailed, open_array, states_first
+from processing.storage.h5_door import damage_as, read_npy
 
 
 def read_frame(file: Path) -> NDArray[Any]:
@@ -51,19 +50,13 @@ def open_stack(text: str, states: int) -> Any:
 
     Parameters
     ----------
-    text : FILE.npy, FILE.rmmd, or HDF5 as FILE::/path/to/dataset.
+    text : FILE.npy, FILE.rmmd, FILE.mat::NAME, or HDF5 as FILE::/path/to/dataset.
     """
-    name, _, inside = text.partition("::")
-    file = Path(name)
-    with damage_as(ImportFailed, f"{text}: cannot be read as .npy or HDF5 (write HDF5 as FILE::/path/to/dataset)"):
-        require_file(file, ImportFailed)
-        if name.endswith(".rmmd"):
-            return read_rmmd(file).states(states)
-        if name.endswith(".npy"):
-            return read_npy(file, ImportFailed)
-        h5 = open_h5(file, ImportFailed)
-        inside = inside or _only_stack(h5, name)
-        return require_dataset(h5, inside, (None,) * getattr(h5.get(inside), "ndim", 3), "uif")
+    if text.endswith(".rmmd"):
+        with damage_as(ImportFailed, f"{text}: cannot be read"):
+            require_file(Path(text), ImportFailed)
+            return read_rmmd(Path(text)).states(states)
+    return states_first(open_array(text), states)
 
 
 def check_stack(text: str, stack: Any, states: int, channels: int) -> None:
@@ -76,12 +69,3 @@ def check_stack(text: str, stack: Any, states: int, channels: int) -> None:
         raise ImportFailed(f"{text}: holds {stack.dtype}; frames are integers or floating numbers.")
     if not 0 < shape[-2] * shape[-1] <= MOST_PIXELS:
         raise ImportFailed(f"{text}: frames of {shape[-2]} x {shape[-1]} pixels; 1 to {MOST_PIXELS:,} pixels are read")
-
-
-def _only_stack(h5: h5py.File, file: str) -> str:
-    found: list[str] = []
-    h5.visititems(lambda name, item: found.append(name) if isinstance(item, h5py.Dataset) and item.ndim >= 3 else None)
-    if len(found) != 1:
-        shown = ", ".join(found) or "none"
-        raise ImportFailed(f"{file}: datasets with three or four dimensions: {shown}. Say which: --stack {file}::/NAME")
-    return found[0]

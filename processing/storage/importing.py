@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
-from itertools import islice
+from itertools import chain, islice
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import h5py
 import numpy as np
@@ -22,11 +22,12 @@ from processing.doors import one_line, read_text, require_place, require_room
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture_schema import CaptureHeader, Detector, Sample, create_layout, write_closing
 from processing.storage.checksums import row_crc32, write_checksums
-from processing.storage.doubtful_units import doubtful_units
+from processing.storage.doubtful_units import require_degrees, require_nm
+from processing.storage.foreign_arrays import ImportFailed, frame_files
 from processing.storage.frame_files import check_stack, open_stack, read_frame
 from processing.storage.h5_door import read_npy
 from processing.storage.nexus import attach
-from processing.storage.state_csv import ImportFailed, StatesFile, read_states
+from processing.storage.state_csv import StatesFile, read_states
 
 #: Called with (states done, states in all).
 Progress = Callable[[int, int], None]
@@ -51,7 +52,7 @@ class FrameSource:
 class ImportRequest:
     """What `process import` was asked for; see its help."""
 
-    states: Path
+    states: Path | None
     out: Path
     wavelength_nm: float
     stack: str | None = None
@@ -61,35 +62,61 @@ class ImportRequest:
     omega_deg: float | None = None
     title: str = ""
     overwrite: bool = False
+    columns: dict[str, str] = field(default_factory=dict)
+    angles: Literal["degrees", "radians"] | None = None
+    darks: str | None = None
 
 
-def import_capture(
-    request: ImportRequest, progress: Progress | None = None, warn: Callable[[str], None] | None = None
-) -> CaptureHeader:
-    """Write a capture file from states.csv and its frames; returns the header that was written.
+@dataclass(frozen=True)
+class Understood:
+    """States and frames as they were read, before anything is written."""
 
-    `warn` is told what looks like numbers in other units than are asked for.
+    states: StatesFile
+    source: FrameSource
+    model: InstrumentModel | None
+
+
+def understand(request: ImportRequest) -> Understood:
+    """Read the states, and find their frames.
 
     Raises
     ------
-    ProcessError : the states file, a frame or the stack cannot be used, or the capture exists already.
+    ProcessError : the states file, a frame or the stack cannot be used, or a number is probably in another unit.
     ConfigError, WavelengthError : the instrument file cannot be used.
     """
-    require_place(request.out, request.overwrite, captures_too=True)
+    require_nm(request.wavelength_nm)
     model = None
     if request.instrument is not None:
         model = InstrumentModel.load(request.instrument)
         model.at(request.wavelength_nm)
-    states = read_states(request.states, model.axes if model else ())
-    for doubt in doubtful_units(states, request.wavelength_nm):
-        if warn is not None:
-            warn(doubt)
+    states = read_states(request.states, model.axes if model else (), request.columns, request.angles == "radians")
+    if request.angles is None:
+        require_degrees(states)
+    if request.stack is not None and states.files is None and (files := frame_files(request.stack)) is not None:
+        if len(files) != len(states):
+            raise ImportFailed(f"{request.stack}: {len(files)} frames for {len(states)} states of {states.path}")
+        states, request = replace(states, files=files), replace(request, stack=None)
     source = _source(request, states, model)
+    if request.darks is not None:
+        states, source = _with_darks(request.darks, states, source)
+    return Understood(states, source, model)
+
+
+def import_capture(request: ImportRequest, progress: Progress | None = None) -> CaptureHeader:
+    """Write a capture file from states and their frames; returns the header that was written.
+
+    Raises
+    ------
+    ProcessError, ConfigError, WavelengthError : as `understand`, or the capture exists already.
+    """
+    require_place(request.out, request.overwrite, captures_too=True)
+    understood = understand(request)
+    states, source, model = understood.states, understood.source, understood.model
     detector = request.detector
     if detector.bits is None and source.dtype.kind == "u":
         detector = detector.model_copy(update={"bits": 8 * source.dtype.itemsize})
     header = CaptureHeader(
-        title=request.title or one_line(f"imported from {request.states.resolve().parent.name}/{request.states.name}"),
+        title=request.title or one_line(f"imported from {states.path.resolve().parent.name}/{states.path.name}"),
         simulated=False,
         mode="import",
         wavelength_nm=request.wavelength_nm,
@@ -214,6 +241,42 @@ def _images(states: StatesFile, names: tuple[str, ...]) -> FrameSource:
                 yield frame
 
     return FrameSource((1, *first.shape), first.dtype, frames, names)
+
+
+def _with_darks(text: str, states: StatesFile, source: FrameSource) -> tuple[StatesFile, FrameSource]:
+    """The states, and after them the dark frames of another file or folder."""
+    exposures = states.exposure_s
+    if exposures is not None and np.ptp(exposures) > 0:
+        raise ImportFailed(f"--darks {text}: the states have several exposures; give darks their own rows in the CSV")
+    files = frame_files(text)
+    if files is not None:
+        darks = [read_frame(f)[None] for f in files]
+    else:
+        stack = open_stack(text, -1)
+        stack = stack[...][None] if len(stack.shape) == 2 else stack
+        check_stack(text, stack, stack.shape[0], source.shape[0])
+        darks = [np.asarray(s).reshape(source.shape[0], *stack.shape[-2:]) for s in stack]
+    number = len(darks)
+    if any(d.shape != source.shape or d.dtype != source.dtype for d in darks):
+        raise ImportFailed(
+            f"--darks {text}: {_kind(darks[0][0])}, but a frame of the sample is {source.shape[2]} x {source.shape[1]} "
+            f"{source.dtype}; all must be alike."
+        )
+
+    def longer(values: NDArray[np.float64] | None, by: float) -> NDArray[np.float64] | None:
+        return None if values is None else np.append(values, np.full(number, by))
+
+    extended = replace(
+        states,
+        line=states.line + states.line[-1:] * number,
+        role=states.role + ("dark",) * number,
+        angles_deg={axis: np.append(values, np.full(number, np.nan)) for axis, values in states.angles_deg.items()},
+        time_s=longer(states.time_s, np.nan),
+        exposure_s=longer(exposures, float("nan") if exposures is None else float(exposures[0])),
+        sigma=longer(states.sigma, float("nan") if states.sigma is None else float(states.sigma.mean())),
+    )
+    frames = source.frames
+    return extended, replace(source, frames=lambda: chain(frames(), darks))
 
 
 def _kind(image: Frame) -> str:

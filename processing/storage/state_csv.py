@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.doors import one_line, read_text
-from processing.errors import ProcessError
 from processing.storage.capture_schema import NOT_AXES
+from processing.storage.foreign_arrays import ImportFailed, is_array, read_column
 
 ROLES = ("sample", "air", "dark", "flat")
 CHANNEL_PREFIX = "channel_"
@@ -30,8 +30,8 @@ MOST_COLUMNS = 200
 MOST_STATES = 100_000
 
 
-class ImportFailed(ProcessError):
-    """Data measured elsewhere cannot be made into a capture."""
+#: Line number and cells.
+Row = tuple[int, list[str]]
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,10 @@ class StatesFile:
         return len(self.role)
 
 
-def read_states(path: Path, axes: Sequence[str]) -> StatesFile:
-    """Read a states file (CSV with a header line).
+def read_states(
+    path: Path | None, axes: Sequence[str], columns: Mapping[str, str] | None = None, radians: bool = False
+) -> StatesFile:
+    """Read a states file (CSV with a header line), arrays with a number a state, or both.
 
     Columns are apart by commas, semicolons or tabs, as the header has them. Beside semicolons numbers may have decimal
     commas; then none has a point.
@@ -75,12 +77,21 @@ def read_states(path: Path, axes: Sequence[str]) -> StatesFile:
     axes : names that must have a column (the instrument's axes), with or without a suffix `_deg`; any other column
         with that suffix is an axis too. Else there are `state`, `role`, `time_s`, `exposure_s`, `sigma`, `file` and
         `channel_<name>`, and no others.
+    columns : where the numbers of a name stand: a header of the file, or an array in another file (`FILE::NAME`). With
+        it other columns of the file are not read, and states without a number are in the order of the rows.
+    radians : whether angles are given in radians.
 
     Raises
     ------
     ImportFailed : not readable, a column is missing, unknown or given twice, a number is none, a state is repeated.
     """
-    header, rows, delimiter = _table(path)
+    mapping = {_axis_name(name): text for name, text in (columns or {}).items()}
+    arrays = {name: read_column(text) for name, text in mapping.items() if is_array(text)}
+    header, rows, delimiter = _table(path) if path is not None else _no_table(arrays)
+    path = path or Path(next(iter(mapping.values())).partition("::")[0])
+    if mapping:
+        header, rows = _mapped(path, header, rows, {n: t for n, t in mapping.items() if n not in arrays}, axes)
+        header, rows = _with_arrays(path, header, rows, arrays)
     names = [_axis_name(h) for h in header]
     _check_names(path, names)
     twice = sorted({n for n in names if names.count(n) > 1})
@@ -98,25 +109,28 @@ def read_states(path: Path, axes: Sequence[str]) -> StatesFile:
             f"{path}:1: unknown column {', '.join(unknown)}. An axis is called <axis>_deg; else there are "
             f"{', '.join(KNOWN)} and {CHANNEL_PREFIX}<name>."
         )
-    columns = {name: [row[k] for _, row in rows] for k, name in enumerate(names)}
+    texts_of = {name: [row[k] for _, row in rows] for k, name in enumerate(names)}
     lines = [line for line, _ in rows]
-    order = _order(path, lines, columns["state"])
+    order = _order(path, lines, texts_of["state"])
     lines = [lines[k] for k in order]
-    columns = {name: [values[k] for k in order] for name, values in columns.items()}
-    role = _roles(path, lines, columns)
-    cells = {n: columns[n] for n in names if n not in ("state", "role", "file")}
+    texts_of = {name: [values[k] for k in order] for name, values in texts_of.items()}
+    role = _roles(path, lines, texts_of)
+    cells = {n: texts_of[n] for n in names if n not in ("state", "role", "file")}
     decimal_commas = delimiter == ";" and any("," in text for texts in cells.values() for text in texts)
     numbers = {n: _numbers(path, lines, n, texts, role, decimal_commas) for n, texts in cells.items()}
-    files = _files(path, lines, columns["file"]) if "file" in columns else None
+    turned = [n for n in names if n not in KNOWN and not n.startswith(CHANNEL_PREFIX)]
+    if radians:
+        numbers.update({n: np.rad2deg(numbers[n]) for n in turned})
+    files = _files(path, lines, texts_of["file"]) if "file" in texts_of else None
     _check_above_zero(path, lines, "sigma", numbers.get("sigma"))
     _check_above_zero(path, lines, "exposure_s", numbers.get("exposure_s"))
-    _check_angles(path, lines, [n for n in names if n not in KNOWN and not n.startswith(CHANNEL_PREFIX)], numbers)
+    _check_angles(path, lines, turned, numbers)
     if set(role) <= {"dark"}:
         raise ImportFailed(f"{path}: every state is dark; give the role of those with light in the column role")
     return StatesFile(
         path=path,
         line=tuple(lines),
-        angles_deg={n: v for n, v in numbers.items() if n not in KNOWN and not n.startswith(CHANNEL_PREFIX)},
+        angles_deg={n: numbers[n] for n in turned},
         role=role,
         time_s=numbers.get("time_s"),
         exposure_s=numbers.get("exposure_s"),
@@ -126,7 +140,46 @@ def read_states(path: Path, axes: Sequence[str]) -> StatesFile:
     )
 
 
-def _table(path: Path) -> tuple[list[str], list[tuple[int, list[str]]], str]:
+def _no_table(arrays: Mapping[str, NDArray[np.float64]]) -> tuple[list[str], list[Row], str]:
+    """Rows without columns, one for each number of the first array."""
+    if not arrays:
+        raise ImportFailed("no states: give --states FILE.csv, or the angles of each axis as --columns AXIS=FILE::NAME")
+    return [], [(k + 1, []) for k in range(len(next(iter(arrays.values()))))], ","
+
+
+def _mapped(
+    path: Path, header: list[str], rows: list[Row], mapping: Mapping[str, str], axes: Sequence[str]
+) -> tuple[list[str], list[Row]]:
+    """The columns that have a name here: by the mapping, or already in the file."""
+    absent = [text for text in mapping.values() if text not in header]
+    if absent:
+        raise ImportFailed(f"{path}:1: no column {absent[0]!r}. Found: {', '.join(header)}")
+    named = {text: name for name, text in mapping.items()}
+    kept = [
+        (k, named.get(h, h))
+        for k, h in enumerate(header)
+        if h in named or (_axis_name(h) not in mapping and _is_known(h, _axis_name(h), axes))
+    ]
+    header, rows = [h for _, h in kept], [(line, [row[k] for k, _ in kept]) for line, row in rows]
+    if "state" not in header:
+        header, rows = ["state", *header], [(line, [str(k), *row]) for k, (line, row) in enumerate(rows)]
+    # An axis has the ending that tells it from a column that is not known.
+    return [f"{h}_deg" if h in mapping and not _is_known(h, h, axes) else h for h in header], rows
+
+
+def _with_arrays(
+    path: Path, header: list[str], rows: list[Row], arrays: Mapping[str, NDArray[np.float64]]
+) -> tuple[list[str], list[Row]]:
+    """The rows with a column more for each array."""
+    for name, values in arrays.items():
+        if len(values) != len(rows):
+            raise ImportFailed(f"--columns {name}: {len(values)} numbers for {len(rows)} states of {path}")
+        header = [*header, name if name in KNOWN or name.startswith(CHANNEL_PREFIX) else f"{name}_deg"]
+        rows = [(line, [*row, repr(float(v))]) for (line, row), v in zip(rows, values, strict=True)]
+    return header, rows
+
+
+def _table(path: Path) -> tuple[list[str], list[Row], str]:
     """Header, rows with their line numbers, and what stands between the columns."""
     text = read_text(path, ImportFailed)
     delimiter = max(DELIMITERS, key=text.partition("\n")[0].count)

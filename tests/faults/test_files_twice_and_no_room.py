@@ -15,9 +15,9 @@ from processing.commands.application import main as process
 from processing.commands.diagnose import main as diagnose
 from processing.errors import ProcessError
 from processing.storage.capture_schema import CaptureHeader, Detector
+from processing.storage.foreign_arrays import ImportFailed
 from processing.storage.importing import ImportRequest, import_capture
 from processing.storage.product import Plane, ProductError, ProductWriter
-from processing.storage.state_csv import ImportFailed
 
 TWICE = {
     "calibrate": (process, ["--instrument", "i.yaml", "--free", "x"]),

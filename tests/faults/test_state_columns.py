@@ -1,5 +1,7 @@
 """Columns of states.csv: the noise stated for each state, and names that nobody knows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,9 +9,10 @@ from processing.diagnosis.captured.read_capture import read_capture
 from processing.instrument.model import InstrumentModel
 from processing.reduction.mueller import Choice, reduce_mueller
 from processing.storage.capture import Capture
+from processing.storage.foreign_arrays import ImportFailed
 from processing.storage.images import MuellerImage
 from processing.storage.importing import ImportRequest, import_capture
-from processing.storage.state_csv import ImportFailed, read_states
+from processing.storage.state_csv import read_states
 
 HEAD = "state,psg_deg,channel_left,channel_right"
 
@@ -114,13 +117,21 @@ def test_a_number_that_could_be_two_is_refused(tmp_path, delimiter, angle, cell)
         read_states(path, ["psa"])
 
 
-@pytest.mark.parametrize(("unit", "asked"), [(np.deg2rad, True), (np.asarray, False)], ids=["radians", "degrees"])
-def test_units_that_are_hardly_meant_are_asked_about(tmp_path, unit, asked):
-    numbers = [(str(k), f"{angle:.6f}", "1000") for k, angle in enumerate(unit(np.arange(0.0, 360.0, 15.0)))]
-    told = []
-    request = ImportRequest(spreadsheet(tmp_path, ",", numbers), tmp_path / "c.h5", 0.55 if asked else 550)
-    import_capture(request, warn=told.append)
-    assert [text.split(".")[0] for text in told] == (["axis psa turns by 6", "a wavelength of 0"] if asked else [])
+def test_angles_that_are_probably_radians_are_refused_until_the_unit_is_given(tmp_path):
+    degrees = np.arange(0.0, 360.0, 15.0)
+    numbers = [(str(k), f"{angle:.6f}", "1000") for k, angle in enumerate(np.deg2rad(degrees))]
+    request = ImportRequest(spreadsheet(tmp_path, ",", numbers), tmp_path / "c.h5", 550)
+    with pytest.raises(ImportFailed, match=r"axis psa turns by 6\.02 degrees.*--angles radians"):
+        import_capture(request)
+    import_capture(replace(request, angles="radians"))
+    with Capture(tmp_path / "c.h5") as capture:
+        assert capture.angles_deg["psa"] == pytest.approx(degrees, abs=1e-4)
+
+
+@pytest.mark.parametrize("wavelength", [0.532, 5.32e-7])
+def test_a_wavelength_in_another_unit_is_refused_with_the_number_in_nm(tmp_path, wavelength):
+    with pytest.raises(ImportFailed, match="--wavelength-nm 532"):
+        import_capture(ImportRequest(tmp_path / "states.csv", tmp_path / "c.h5", wavelength))
 
 
 def test_frames_may_be_npy_files(tmp_path):
