@@ -44,6 +44,7 @@ def calibrate_command(
     from processing.calibration.fitted_file import write_fitted
     from processing.calibration.known_sample import part_of
     from processing.calibration.train import POOR_FIT, fit_curves, fit_trains
+    from processing.commands.region import parse_region
     from processing.doors import require_distinct, require_new
     from processing.instrument.model import InstrumentModel
     from processing.reduction.instrument_of_capture import require_belongs
@@ -58,7 +59,7 @@ def calibrate_command(
     for capture in captures:
         with Capture(capture, by_super_pixel=True) as source:
             nm = source.header.wavelength_nm
-            rows, columns = _region(region, source.frame_shape)
+            rows, columns = parse_region(region, source.frame_shape)
             require_belongs(source, model.at(nm))
             parts.append(part_of(source, model.at(nm), rows, columns))
             simulated |= source.simulated
@@ -145,18 +146,3 @@ def _wavelengths(text: str | None, dispersion: int | None) -> list[float]:
         return [float(word) for word in text.split(",")]
     except ValueError:
         raise CalibrationError(f"--at {text}: write wavelengths as 500,550.5") from None
-
-
-def _region(text: str | None, shape: tuple[int, int]) -> tuple[slice, slice]:
-    from processing.calibration.known_sample import CalibrationError
-
-    height, width = shape
-    if text is None:
-        return slice(height // 4, max(height - height // 4, 1)), slice(width // 4, max(width - width // 4, 1))
-    try:
-        (r0, r1), (c0, c1) = ((int(v) for v in part.split(":")) for part in text.split(","))
-    except ValueError:
-        raise CalibrationError(f"--region {text}: write it as r0:r1,c0:c1, whole numbers") from None
-    if not (0 <= r0 < r1 <= height and 0 <= c0 < c1 <= width):
-        raise CalibrationError(f"--region {text}: no part of a frame of {height} rows and {width} columns")
-    return slice(r0, r1), slice(c0, c1)

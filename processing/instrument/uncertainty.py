@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,8 +11,23 @@ from processing.instrument.elements import number
 from processing.instrument.model import InstrumentModel
 
 
-def value_directions(model: InstrumentModel) -> Iterator[tuple[str, InstrumentModel]]:
-    """What is uncertain, and the model moved by one standard uncertainty of it; of a model at one wavelength.
+class ValueDirection(NamedTuple):
+    """One independent direction: values that move together by one standard uncertainty.
+
+    Attributes
+    ----------
+    label : the value, or the values that are correlated.
+    u : of the value, in its unit; NaN for several.
+    moved : the model with it.
+    """
+
+    label: str
+    u: float
+    moved: InstrumentModel
+
+
+def value_directions(model: InstrumentModel) -> Iterator[ValueDirection]:
+    """Directions of a model at one wavelength; none where its file states no uncertainty.
 
     Correlated values move together. What `systematic` holds, because `diagnose` fitted it, is left out here.
     """
@@ -20,7 +36,7 @@ def value_directions(model: InstrumentModel) -> Iterator[tuple[str, InstrumentMo
     together = [[name for name in c.between if name in stated] for c in model.correlations]
     for name, u in stated.items():
         if not any(name in group for group in together):
-            yield f"{name} (u = {u:.3g})", _moved(model, {name: u})
+            yield ValueDirection(name, u, _moved(model, {name: u}))
     for correlation, names in zip(model.correlations, together, strict=True):
         part = [correlation.between.index(name) for name in names]
         sigma = np.array([stated[name] for name in names])
@@ -28,7 +44,7 @@ def value_directions(model: InstrumentModel) -> Iterator[tuple[str, InstrumentMo
         for size, direction in zip(sizes, directions.T, strict=True):
             if size > 0:
                 shift = dict(zip(names, (np.sqrt(size) * direction).tolist(), strict=True))
-                yield " & ".join(names), _moved(model, shift)
+                yield ValueDirection(" & ".join(names), np.nan, _moved(model, shift))
 
 
 def _moved(model: InstrumentModel, shifts: Mapping[str, float]) -> InstrumentModel:

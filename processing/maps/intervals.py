@@ -34,6 +34,7 @@ APART = 5.0
 _REPELLED = 4.0
 #: A rotation is determined where the weakest factor that it is divided by is this many times its noise.
 SEEN = 3.0
+EITHER_AXIS = "retardance_axis_or_90_deg"
 #: Angles whose range is all directions, by what they are angles of.
 ANGLES = (
     "diattenuation_orientation_deg",
@@ -41,7 +42,7 @@ ANGLES = (
     "dominant_diattenuation_orientation_deg",
     "dominant_polarizance_orientation_deg",
     "retardance_fast_axis_deg",
-    "retardance_axis_or_90_deg",
+    EITHER_AXIS,
     "differential_retardance_fast_axis_deg",
 )
 #: Ranges of what the differential decomposition gives; where it does not exist any of them may be.
@@ -126,7 +127,7 @@ def set_angles(planes: Planes) -> None:
     for name in ANGLES:
         if name not in planes:
             continue
-        either = name == "retardance_axis_or_90_deg"
+        either = name == EITHER_AXIS
         halves = directions(np.deg2rad(2 * planes[f"{name}_errors"].astype(float)), both_ends=either)
         half_68, half_95 = (np.rad2deg(h) / 2 for h in halves)
         value = planes[name]
@@ -236,7 +237,7 @@ def set_retardance(
         half,
         *(np.where(wide, value + s, b) for s, b in zip((-90, 90), bounds, strict=True)),
     )
-    name = "retardance_axis_or_90_deg"
+    name = EITHER_AXIS
     value, bounds = planes[name].astype(float), planes[f"{name}_95"]
     half = np.where(is_determined, planes[f"{name}_errors"], 45.0)
     _put(

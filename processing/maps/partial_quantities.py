@@ -44,9 +44,16 @@ def determined_maps(seen: BoolArray, pairs: Pairs) -> list[str]:
 
 
 def partial_block(
-    image: MuellerImage, names: list[str], pairs: Pairs, moves: NDArray[np.float64] | None = None
+    image: MuellerImage,
+    names: list[str],
+    pairs: Pairs,
+    moves: NDArray[np.float64] | None = None,
+    by_input: dict[str, NDArray[Any]] | None = None,
 ) -> dict[str, NDArray[Any]]:
-    """The maps of these names with their errors, and `lit`, for an image or for some rows of it."""
+    """The maps of these names with their errors, and `lit`, for an image or for some rows of it.
+
+    `moves` and `by_input` are those of `processing.maps.quantities.quantities_block`.
+    """
     # What was not determined is not in any of them.
     m = np.where(image.seen.reshape(4, 4), image.matrices.astype(float), 0.0)
     found: dict[str, NDArray[Any]] = {}
@@ -58,7 +65,9 @@ def partial_block(
         set_magnitudes(found, derived, m, image)
         set_angles(found)
         if moves is not None:
-            set_systematic(found, {name: derived[name] for name in names}, moves)
+            moved = set_systematic(found, {name: derived[name] for name in names}, moves)
+            if by_input is not None:
+                by_input |= moved
     found["lit"] = (image.values[0, 0] > LIT_ERRORS * np.nan_to_num(image.errors[0, 0])).astype(np.uint8)
     return found
 

@@ -157,10 +157,10 @@ def reduce_stokes(
     facts |= references(capture, model)
     with ProductWriter(out, "stokes", capture.header, (rows, columns), planes, steps, overwrite) as product:
         product.array("measurement_matrix", model_rows, "", "W (channel, 16): intensity = W . vec(M), row-major")
-        correlation = neighbour_correlation(layout, method, tuple(map(tuple, np.linalg.pinv(analyzers).tolist())))
-        product.array(
-            "neighbour_correlation", correlation, "", "of the noise of S1, S2 by distance in rows and columns"
-        )
+        solve = tuple(map(tuple, np.linalg.pinv(analyzers).tolist()))
+        for name, parts in (("neighbour_correlation", (1, 2)), ("neighbour_correlation_s0", (0,))):
+            text = f"of the noise of {', '.join(f'S{k}' for k in parts)} by distance in rows and columns"
+            product.array(name, neighbour_correlation(layout, method, solve, parts), "", text)
         product.array("analyzers", analyzers, "", "rows (channel, 3): intensity = row . (S0, S1, S2)")
         facts |= systematic.store(product) if systematic is not None else {}
         product.write(slice(0, rows), **found)
@@ -197,6 +197,19 @@ def stokes(
         if merged.relative is not None:
             variance += _by_channel(merged.relative, layout, channels) * light**2
     covariance = stokes_covariance(variance, layout, method, solve, frame)
+    found = {"s0": s0, "s1": s1, "s2": s2, "closure": closure, "stokes_covariance": covariance}
+    found |= {f"s{k}_errors": np.sqrt(covariance[k]) for k in range(LINEAR)}
+    found |= linear_polarization(s0, s1, s2, covariance)
+    return {name: np.asarray(values, dtype=np.float32) for name, values in found.items()}
+
+
+def linear_polarization(
+    s0: NDArray[np.floating], s1: NDArray[np.floating], s2: NDArray[np.floating], covariance: NDArray[np.floating]
+) -> dict[str, NDArray[np.floating]]:
+    """Degree and angle of linear polarization with their intervals, as in `PLANES`.
+
+    `covariance` (6, ...) is packed as `stokes_covariance`.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         linear = np.hypot(s1, s2)
         dolp = linear / s0
@@ -211,19 +224,9 @@ def stokes(
         degree = interval(dolp, np.maximum(dolp_variance, 0.0), *own)
         halves = [np.rad2deg(half) / 2 for half in directions(np.sqrt(np.maximum(across, 0.0)) / linear)]
     angle = np.rad2deg(aolp)
-    found = {
-        "s0": s0,
-        "s1": s1,
-        "s2": s2,
-        "s0_errors": np.sqrt(c00),
-        "s1_errors": np.sqrt(c11),
-        "s2_errors": np.sqrt(c22),
-    }
-    found |= {"stokes_covariance": covariance, "closure": closure}
-    found |= {"dolp": degree.value, "dolp_errors": degree.error, "dolp_95": np.stack([degree.low, degree.high])}
+    found = {"dolp": degree.value, "dolp_errors": degree.error, "dolp_95": np.stack([degree.low, degree.high])}
     found |= {"aolp_deg": angle, "aolp_deg_errors": halves[0]}
-    found |= {"aolp_deg_95": np.stack([angle - halves[1], angle + halves[1]])}
-    return {name: np.asarray(values, dtype=np.float32) for name, values in found.items()}
+    return found | {"aolp_deg_95": np.stack([angle - halves[1], angle + halves[1]])}
 
 
 def _systematic(capture: Capture, model: InstrumentModel, states: NDArray[np.int64]) -> Systematic | None:
@@ -240,13 +243,18 @@ def _systematic(capture: Capture, model: InstrumentModel, states: NDArray[np.int
 def systematic_errors(systematic: Systematic, found: dict[str, NDArray[Any]]) -> dict[str, NDArray[np.float32]]:
     """Planes `SYSTEMATIC` of an image of s0, s1 and s2."""
     s = np.stack([found[name] for name in ("s0", "s1", "s2")])
-    moved = np.stack(list(systematic.moves(s.reshape(LINEAR, -1)))).reshape(-1, *s.shape)[:, 1:]
+    moved = np.stack(list(systematic.moves(s.reshape(LINEAR, -1)))).reshape(-1, *s.shape)
+    each = (moved[:, 1], moved[:, 2], *moved_polarization(s, moved))
+    return {name: np.sqrt(np.sum(e**2, axis=0), dtype=np.float32) for name, e in zip(SYSTEMATIC, each, strict=True)}
+
+
+def moved_polarization(s: NDArray[np.floating], moved: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """By how much dolp and aolp_deg change where S (3, ...) moves by `moved` (D, 3, ...), its S0 held."""
     with np.errstate(divide="ignore", invalid="ignore"):
         linear = np.hypot(s[1], s[2])
         u, v = s[1:] / linear
-        along, across = u * moved[:, 0] + v * moved[:, 1], u * moved[:, 1] - v * moved[:, 0]
-        each = (moved[:, 0], moved[:, 1], along / s[0], np.rad2deg(across / linear / 2))
-    return {name: np.sqrt(np.sum(e**2, axis=0), dtype=np.float32) for name, e in zip(SYSTEMATIC, each, strict=True)}
+        along, across = u * moved[:, 1] + v * moved[:, 2], u * moved[:, 2] - v * moved[:, 1]
+        return along / s[0], np.rad2deg(across / linear / 2)
 
 
 def _by_channel(raw: NDArray[np.float32], layout: MosaicLayout, channels: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -30,12 +30,14 @@ class Direction:
     Attributes
     ----------
     label : what is uncertain.
+    u : standard uncertainty of that value, in its unit; NaN where it is no single value of the train.
     turn : (K, K); the unknowns of a pixel move by `turn` times themselves.
     rows : (L, 16), the measurement matrix with this error.
     counts : a correction of the counts that moves the unknowns further; None without.
     """
 
     label: str
+    u: float
     turn: Array
     rows: Array
     counts: CountsCorrection | None
@@ -74,15 +76,15 @@ class Systematic:
         counts : makes of them what is corrected in the counts.
         basis : (K, R) what the instrument determines of the unknowns; they move inside of that alone.
         """
-        moved: list[tuple[str, InstrumentModel, CountsCorrection | None]] = [
-            (label, other, None) for label, other in value_directions(model)
+        moved: list[tuple[str, float, InstrumentModel, CountsCorrection | None]] = [
+            (*value, None) for value in value_directions(model)
         ]
         for error in model.systematic:
             for effects in error.directions:
                 label = ", ".join(dict.fromkeys(" ".join(filter(None, (e.kind, e.element))) for e in effects))
                 bent = counts(model.model_copy(update={"effects": effects}))
                 other = model.model_copy(update={"effects": (*model.effects, *effects)})
-                moved.append((label, other, bent if bent is not None and bent.response else None))
+                moved.append((label, np.nan, other, bent if bent is not None and bent.response else None))
         if not moved:
             return None
 
@@ -91,10 +93,10 @@ class Systematic:
 
         w = matrix(model)[1]
         flat, out = w.reshape(-1, len(basis)), []
-        for label, other, bent in moved:
+        for label, u, other, bent in moved:
             rows, own = matrix(other)
             turn = inverse(own) @ flat - basis @ basis.T
-            out.append(Direction(label, turn, rows.reshape(-1, 16), bent))
+            out.append(Direction(label, u, turn, rows.reshape(-1, 16), bent))
         return cls(tuple(out), flat, inverse(w), w.shape[1])
 
     def store(self, product: ProductWriter) -> dict[str, str]:
@@ -103,6 +105,8 @@ class Systematic:
         text = "one standard uncertainty of each direction moves the unknowns of a pixel by this matrix times them"
         product.array("systematic_turns", turns, "", text)
         product.array("systematic_rows", rows, "", "measurement_matrix with one standard uncertainty of each direction")
+        text = "standard uncertainty of each direction, in its own unit; NaN for several values together"
+        product.array("systematic_u", np.array([d.u for d in self.directions]), "", text)
         bent = [d.counts for d in self.directions if d.counts is not None]
         if bent:
             each = [self._coefficients(d.counts) for d in self.directions]
@@ -132,7 +136,7 @@ class Systematic:
             responses = [{f: c for f, c in zip(FEATURES, one, strict=True) if c.any()} for one in each]
             counts = [CountsCorrection(top, one, np.zeros((1, 2))) if one else None for one in responses]
         flat = w.reshape(-1, turns.shape[1])
-        directions = map(Direction, labels, turns, rows, counts)
+        directions = map(Direction, labels, product.array("systematic_u").tolist(), turns, rows, counts)
         return cls(tuple(directions), flat, np.linalg.pinv(flat, rcond=SMALLEST), w.shape[-2])
 
     @property

@@ -88,9 +88,7 @@ def test_a_file_states_them_with_the_values(stated, configs):
     assert model.at(662).stderr == U
     assert model.at(451).stderr == {}
     assert model.model_copy(update={"stderr": {}}) == plain
-    labels = [label for label, _ in value_directions(model.at(662))]
-    assert "psg_retarder.retardance_deg (u = 0.3)" in labels
-    assert len(labels) == len(U)
+    assert {one.label: one.u for one in value_directions(model.at(662))} == U
     with pytest.raises(ConfigError, match=r"psg_retarder.retardance_deg.*0 or more"):
         parse_yaml(stated.read_text().replace("u: 0.3", "u: -0.3"), InstrumentModel)
 
@@ -100,7 +98,7 @@ def test_correlated_values_move_together(stated):
         "correlations:\n  - between: [psg_retarder.azimuth_deg, analyzer.azimuth_deg]\n    coefficients: [0.96]\n"
     )
     model = parse_yaml(text, InstrumentModel).at(662)
-    moved = [other for label, other in value_directions(model) if "&" in label]
+    moved = [one.moved for one in value_directions(model) if "&" in one.label]
     off = np.array([[other.value_of(n) - model.value_of(n) for n in model.correlations[0].between] for other in moved])
     assert off.T @ off == pytest.approx(0.01 * np.array([[1, 0.96], [0.96, 1]]), abs=1e-9)
 

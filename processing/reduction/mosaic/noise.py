@@ -55,12 +55,12 @@ def noise_gain(layout: MosaicLayout, method: str, solve: tuple[tuple[float, ...]
 
 @lru_cache(maxsize=32)
 def neighbour_correlation(
-    layout: MosaicLayout, method: str, solve: tuple[tuple[float, ...], ...]
+    layout: MosaicLayout, method: str, solve: tuple[tuple[float, ...], ...], parts: tuple[int, ...] = (1, 2)
 ) -> NDArray[np.float64]:
     """Correlation of the noise of S1 and S2 between pixels, (2 R + 1, 2 R + 1) by row and column distance.
 
-    Neighbours are made of the same raw pixels. Mean of S1 and S2 and of the four positions in the super-pixel, for even
-    light; `superpixel` has none.
+    Neighbours are made of the same raw pixels. Mean of `parts` of S and of the four positions in the super-pixel, for
+    even light; `superpixel` has none.
     """
     matrix = np.asarray(solve)
     flat = np.full((_SIZE, _SIZE), _LEVEL, np.float32)
@@ -71,7 +71,7 @@ def neighbour_correlation(
         poked = flat.copy()
         poked[middle + r, middle + c] += _STEP
         moved = np.einsum("sc,crk->srk", matrix, (demosaic(poked, layout, method) - still) / _STEP)
-        for image in moved[1:]:
+        for image in moved[list(parts)]:
             # Twice as wide, so that what leaves on one side does not come in on the other; scipy.signal takes half a
             # second to import.
             wide = (2 * image.shape[0], 2 * image.shape[1])

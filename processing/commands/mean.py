@@ -1,0 +1,110 @@
+"""`process mean`: mean and uncertainty of a region, of repeats, of the captures of a night."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isnan
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from processing.commands.batch import captures_and, files_of
+
+if TYPE_CHECKING:
+    from processing.maps.means import MeanValue
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    app.command("mean")(mean_command)
+
+
+def mean_command(
+    sources: Annotated[list[Path], typer.Argument(help="Captures or products of one sample, or folders of them.")],
+    region: Annotated[
+        str | None, typer.Option(help="Pixels to average: r0:r1,c0:c1; default: the middle half of the frame.")
+    ] = None,
+    budget: Annotated[
+        str | None, typer.Option(help="Quantity whose uncertainty budget (GUM) is printed, e.g. depolarization_index.")
+    ] = None,
+    instrument: Annotated[Path | None, typer.Option(help="Instrument file to reduce captures with.")] = None,
+    out: Annotated[Path | None, typer.Option(help="New file with all means: .csv or .json.")] = None,
+) -> None:
+    """Mean M or S of a region and of several captures, and every quantity of that mean, with all uncertainties.
+
+    "u noise" gets smaller with more pixels and captures, "u instrument" does not.
+    """
+    from processing.commands.progress_bar import progress_bar
+    from processing.commands.region import parse_region
+    from processing.doors import require_distinct, require_new
+    from processing.errors import ProcessError
+    from processing.export.means_file import write_means
+    from processing.maps.means import mean_of
+    from processing.steps.reduction import reduced
+    from processing.storage.product import Product
+
+    if out is not None:
+        require_new(out)
+        if out.suffix not in (".csv", ".json"):
+            raise ProcessError(f"--out {out}: means are written as .csv or .json. Choose one of these endings.")
+    inputs = files_of(sources, captures_and(("mueller", "stokes")), "captures")
+    require_distinct(inputs)
+    products = []
+    with progress_bar("reducing", "rows") as tick:
+        for path in inputs:
+            products.append(reduced(path, instrument, tick).path)
+    places, simulated = [], False
+    for path in products:
+        with Product(path) as product:
+            places.append(parse_region(region, product.shape))
+            simulated |= product.simulated
+    if any(place != places[0] for place in places):
+        raise ProcessError("the captures have frames of several sizes. Name the pixels: --region r0:r1,c0:c1")
+    rows, columns = places[0]
+    found = mean_of(products, places[0])
+    place = f"rows {rows.start}:{rows.stop}, columns {columns.start}:{columns.stop}"
+    captures = f"{len(products)} capture{'s' if len(products) > 1 else ''}"
+    if simulated:
+        typer.echo("SIMULATED data")
+    typer.echo(f"mean of {place} of {captures}; intervals of 95 %")
+    if budget is None:
+        _print_means(found)
+    else:
+        _print_budget(found, budget)
+    if out is not None:
+        facts = {"captures": ", ".join(path.name for path in inputs), "pixels": place, "simulated": simulated}
+        write_means(out, found, facts)
+        typer.echo(str(out))
+
+
+def _print_means(found: Sequence[MeanValue]) -> None:
+    head = ("quantity", "value", "u noise", "u instrument", "scatter", "dof", "interval")
+    typer.echo("{:38} {:>11} {:>9} {:>12} {:>9} {:>6}  {}".format(*head))
+    for one in found:
+        typer.echo(
+            f"{one.name:38} {one.value:11.5g} {one.u_noise:9.2g} {one.u_systematic:12.2g} {one.scatter:9.2g} "
+            f"{one.degrees_of_freedom:6.3g}  {one.low:.5g} to {one.high:.5g} {one.unit}"
+        )
+
+
+def _print_budget(found: Sequence[MeanValue], name: str) -> None:
+    from processing.errors import ProcessError
+    from processing.maps.means import Contribution
+
+    one = next((value for value in found if value.name == name), None)
+    if one is None:
+        raise ProcessError(f"--budget {name}: no such quantity. Choose one of: {', '.join(v.name for v in found)}")
+    typer.echo(f"{one.name} = {one.value:.6g} {one.unit}")
+    typer.echo(f"  {'input':50} {'u(input)':>9} {'sensitivity':>11} {'contribution':>12} {'share':>7} {'dof':>5}")
+    whole = Contribution("combined standard uncertainty", one.u, one.degrees_of_freedom)
+    for part in [*sorted(one.budget, key=lambda part: -part.u), whole]:
+        share = 100 * part.u**2 / one.u**2 if one.u else 0.0
+        given = "" if isnan(part.u_input) else f"{part.u_input:.3g}"
+        slope = "" if isnan(part.sensitivity) else f"{part.sensitivity:.3g}"
+        typer.echo(
+            f"  {part.source:50} {given:>9} {slope:>11} {part.u:12.3g} {share:5.1f} % {part.degrees_of_freedom:5.3g}"
+        )
+    typer.echo(
+        f"  k = {one.k:.2f}, U95 = {one.k * one.u:.3g}; 95 % interval {one.low:.6g} to {one.high:.6g} {one.unit}"
+    )

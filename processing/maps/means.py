@@ -1,0 +1,340 @@
+"""Means over a region, over repeats, over the captures of a night: M or S first, quantities of the mean after.
+
+Maps of magnitudes are never negative, so their mean over pixels is too large; M is linear in the counts. Uncertainties
+(GUM, JCGM 100): noise, with what neighbouring pixels share; scatter between captures (type A); and the instrument's,
+which does not average. The interval uses the effective degrees of freedom (Welch and Satterthwaite).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from processing.arrays import Array
+from processing.errors import ProcessError
+from processing.maps.intervals import ANGLES, EITHER_AXIS, moves_of
+from processing.maps.partial_quantities import determined_maps, partial_block
+from processing.maps.quantities import quantities_block
+from processing.polarization.magnitude import NORMAL_95
+from processing.polarization.quantities import PAPER_PAIRS
+from processing.reduction.stokes import linear_polarization, moved_polarization
+from processing.reduction.systematic import Systematic
+from processing.reflectance.shared_noise import shared_variance
+from processing.storage.images import MuellerImage, StokesImage, neighbour_correlation
+from processing.storage.pixel_mask import Mask
+from processing.storage.product import Product
+
+Region = tuple[slice, slice]
+Inputs = tuple[tuple[str, float], ...]
+
+
+@dataclass(frozen=True)
+class Contribution:
+    """One line of an uncertainty budget.
+
+    Attributes
+    ----------
+    source : noise, scatter between captures, or an uncertain value of the instrument.
+    u : standard uncertainty of the result by it.
+    degrees_of_freedom : infinite where it is not estimated from few values.
+    u_input : standard uncertainty of the input, in its unit; NaN where it is no single value.
+    sensitivity : change of the result by one unit of the input; NaN likewise.
+    """
+
+    source: str
+    u: float
+    degrees_of_freedom: float = np.inf
+    u_input: float = np.nan
+    sensitivity: float = np.nan
+
+
+@dataclass(frozen=True)
+class MeanValue:
+    """Mean of one quantity.
+
+    Attributes
+    ----------
+    value : of the mean M or S.
+    u_noise, u_systematic : standard uncertainties.
+    scatter : standard deviation of the captures' own values; NaN for one capture.
+    low, high : of the 95 % interval, all uncertainties included.
+    budget : what the combined uncertainty is made of.
+    """
+
+    name: str
+    unit: str
+    value: float
+    u_noise: float
+    u_systematic: float
+    scatter: float
+    low: float
+    high: float
+    budget: tuple[Contribution, ...]
+
+    @property
+    def u(self) -> float:
+        """Combined standard uncertainty."""
+        return float(np.sqrt(sum(c.u**2 for c in self.budget)))
+
+    @property
+    def degrees_of_freedom(self) -> float:
+        """Effective degrees of freedom."""
+        shares = sum(c.u**4 / c.degrees_of_freedom for c in self.budget)
+        return float(self.u**4 / shares) if shares > 0 else float("inf")
+
+    @property
+    def k(self) -> float:
+        """Coverage factor for 95 %."""
+        return coverage_factor(self.degrees_of_freedom)
+
+
+def coverage_factor(degrees_of_freedom: float) -> float:
+    """Half the 95 % interval of Student's distribution, in standard uncertainties."""
+    return NORMAL_95 if np.isinf(degrees_of_freedom) else float(stdtrit(max(degrees_of_freedom, 1.0), 0.975))
+
+
+def mean_of(sources: Sequence[Path], region: Region) -> list[MeanValue]:
+    """Mean M or S over a region of products of one kind, and every quantity of it.
+
+    Parameters
+    ----------
+    region : rows and columns, inside each frame.
+
+    Raises
+    ------
+    ProcessError : no pixel of the region can be used, or the products differ in kind, wavelength or instrument.
+    """
+    means = [_Mean.of(source, region) for source in sources]
+    first = means[0]
+    for source, mean in zip(sources, means, strict=True):
+        if mean.alike != first.alike:
+            raise ProcessError(
+                f"{source} and {sources[0]} are not of one kind, wavelength and instrument, or one of them is "
+                "simulated. Give those that belong together."
+            )
+    found = _together(means).numbers()
+    each = [mean.numbers() for mean in means] if len(means) > 1 else []
+    return [_value(name, one, [e[name].value for e in each], first.inputs) for name, one in found.items()]
+
+
+class _Number(NamedTuple):
+    """A number of a mean: noise alone in `error` and `ends` (2,) of its 95 % interval; `moved` (D,) by each input."""
+
+    value: float
+    error: float
+    moved: Array
+    unit: str = ""
+    ends: NDArray[np.floating] | None = None
+
+
+@dataclass(frozen=True)
+class _Mean:
+    """Mean of a region of one capture, as an image of one pixel.
+
+    Attributes
+    ----------
+    image : with the noise of the mean.
+    moves : (D, K, 1, 1), what each uncertain input of the instrument does to the K unknowns; D = 0 without any.
+    inputs : of the instrument that are uncertain, with their u, D of them.
+    """
+
+    image: MuellerImage | StokesImage
+    moves: Array
+    inputs: Inputs
+
+    @property
+    def alike(self) -> tuple[object, ...]:
+        """What captures of one mean have in common."""
+        i = self.image
+        rank = tuple(i.seen) if isinstance(i, MuellerImage) else ()
+        return type(i), rank, round(i.header.wavelength_nm), i.simulated, repr(self.inputs)
+
+    @classmethod
+    def of(cls, source: Path, region: Region) -> _Mean:
+        with Product(source) as product:
+            product.require("mueller", "stokes")
+            rows, columns = region
+            if "stokes" in product.names:
+                raise ProcessError(f"{source} has no elements of M; `process quantities` gives what it has.")
+            systematic = Systematic.of_product(product)
+            inputs = () if systematic is None else tuple((d.label, d.u) for d in systematic.directions)
+            if product.kind == "stokes":
+                s0 = "neighbour_correlation_s0"
+                shared = product.array(s0) if product.has_array(s0) else neighbour_correlation(product)
+                stokes = _stokes_mean(StokesImage.load(source, rows), columns, shared, source)
+                values = stokes.values.reshape(3, 1)
+                moved = () if systematic is None else list(systematic.moves(values))
+                return cls(stokes, np.reshape(moved, (len(inputs), 3, 1, 1)), inputs)
+            image = _mueller_mean(MuellerImage.of(product, rows), columns, source)
+        moves = np.zeros((0, 16, 1, 1)) if systematic is None else moves_of(systematic, image)
+        return cls(image, moves, inputs)
+
+    def numbers(self) -> dict[str, _Number]:
+        if isinstance(self.image, StokesImage):
+            return _stokes_numbers(self.image, self.moves[..., 0, 0])
+        return _mueller_numbers(self.image, self.moves)
+
+
+def _good(mask: NDArray[np.uint8], values: NDArray[np.floating], source: Path) -> NDArray[np.bool_]:
+    good = ((mask & ~np.uint8(Mask.STRUCK)) == 0) & np.isfinite(values).all(axis=0)
+    if not good.any():
+        raise ProcessError(f"{source}: no pixel of the region can be used. Choose another --region.")
+    return np.asarray(good)
+
+
+def _variance_of_sum(sigma: NDArray[np.floating], good: NDArray[np.bool_], correlation: Array) -> float:
+    return float(shared_variance(np.where(good, 0, -1), sigma.astype(float), correlation)[good].sum())
+
+
+def _mueller_mean(image: MuellerImage, columns: slice, source: Path) -> MuellerImage:
+    values = image.values[..., columns].reshape(16, image.mask.shape[0], -1).astype(float)
+    errors = image.errors[..., columns].reshape(values.shape).astype(float)
+    good = _good(image.mask[:, columns], values[image.seen], source)
+    count = int(good.sum())
+    # Pixels of a Mueller image share no noise.
+    total = np.square(errors[:, good]).sum(axis=1)
+    return replace(
+        image,
+        values=values[:, good].mean(axis=1).reshape(4, 4, 1, 1).astype(np.float32),
+        errors=(np.sqrt(total) / count).reshape(4, 4, 1, 1).astype(np.float32),
+        mask=np.zeros((1, 1), np.uint8),
+        residual_rms=np.sqrt(np.mean(np.square(image.residual_rms[:, columns][good])) / count).reshape(1, 1),
+        noise_slope=image.noise_slope / count,
+        noise_floor=image.noise_floor / count,
+        dark=image.dark / np.sqrt(count),
+    )
+
+
+def _stokes_mean(image: StokesImage, columns: slice, correlation_s0: Array, source: Path) -> StokesImage:
+    values, covariance = image.values[..., columns].astype(float), image.covariance[:, columns].astype(float)
+    good = _good(image.mask[:, columns], values, source)
+    count = int(good.sum())
+    kernels = (correlation_s0, image.neighbour_correlation, image.neighbour_correlation)
+    own = np.array([_variance_of_sum(np.sqrt(covariance[..., k, k]), good, kernel) for k, kernel in enumerate(kernels)])
+    plain = covariance[good].sum(axis=0)
+    wider = np.sqrt(own / np.diag(plain))
+    return replace(
+        image,
+        values=values[:, good].mean(axis=1).reshape(3, 1, 1),
+        covariance=(plain * np.outer(wider, wider) / count**2)[None, None],
+        mask=np.zeros((1, 1), np.uint8),
+    )
+
+
+def _together(means: Sequence[_Mean]) -> _Mean:
+    """The mean of several captures; what one instrument does to all of them does not average.
+
+    Each counts alike, whatever its light: they are scaled to one m00 or S0.
+    """
+    first, count = means[0], len(means)
+    if count == 1:
+        return first
+    level = np.array([float(mean.image.values.reshape(-1)[0]) for mean in means])
+    scale = level.mean() / level
+    values = np.mean([c * mean.image.values for c, mean in zip(scale, means, strict=True)], axis=0)
+    moves = np.mean([c * mean.moves for c, mean in zip(scale, means, strict=True)], axis=0)
+    image = first.image
+    if isinstance(image, StokesImage):
+        pairs = [(c, m.image) for c, m in zip(scale, means, strict=True) if isinstance(m.image, StokesImage)]
+        covariances = [c**2 * other.covariance for c, other in pairs]
+        covariance = np.sum(covariances, axis=0) / count**2
+        return replace(first, image=replace(image, values=values, covariance=covariance), moves=moves)
+    same = [(c, m.image) for c, m in zip(scale, means, strict=True) if isinstance(m.image, MuellerImage)]
+    variance = np.sum([np.square(c * other.errors) for c, other in same], axis=0)
+    image = replace(
+        image,
+        values=values.astype(np.float32),
+        errors=(np.sqrt(variance) / count).astype(np.float32),
+        residual_rms=image.residual_rms / np.float32(np.sqrt(count)),
+        noise_slope=image.noise_slope / count,
+        noise_floor=image.noise_floor / count,
+        dark=image.dark / np.sqrt(count),
+    )
+    return replace(first, image=image, moves=moves)
+
+
+def _stokes_numbers(image: StokesImage, moves: Array) -> dict[str, _Number]:
+    s, c = image.values.reshape(3).astype(float), image.covariance.reshape(3, 3)
+    none = np.zeros(len(moves))
+    found = {"s0": _Number(s[0], float(np.sqrt(c[0, 0])), none, "count")}
+    for k in (1, 2):
+        ratio = s[k] / s[0]
+        error = np.sqrt(c[k, k] - 2 * ratio * c[0, k] + ratio**2 * c[0, 0]) / s[0]
+        found[f"s{k}_over_s0"] = _Number(ratio, float(error), moves[:, k] / s[0])
+    packed = np.array([c[0, 0], c[1, 1], c[2, 2], c[0, 1], c[0, 2], c[1, 2]])
+    light = linear_polarization(s[:1], s[1:2], s[2:], packed[:, None])
+    for name, moved in zip(("dolp", "aolp_deg"), moved_polarization(s, moves), strict=True):
+        value, error, ends = (light[f"{name}{part}"].reshape(-1) for part in ("", "_errors", "_95"))
+        unit = "degree" if name == "aolp_deg" else ""
+        found[name] = _Number(float(value[0]), float(error[0]), moved, unit, ends)
+    return found
+
+
+def _mueller_numbers(image: MuellerImage, moves: Array) -> dict[str, _Number]:
+    found, m = {}, image.values.reshape(16).astype(float)
+    for k in np.flatnonzero(image.seen).tolist():
+        gradient = np.zeros(16)
+        # A common gain is not measured: the error of m00 is noise alone.
+        value = m[0] if k == 0 else m[k] / m[0]
+        gradient[0] = 1.0 if k == 0 else -value / m[0]
+        if k:
+            gradient[k] = 1 / m[0]
+        error = float(np.sqrt(image.variance_of(gradient.reshape(1, 1, 16)).item()))
+        moved = np.asarray(moves[..., 0, 0] @ gradient) if k else np.zeros(len(moves))
+        name, unit = ("m00", "count") if k == 0 else (f"m{k // 4}{k % 4}_over_m00", "")
+        found[name] = _Number(float(value), error, moved, unit)
+    by_input: dict[str, NDArray[Any]] = {}
+    # Intervals by noise alone first: those of the second are wider by the instrument's uncertainty.
+    if image.seen.all():
+        planes = quantities_block(image, (), PAPER_PAIRS)
+        quantities_block(image, (), PAPER_PAIRS, moves, by_input)
+    else:
+        names = determined_maps(image.seen, PAPER_PAIRS)
+        planes = partial_block(image, names, PAPER_PAIRS)
+        partial_block(image, names, PAPER_PAIRS, moves, by_input)
+    for name in by_input:
+        # 16 elements of the dominant process would make a table that nobody reads.
+        if planes[name].size == 16:
+            continue
+        values, errors = planes[name].reshape(-1).tolist(), planes[f"{name}_errors"].reshape(-1).tolist()
+        ends = planes[f"{name}_95"].reshape(2, -1) if f"{name}_95" in planes else None
+        unit = "degree" if name.endswith("_deg") else ""
+        for j, (value, error) in enumerate(zip(values, errors, strict=True)):
+            label = name if len(values) == 1 else f"{name}_{j}"
+            own = None if ends is None else ends[:, j]
+            found[label] = _Number(value, error, by_input[name].reshape(len(values), -1)[j].astype(float), unit, own)
+    return found
+
+
+def _value(name: str, one: _Number, own: Sequence[float], inputs: Inputs) -> MeanValue:
+    """Put together the budget of one number; `own` are the values of the single captures."""
+    random, scatter = Contribution("noise of light and camera", one.error), float("nan")
+    if own:
+        off = np.array(own) - one.value
+        if name in ANGLES or name == "aolp_deg":
+            period = 90 if name == EITHER_AXIS else 180
+            off -= period * np.round(off / period)
+        scatter = float(np.std(off, ddof=1))
+        between = Contribution(f"noise and scatter of {len(own)} captures", scatter / np.sqrt(len(own)), len(own) - 1.0)
+        # Few captures say little of their scatter: whichever makes the wider interval.
+        if coverage_factor(between.degrees_of_freedom) * between.u > NORMAL_95 * one.error:
+            random = between
+    budget = [random]
+    for (label, u), moved in zip(inputs, one.moved.tolist(), strict=True):
+        budget.append(Contribution(label, abs(moved), np.inf, u, moved / u))
+    systematic = float(np.sqrt(np.sum(np.square(one.moved))))
+    found = MeanValue(name, one.unit, one.value, one.error, systematic, scatter, np.nan, np.nan, tuple(budget))
+    half = found.k * found.u
+    low, high = one.value - half, one.value + half
+    if one.ends is not None:
+        more = max(half**2 - (NORMAL_95 * one.error) ** 2, 0.0)
+        low = one.value - float(np.sqrt((one.value - one.ends[0]) ** 2 + more))
+        high = one.value + float(np.sqrt((one.ends[1] - one.value) ** 2 + more))
+        low = max(low, 0.0) if one.ends[0] == 0 else low
+    return replace(found, low=low, high=high)
