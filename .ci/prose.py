@@ -2,7 +2,7 @@
 
 A sentence has at most 30 words, a page under 18 on average, a line of prose at most 120 characters. No page uses a word
 of `IDIOM`. The first paragraph of a page in docs/ begins with its purpose, such as "Reference." An explanation has at
-most 2,500 words, docs/ without docs/studies/ at most 40,000. Code, tables, headings are not read.
+most 2,500 words, docs/ without docs/studies/ at most 40,000. Code, tables and headings are not read.
 """
 
 import re

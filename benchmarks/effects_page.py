@@ -37,9 +37,9 @@ SIDE, PERIOD_S, FLUX = 64, 1.0, 8e5
 EXPOSURE_S = 0.02
 HEAD = """# Effects
 
-*Reference.* Every effect that `diagnose` can find: its cause, its remedy, the line that builds it into the simulated
-rig, and its residual. `python benchmarks/effects_page.py` makes this page. [The demo](demo.md) draws its faults from
-this list, and `configs/rigs/faulty.yaml` has them ready to switch on:
+*Reference.* Every effect that `diagnose` can find: its cause, its remedy, and its residual. *Rig* is the entry of
+`simulator: effects:` that gives the fault to the simulated rig. `python benchmarks/effects_page.py` makes this page.
+[The demo](demo.md) draws its faults from this list. `configs/rigs/faulty.yaml` has them ready to switch on:
 
 ```bash
 ./lab acquire --omega 35 --rig configs/rigs/faulty.yaml
@@ -107,7 +107,7 @@ def page() -> str:
         if fault is None:
             parts.append("\nThe simulated rig does not have it.\n")
             continue
-        parts.append(f'\n```yaml title="in a rig file"\nsimulator:\n  effects:\n    - {flow(fault.example())}\n```\n')
+        parts.append(f"\n**Rig:** `{flow(fault.example())}`\n")
         if fault.hidden:
             parts.append(f"\n{wrapped(f'The default plan cannot show it: {fault.hidden}.')}\n")
         if effect.kind in pictured():
