@@ -49,7 +49,7 @@ def _moving(simulation):
 
 
 def _until(condition, child=None):
-    # How long it takes is measured by benchmarks/guard_time.py.
+    # How long it takes: docs/promises.md.
     while not condition():
         assert child is None or child.poll() is None, child.communicate()
         time.sleep(0.01)

@@ -1,7 +1,7 @@
 """Lu-Chipman, symmetric and differential decompositions: analytic cases, rebuilt matrices, and others' packages.
 
 tests/physics/peer_decompositions.json holds what py_pol 1.3.0, muellerkit 0.1.2, katsu 0.1.0 and pymueller 0.1.3 answer
-for 16 matrices (written by benchmarks/peer_decompositions.py). Conventions:
+for 16 matrices (benchmarks/peer_decompositions.py of commit 6022f66 asked them). Conventions:
 - det M > 0: py_pol, muellerkit, katsu give our three factors. pymueller returns scalars only; its diattenuation agrees,
   its other numbers differ from all, because it builds MD from D D^T without dividing by |D|^2.
 - det M < 0: muellerkit keeps det MR = +1 with a negative depolarizer, as we do. katsu tests the sign of det(m m^T),
