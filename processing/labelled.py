@@ -32,6 +32,119 @@ def open_dataset(path: Path | str) -> xr.Dataset:
     return _of_product(path) if is_product(path) else _of_capture(path)
 
 
+def open_campaign(folder: Path | str, kind: str = "mueller") -> xr.Dataset:
+    """All products of one kind in a folder as one Dataset; images are read when they are used.
+
+    Parameters
+    ----------
+    folder
+        Folder with products, and its subfolders.
+    kind
+        Kind of product: "mueller", "stokes", "xi0", "quantities" ...
+
+    Returns
+    -------
+    Dataset
+        Floating-point planes with the dimensions (sample, wavelength, omega, repeat), then those of one product.
+        `wavelength` is in nm, `omega` in degrees (NaN: not known). Repeats are in the order of their file names. A
+        combination that was not measured is NaN. `file` (sample, wavelength, omega, repeat) names the products.
+
+    Raises
+    ------
+    ProcessError
+        There is no product of that kind, or the images have different sizes.
+
+    Examples
+    --------
+    The median of m11 over the arm angle::
+
+        stack = open_campaign("captures")
+        m11 = stack.mueller.sel(row=1, column=1) / stack.mueller.sel(row=0, column=0)
+        print(m11.median(["y", "x"]).squeeze().to_series())
+    """
+    import xarray as xr
+
+    files = [path for path in sorted(Path(folder).rglob("*.h5")) if is_product(path)]
+    places: dict[tuple[str, float, float], list[Path]] = {}
+    first = None
+    for path in files:
+        with Product(path) as product:
+            if product.kind != kind:
+                continue
+            header, sample = product.header, product.header.sample
+            omega = np.nan if header.omega_deg is None else header.omega_deg
+            places.setdefault((sample.name or sample.kind, header.wavelength_nm, omega), []).append(path)
+            first = first or path
+            with Product(first) as other:
+                if product.shape != other.shape:
+                    raise ProcessError(
+                        f"{path}: {product.shape} pixels, but {first} has {other.shape}. Give a folder with images of "
+                        "one size"
+                    )
+    if first is None:
+        raise ProcessError(f"{folder}: no product of kind {kind!r}. Make them with: ./lab process reduce {folder}")
+    # NaN is not equal to itself: angles are compared as text.
+    axes = [sorted({str(place[k]): place[k] for place in places}.items(), key=lambda item: item[1]) for k in range(3)]
+    shape = (*(len(axis) for axis in axes), max(len(paths) for paths in places.values()))
+    grid = np.full(shape, "", dtype=object)
+    for place, paths in places.items():
+        where = tuple([text for text, _ in axis].index(str(value)) for axis, value in zip(axes, place, strict=True))
+        grid[where][: len(paths)] = [str(path) for path in paths]
+    one = _of_product(first)
+    leading = ("sample", "wavelength", "omega", "repeat")
+    variables = {
+        str(name): ((*leading, *plane.dims), _on_demand(grid, str(name), plane.dtype, plane.shape), plane.attrs)
+        for name, plane in one.data_vars.items()
+        if plane.dtype.kind == "f"
+    }
+    coords: dict[str, Any] = {
+        "sample": [value for _, value in axes[0]],
+        "wavelength": ("wavelength", [value for _, value in axes[1]], {"units": "nm"}),
+        "omega": ("omega", [value for _, value in axes[2]], {"units": "degree"}),
+        "file": (leading, grid.astype(str)),
+    }
+    attributes = {"kind": kind, "simulated": one.attrs["simulated"]}
+    return xr.Dataset(variables, coords | dict(one.coords), attributes)
+
+
+def _on_demand(grid: Any, name: str, dtype: Any, plane: tuple[int, ...]) -> Any:
+    """A plane of the products of a grid, as an array that reads what is used of it."""
+    from xarray.backends import BackendArray
+    from xarray.core import indexing
+
+    class Stack(BackendArray):
+        """Planes of many products."""
+
+        def __init__(self) -> None:
+            self.shape, self.dtype = (*grid.shape, *plane), np.dtype(dtype)
+
+        def __getitem__(self, key: Any) -> Any:
+            return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.OUTER, self._read)
+
+        def _read(self, key: tuple[Any, ...]) -> Any:
+            files, inner = np.asarray(_outer(grid, key[: grid.ndim])), key[grid.ndim :]
+            parts = [self._plane(str(file), inner) for file in files.reshape(-1)]
+            return np.stack(parts).reshape(*files.shape, *parts[0].shape)
+
+        def _plane(self, file: str, key: tuple[Any, ...]) -> Any:
+            if not file:
+                return _outer(np.broadcast_to(np.asarray(np.nan, dtype), plane), key)
+            rows = key[-2]
+            in_block = isinstance(rows, slice) and rows.step in (1, None)
+            with Product(file) as product:
+                values = product.get(name, rows if in_block else slice(None))
+            return _outer(values, (*key[:-2], slice(None) if in_block else rows, key[-1]))
+
+    return indexing.LazilyIndexedArray(Stack())
+
+
+def _outer(values: Any, key: tuple[Any, ...]) -> Any:
+    """The values at the combinations of one index for each axis."""
+    for axis in reversed(range(len(key))):
+        values = values[(slice(None),) * axis + (key[axis],)]
+    return values
+
+
 def reduce_to_dataset(capture: Path | str, instrument: Path | str | None = None, **options: Any) -> xr.Dataset:
     """The Mueller or Stokes image of a capture as a Dataset; no file is left behind.
 

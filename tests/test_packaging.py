@@ -1,4 +1,4 @@
-"""The distribution: five import names of ours, nothing else, and an environment that is not Debian's."""
+"""The distribution: six import names of ours, nothing else, and an environment that is not Debian's."""
 
 import importlib
 import os
@@ -15,7 +15,7 @@ import pytest
 from setuptools import find_packages
 
 ROOT = Path(__file__).resolve().parents[1]
-NAMES = ("drivers", "processing", "simulators", "acquisition", "viewer")
+NAMES = ("umov", "drivers", "processing", "simulators", "acquisition", "viewer")
 
 
 @pytest.mark.parametrize("name", NAMES)
