@@ -6,6 +6,7 @@ PYTHONPATH=. python benchmarks/effects_page.py
 from __future__ import annotations
 
 import inspect
+from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -76,12 +77,13 @@ class Described:
         cause, _, remedy = rest.partition("Mend:")
         return cls(kind, *(" ".join(text.split()) for text in (title, cause, remedy)))
 
-    def lines(self) -> str:
-        """Heading, title, cause and remedy."""
-        return (
-            f"\n### {self.kind}\n\n{wrapped(self.title)}\n\n"
-            f"{wrapped(f'**Cause:** {self.cause}')}\n\n{wrapped(f'**Remedy:** {self.remedy}')}\n"
-        )
+    def lines(self, before: Sequence[Described]) -> str:
+        """Heading, title, cause and remedy; a reference where an effect `before` has the same."""
+        head = f"\n### {self.kind}\n\n{wrapped(self.title)}\n\n"
+        for other in before:
+            if (other.cause, other.remedy) == (self.cause, self.remedy):
+                return f"{head}Cause and remedy are those of [{other.kind}](#{other.kind}).\n"
+        return f"{head}{wrapped(f'**Cause:** {self.cause}')}\n\n{wrapped(f'**Remedy:** {self.remedy}')}\n"
 
 
 def wrapped(text: str) -> str:
@@ -100,20 +102,20 @@ def described(effects: dict[str, object]) -> list[Described]:
 
 def page() -> str:
     """The page as it should be."""
-    parts = [HEAD]
-    for effect in described(instrument_effects()):
-        parts.append(effect.lines())
+    parts, effects = [HEAD], described(instrument_effects())
+    for k, effect in enumerate(effects):
+        parts.append(effect.lines(effects[:k]))
         fault = FAULTS.get(effect.kind)
         if fault is None:
-            parts.append("\nThe simulated rig does not have it.\n")
+            parts.append("\nNot on the simulated rig.\n")
             continue
         parts.append(f"\n**Rig:** `{flow(fault.example())}`\n")
         if fault.hidden:
             parts.append(f"\n{wrapped(f'The default plan cannot show it: {fault.hidden}.')}\n")
         if effect.kind in pictured():
-            parts.append(f"\n![Residual of {effect.kind}](images/effects/{effect.kind}.png)\n")
+            parts.append(f"\n![residual](images/effects/{effect.kind}.png)\n")
     parts.append(SURFACE)
-    parts += [effect.lines() for effect in described(reflectance_effects())]
+    parts += [effect.lines(effects) for effect in described(reflectance_effects())]
     return "".join(parts)
 
 
