@@ -150,7 +150,8 @@ def read_text(path: Path, error: type[ProcessError] = ProcessError, most_bytes: 
     size = require_file(path, error, most_bytes, may_be_empty=True)
     try:
         # No more than was looked at, and without waiting: another program may have put a pipe there meanwhile.
-        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+        without_waiting = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+        with open(os.open(path, os.O_RDONLY | without_waiting), "rb") as file:
             return (file.read(size) or b"").decode("utf-8-sig")
     except OSError as why:
         raise error(f"{path}: cannot be read ({why.strerror})") from why

@@ -39,12 +39,9 @@ def whole_file(path: Path, *, new: bool = False, follow: bool = True) -> Iterato
     beside = path.with_name(f".{path.stem}.{os.getpid()}.new{path.suffix}")
     try:
         yield beside
-        file = os.open(beside, os.O_RDONLY)
-        try:
-            # A disc may tell only now that it is full.
+        # A disc may tell only now that it is full. Windows syncs only what is open for writing.
+        with beside.open("rb+") as file:
             os.fsync(file)
-        finally:
-            os.close(file)
         if new:
             _take_free_name(beside, path)
         else:
@@ -76,7 +73,10 @@ def open_plain(path: Path, flags: int) -> int:
     OSError
         Somebody has put a link, a pipe or a device there, or a second name of another file.
     """
-    file = os.open(path, flags | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+    # Windows has neither such links nor such pipes, but would translate the ends of lines.
+    for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"):
+        flags |= getattr(os, name, 0)
+    file = os.open(path, flags | os.O_CREAT, 0o666)
     found = os.fstat(file)
     if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
         os.close(file)

@@ -9,12 +9,13 @@ import typer
 
 from processing.commands.batch import Made, files_of, place_for, run_batch, written_if_changed
 from processing.commands.product_options import Overwrite, ProductFile
+from processing.commands.purposes import DATA, EXPORT
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    app.command("from-axostep")(from_axostep_command)
-    app.command("to-axostep")(to_axostep_command)
+    app.command("from-axostep", rich_help_panel=DATA)(from_axostep_command)
+    app.command("to-axostep", rich_help_panel=EXPORT)(to_axostep_command)
 
 
 def from_axostep_command(

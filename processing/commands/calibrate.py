@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from processing.commands.product_options import Overwrite, ProductFile
+from processing.commands.purposes import CALIBRATION
 
 if TYPE_CHECKING:
     from processing.calibration.train import CurveFit, FittedValues
@@ -15,8 +16,8 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    app.command("calibrate")(calibrate_command)
-    app.command("calibrate-mosaic")(calibrate_mosaic_command)
+    app.command("calibrate", rich_help_panel=CALIBRATION)(calibrate_command)
+    app.command("calibrate-mosaic", rich_help_panel=CALIBRATION)(calibrate_mosaic_command)
 
 
 def calibrate_command(

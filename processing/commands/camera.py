@@ -9,11 +9,12 @@ import typer
 
 from processing.commands.drawing import FigureFile, NoFigure, draw
 from processing.commands.product_options import Overwrite
+from processing.commands.purposes import CALIBRATION
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    app.command("camera")(camera_command)
+    app.command("camera", rich_help_panel=CALIBRATION)(camera_command)
 
 
 def camera_command(

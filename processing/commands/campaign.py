@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from processing.commands.purposes import REPORTS
 from processing.whole_file import whole_file
 
 if TYPE_CHECKING:
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    app.command("campaign")(campaign_command)
+    app.command("campaign", rich_help_panel=REPORTS)(campaign_command)
 
 
 def campaign_command(

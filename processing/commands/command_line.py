@@ -11,8 +11,10 @@ from importlib.metadata import version
 from typing import Annotated, Any, NoReturn
 
 import typer
+from typer.core import TyperGroup
 from typer.exceptions import TyperException
 
+from processing.commands.purposes import PURPOSES
 from processing.doors import CONTROL
 from processing.errors import ProcessError
 
@@ -38,6 +40,25 @@ def _tell_version(wanted: bool) -> None:
 Version = Annotated[
     bool, typer.Option("--version", help="print the version and stop", callback=_tell_version, is_eager=True)
 ]
+
+
+class Commands(TyperGroup):
+    """Commands whose help lists them by purpose (`rich_help_panel`), each with its whole first sentence."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write a list a purpose, and last those that name none."""
+        shown = {name: command for name, command in self.commands.items() if not command.hidden}
+        purposes = {getattr(command, "rich_help_panel", None) or "Commands" for command in shown.values()}
+        widest = max(map(len, shown), default=0)
+        for purpose in sorted(purposes, key=(*PURPOSES, "Commands").index):
+            rows = [
+                # Padded: the summaries of all lists begin in one column.
+                (name.ljust(widest), command.get_short_help_str(limit=1000))
+                for name, command in shown.items()
+                if (getattr(command, "rich_help_panel", None) or "Commands") == purpose
+            ]
+            with formatter.section(purpose):
+                formatter.write_dl(rows)
 
 
 class Application(typer.Typer):
@@ -72,6 +93,7 @@ def application(name: str, text: str) -> Application:
     """An application with the look that all five share: plain help, also by -h, and shell completion."""
     return Application(
         name=name,
+        cls=Commands,
         help=text,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from processing.commands.purposes import CALIBRATION
 from processing.whole_file import write_new_text
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    app.command("design")(design_command)
+    app.command("design", rich_help_panel=CALIBRATION)(design_command)
 
 
 def design_command(

@@ -8,11 +8,12 @@ from typing import Annotated
 import typer
 
 from processing.commands.batch import Made, files_of, place_for, run_batch, written_if_changed
+from processing.commands.purposes import EXPORT
 
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("export")(export_command)
+    app.command("export", rich_help_panel=EXPORT)(export_command)
 
 
 def export_command(

@@ -7,13 +7,14 @@ from typing import Annotated
 
 import typer
 
+from processing.commands.purposes import CALIBRATION
 from processing.whole_file import write_whole_text
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    app.command("camera-pose")(camera_pose_command)
-    app.command("register")(register_command)
+    app.command("camera-pose", rich_help_panel=CALIBRATION)(camera_pose_command)
+    app.command("register", rich_help_panel=CALIBRATION)(register_command)
 
 
 def camera_pose_command(

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from processing.commands.batch import Made, files_of, run_batch
+from processing.commands.purposes import DATA
 from processing.commands.recipe import keep_recipe, read_recipe
 
 
@@ -21,8 +22,8 @@ class AngleUnit(StrEnum):
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    app.command("import")(import_command)
-    app.command("colours")(colours_command)
+    app.command("import", rich_help_panel=DATA)(import_command)
+    app.command("colours", rich_help_panel=DATA)(colours_command)
 
 
 def import_command(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from processing.commands.batch import captures_and, files_of
+from processing.commands.purposes import IMAGES
 
 if TYPE_CHECKING:
     from processing.maps.means import MeanValue
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    app.command("mean")(mean_command)
+    app.command("mean", rich_help_panel=IMAGES)(mean_command)
 
 
 def mean_command(

@@ -10,6 +10,7 @@ import typer
 from processing.commands.batch import captures_and, files_of, make_products
 from processing.commands.drawing import FigureFile, NoFigure
 from processing.commands.product_options import Overwrite, ProductFile
+from processing.commands.purposes import IMAGES
 
 if TYPE_CHECKING:
     from processing.polarization.quantities import NamedStokes
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    app.command("quantities")(quantities_command)
+    app.command("quantities", rich_help_panel=IMAGES)(quantities_command)
 
 
 def quantities_command(

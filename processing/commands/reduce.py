@@ -10,6 +10,7 @@ import typer
 from processing.commands.batch import files_of, make_products
 from processing.commands.drawing import FigureFile, NoFigure
 from processing.commands.product_options import Overwrite, ProductFile
+from processing.commands.purposes import IMAGES
 
 if TYPE_CHECKING:
     from processing.steps.file_step import FileStep, Progress
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    app.command("reduce")(reduce_command)
+    app.command("reduce", rich_help_panel=IMAGES)(reduce_command)
 
 
 def reduce_command(

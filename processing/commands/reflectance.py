@@ -10,6 +10,7 @@ import typer
 from processing.commands.batch import captures_and, files_of, make_products
 from processing.commands.drawing import FigureFile, NoFigure
 from processing.commands.product_options import Overwrite, ProductFile
+from processing.commands.purposes import REFLECTANCE
 from processing.whole_file import whole_file
 
 if TYPE_CHECKING:
@@ -18,8 +19,8 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    app.command("fit-material")(fit_material_command)
-    app.command("extrapolate")(extrapolate_command)
+    app.command("fit-material", rich_help_panel=REFLECTANCE)(fit_material_command)
+    app.command("extrapolate", rich_help_panel=REFLECTANCE)(extrapolate_command)
 
 
 def design_command(

@@ -7,10 +7,12 @@ from typing import Annotated
 
 import typer
 
+from processing.commands.purposes import REPORTS
+
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    app.command("report")(report_command)
+    app.command("report", rich_help_panel=REPORTS)(report_command)
 
 
 def report_command(

@@ -7,10 +7,12 @@ from typing import Annotated
 
 import typer
 
+from processing.commands.purposes import REPORTS
+
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    app.command("show")(show_command)
+    app.command("show", rich_help_panel=REPORTS)(show_command)
 
 
 def show_command(

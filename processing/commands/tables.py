@@ -7,15 +7,16 @@ from typing import Annotated, Literal
 
 import typer
 
+from processing.commands.purposes import DATA, EXPORT, REFLECTANCE
 from processing.whole_file import whole_file
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    app.command("table")(table_command)
-    app.command("compare-tables")(compare_command)
-    app.command("export-pbsdf")(export_command)
-    app.command("import-pbsdf")(import_command)
+    app.command("table", rich_help_panel=REFLECTANCE)(table_command)
+    app.command("compare-tables", rich_help_panel=REFLECTANCE)(compare_command)
+    app.command("export-pbsdf", rich_help_panel=EXPORT)(export_command)
+    app.command("import-pbsdf", rich_help_panel=DATA)(import_command)
 
 
 def table_command(
@@ -53,7 +54,7 @@ def compare_command(
     size: Annotated[int, typer.Option(min=16, help="Rows and columns of the virtual image.")] = 600,
     figure: Annotated[Path, typer.Option(help="Figure of the first angle (PNG).")] = Path("compare_tables.png"),
 ) -> None:
-    """Evaluate two tables of xi0 on a virtual object and compare them, as in Jarecki and Kupinski's Sec. V-B."""
+    """Evaluate two tables of xi0 on a virtual object and compare them (Jarecki and Kupinski, V-B)."""
     from processing.campaign.run import compare_on_sphere
     from processing.errors import ProcessError
     from processing.geometry.viewing import ViewingGeometry

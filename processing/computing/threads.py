@@ -23,7 +23,8 @@ def thread_count() -> int:
                 f"{THREADS_VARIABLE}={text!r} is not a number of threads; set it to 1 or more, or unset it"
             )
         return int(text)
-    return len(os.sched_getaffinity(0))
+    # Linux alone tells what this process may use.
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def for_ranges(items: int, loop: Callable[[int, int], object], align: int = 256, smallest: int = 4096) -> None:

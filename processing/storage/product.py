@@ -366,12 +366,12 @@ def is_product(path: Path) -> bool:
 
 def _take_space(path: Path) -> None:
     """Have the disc hold the file as long as it is: one that is only said to be long can still find it full."""
+    if not hasattr(os, "posix_fallocate"):
+        # macOS and Windows: writing finds out.
+        return
     # For reading too: where the file system cannot do it, the C library looks at every block.
-    file = os.open(path, os.O_RDWR | os.O_CLOEXEC)
-    try:
-        os.posix_fallocate(file, 0, os.fstat(file).st_size)
-    finally:
-        os.close(file)
+    with path.open("rb+") as file:
+        os.posix_fallocate(file.fileno(), 0, os.fstat(file.fileno()).st_size)
 
 
 def _early(parent: h5py.Group, name: str, shape: tuple[int, ...], dtype: Any) -> h5py.Dataset:

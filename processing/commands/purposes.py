@@ -1,0 +1,12 @@
+"""Headings of `process --help`: what its commands are for, in the order of the work."""
+
+from __future__ import annotations
+
+DATA = "Bring data in"
+IMAGES = "Images and quantities"
+CALIBRATION = "Calibrate and design"
+REFLECTANCE = "Reflectance"
+REPORTS = "Campaigns and reports"
+EXPORT = "Write for other programs"
+#: In this order.
+PURPOSES = (DATA, IMAGES, CALIBRATION, REFLECTANCE, REPORTS, EXPORT)
