@@ -15,6 +15,7 @@ from typing import Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from processing.arrays import Array
 from processing.storage.capture import Capture
@@ -31,8 +32,10 @@ SPARE = 4
 DECISIVE = 50.0
 #: Least change of brightness that is reported; a lamp drifts by less between two states.
 LEAST_CHANGE = 0.03
-#: Part of the residual that mirroring must leave at most, and least residual over the signal that is looked at.
+#: Part of the residual that mirroring all from one on must leave at most, and least residual over the signal for that.
 MIRRORED_LEAVES, LEAST_PATTERN = 0.25, 0.01
+#: How often a capture may have a sound state that is called mirrored.
+MIRRORED_BY_CHANCE = 1e-3
 #: States of one capture that are named.
 MOST_FOUND = 5
 #: Blocks a side into which a picture is averaged.
@@ -220,32 +223,76 @@ def _drifts(outside: Array, y: Array, step: float) -> bool:
 
 
 def mirrored_pictures(states: NDArray[np.int64], rows: Array, blocks: Array) -> list[Finding]:
-    """A state, or all from one on, whose picture (N, blocks, blocks) agrees with the others once it is mirrored."""
-    n, spare, outside = _outside(rows)
+    """All states from one on, or single ones, whose picture agrees with the others once it is mirrored.
+
+    Parameters
+    ----------
+    states : (N,) numbers in the plan, ascending.
+    rows : (N, 16) of the measurement matrix.
+    blocks : (N, blocks, blocks) light of the parts of each picture.
+    """
+    _, spare, outside = _outside(rows)
     if spare < SPARE:
         return []
+    if (step := _mirrored_from(outside, blocks)) is not None:
+        k, words = step
+        return [_mirrored(int(states[k]), f"from state {states[k]} on", words)]
+    found: list[Finding] = []
+    blocks = blocks.copy()
+    while len(found) < MOST_FOUND and (one := _mirrored_alone(rows, blocks)) is not None:
+        k, words = one
+        blocks[k] = MIRRORS[words](blocks[k])
+        found.append(_mirrored(int(states[k]), f"state {states[k]} alone", words))
+    return found
+
+
+def _mirrored(state: int, where: str, words: str) -> Finding:
+    return Finding(state, "picture", f"{where}: the picture is {words} against the other states: the camera changed")
+
+
+def _mirrored_from(outside: Array, blocks: Array) -> tuple[int, str] | None:
+    """From which state on mirroring lets all agree with those before, and how; None if from no state on."""
+    n = len(blocks)
     flat = blocks.reshape(n, -1)
     left = outside @ flat
     rss, power = float(np.square(left).sum()), float(np.square(flat).sum())
-    if rss < (LEAST_PATTERN**2) * power * spare / n**2:
-        return []
-    best: tuple[float, int, bool, str] = (rss, 0, False, "")
+    best: tuple[float, int, str] = (MIRRORED_LEAVES * rss, 0, "")
     for words, mirror in MIRRORS.items():
         change = mirror(blocks).reshape(n, -1) - flat
-        # Adds the states one after another, from the last: all from one on.
         onwards = left.copy()
         for k in range(n - 1, 0, -1):
-            alone = float(np.square(left + np.outer(outside[:, k], change[k])).sum())
             onwards += np.outer(outside[:, k], change[k])
-            from_here = float(np.square(onwards).sum())
-            best = min(best, (alone, k, False, words), (from_here, k, k < n - 1, words))
-        best = min(best, (float(np.square(left + np.outer(outside[:, 0], change[0])).sum()), 0, False, words))
-    remaining, k, is_onwards, words = best
-    if remaining > MIRRORED_LEAVES * rss:
-        return []
-    state = int(states[k])
-    where = f"from state {state} on" if is_onwards else f"state {state} alone"
-    return [Finding(state, "picture", f"{where}: the picture is {words} against the other states: the camera changed")]
+            if k < n - 1:
+                best = min(best, (float(np.square(onwards).sum()), k, words))
+    seen = rss > LEAST_PATTERN**2 * power * np.trace(outside) / n**2
+    return best[1:] if best[2] and seen else None
+
+
+def _mirrored_alone(rows: Array, blocks: Array) -> tuple[int, str] | None:
+    """The state whose picture has the odd part of its prediction with the opposite sign, and how; None without one.
+
+    Mirroring changes the part of a picture that is odd under it, and nothing else. The others predict that part. Its
+    agreement with the state's own is held against the agreement of their residuals: Student's t.
+    """
+    n, best = len(rows), (np.inf, 0, "")
+    for k in range(n):
+        others = np.arange(n) != k
+        inverse = np.linalg.pinv(rows[others], rcond=1e-8)
+        weights = rows[k] @ inverse
+        freedom = n - 1 - round(float(np.trace(rows[others] @ inverse)))
+        if freedom < SPARE - 1:
+            continue
+        residual = blocks[others] - np.tensordot(rows[others] @ inverse, blocks[others], axes=1)
+        predicted = np.tensordot(weights, blocks[others], axes=1)
+        limit = stdtrit(freedom, MIRRORED_BY_CHANCE / (n * len(MIRRORS)))
+        for mirror in MIRRORS.values():
+            odd = predicted - mirror(predicted)
+            spread = np.square(np.tensordot(residual, odd, axes=2)).sum() / freedom * (1 + weights @ weights)
+            beyond = float(np.sum(blocks[k] * odd)) / np.sqrt(spread) - limit if spread > 0 else 0.0
+            if beyond < min(best[0], 0.0):
+                fits = {words: np.square(way(blocks[k]) - predicted).sum() for words, way in MIRRORS.items()}
+                best = beyond, k, min(fits, key=lambda words: fits[words])
+    return best[1:] if best[2] else None
 
 
 def evidence_of(capture: Capture) -> tuple[str, ...]:
