@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import traceback
 from pathlib import Path
+from typing import Any
 
 from drivers.errors import DeviceError
 from processing.errors import ProcessError
@@ -19,6 +20,9 @@ class PlanRefused(AcquisitionError):
     def __init__(self, failures: list[str]) -> None:
         super().__init__("the plan is refused, nothing was moved:\n" + "\n".join(f"  - {f}" for f in failures))
         self.failures = failures
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.failures,)
 
 
 class RunFailed(AcquisitionError):
@@ -60,4 +64,7 @@ class Differs(AcquisitionError):
             + "\n".join(f"  - {line}" for line in found)
             + "\nNothing was moved or changed. Go on with what began it, or keep what comes now apart with --as-new."
         )
-        self.found = found
+        self.what, self.found = what, found
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.what, self.found)

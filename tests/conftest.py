@@ -5,7 +5,8 @@ import fcntl
 import os
 import socket
 import struct
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -148,6 +149,14 @@ def acquire(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., 
         return (code if isinstance(code, int) else 0), out, err
 
     return run
+
+
+@pytest.fixture(autouse=True)
+def _disc_of_one_test() -> Iterator[None]:
+    """A disc process has inherited what its test has patched: it ends with the test."""
+    yield
+    if "acquisition.disc" in sys.modules:
+        sys.modules["acquisition.disc"].end_disc()
 
 
 class SyntheticCapture:

@@ -7,7 +7,7 @@ import json
 import logging
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import numpy as np
 from acquisition.campaign.identity import IDENTITY
 from acquisition.campaign.plan import Campaign, CampaignCapture
 from acquisition.capture.synced import make_folder, sync
-from acquisition.cleanup import on_disc
+from acquisition.disc import on_disc
 from acquisition.errors import AcquisitionError
 from processing.doors import read_json, read_text
 from processing.errors import ProcessError
@@ -44,9 +44,8 @@ class CampaignFolder:
     def __init__(self, folder: Path, campaign: Campaign) -> None:
         self.folder = folder
         make_folder(folder)
-        self._lock = filelock.FileLock(folder / ".lock")
         try:
-            self._lock.acquire(timeout=0)
+            on_disc(f"lock {folder}", _hold, folder)
         except filelock.Timeout:
             raise AcquisitionError(f"another program runs the campaign in {folder}. End that one first.") from None
         try:
@@ -76,20 +75,9 @@ class CampaignFolder:
     def log(self, event: str, **details: Any) -> None:
         """Add a line to the log; it is on the disc when this returns."""
         line = {"time": datetime.datetime.now().astimezone().isoformat(timespec="milliseconds"), "event": event}
-        text = json.dumps(line | details, default=str) + "\n"
         path = self.folder / LOG
-
-        def append() -> None:
-            with open(open_plain(path, os.O_RDWR | os.O_APPEND), "ab+") as file:
-                # A line that was cut off by a full disc must not spoil the next.
-                end = file.seek(0, os.SEEK_END)
-                cut_off = end and file.seek(end - 1) is not None and file.read(1) != b"\n"
-                file.write(("\n" * bool(cut_off) + text).encode())
-                file.flush()
-                os.fsync(file.fileno())
-
         with self._room_for(path):
-            on_disc(f"write {path}", append)
+            on_disc(f"write {path}", _append, path, json.dumps(line | details, default=str) + "\n")
 
     def record(self, capture: str, **details: Any) -> None:
         """Write what became of a capture into the index, which is whole at any instant."""
@@ -97,19 +85,8 @@ class CampaignFolder:
         self._write_whole(self.folder / INDEX, json.dumps(self.index, indent=1, default=str))
 
     def _write_whole(self, path: Path, text: str) -> None:
-        new = path.with_name(path.name + ".new")
-
-        def write() -> None:
-            with open(open_plain(new, os.O_WRONLY), "w", encoding="utf-8") as file:
-                file.truncate(0)
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(new, path)
-            sync(path.parent)
-
         with self._room_for(path):
-            on_disc(f"write {path}", write)
+            on_disc(f"write {path}", _replace, path, text)
 
     @contextmanager
     def _room_for(self, path: Path) -> Iterator[None]:
@@ -123,7 +100,44 @@ class CampaignFolder:
 
     def close(self) -> None:
         """Let another program run the campaign."""
-        self._lock.release()
+        with suppress(AcquisitionError):
+            on_disc(f"let go of {self.folder}", _let_go, self.folder)
+
+
+#: Locks of the folders that are held, in the disc process.
+_held: dict[Path, filelock.BaseFileLock] = {}
+
+
+def _hold(folder: Path) -> None:
+    lock = filelock.FileLock(folder / ".lock")
+    lock.acquire(timeout=0)
+    _held[folder] = lock
+
+
+def _let_go(folder: Path) -> None:
+    if (lock := _held.pop(folder, None)) is not None:
+        lock.release()
+
+
+def _append(path: Path, text: str) -> None:
+    with open(open_plain(path, os.O_RDWR | os.O_APPEND), "ab+") as file:
+        # A line that was cut off by a full disc must not spoil the next.
+        end = file.seek(0, os.SEEK_END)
+        cut_off = end and file.seek(end - 1) is not None and file.read(1) != b"\n"
+        file.write(("\n" * bool(cut_off) + text).encode())
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _replace(path: Path, text: str) -> None:
+    new = path.with_name(path.name + ".new")
+    with open(open_plain(new, os.O_WRONLY), "w", encoding="utf-8") as file:
+        file.truncate(0)
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(new, path)
+    sync(path.parent)
 
 
 def read_index(folder: Path) -> dict[str, dict[str, Any]]:

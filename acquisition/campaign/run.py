@@ -15,12 +15,14 @@ from acquisition.capture import session
 from acquisition.capture.checks import Check, refuse_failed
 from acquisition.capture.estimate import capture_seconds, last_pose_deg
 from acquisition.capture.identity import require_same
-from acquisition.capture.job import Job, Result, check_with_devices, existing, job_of
+from acquisition.capture.job import Job, Result, check_disc, check_with_devices, job_of
 from acquisition.capture.job import prepare as prepare_job
 from acquisition.capture.machine_checks import check_machine
 from acquisition.capture.operator import Operator
-from acquisition.capture.writer import PARTIAL, bytes_needed, check_space, seal_whole
-from acquisition.errors import AcquisitionError, Differs, InterlockOpened, PlanRefused, Stopped, Unforeseen, as_known
+from acquisition.capture.plan import MeasurementPlan
+from acquisition.capture.writer import PARTIAL, bytes_needed, seal_whole
+from acquisition.disc import on_disc
+from acquisition.errors import Differs, InterlockOpened, PlanRefused, Stopped, Unforeseen, as_known
 from acquisition.rig.config import RigConfig
 from acquisition.rig.continuous_rotation import states_deg, unwound
 from acquisition.rig.folded_angles import folded
@@ -80,12 +82,7 @@ def check_all(jobs: Sequence[tuple[CampaignCapture, Job]], rig: Rig, folder: Pat
     samples = [job.plan.sample.name or job.plan.sample.kind for _, job in jobs]
     checks = [*check_machine(rig.config, samples), *seen.values()]
     missing = sum(p.size for p in planned if not (folder / p.capture.name).exists())
-    try:
-        check_space(existing(folder), missing + BOOKS)
-        checks.append(Check("disc for the campaign", True, f"{missing / 1e9:.2f} GB in {folder}"))
-    except AcquisitionError as error:
-        checks.append(Check("disc for the campaign", False, str(error)))
-    return planned, checks
+    return planned, [*checks, check_disc("disc for the campaign", folder, missing + BOOKS)]
 
 
 def _trace(error: Exception) -> dict[str, str]:
@@ -198,7 +195,7 @@ class CampaignRun:
                 "capture ended", capture=capture.name, status=result.status, states=result.states_done,
                 saturated_fraction=result.saturated_fraction, ledger=result.ledger, messages=result.messages,
             )  # fmt: skip
-            self.folder.record(capture.name, **entry_of(capture, result.path))
+            self.folder.record(capture.name, **on_disc(f"read {result.path}", entry_of, capture, result.path))
             return result
 
     def _wait_for_door(self, rig: Rig, capture: CampaignCapture) -> None:
@@ -217,12 +214,9 @@ class CampaignRun:
 
     def _take_once(self, capture: CampaignCapture, job: Job, rig: Rig) -> Result:
         final = self.folder.folder / capture.name
-        partial = final.with_name(final.name + PARTIAL)
-        if final.exists():
-            # Aborted by Ctrl-C: sealed, but with states missing.
-            partial = final
-        if partial.exists():
-            job = job_of(partial, self.config, capture.plan)
+        partial = on_disc(f"look at {final}", _begun, final)
+        if partial is not None:
+            job = on_disc(f"read {partial}", job_of, partial, self.config, capture.plan)
             refuse_failed(check_with_devices(job, rig, final.parent))
             return session.resume(job, rig, partial, self.stop, self.observers, self.home)
         refuse_failed(check_with_devices(job, rig, final.parent))
@@ -231,30 +225,19 @@ class CampaignRun:
     def _complete(self, capture: CampaignCapture, job: Job) -> bool:
         """Whether a capture is there, whole, and of this campaign. Raises Differs."""
         path = self.folder.folder / capture.name
-        partial = path.with_name(path.name + PARTIAL)
-        if partial.exists() and seal_whole(partial) is not None:
+        if on_disc(f"look at {path}", _seal, path):
             self.folder.log("sealed", capture=capture.name, why="its run was killed after the last state")
-        if not path.exists():
-            return False
-        with Capture(path) as there:
-            require_same(there, capture.plan, self.config, job.instrument)
-            return there.status == "complete"
+        return on_disc(f"read {path}", _is_complete, path, capture.plan, self.config, job.instrument)
 
     def _catch_up(self, capture: CampaignCapture) -> None:
         """Put a complete capture into the index, where a kill or a full disc has kept it out."""
         if self.folder.index.get(capture.name, {}).get("status") != "complete":
-            self.folder.record(capture.name, **entry_of(capture, self.folder.folder / capture.name))
+            path = self.folder.folder / capture.name
+            self.folder.record(capture.name, **on_disc(f"read {path}", entry_of, capture, path))
 
     def _states_done(self, capture: CampaignCapture) -> int:
-        final = self.folder.folder / capture.name
-        for path in (final, final.with_name(final.name + PARTIAL)):
-            if path.exists():
-                try:
-                    with Capture(path) as there:
-                        return len(there.done)
-                except CaptureError:
-                    return 0
-        return 0
+        path = self.folder.folder / capture.name
+        return on_disc(f"read {path}", _states_in, path)
 
     @property
     def rig(self) -> Rig | None:
@@ -267,7 +250,7 @@ class CampaignRun:
             rig.__enter__()
             self._rig = rig
             # A device may have been changed between two tries.
-            require_same_campaign(self.folder.folder, with_devices({}, rig))
+            on_disc("read the campaign", require_same_campaign, self.folder.folder, with_devices({}, rig))
             rig.start_guard(self.folder.folder / GUARD_LOG)
         return self._rig
 
@@ -284,3 +267,35 @@ class CampaignRun:
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s and not self.stop.requested:
             time.sleep(0.05)
+
+
+# --- what the disc process does --------------------------------------------------------------------------------------
+
+
+def _begun(final: Path) -> Path | None:
+    """The file of a capture that is there, under its final name (aborted by Ctrl-C, or whole) or its partial one."""
+    return next((path for path in (final, final.with_name(final.name + PARTIAL)) if path.exists()), None)
+
+
+def _seal(final: Path) -> bool:
+    partial = final.with_name(final.name + PARTIAL)
+    return partial.exists() and seal_whole(partial) is not None
+
+
+def _is_complete(path: Path, plan: MeasurementPlan, config: RigConfig, instrument: InstrumentModel) -> bool:
+    if not path.exists():
+        return False
+    with Capture(path) as there:
+        require_same(there, plan, config, instrument)
+        return there.status == "complete"
+
+
+def _states_in(final: Path) -> int:
+    path = _begun(final)
+    try:
+        if path is not None:
+            with Capture(path) as there:
+                return len(there.done)
+    except CaptureError:
+        pass
+    return 0

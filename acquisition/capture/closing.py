@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from acquisition.capture.header import now
 from acquisition.capture.time_ledger import summed
+from acquisition.rig import alarms
 
 
 def closing_record(records: Sequence[dict[str, Any]], last: dict[str, Any]) -> dict[str, Any]:
@@ -28,6 +31,11 @@ def closing_record(records: Sequence[dict[str, Any]], last: dict[str, Any]) -> d
     closing["evidence"] = [finding for end in ends for finding in end.get("evidence", [])]
     closing["interlocks"] = [event for end in ends for event in end["interlocks"]]
     return closing
+
+
+def keep_end(path: Path, closing: dict[str, Any]) -> str:
+    """Write the closing record into memory, where the disc does not take it; returns a sentence that says where."""
+    return alarms.keep("record of the end", f"end-{path.name}.json", json.dumps(closing, indent=1, default=str))
 
 
 def closing_of_killed(records: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -6,12 +6,11 @@ import itertools
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import partial
 from pathlib import Path
 
 from acquisition.capture.synced import make_folder
-from acquisition.capture.writer import NEW, PARTIAL, PATIENCE_S
-from acquisition.cleanup import on_disc
+from acquisition.capture.writer import NEW, PARTIAL
+from acquisition.disc import on_disc
 from acquisition.errors import AcquisitionError
 
 
@@ -25,8 +24,7 @@ def free_name(path: Path) -> Iterator[Path]:
         The folder cannot be written.
     """
     try:
-        make_folder(path.parent)
-        free = next(name for name in _numbered(path) if _taken_hold_of(name))
+        free = on_disc(f"create {path}", _take, path)
     except OSError as error:
         raise AcquisitionError(f"{path} cannot be created ({error}). Choose another folder with --out.") from error
     try:
@@ -34,7 +32,12 @@ def free_name(path: Path) -> Iterator[Path]:
     finally:
         # Not there any more once the capture has begun.
         with suppress(OSError, AcquisitionError):
-            on_disc(f"remove {_with(free, NEW)}", partial(_with(free, NEW).unlink, missing_ok=True), PATIENCE_S)
+            on_disc(f"remove {_with(free, NEW)}", _with(free, NEW).unlink, missing_ok=True)
+
+
+def _take(path: Path) -> Path:
+    make_folder(path.parent)
+    return next(name for name in _numbered(path) if _taken_hold_of(name))
 
 
 def _numbered(path: Path) -> Iterator[Path]:

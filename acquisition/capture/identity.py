@@ -125,12 +125,16 @@ def require_same(capture: Capture, plan: MeasurementPlan, config: RigConfig, ins
         raise Differs(str(capture.path), found)
 
 
-def require_same_devices(capture: Capture, rig: Rig) -> None:
-    """Refuse to go on with other devices, or a camera that is set otherwise. Raises Differs."""
+def devices_of(rig: Rig) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What lasts of the devices of a rig, and the settings of its camera."""
+    return lasting(rig.describe()), rig.require_camera().settings.model_dump(mode="json")
+
+
+def require_same_devices(capture: Capture, devices: dict[str, Any], settings: dict[str, Any]) -> None:
+    """Refuse to go on with other devices, or a camera that is set otherwise (`devices_of`). Raises Differs."""
     began = capture.segments[0]
     then = began.identity.devices if began.identity is not None else {}
-    settings = rig.require_camera().settings.model_dump(mode="json")
-    found = [*differences(then, lasting(rig.describe()), "device")]
+    found = [*differences(then, devices, "device")]
     for key in CameraSettings.model_fields:
         if key not in PASSING:
             found += differences(began.camera_settings.get(key), settings.get(key), f"camera setting.{key}")

@@ -23,6 +23,7 @@ from acquisition.capture.identity import require_same
 from acquisition.capture.mosaic_phase import seen_by_camera
 from acquisition.capture.plan import AutoExposure, MeasurementPlan
 from acquisition.capture.writer import bytes_needed, check_space
+from acquisition.disc import on_disc
 from acquisition.errors import AcquisitionError
 from acquisition.rig.config import RigConfig
 from acquisition.rig.folded_angles import folded
@@ -105,12 +106,23 @@ def check_with_devices(job: Job, rig: Rig, folder: Path, here_deg: Mapping[str, 
     if job.instrument.beams is not None:
         checks.append(_check_beams(job.instrument.beams, rows, columns))
     needed = bytes_needed(len(job.table), 1, (rows, columns))
+    return [*checks, check_disc("disc", folder, needed)]
+
+
+def check_disc(what: str, folder: Path, needed: int) -> Check:
+    """Whether a folder has room for so many bytes."""
     try:
-        check_space(existing(folder), needed)
-        checks.append(Check("disc", True, f"{needed / 1e6:.0f} MB in {folder}"))
+        on_disc(f"look at {folder}", _check_space_in, folder, needed)
     except AcquisitionError as error:
-        checks.append(Check("disc", False, str(error)))
-    return checks
+        return Check(what, False, str(error))
+    return Check(what, True, f"{needed / 1e6:.0f} MB in {folder}")
+
+
+def _check_space_in(folder: Path, needed: int) -> None:
+    """Check the folder, or the nearest one above it that is there."""
+    while not folder.exists():
+        folder = folder.parent
+    check_space(folder, needed)
 
 
 def _check_mosaic(instrument: InstrumentModel, rig: Rig) -> Check:
@@ -200,10 +212,3 @@ def frame_shape(rig: Rig) -> tuple[int, int]:
     if settings.height is None or settings.width is None:
         raise AcquisitionError("the camera does not tell the size of its frames")
     return settings.height, settings.width
-
-
-def existing(folder: Path) -> Path:
-    """The folder, or the nearest one above it that is there."""
-    while not folder.exists():
-        folder = folder.parent
-    return folder

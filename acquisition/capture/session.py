@@ -10,22 +10,23 @@ from typing import Any
 
 import numpy as np
 
-from acquisition.capture.closing import closing_record
+from acquisition.capture.closing import closing_record, keep_end
 from acquisition.capture.header import capture_header, now, title_of
-from acquisition.capture.identity import require_same_devices
+from acquisition.capture.identity import devices_of, require_same_devices
 from acquisition.capture.job import Job, Result, frame_shape
 from acquisition.capture.mosaic_phase import seen_by_camera
 from acquisition.capture.plan import ARM, AutoExposure
 from acquisition.capture.records import begin_record, end_record
 from acquisition.capture.runner import CaptureRunner, TooBright
 from acquisition.capture.writer import CaptureWriter, as_partial
-from acquisition.cleanup import on_disc, run_all
+from acquisition.cleanup import run_all
+from acquisition.disc import on_disc
 from acquisition.errors import AcquisitionError, Stopped, as_known
 from acquisition.rig.continuous_rotation import turns_to, unwound
 from acquisition.rig.folded_angles import folded
 from acquisition.rig.interlocks import LightSoFar, light_so_far
 from acquisition.rig.rig import Rig
-from acquisition.screen.observer import Observer
+from acquisition.screen.observer import Mosaic, Observer
 from acquisition.stop_request import StopRequest
 from processing.arrays import Array
 from processing.instrument.applied_effects import changes_at
@@ -80,37 +81,49 @@ def resume(
     """
     _require_reference(rig, home)
     place_sample(job, rig)
-    with Capture(partial) as capture:
-        done = set(capture.done.tolist())
-        if capture.stored_shape != frame_shape(rig):
-            raise AcquisitionError(
-                f"{partial} has frames of {capture.stored_shape}, the camera gives {frame_shape(rig)}. "
-                "Go on with the camera and the settings that began it."
-            )
-        job = replace(job, instrument=seen_by_camera(job.instrument, rig.require_camera()))
-        if capture.header.mosaic != job.instrument.mosaic:
-            raise AcquisitionError(
-                f"{partial} has the mosaic {capture.header.mosaic}, "
-                f"the camera's region now gives {job.instrument.mosaic}. Go on with the region that began it."
-            )
-        require_same_devices(capture, rig)
-        lights = sum(role != "dark" for role in job.table.role)
-        look, wrong = seen_so_far(capture, lights)
-        if wrong is not None:
-            raise AcquisitionError(f"{partial}: {wrong}. There is nothing to go on with: begin the capture again.")
-        earlier = Earlier(len(capture.segments), light_so_far(capture), look)
-    writer = CaptureWriter(as_partial(partial), rig.clock)
-    pending = [k for k in range(len(job.table)) if k not in done]
+    job = replace(job, instrument=seen_by_camera(job.instrument, rig.require_camera()))
+    lights = sum(role != "dark" for role in job.table.role)
+    earlier = on_disc(
+        f"read {partial}", _earlier, partial, frame_shape(rig), job.instrument.mosaic, devices_of(rig), lights
+    )
+    writer = CaptureWriter(on_disc(f"rename {partial}", as_partial, partial), rig.clock)
+    pending = [k for k in range(len(job.table)) if k not in earlier.done]
     return _run(job, rig, writer, pending, stop, observers, earlier)
 
 
 @dataclass(frozen=True)
 class Earlier:
-    """What a capture that is gone on with brings along: its number of segments, the light in them, and its darks."""
+    """What a capture that is resumed brings along: its states, number of segments, the light in them, its darks."""
 
+    done: set[int]
     segments: int
     light: LightSoFar
     darks: LitDarks
+
+
+def _earlier(
+    partial: Path,
+    shape: tuple[int, int],
+    mosaic: Mosaic | None,
+    devices: tuple[dict[str, Any], dict[str, Any]],
+    lights: int,
+) -> Earlier:
+    with Capture(partial) as capture:
+        if capture.stored_shape != shape:
+            raise AcquisitionError(
+                f"{partial} has frames of {capture.stored_shape}, the camera gives {shape}. "
+                "Go on with the camera and the settings that began it."
+            )
+        if capture.header.mosaic != mosaic:
+            raise AcquisitionError(
+                f"{partial} has the mosaic {capture.header.mosaic}, the camera's region now gives {mosaic}. Go on with "
+                "the region that began it."
+            )
+        require_same_devices(capture, *devices)
+        look, wrong = seen_so_far(capture, lights)
+        if wrong is not None:
+            raise AcquisitionError(f"{partial}: {wrong}. There is nothing to go on with: begin the capture again.")
+        return Earlier(set(capture.done.tolist()), len(capture.segments), light_so_far(capture), look)
 
 
 def place_sample(job: Job, rig: Rig) -> None:
@@ -277,7 +290,7 @@ def _begin_segment(job: Job, rig: Rig, runner: CaptureRunner, earlier: Earlier) 
     writer.segment = earlier.segments
     runner.warn(f"gone on with as segment {writer.segment}")
     try:
-        writer.file.add_segment_record(begin_record(job, rig, writer.segment))
+        writer.add_segment_record(begin_record(job, rig, writer.segment))
     except BaseException:
         writer.abandon()
         raise
@@ -292,43 +305,36 @@ def _end_segment(
     closing = closing_record([], end)
     try:
         writer.settle(in_haste=failure is not None)
-
-        def write() -> tuple[dict[str, Any], Path]:
-            records = writer.file.segment_records()
-            closing = closing_record(records, end)
-            # Half of what is left, so that there is room for the next.
-            writer.file.add_segment_record(end, part=0.5)
-            # A run that can go on keeps its partial name, but for the orderly end after one Ctrl-C.
-            return closing, writer.seal(status, closing, keep_partial=failure is not None)
-
-        return on_disc(f"seal {writer.path}", write)
+        closing = closing_record(writer.segment_records(), end)
+        # Half of what is left, so that there is room for the next.
+        writer.add_segment_record(end, part=0.5)
+        # A run that can go on keeps its partial name, but for the orderly end after one Ctrl-C.
+        return closing, writer.seal(status, closing, keep_partial=failure is not None)
     except (AcquisitionError, OSError) as error:
         writer.abandon()
+        kept = keep_end(writer.path, closing)
         if failure is None:
+            error.add_note(kept)
             raise
         if str(error) != str(failure):
             failure.add_note(f"the end of the run could not be recorded: {error}")
+        failure.add_note(kept)
         return closing, writer.path
 
 
 def _result(path: Path, status: Status, job: Job, runner: CaptureRunner) -> Result:
+    done, saturated, off_deg = on_disc(f"read {path}", _read_back, path, dict(job.table.angles_deg))
+    ledger, messages = runner.ledger.summary(), tuple(runner.messages.texts)
+    return Result(path, status, done, len(job.table), ledger, messages, saturated, off_deg)
+
+
+def _read_back(path: Path, targets_deg: dict[str, Array]) -> tuple[int, float, float]:
+    """States done, largest part of saturated pixels, and largest angle off a target."""
     with Capture(path) as capture:
         saturated = capture.column("saturated_fraction")
-        done = capture.done
         off = [
             # A part of the states may have been taken some turns away.
-            np.abs((capture.angles_deg[axis] - target[done] + 180.0) % 360.0 - 180.0)
-            for axis, target in job.table.angles_deg.items()
+            np.abs((capture.angles_deg[axis] - target[capture.done] + 180.0) % 360.0 - 180.0)
+            for axis, target in targets_deg.items()
         ]
-    worst = float(np.max(saturated, initial=0.0))
-    worst_angle = float(np.max(off, initial=0.0))
-    return Result(
-        path,
-        status,
-        len(done),
-        len(job.table),
-        runner.ledger.summary(),
-        tuple(runner.messages.texts),
-        worst,
-        worst_angle,
-    )
+        return len(capture.done), float(np.max(saturated, initial=0.0)), float(np.max(off, initial=0.0))

@@ -181,12 +181,19 @@ class StateFile:
         """Replace the closing record; one that is too long loses what `fitted_json` leaves out."""
         self._write_text(self._closing, 0, fitted_json(record, self._closing.room))
 
-    def is_at(self, path: Path) -> bool:
-        """Whether the open file is the one of that name: False once it was deleted or moved."""
-        try:
-            return os.path.samestat(os.fstat(self._file), os.stat(path))
-        except OSError:
-            return False
+    def forget(self) -> None:
+        """Mark every state as not done."""
+        self.write_column("done", np.zeros(self.states))
+
+    def require_at(self, path: Path) -> None:
+        """Raise AcquisitionError if the file is not of that name any more: what is written then is lost with it."""
+        with contextlib.suppress(OSError):
+            if os.path.samestat(os.fstat(self._file), os.stat(path)):
+                return
+        raise AcquisitionError(
+            f"{path} was deleted or moved while it was written. Put it back where it was, then go on with --resume; if "
+            "it is gone, begin a new capture."
+        )
 
     def write_status(self, status: Status) -> None:
         """Replace the status, in the bytes that it has."""

@@ -1,7 +1,7 @@
 """Writes a capture state by state so that neither a crash nor a power cut takes a state that was marked done.
 
-All space is taken before the first motion. Each state is written, synced, marked done and synced again, by one thread,
-while the next state is under way. A finished file loses its `.partial` and is on the disc by then.
+All space is taken before the first motion. Each state is written, synced, marked done and synced again, by the disc
+process, while the next state is under way. A finished file loses its `.partial` and is on the disc by then.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import os
 import shutil
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, wait
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from acquisition.capture.closing import closing_of_killed
 from acquisition.capture.layout import put_layout
 from acquisition.capture.state_file import StateFile
 from acquisition.capture.synced import make_folder, sync
+from acquisition.disc import disc, on_disc
 from acquisition.errors import AcquisitionError
 from drivers.clock import REAL, Clock
 from drivers.motion import Position
@@ -34,14 +36,11 @@ from processing.storage.segments import encode_line
 
 PARTIAL = ".partial"
 NEW = ".new"
-THREAD = "capture writer"
 #: How long the disc may take for one state before nothing is measured any more, and before the run is ended.
 PATIENCE_S = 1.5
 DEAD_S = 30.0
-#: How long any call may take before the light is shut; one that changes no byte is tried all the time.
+#: How long any call may take before the light is shut; one that changes no byte is tried every LOOK_S.
 DARK_S = 1.0
-PROBE_S = 0.2
-#: How often it is looked at.
 LOOK_S = 0.2
 #: Layout, notes and journals besides the frames, and the columns of a state, generously.
 LAYOUT_BYTES = 3 << 19
@@ -81,15 +80,15 @@ def check_space(folder: Path, needed: int) -> None:
 
 
 class CaptureWriter:
-    """An open `.partial` file and the thread that writes into it.
+    """An open `.partial` file, in which the disc process writes.
 
     `put` hands over a state once the one before is on the disc, and returns at once: a power cut takes one state at
-    most of those handed over. Whatever ends the writing thread is raised by the next `put` or by `seal`, and told to
+    most of those handed over. Whatever ends the writing is raised by the next `put` or by `seal`, and told to
     `on_failure` at once.
 
     Attributes
     ----------
-    on_failure : called from the writing thread with what `put` would raise.
+    on_failure : called from another thread with what `put` would raise.
     on_blocked : called from a thread of its own, once each time the disc has taken nothing for DARK_S.
     segment : number of the segment that the states written now belong to.
 
@@ -100,22 +99,19 @@ class CaptureWriter:
     """
 
     def __init__(self, path: Path, clock: Clock = REAL) -> None:
-        self.path = path
+        # Its name changes when it is sealed; there it keeps the one that it was opened with.
+        self.path = self._place = path
         self._clock = clock
-        self.file = StateFile(path)
+        self._disc = disc()
         self.segment = 0
         self.on_failure: Callable[[AcquisitionError], None] | None = None
         self.on_blocked: Callable[[], None] | None = None
-        self._probed_s = clock.now_s()
-        self._change = threading.Condition()
-        self._record: StateRecord | None = None
+        self._state: Future[None] | None = None
         self._since_s = 0.0
-        self._error: BaseException | None = None
-        self._ending = False
-        self._thread = threading.Thread(target=self._work, name=THREAD, daemon=True)
-        self._thread.start()
-        for name, work in (("watch", self._watch), ("probe", self._probe)):
-            threading.Thread(target=work, name=f"{THREAD}, {name}", daemon=True).start()
+        self._ended = threading.Event()
+        self._disc.call(f"open {path}", _open, path)
+        self._watching = threading.Thread(target=self._watch, name="capture writer, watch", daemon=True)
+        self._watching.start()
 
     @classmethod
     def create(
@@ -139,63 +135,45 @@ class CaptureWriter:
         AcquisitionError
             The file exists, the folder cannot be written, or the disc has not enough room.
         """
-        partial = path.with_name(path.name + PARTIAL)
-        # A partial file is whole from the moment it has that name.
-        new = path.with_name(path.name + NEW)
-        needed = bytes_needed(len(table), len(header.channels), frame_shape)
-        if path.exists() or partial.exists():
-            raise AcquisitionError(f"{path if path.exists() else partial} exists already; nothing was changed")
-
-        def make(h5: h5py.File) -> None:
-            create_layout(h5, header, dict(table.angles_deg), table.role, frame_shape, np.uint16, start_time)
-            h5["entry/states/exposure_s"][...] = table.exposure_s
-            h5["entry/states/repeats"][...] = table.repeats
-
-        try:
-            make_folder(path.parent)
-            check_space(path.parent, needed)
-            put_layout(new, needed, make, b"" if begin is None else encode_line(json_bytes(begin)))
-            _require_layout(new, table)
-            os.rename(new, partial)
-            sync(partial.parent)
-        except OSError as error:
-            with contextlib.suppress(OSError):
-                new.unlink(missing_ok=True)
-            if error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT):
-                raise _no_room(path.parent, needed, error) from error
-            raise AcquisitionError(
-                f"{partial} cannot be created ({error}). Choose another folder with --out."
-            ) from error
-        return cls(partial, clock)
+        return cls(on_disc(f"create {path}", _create, path, header, table, frame_shape, start_time, begin), clock)
 
     def put(self, record: StateRecord) -> None:
         """Hand over a state, when the one before is on the disc. Raises AcquisitionError after DEAD_S."""
         self.settle()
-        self._require_there()
-        with self._change:
-            self._record, self._since_s = record, self._clock.now_s()
-            self._change.notify_all()
+        pixels = record.pixels if record.pixels.ndim == 3 else record.pixels[np.newaxis]
+        positions = {axis: (position.deg, position.counts) for axis, position in record.positions.items()}
+        columns = {**record.columns, "segment": self.segment}
+        self._since_s = self._clock.now_s()
+        self._state = self._disc.submit(_write_state, self._place, record.state, positions, columns, frame=pixels)
+        self._state.add_done_callback(self._written)
 
-    def _require_there(self) -> None:
-        """Raise AcquisitionError if the file is not in its folder any more: what is written then is lost with it."""
-        if not self.file.is_at(self.path):
-            raise AcquisitionError(
-                f"{self.path} was deleted or moved while it was written. Put it back where it was, then go on with "
-                "--resume; if it is gone, begin a new capture."
-            )
+    def _written(self, state: Future[None]) -> None:
+        error = state.exception()
+        if error is not None and self.on_failure is not None:
+            self.on_failure(self._failure(error))
 
     def set_exposure(self, exposure_s: NDArray[np.float64]) -> None:
         """Write the exposure of every state; NaN while it is not known."""
-        self._write_column("exposure_s", exposure_s)
+        self._call("write_column", "exposure_s", exposure_s)
 
     def forget(self) -> None:
         """Mark every state as not done."""
-        self._write_column("done", np.zeros(self.file.states))
+        self._call("forget")
 
-    def _write_column(self, name: str, values: NDArray[Any]) -> None:
+    def segment_records(self) -> list[dict[str, Any]]:
+        """The lines of the journal of segments."""
+        records: list[dict[str, Any]] = self._call("segment_records")
+        return records
+
+    def add_segment_record(self, record: Mapping[str, Any], part: float = 1.0) -> None:
+        """Add a line to the journal of segments. Raises AcquisitionError if it is full."""
+        self._call("add_segment_record", record, part)
+
+    def _call(self, method: str, *arguments: Any) -> Any:
+        """Have the open file do something, once the states handed over are on the disc."""
         self.settle()
         try:
-            self.file.write_column(name, values)
+            return self._disc.call(f"write {self.path}", _on_file, self._place, method, *arguments)
         except OSError as error:
             raise self._failure(error) from error
 
@@ -216,12 +194,11 @@ class CaptureWriter:
             A state could not be written.
         """
         try:
-            self.settle()
-            self._require_there()
-            self.file.write_closing(closing)
-            self.file.write_status(status)
+            self._call("require_at", self.path)
+            self._call("write_closing", closing)
+            self._call("write_status", status)
             if not keep_partial:
-                self.path = finish(self.path)
+                self.path = self._disc.call(f"seal {self.path}", finish, self.path)
         except OSError as error:
             raise self._failure(error) from error
         finally:
@@ -230,10 +207,10 @@ class CaptureWriter:
 
     def abandon(self) -> None:
         """Write what waits, if the disc takes it, and let go of the file; never raises."""
-        with self._change:
-            self._ending = True
-            self._change.notify_all()
-        self._thread.join(min(PATIENCE_S, DEAD_S))
+        if not self._ended.is_set():
+            self._ended.set()
+            wait([self._disc.submit(_close, self._place)], PATIENCE_S)
+            self._watching.join(PATIENCE_S)
 
     def is_settled(self) -> bool:
         """Wait until every state handed over is on the disc, but for PATIENCE_S at most. Raises AcquisitionError."""
@@ -244,45 +221,38 @@ class CaptureWriter:
 
         Parameters
         ----------
-        in_haste : for a run that has failed already, wait for PATIENCE_S only.
+        in_haste : for a run that has failed already, wait for PATIENCE_S only, here and with all that follows.
         """
+        if in_haste:
+            self._disc.hurry()
         patience_s = PATIENCE_S if in_haste else DEAD_S
         if not self._settled(patience_s):
             raise self._blocked(patience_s)
 
     def _settled(self, patience_s: float) -> bool:
-        with self._change:
-            while self._record is not None and self._error is None:
-                if self._clock.now_s() - self._since_s > patience_s:
-                    return False
-                self._change.wait(LOOK_S)
-            if self._error is not None:
-                raise self._failure(self._error) from self._error
+        if self._state is None:
+            return True
+        while not wait([self._state], LOOK_S).done:
+            if self._clock.now_s() - self._since_s > patience_s:
+                return False
+        error = self._state.exception()
+        if error is not None:
+            raise self._failure(error) from error
         return True
 
-    def _probe(self) -> None:
-        """Touch the file again and again: a disc that hangs is noticed in a long exposure too."""
-        while not self._ending and self._error is None:
-            with contextlib.suppress(OSError):
-                os.utime(self.path)
-            self._probed_s = self._clock.now_s()
-            with self._change:
-                self._change.wait(PROBE_S)
-
     def _watch(self) -> None:
-        """Tell of a disc that blocks although nobody hands over a state, as in a long exposure."""
-        is_blocked = False
-        with self._change:
-            while not self._ending and self._error is None:
-                self._change.wait(LOOK_S)
-                now_s = self._clock.now_s()
-                since_s = min(self._probed_s + PROBE_S, now_s if self._record is None else self._since_s)
-                if is_blocked != (is_blocked := now_s - since_s > DARK_S) and is_blocked and self.on_blocked:
-                    self.on_blocked()
-                if self._record is not None and self._clock.now_s() - self._since_s > DEAD_S:
-                    if self.on_failure is not None:
-                        self.on_failure(self._blocked(DEAD_S))
-                    return
+        """Ask for a sign of the disc again and again: one that hangs is noticed in a long exposure too."""
+        probe, answered_s, is_blocked = self._disc.submit(os.utime, self.path), self._clock.now_s(), False
+        while not self._ended.wait(LOOK_S):
+            now_s = self._clock.now_s()
+            if probe.done():
+                probe, answered_s = self._disc.submit(os.utime, self.path), now_s
+            if is_blocked != (is_blocked := now_s - answered_s > DARK_S) and is_blocked and self.on_blocked:
+                self.on_blocked()
+            if self._state is not None and not self._state.done() and now_s - self._since_s > DEAD_S:
+                if self.on_failure is not None:
+                    self.on_failure(self._blocked(DEAD_S))
+                return
 
     def _blocked(self, waited_s: float) -> AcquisitionError:
         return AcquisitionError(
@@ -297,32 +267,73 @@ class CaptureWriter:
             "go on with --resume when the disc is well."
         )
 
-    def _work(self) -> None:
-        try:
-            while (record := self._next()) is not None:
-                self._write(record)
-                with self._change:
-                    self._record = None
-                    self._change.notify_all()
-        except BaseException as error:  # noqa: BLE001 - whatever it is, the measuring thread must hear of it
-            with self._change:
-                self._error = error
-                self._change.notify_all()
-            if self.on_failure is not None:
-                self.on_failure(self._failure(error))
-        finally:
-            self.file.close()
 
-    def _next(self) -> StateRecord | None:
-        with self._change:
-            while self._record is None and not self._ending:
-                self._change.wait()
-            return self._record
+# --- what the disc process does --------------------------------------------------------------------------------------
 
-    def _write(self, record: StateRecord) -> None:
-        pixels = record.pixels if record.pixels.ndim == 3 else record.pixels[np.newaxis]
-        positions = {axis: (position.deg, position.counts) for axis, position in record.positions.items()}
-        self.file.write_state(record.state, pixels, positions, {**record.columns, "segment": self.segment})
+#: Open files there, by their partial names.
+_files: dict[Path, StateFile] = {}
+
+
+def _create(
+    path: Path,
+    header: CaptureHeader,
+    table: StateTable,
+    frame_shape: tuple[int, int],
+    start_time: str,
+    begin: Mapping[str, Any] | None,
+) -> Path:
+    """Make the partial file, as `CaptureWriter.create` says; returns its path."""
+    partial = path.with_name(path.name + PARTIAL)
+    # A partial file is whole from the moment it has that name.
+    new = path.with_name(path.name + NEW)
+    needed = bytes_needed(len(table), len(header.channels), frame_shape)
+    if path.exists() or partial.exists():
+        raise AcquisitionError(f"{path if path.exists() else partial} exists already; nothing was changed")
+
+    def make(h5: h5py.File) -> None:
+        create_layout(h5, header, dict(table.angles_deg), table.role, frame_shape, np.uint16, start_time)
+        h5["entry/states/exposure_s"][...] = table.exposure_s
+        h5["entry/states/repeats"][...] = table.repeats
+
+    try:
+        make_folder(path.parent)
+        check_space(path.parent, needed)
+        put_layout(new, needed, make, b"" if begin is None else encode_line(json_bytes(begin)))
+        _require_layout(new, table)
+        os.rename(new, partial)
+        sync(partial.parent)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            new.unlink(missing_ok=True)
+        if error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT):
+            raise _no_room(path.parent, needed, error) from error
+        raise AcquisitionError(f"{partial} cannot be created ({error}). Choose another folder with --out.") from error
+    return partial
+
+
+def _open(path: Path) -> None:
+    _files[path] = StateFile(path)
+
+
+def _close(path: Path) -> None:
+    if (file := _files.pop(path, None)) is not None:
+        file.close()
+
+
+def _on_file(path: Path, method: str, *arguments: Any) -> Any:
+    return getattr(_files[path], method)(*arguments)
+
+
+def _write_state(
+    path: Path,
+    state: int,
+    positions: Mapping[str, tuple[float, float]],
+    columns: Mapping[str, Any],
+    pixels: NDArray[Any],
+) -> None:
+    file = _files[path]
+    file.require_at(path)
+    file.write_state(state, pixels, positions, columns)
 
 
 def finish(partial: Path) -> Path:

@@ -112,7 +112,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     except Exception as error:  # noqa: BLE001 - the last boundary: a user reads a line, the traceback goes to a file
         known = as_known(error)
         if isinstance(known, Unforeseen):
-            known.add_note(_keep_trace(known.trace))
+            from acquisition.rig import alarms
+
+            known.add_note(alarms.keep("traceback", f"traceback-{os.getpid()}.txt", known.trace))
         _report(known, 1)
 
 
@@ -122,19 +124,6 @@ def _say_alarms() -> None:
     for alarm in alarms.unacknowledged():
         text = f"ALARM since {alarm.time}, rig {alarm.rig}: {alarm.text}. Acknowledge with: {alarms.ACKNOWLEDGE}"
         typer.echo(text, err=True)
-
-
-def _keep_trace(trace: str) -> str:
-    """Write a traceback to a file in memory; returns a line that says where."""
-    from acquisition.rig import alarms
-
-    path = alarms.folder() / f"traceback-{os.getpid()}.txt"
-    try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        path.write_text(trace, encoding="utf-8")
-    except OSError as error:
-        return f"The traceback could not be kept ({error})."
-    return f"The traceback is in {path}."
 
 
 def _report(error: BaseException, code: int, text: str | None = None) -> NoReturn:

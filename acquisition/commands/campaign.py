@@ -5,9 +5,10 @@ from __future__ import annotations
 import contextlib
 import os
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import typer
 from rich.console import Console
@@ -22,6 +23,8 @@ from acquisition.capture.checks import Check, refuse_failed
 from acquisition.capture.operator import Operator
 from acquisition.commands.defaults import DEFAULT_RIG, INTERRUPTED
 from acquisition.commands.single import Options, given_rig, live_page, say_simulated, seeded, show_checks
+from acquisition.disc import disc_process, on_disc
+from acquisition.errors import AcquisitionError
 from acquisition.rig.own_rigs import is_own_rig, note_campaign
 from acquisition.rig.rig import Rig
 from acquisition.screen.notify import notifying
@@ -37,6 +40,11 @@ from processing.yaml_file import ConfigError
 
 def run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Observer] = ()) -> int:
     """Run a campaign or, with --dry-run, only check it; returns the exit code."""
+    with disc_process():
+        return _run(options, file, stop, observers)
+
+
+def _run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Observer]) -> int:
     console = Console(stderr=True)
     _refuse_with_campaign(options, file)
     campaign = Campaign.load(file)
@@ -111,9 +119,16 @@ def _refuse_with_campaign(options: Options, file: Path) -> None:
 
 def _sum_up(held: CampaignFolder, names: Sequence[str]) -> list[str]:
     """Write the summary into the folder, whatever the run came to, if the disc takes it."""
-    lines = summary_lines(held.folder, names, held.index)
+    try:
+        return on_disc("write the summary", _write_summary, held.folder, names, held.index)
+    except AcquisitionError as error:
+        return [f"no summary: {error}"]
+
+
+def _write_summary(folder: Path, names: Sequence[str], index: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    lines = summary_lines(folder, names, index)
     with contextlib.suppress(OSError):
-        write_whole_text(held.folder / SUMMARY, "\n".join(lines) + "\n", follow=False)
+        write_whole_text(folder / SUMMARY, "\n".join(lines) + "\n", follow=False)
     return lines
 
 

@@ -27,6 +27,8 @@ from acquisition.capture.plan import MeasurementPlan
 from acquisition.capture.synced import make_folder
 from acquisition.capture.writer import PARTIAL, seal_whole
 from acquisition.commands.defaults import CONFIGS, DEFAULT_RIG, INTERRUPTED
+from acquisition.disc import disc_process, on_disc
+from acquisition.errors import AcquisitionError
 from acquisition.rig.config import RigConfig, load_rig
 from acquisition.rig.guarded import GUARD_LOG
 from acquisition.rig.own_rigs import note_rig, own_rigs
@@ -71,6 +73,11 @@ class Options:
 
 def run(options: Options, stop: StopRequest) -> int:
     """Take or go on with one capture; returns the exit code. Raises the errors that `main` prints."""
+    with disc_process():
+        return _run(options, stop)
+
+
+def _run(options: Options, stop: StopRequest) -> int:
     console = Console(stderr=True)
     if options.resume is not None and (sealed := _sealed(options.resume)) is not None:
         typer.echo(f"every state was there already; sealed as {sealed}")
@@ -91,7 +98,7 @@ def run(options: Options, stop: StopRequest) -> int:
             return INTERRUPTED
         take = session.resume if resuming else session.take
         told = RunFile(path.parent, job.rig.simulated)
-        make_folder(path.parent)
+        on_disc(f"make {path.parent}", make_folder, path.parent)
         rig.start_guard(path.parent / GUARD_LOG)
         with (
             nullcontext(path) if resuming else free_name(path) as path,
@@ -236,13 +243,11 @@ def show_checks(console: Console, checks: tuple[Check, ...]) -> None:
 
 def summarize(job: Job, result: Result) -> None:
     """Draw the quick look and print one screen."""
-    from acquisition.screen.quicklook import draw
-
     try:
-        figure = str(draw(result.path))
-    except OSError as error:
+        figure = str(on_disc("draw the quick look", _drawn, result.path))
+    except (OSError, AcquisitionError) as error:
         # The capture is whole: a picture less is no reason to call it failed.
-        figure = f"not drawn ({error.strerror or error}); the capture is whole"
+        figure = f"not drawn ({getattr(error, 'strerror', None) or error}); the capture is whole"
     plan, ledger = job.plan, result.ledger
     darks = sum(role == "dark" for role in job.table.role)
     what = f"{plan.mode}, {plan.wavelength_nm:g} nm, Omega {plan.omega_deg:g} deg, {plan.sample.name}"
@@ -260,6 +265,12 @@ def summarize(job: Job, result: Result) -> None:
     ]
     for label, text in lines:
         typer.echo(f"{label:<11} {text}")
+
+
+def _drawn(path: Path) -> Path:
+    from acquisition.screen import quicklook
+
+    return quicklook.draw(path)
 
 
 def _steps(ledger: dict[str, float]) -> list[str]:

@@ -43,6 +43,17 @@ def give_alarm(rig: str, text: str) -> Path:
     return path
 
 
+def keep(what: str, name: str, text: str) -> str:
+    """Write a text to a file in memory; returns a sentence that says where."""
+    path = folder() / name
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        return f"The {what} could not be kept ({error})."
+    return f"The {what} is in {path}."
+
+
 def unacknowledged() -> list[Alarm]:
     """The alarms that nobody has acknowledged, the oldest first."""
     found = []

@@ -15,6 +15,8 @@ from collections import deque
 from pathlib import Path
 from typing import Any, Self
 
+from acquisition.disc import on_disc
+from acquisition.errors import AcquisitionError
 from acquisition.screen.observer import Mosaic, Observer, StateReport
 from processing.doors import read_json
 from processing.errors import ProcessError
@@ -51,11 +53,7 @@ class RunFile(Observer):
         self._writing = threading.Thread(target=self._keep, name="run file", daemon=True)
 
     def __enter__(self) -> Self:
-        for old in self._path.parent.glob(".run-*"):
-            # Left behind by a run that was killed, or killed while it wrote.
-            if old.suffix in (".json", NEW) and _read(old.with_suffix(".json")) is None:
-                with contextlib.suppress(OSError):
-                    old.unlink()
+        on_disc(f"look at {self._path.parent}", _remove_left, self._path.parent)
         self._writing.start()
         self._show()
         return self
@@ -99,18 +97,30 @@ class RunFile(Observer):
         self._changed.set()
 
     def _keep(self) -> None:
-        new = self._path.with_suffix(NEW)
         while not self._ended.is_set():
             self._changed.wait()
             self._changed.clear()
-            with contextlib.suppress(OSError):
-                with open(open_plain(new, os.O_WRONLY), "w", encoding="utf-8") as file:
-                    file.truncate(0)
-                    file.write(json.dumps(self._facts))
-                os.replace(new, self._path)
+            with contextlib.suppress(OSError, AcquisitionError):
+                on_disc(f"write {self._path}", _replace, self._path, json.dumps(self._facts))
             self._ended.wait(EVERY_S)
-        with contextlib.suppress(OSError):
-            self._path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError, AcquisitionError):
+            on_disc(f"remove {self._path}", self._path.unlink, missing_ok=True)
+
+
+def _remove_left(folder: Path) -> None:
+    """Remove what runs have left that were killed, or killed while they wrote."""
+    for old in folder.glob(".run-*"):
+        if old.suffix in (".json", NEW) and _read(old.with_suffix(".json")) is None:
+            with contextlib.suppress(OSError):
+                old.unlink()
+
+
+def _replace(path: Path, text: str) -> None:
+    new = path.with_suffix(NEW)
+    with open(open_plain(new, os.O_WRONLY), "w", encoding="utf-8") as file:
+        file.truncate(0)
+        file.write(text)
+    os.replace(new, path)
 
 
 def begun_ticks(pid: int) -> int | None:

@@ -1,4 +1,4 @@
-/* Counts the system calls of a process that change files below a folder; kills or stops it before one of them, and
+/* Counts the system calls of a process and its children that change files below a folder; kills or stops it before one of them, and
  * writes down what each of them does, so that any state of the disc can be made again.
  *
  * Loaded with LD_PRELOAD. Environment: UMOV_DISC_FOLDER, and UMOV_DISC_LOG for the record. Functions for the program
@@ -19,16 +19,44 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/mman.h>
 #include <sys/stat.h>
 #include <sys/uio.h>
 #include <unistd.h>
 
-static pthread_mutex_t lock = PTHREAD_RECURSIVE_MUTEX_INITIALIZER_NP;
-static long made, armed, to_fail;
-static int armed_signal = SIGKILL;
+/* Shared by a program and the children that it forks: they count together, and end or stop together. */
+#define MOST 16
+static struct {
+    pthread_mutex_t lock;
+    long made, armed, to_fail;
+    int armed_signal, processes;
+    pid_t pids[MOST];
+} *all;
 /* Set when the call that is being made is to fail with an input/output error. */
 static __thread int failing;
 static int record = -2;
+
+static void forked(void) {
+    record = -2;
+    int number = __atomic_fetch_add(&all->processes, 1, __ATOMIC_SEQ_CST);
+    if (number < MOST) all->pids[number] = getpid();
+}
+
+static void count_anew(void) {
+    all = mmap(NULL, sizeof *all, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
+    pthread_mutexattr_t kind;
+    pthread_mutexattr_init(&kind);
+    pthread_mutexattr_settype(&kind, PTHREAD_MUTEX_RECURSIVE);
+    pthread_mutexattr_setpshared(&kind, PTHREAD_PROCESS_SHARED);
+    pthread_mutex_init(&all->lock, &kind);
+    all->processes = 1;
+    all->pids[0] = getpid();
+}
+
+__attribute__((constructor)) static void begin(void) {
+    count_anew();
+    pthread_atfork(NULL, NULL, forked);
+}
 
 #define REAL(name, type) static __typeof__(type) real; if (!real) real = (__typeof__(type))dlsym(RTLD_NEXT, name)
 
@@ -77,12 +105,14 @@ static void put(const char *call, const char *path, long offset, const void *dat
 
 /* Before a call that changes the disc. */
 static void before(const char *call, const char *path, long offset, const void *data, size_t size) {
-    made++;
-    if (to_fail && made == to_fail) { failing = 1; return; }
-    if (armed && made == armed) {
-        kill(getpid(), armed_signal);
+    all->made++;
+    if (all->to_fail && all->made == all->to_fail) { failing = 1; return; }
+    if (all->armed && all->made == all->armed) {
+        for (int k = 0; k < all->processes && k < MOST; k++)
+            if (all->pids[k] != getpid()) kill(all->pids[k], all->armed_signal);
+        kill(getpid(), all->armed_signal);
         /* A signal to the process may take a moment to arrive at this thread. */
-        while (armed_signal == SIGKILL) pause();
+        while (all->armed_signal == SIGKILL) pause();
     }
     put(call, path, offset, data, size);
 }
@@ -94,11 +124,16 @@ static int failed(void) {
     return 1;
 }
 
-void disc_calls_arm(long n, int number, long fails) { made = 0; armed = n; armed_signal = number; to_fail = fails; }
-long disc_calls_made(void) { return made; }
-void disc_calls_note(const char *text) { pthread_mutex_lock(&lock); put("note", text, 0, NULL, 0); pthread_mutex_unlock(&lock); }
+#define LOCKED(work) pthread_mutex_lock(&all->lock); work; pthread_mutex_unlock(&all->lock)
 
-#define LOCKED(work) pthread_mutex_lock(&lock); work; pthread_mutex_unlock(&lock)
+void disc_calls_arm(long n, int number, long fails) {
+    count_anew();
+    all->armed = n;
+    all->armed_signal = number;
+    all->to_fail = fails;
+}
+long disc_calls_made(void) { return all->made; }
+void disc_calls_note(const char *text) { LOCKED(put("note", text, 0, NULL, 0)); }
 
 static int opened(const char *name, int at, const char *path, int flags, mode_t mode) {
     REAL("openat", int (*)(int, const char *, int, ...));

@@ -225,12 +225,18 @@ def test_a_closing_record_that_is_too_long_says_what_it_lost(path, file):
 
 
 def test_it_knows_whether_it_is_still_the_file_of_its_name(path, file):
-    assert file.is_at(path)
-    assert not file.is_at(path.with_name("other"))
+    def lost():
+        return pytest.raises(AcquisitionError, match="was deleted or moved while it was written")
+
+    file.require_at(path)
+    with lost():
+        file.require_at(path.with_name("other"))
     path.rename(path.with_name("moved"))
-    assert not file.is_at(path)
+    with lost():
+        file.require_at(path)
     path.write_bytes(b"")
-    assert not file.is_at(path)
+    with lost():
+        file.require_at(path)
 
 
 def test_a_file_system_without_locks_is_good_enough_and_a_broken_one_is_not(path, monkeypatch):

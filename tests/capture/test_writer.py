@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import errno
+import multiprocessing
 import os
+import pickle
 import threading
 from pathlib import Path
 from types import SimpleNamespace
@@ -65,15 +67,17 @@ def create(tmp_path: Path):
 
 
 @pytest.fixture
-def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
-    """System calls that concern the disc, in their order."""
-    seen: list[tuple[Any, ...]] = []
+def calls(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory):
+    """System calls of the disc process that concern the disc, in their order, since the last look."""
+    record = tmp_path_factory.mktemp("calls") / "record"
+    record.touch()
 
     def watch(name: str, note: Any) -> None:
         call = getattr(os, name)
 
         def watched(*arguments: Any) -> Any:
-            seen.append((name, *note(*arguments)))
+            with record.open("ab") as file:
+                pickle.dump((name, *note(*arguments)), file)
             return call(*arguments)
 
         monkeypatch.setattr(os, name, watched)
@@ -82,6 +86,15 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     watch("fdatasync", lambda file: ())
     watch("fsync", lambda file: (os.readlink(f"/proc/self/fd/{file}").rpartition("/")[2],))
     watch("rename", lambda old, new: (Path(old).name, Path(new).name))
+
+    def seen() -> list[tuple[Any, ...]]:
+        with record.open("rb") as file:
+            found = []
+            while file.peek():
+                found.append(pickle.load(file))
+        record.write_bytes(b"")
+        return found
+
     return seen
 
 
@@ -89,28 +102,30 @@ def test_a_state_is_synced_before_it_is_marked_done_and_the_mark_after(create, c
     writer = create()
     with h5py.File(writer.path, locking=False) as h5:
         mark = h5["entry/states/done"].id.get_offset()
-    calls.clear()
+    calls()
     writer.put(record(1))
     writer.settle()
-    names = [call[0] for call in calls]
+    seen = calls()
+    names = [call[0] for call in seen]
     assert names[-3:] == ["fdatasync", "pwrite", "fdatasync"]
     assert "fdatasync" not in names[:-3]
-    assert calls[-2][1] == mark + calls[-2][2].__len__()
-    assert any(call[0] == "pwrite" and record(1).pixels.tobytes() in call[2] for call in calls[:-3])
+    assert seen[-2][1] == mark + seen[-2][2].__len__()
+    assert any(call[0] == "pwrite" and record(1).pixels.tobytes() in call[2] for call in seen[:-3])
     # Nothing of the state is written after its mark.
-    assert int.from_bytes(calls[-2][2], "little") == 1
+    assert int.from_bytes(seen[-2][2], "little") == 1
 
 
 def test_the_file_has_its_final_name_when_all_is_on_the_disc(create, calls, tmp_path):
     writer = create()
-    assert ("fsync", "c.h5.new") in calls
-    assert calls.index(("fsync", "c.h5.new")) < calls.index(("rename", "c.h5.new", "c.h5.partial"))
-    assert calls[-1] == ("fsync", tmp_path.name)
-    calls.clear()
+    seen = calls()
+    assert ("fsync", "c.h5.new") in seen
+    assert seen.index(("fsync", "c.h5.new")) < seen.index(("rename", "c.h5.new", "c.h5.partial"))
+    assert seen[-1] == ("fsync", tmp_path.name)
     assert writer.seal("complete", {"end_time": "now"}) == tmp_path / "c.h5"
     # The closing record and the status are synced before the file has its name, and its folder after.
-    assert calls[-3][0] in ("fdatasync", "fsync")
-    assert calls[-2:] == [("rename", "c.h5.partial", "c.h5"), ("fsync", tmp_path.name)]
+    seen = calls()
+    assert seen[-3][0] in ("fdatasync", "fsync")
+    assert seen[-2:] == [("rename", "c.h5.partial", "c.h5"), ("fsync", tmp_path.name)]
     assert writer.path == tmp_path / "c.h5"
 
 
@@ -216,9 +231,9 @@ def test_an_error_of_the_disc_is_told_at_once_and_by_the_next_call(create, monke
     def fail(*_: object) -> None:
         raise OSError(errno.EIO, "Input/output error")
 
+    monkeypatch.setattr(StateFile, "write_state", fail)
     writer = create()
     writer.on_failure = lambda error: (told.append(error), heard.set())
-    monkeypatch.setattr(StateFile, "write_state", fail)
     writer.put(record(0))
     heard.wait()
     assert "could not be written ([Errno 5] Input/output error)" in str(told[0])
@@ -276,7 +291,7 @@ class Passing(ManualClock):
 
 
 def test_a_disc_that_takes_nothing_is_given_up_after_a_while_and_the_next_state_waits(create, monkeypatch):
-    going_on = threading.Event()
+    going_on = multiprocessing.Event()
     write = StateFile.write_state
     monkeypatch.setattr(StateFile, "write_state", lambda *arguments: (going_on.wait(), write(*arguments)))
     writer = create(clock=Passing())
@@ -291,7 +306,7 @@ def test_a_disc_that_takes_nothing_is_given_up_after_a_while_and_the_next_state_
 
 def test_a_disc_that_blocks_while_nobody_hands_over_a_state_is_told_of(create, monkeypatch):
     told: list[AcquisitionError] = []
-    heard, going_on = threading.Event(), threading.Event()
+    heard, going_on = threading.Event(), multiprocessing.Event()
     write = StateFile.write_state
     monkeypatch.setattr(StateFile, "write_state", lambda *arguments: (going_on.wait(), write(*arguments)))
     writer = create(clock=Passing())

@@ -144,6 +144,7 @@ def run_with(quick_rig: Callable[..., Path], tmp_path: Path) -> Callable[..., tu
     from acquisition.capture import session
     from acquisition.capture.job import check_with_devices, prepare
     from acquisition.capture.plan import MeasurementPlan
+    from acquisition.disc import disc_process
     from acquisition.errors import AcquisitionError
     from acquisition.rig.config import load_rig
     from acquisition.rig.rig import Rig
@@ -165,7 +166,7 @@ def run_with(quick_rig: Callable[..., Path], tmp_path: Path) -> Callable[..., tu
         job = prepare(MeasurementPlan().with_changes(**(plan or {})), config)
         folder = tmp_path / f"capture{next(numbers)}" if resume is None else resume.parent
         error: BaseException | None = None
-        with Rig(config) as rig:
+        with disc_process(), Rig(config) as rig:
 
             class Act(Observer):
                 def exposing(self, state: int, retake: int) -> None:

@@ -4,6 +4,7 @@ As SQLite's tests do, a counter runs through the calls of each kind. After each 
 intact and at the angles that their pixels show, and the capture goes on.
 """
 
+import multiprocessing
 import os
 import random
 import threading
@@ -30,25 +31,30 @@ CALLS = {
 
 
 class Injected:
-    """Lets the calls of one kind fail from a number on, so many times; only while `armed`."""
+    """Lets the calls of one kind fail from a number on, so many times; only while armed."""
 
     def __init__(self, patch, kind, chance):
         place, name, errors, calls = CALLS[kind]
-        self.armed = False
-        self._left, self._until = chance.randint(1, calls), chance.choice([1, 10**9])
-        self.holds_the_light = place is SerialLink and self._until > 1
+        # The disc process counts too.
+        self._armed = multiprocessing.Value("b", False)
+        left, until = chance.randint(1, calls), chance.choice([1, 10**9])
+        self._left, self._until = multiprocessing.Value("l", left), multiprocessing.Value("l", until)
+        self.holds_the_light = place is SerialLink and until > 1
         self._error = chance.choice(errors)
         call = getattr(place, name)
 
         def fail(*arguments, **options):
-            if self.armed:
-                self._left -= 1
-                if self._left <= 0 and self._until > 0:
-                    self._until -= 1
+            if self._armed.value:
+                self._left.value -= 1
+                if self._left.value <= 0 and self._until.value > 0:
+                    self._until.value -= 1
                     raise self._error("injected")
             return call(*arguments, **options)
 
         patch.setattr(place, name, fail)
+
+    def arm(self, armed):
+        self._armed.value = armed
 
 
 @pytest.mark.parametrize("kind", [*CALLS, "two at a time"])
@@ -62,11 +68,11 @@ def test_after_any_failure_the_light_is_off_and_the_capture_goes_on(run_with, in
             def arm(rig, state, retake, injected=injected, rigs=rigs):
                 rigs.append(rig)
                 for each in injected:
-                    each.armed = True
+                    each.arm(True)
 
             error, path = run_with(arm, plan=SHORT)
             for each in injected:
-                each.armed = False
+                each.arm(False)
         assert error is None or isinstance(error, AcquisitionError | DeviceError), error
         # A shutter whose line fails for good cannot be shut; the guard of a real rig has a line of its own.
         if not any(each.holds_the_light for each in injected):

@@ -9,7 +9,7 @@ import h5py
 import pytest
 from ruamel.yaml import YAML
 
-from acquisition.capture.identity import require_same_devices
+from acquisition.capture.identity import devices_of, require_same_devices
 from acquisition.capture.job import job_of
 from acquisition.errors import Differs
 from acquisition.rig.config import load_rig
@@ -124,12 +124,12 @@ def test_other_devices_and_camera_settings_are_refused(partial):
                 require_camera=lambda: SimpleNamespace(settings=settings.model_copy(update=camera)),
             )
 
-        require_same_devices(capture, rig())
+        require_same_devices(capture, *devices_of(rig()))
         with pytest.raises(Differs, match=r"camera setting.gain_db: .* at the start, 6.0 now"):
-            require_same_devices(capture, rig(gain_db=6.0))
+            require_same_devices(capture, *devices_of(rig(gain_db=6.0)))
         told["psa"]["serial_number"] = "another"
         with pytest.raises(Differs, match=r"device.psa.serial_number: 110002 at the start, another now"):
-            require_same_devices(capture, rig())
+            require_same_devices(capture, *devices_of(rig()))
 
 
 def test_plan_options_are_refused_with_resume(partial, acquire):

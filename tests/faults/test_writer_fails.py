@@ -1,6 +1,7 @@
 """Promises 16 and 21: whatever ends or blocks the writer ends the run in order; a changed byte is found at reading."""
 
 import errno
+import multiprocessing
 import threading
 import time
 from pathlib import Path
@@ -55,7 +56,7 @@ def test_any_exception_in_the_writer_ends_the_run_and_it_goes_on(run_with, intac
 def test_a_disc_that_takes_nothing_shuts_the_light_and_ends_the_run(run_with, intact, monkeypatch):
     monkeypatch.setattr(writer, "PATIENCE_S", 0.2)
     monkeypatch.setattr(writer, "DEAD_S", 1.0)
-    blocked, rigs, lit = threading.Event(), [], []
+    blocked, rigs, lit = multiprocessing.Event(), [], []
 
     class Told(Observer):
         def warning(self, text):
@@ -80,7 +81,7 @@ def test_a_run_stopped_at_once_does_not_wait_for_a_disc_that_blocks(run_with, mo
     """Ctrl-C twice while the disc blocks: the run ends after the short patience, not after the long one."""
     monkeypatch.setattr(writer, "PATIENCE_S", 0.2)
     monkeypatch.setattr(writer, "DEAD_S", 3600.0)
-    blocked = threading.Event()
+    blocked = multiprocessing.Event()
 
     class Twice(Observer):
         def warning(self, text):
@@ -104,7 +105,7 @@ def _then(function, act):
 
 def test_a_disc_that_comes_back_is_waited_for(run_with, intact, monkeypatch):
     monkeypatch.setattr(writer, "PATIENCE_S", 0.1)
-    back = threading.Event()
+    back = multiprocessing.Event()
 
     class Told(Observer):
         def warning(self, text):

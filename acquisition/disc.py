@@ -1,0 +1,271 @@
+"""The disc process: a child of this program that opens, writes and syncs the files of the captures.
+
+Linux lets no process end, and hear no Ctrl-C, while one of its threads waits for a disc in the kernel. Here the child
+waits. The program that measures sends it one call at a time and can go on, shut the light and end without an answer.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import gc
+import mmap
+import os
+import queue
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, wait
+from contextlib import contextmanager
+from functools import partial
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from multiprocessing.pool import ExceptionWithTraceback  # type: ignore[attr-defined]
+from typing import Any, NoReturn, ParamSpec, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acquisition.errors import AcquisitionError
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+#: Longest wait for a disc that takes nothing; the same for a run that has failed already.
+DISC_S, HASTE_S = 30.0, 1.5
+#: How often a waiting thread can be interrupted, and how long an orderly end may take.
+SLICE_S, END_S = 0.1, 2.0
+#: Of prctl: the signal that a process gets when its parent has ended.
+PR_SET_PDEATHSIG = 1
+
+
+class SharedFrame:
+    """Memory for one frame that both processes see, so that no pixel goes through the pipe."""
+
+    def __init__(self) -> None:
+        self.file = os.memfd_create("frame", os.MFD_CLOEXEC)
+        self._memory: mmap.mmap | None = None
+
+    def array(self, shape: tuple[int, ...], dtype: str) -> NDArray[Any]:
+        """The memory as an array of this shape; it grows as needed."""
+        values = int(np.prod(shape))
+        size = max(1, values * np.dtype(dtype).itemsize)
+        if self._memory is None or len(self._memory) < size:
+            os.ftruncate(self.file, max(size, os.fstat(self.file).st_size))
+            self._memory = mmap.mmap(self.file, size)
+        return np.frombuffer(self._memory, dtype, values).reshape(shape)
+
+    def close(self) -> None:
+        """Let go of the memory once nobody holds an array of it."""
+        self._memory = None
+        os.close(self.file)
+
+
+class DiscProcess:
+    """A forked child that carries out calls one after the other; a thread hands them over.
+
+    It closes all descriptors that it inherits: no port is held by it. It ends with this process.
+
+    Raises
+    ------
+    AcquisitionError
+        No process can be started.
+    """
+
+    def __init__(self) -> None:
+        self._frame = SharedFrame()
+        self._line, theirs = Pipe()
+        self._patience_s = DISC_S
+        self._busy_since_s: float | None = None
+        self._jobs: queue.SimpleQueue[tuple[Future[Any], Any, NDArray[Any] | None] | None] = queue.SimpleQueue()
+        self.owner, self.has_ended = os.getpid(), False
+        # A thread that ends counts as the parent's end.
+        dies_with = self.owner if threading.current_thread() is threading.main_thread() else 0
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+        try:
+            self._pid = os.fork()
+            if self._pid == 0:
+                _serve(theirs, self._frame, dies_with)
+        except OSError as error:
+            raise AcquisitionError(
+                f"no process can be started that writes the captures ({error}). Nothing was moved. End other programs, "
+                "then give the same command."
+            ) from error
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        theirs.close()
+        self._thread = threading.Thread(target=self._dispatch, name="disc", daemon=True)
+        try:
+            self._thread.start()
+        except RuntimeError:
+            self._line.close()
+            raise
+
+    def submit(self, function: Callable[..., T], *arguments: Any, frame: NDArray[Any] | None = None) -> Future[T]:
+        """Have a function of a module called there; `frame`, if any, arrives as its last argument."""
+        future: Future[T] = Future()
+        if self.has_ended:
+            future.set_exception(_ended())
+        else:
+            self._jobs.put((future, (function, arguments), frame))
+        return future
+
+    def call(self, what: str, function: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:
+        """Call a function there and return what it returns.
+
+        Raises
+        ------
+        AcquisitionError
+            The disc has not answered for DISC_S; what was begun ends when it answers.
+        """
+        future = self.submit(partial(function, **options), *arguments)
+        while not wait([future], SLICE_S).done:
+            since_s = self._busy_since_s
+            if since_s is not None and time.monotonic() - since_s > self._patience_s:
+                raise AcquisitionError(
+                    f"{what}: the disc has not answered for {time.monotonic() - since_s:.0f} s. The light is off. Go "
+                    "on with the same command, or --resume, when the disc is well."
+                )
+        return future.result()
+
+    def hurry(self) -> None:
+        """Wait for HASTE_S only from now on: the run has failed, or somebody wants its end."""
+        self._patience_s = HASTE_S
+
+    def end(self) -> None:
+        """Let it finish what it was given and end; a disc that hangs is not waited for."""
+        self._jobs.put(None)
+        self._thread.join(HASTE_S)
+        end_s = time.monotonic() + END_S
+        while not self._thread.is_alive() and time.monotonic() < end_s:
+            with contextlib.suppress(ChildProcessError):
+                if os.waitpid(self._pid, os.WNOHANG)[0] == 0:
+                    time.sleep(0.005)
+                    continue
+            break
+
+    def _dispatch(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            future, asked, frame = job
+            self._busy_since_s = time.monotonic()
+            try:
+                self._line.send((*asked, self._shared(frame)))
+                is_well, answer = self._line.recv()
+            except (EOFError, ConnectionError):
+                self.has_ended = True
+                future.set_exception(_ended())
+                break
+            except Exception as error:  # noqa: BLE001 - what cannot be sent fails, and the next call goes on
+                is_well, answer = False, error
+            self._busy_since_s = None
+            if is_well:
+                future.set_result(answer)
+            else:
+                self_made: BaseException = answer
+                future.set_exception(self_made)
+        self.has_ended = True
+        with contextlib.suppress(queue.Empty):
+            while True:
+                if (job := self._jobs.get_nowait()) is not None:
+                    job[0].set_exception(_ended())
+        self._line.close()
+        self._frame.close()
+
+    def _shared(self, frame: NDArray[Any] | None) -> tuple[tuple[int, ...], str] | None:
+        if frame is None:
+            return None
+        np.copyto(self._frame.array(frame.shape, frame.dtype.str), frame)
+        return frame.shape, frame.dtype.str
+
+
+def _ended() -> AcquisitionError:
+    return AcquisitionError("the process that writes the captures has ended: out of memory, or somebody killed it")
+
+
+_current: DiscProcess | None = None
+_starting = threading.Lock()
+_is_child = False
+
+
+def disc() -> DiscProcess:
+    """The disc process of this program; it is started if there is none. Raises AcquisitionError."""
+    global _current
+    with _starting:
+        if _current is None or _current.has_ended or _current.owner != os.getpid():
+            _current = DiscProcess()
+        return _current
+
+
+@contextmanager
+def disc_process() -> Iterator[None]:
+    """A disc process for this block; begin it before devices are open and threads run. Raises as `disc`."""
+    disc()
+    try:
+        yield
+    finally:
+        end_disc()
+
+
+def end_disc() -> None:
+    """Let the disc process of this program end, if there is one; the next call begins another."""
+    global _current
+    with _starting:
+        ending, _current = _current, None
+    if ending is not None and ending.owner == os.getpid():
+        ending.end()
+
+
+def on_disc(what: str, function: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:
+    """Call a function in the disc process; a disc that hangs never holds the caller. Raises as `DiscProcess.call`."""
+    return function(*arguments, **options) if _is_child else disc().call(what, function, *arguments, **options)
+
+
+# --- in the child ----------------------------------------------------------------------------------------------------
+
+
+def _serve(line: Connection, frame: SharedFrame, dies_with: int) -> NoReturn:
+    """Answer calls until the other end is closed, or that process has ended."""
+    global _is_child
+    _is_child = True
+    try:
+        _let_go_of_all_but(line.fileno(), frame.file)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1, signal.SIGTSTP):
+            signal.signal(number, signal.SIG_IGN)
+        signal.pthread_sigmask(signal.SIG_SETMASK, [])
+        if dies_with:
+            # Killed with its parent, as one process would be.
+            ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        # What is here already is never collected: its pages stay shared.
+        gc.freeze()
+        while dies_with in (0, os.getppid()):
+            function, arguments, shared = line.recv()
+            try:
+                answer = True, function(*arguments, *([] if shared is None else [frame.array(*shared)]))
+            except BaseException as error:  # noqa: BLE001 - raised again by the caller
+                answer = False, ExceptionWithTraceback(error, error.__traceback__)
+            _send(line, answer)
+    except (EOFError, OSError):
+        os._exit(0)
+    finally:
+        os._exit(1)
+
+
+def _send(line: Connection, answer: tuple[bool, Any]) -> None:
+    try:
+        line.send(answer)
+    except (EOFError, OSError):
+        raise
+    except Exception as error:  # noqa: BLE001 - a value that cannot be sent is told as such
+        line.send((False, AcquisitionError(f"the answer of the disc process cannot be sent: {error}")))
+
+
+def _let_go_of_all_but(*kept: int) -> None:
+    """Close what was inherited; the standard streams lead nowhere, so that nobody waits for their end."""
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for number in (0, 1, 2):
+        os.dup2(nothing, number)
+    for number in map(int, os.listdir("/proc/self/fd")):
+        if number > 2 and number not in kept:
+            with contextlib.suppress(OSError):
+                os.close(number)

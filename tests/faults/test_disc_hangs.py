@@ -1,0 +1,101 @@
+"""Promise 25: a disc that hangs holds a process of its own, and neither the light, nor Ctrl-C, nor the program's end.
+
+The disc process is stopped, which is what a hanging disc is for the process that measures; `benchmarks/safety_table.py`
+freezes a file system.
+"""
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from processing.storage.capture import Capture
+from simulators.rig.served_rig import serve
+
+
+def _children(pid):
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def _disc_process(pid):
+    """The child that runs the same command line: it was forked, and no other program was begun in it."""
+    own = Path(f"/proc/{pid}/cmdline").read_bytes()
+    (found,) = [child for child in _children(pid) if Path(f"/proc/{child}/cmdline").read_bytes() == own]
+    return found
+
+
+def _open_files(pid):
+    for link in Path(f"/proc/{pid}/fd").iterdir():
+        yield Path(os.readlink(link))
+
+
+@pytest.fixture
+def begun(small_rig, spawn, tmp_path, monkeypatch):
+    """A long capture behind real ports; returns the rig outside of the program, the program and its captures."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    rig = small_rig("rig.yaml", top={"settle_s": 0.0}, clock_speed=1, camera_wait_s=60)
+    with serve(rig, tmp_path / "served.yaml", "red_sphere") as simulation:
+        out = tmp_path / "captures"
+        child = spawn("--omega", 35, "--rig", tmp_path / "served.yaml", "--out", out)
+        yield simulation, child, out
+
+
+def _wait_for(what, child=None, limit_s=60.0):
+    end_s = time.monotonic() + limit_s
+    while not what():
+        assert time.monotonic() < end_s
+        assert child is None or child.poll() is None, child.communicate()
+        time.sleep(0.005)
+
+
+def test_a_disc_that_hangs_shuts_the_light_and_lets_the_program_end(begun, partial_of, tmp_path):
+    simulation, child, out = begun
+    partial = partial_of(out, child, states=2)
+    _wait_for(lambda: simulation.light() > 0, child)
+    hung = _disc_process(child.pid)
+    os.kill(hung, signal.SIGSTOP)
+    begin_s = time.monotonic()
+    _wait_for(lambda: simulation.light() == 0)
+    assert time.monotonic() - begin_s < 2.0
+    for _ in range(2):
+        child.send_signal(signal.SIGINT)
+        time.sleep(0.2)
+    begin_s = time.monotonic()
+    _, said = child.communicate(timeout=30)
+    assert time.monotonic() - begin_s < 10.0
+    assert child.returncode == 130, said
+    assert "the end of the run could not be recorded" in said
+    (kept,) = (tmp_path / "umov").glob("end-*.json")
+    assert json.loads(kept.read_text())["status"] == "aborted"
+    # What was done before is intact, and the file is free.
+    _wait_for(lambda: not Path(f"/proc/{hung}").exists())
+    with Capture(partial) as capture:
+        assert len(capture.done) >= 2
+        assert not capture.damaged_states()
+
+
+def test_the_process_that_measures_has_no_file_of_the_captures_open(begun, partial_of):
+    _, child, out = begun
+    partial = partial_of(out, child, states=2)
+    for _ in range(20):
+        assert not [path for path in _open_files(child.pid) if out in path.parents]
+        time.sleep(0.02)
+    disc = _disc_process(child.pid)
+    assert partial in _open_files(disc)
+    # And the other one has no port of the rig.
+    others = [str(path) for path in _open_files(disc) if path != partial]
+    assert not [path for path in others if path.startswith("/dev/") and path != os.devnull]
+    assert len([path for path in others if path.startswith("socket")]) == 1
+
+
+def test_a_capture_goes_on_in_a_new_run_when_the_disc_process_was_killed(begun, partial_of, acquire):
+    simulation, child, out = begun
+    partial_of(out, child, states=2)
+    os.kill(_disc_process(child.pid), signal.SIGKILL)
+    _, said = child.communicate(timeout=60)
+    assert child.returncode == 1
+    assert "the process that writes the captures has ended" in said
+    assert not simulation.light()
