@@ -106,6 +106,18 @@ def test_a_citation_that_leads_outside_is_seen():
     assert not cited_outside('docs/conventions.md, "Frames"')
 
 
+def test_a_page_names_modules_that_exist():
+    folders = [*PACKAGES, "tests", "benchmarks", "examples", ".ci"]
+    modules = [f"/{path.relative_to(ROOT)}" for folder in folders for path in (ROOT / folder).rglob("*.py")]
+    wrong = [
+        f"{page.name}: {name}"
+        for page in (ROOT / "docs").glob("*.md")
+        for name in re.findall(r"`([\w./-]+\.py)`", page.read_text(encoding="utf-8"))
+        if not any(module.endswith(f"/{name}") for module in modules)
+    ]
+    assert wrong == []
+
+
 def test_a_page_that_speaks_of_the_paper_names_it():
     pages = [page for page in (ROOT / "docs").rglob("*.md") if re.search(r"\b[Tt]he paper\b", page.read_text("utf-8"))]
     assert pages
