@@ -39,8 +39,8 @@ EXPOSURE_S = 0.02
 HEAD = """# Effects
 
 *Reference.* Every effect that `diagnose` can find: its cause, its remedy, and its residual. *Rig* is the entry of
-`simulator: effects:` that gives the fault to the simulated rig. `python benchmarks/effects_page.py` makes this page.
-[The demo](demo.md) draws its faults from this list. `configs/rigs/faulty.yaml` has them ready to switch on:
+`simulator: effects:` that gives the fault to the simulated rig. `configs/rigs/faulty.yaml` has them ready to switch on,
+and [the demo](demo.md) draws from them:
 
 ```bash
 ./lab acquire --omega 35 --rig configs/rigs/faulty.yaml
@@ -48,7 +48,7 @@ HEAD = """# Effects
 
 A picture shows the residual of the declared model, without noise. The plot gives its mean for each state, in percent of
 the mean signal. The maps give its rms over the states in each pixel of the sphere (35 degrees) and of air (180
-degrees). If a map is zero, this sample cannot show the fault.
+degrees). If a map is zero, this sample cannot show the fault. `benchmarks/effects_page.py` makes this page.
 
 ## Of the instrument
 """
@@ -107,7 +107,6 @@ def page() -> str:
         parts.append(effect.lines(effects[:k]))
         fault = FAULTS.get(effect.kind)
         if fault is None:
-            parts.append("\nNot on the simulated rig.\n")
             continue
         parts.append(f"\n**Rig:** `{flow(fault.example())}`\n")
         if fault.hidden:
