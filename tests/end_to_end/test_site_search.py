@@ -28,8 +28,8 @@ def test_the_search_of_the_site_works_without_a_server(tmp_path):
     yaml.dump(settings, tmp_path / "mkdocs.yml")
     shutil.copytree(ROOT / "docs/javascripts", tmp_path / "docs/javascripts")
     shutil.copytree(ROOT / "docs/stylesheets", tmp_path / "docs/stylesheets")
-    (tmp_path / "docs/index.md").write_text("# Home\n\nNothing of the kind.\n")
-    (tmp_path / "docs/light.md").write_text("# Light\n\nThe guard shuts the light.\n")
+    (tmp_path / "docs" / "index.md").write_text("# Home\n\nNothing of the kind.\n")
+    (tmp_path / "docs" / "light.md").write_text("# Light\n\nThe guard shuts the light.\n")
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
     subprocess.run([sys.executable, "-m", "mkdocs", "build", "--quiet"], cwd=tmp_path, env=environment, check=True)
     with sync_playwright() as playwright:
