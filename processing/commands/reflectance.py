@@ -68,27 +68,33 @@ def fit_material_command(
     geometry: Annotated[Path, typer.Option(help="Geometry file: camera, source, shape.")],
     out: Annotated[Path, typer.Option(help="Material file (YAML) to write.")],
     name: Annotated[str, typer.Option(help="Name of the material.")] = "fitted material",
+    correlation: Annotated[bool, typer.Option("--correlation", help="Maximum linear correlation.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file of that name.")] = False,
 ) -> None:
-    """Fit n + i k, a and b to Mueller images, or to linear Stokes images by maximum linear correlation."""
+    """Fit n + i k, a and b: to the dominant process of Mueller images, to other images by maximum linear correlation.
+
+    --correlation takes the second for Mueller images too: it is more precise, and wrong where small eigenvalues differ.
+    """
     from processing.doors import require_place
     from processing.reflectance.material_fit import NAMES
     from processing.steps.material import MaterialFitting
 
     require_place(out, overwrite)
-    found = MaterialFitting(tuple(sources), geometry, name).fitted()
+    found = MaterialFitting(tuple(sources), geometry, name, correlation).fitted()
     fit = found.fit
     if found.simulated:
         typer.echo("SIMULATED data")
     for key, value, stderr in zip(NAMES, fit.constants, fit.stderr, strict=True):
         known = "" if fit.identified[key] else "   NOT IDENTIFIED by these data"
         typer.echo(f"  {key} = {value:.5g} +- {stderr:.2g}{known}")
-    typer.echo(f"  condition number of the fit: {fit.condition:.3g}, pixels: {fit.pixels}")
-    typer.echo(f"  residual over polarized signal: {100 * fit.residual:.2f} %")
+    typer.echo(f"  method: {fit.method}; condition number {fit.condition:.3g}, {fit.pixels} pixels")
+    typer.echo(f"  reduced chi-square against the known noise: {fit.chi_square:.3g}")
     if fit.correlation == fit.correlation:
-        typer.echo(f"  mean linear correlation: {fit.correlation:.4f}")
+        typer.echo(
+            f"  residual over polarized signal: {100 * fit.residual:.2f} %, mean correlation {fit.correlation:.4f}"
+        )
     notes = fit.notes([p.name for p in sources])
-    typer.echo("\n".join(f"  {note}" for note in notes[2:]))
+    typer.echo("\n".join(f"  {note}" for note in notes[3:]))
     found.save(out, overwrite)
     typer.echo(str(out))
 

@@ -18,6 +18,8 @@ from processing.reflectance.material_fit import MaterialFit, fit_values
 from processing.storage.images import SMALLEST, MuellerImage, StokesImage
 from processing.storage.product import Product
 
+#: Points, values (K, N), rows (K, 16) and covariance (N, K, K).
+_Data = tuple[ScatteringGeometry, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 #: At most so many pixels of each image go into a fit.
 PIXELS = 3000
 #: Pixels nearer than this to the outline are left out: the default demosaicing reaches across it.
@@ -28,8 +30,10 @@ LEAST_VALUES = 3
 ALIKE = 1e-4
 
 
-def fit_products(sources: Sequence[Path], geometry_file: Path) -> tuple[MaterialFit, float, bool]:
-    """Fit Mueller or Stokes products by linear correlation in units of their noise: fit, wavelength, simulated.
+def fit_products(
+    sources: Sequence[Path], geometry_file: Path, *, correlation: bool = False
+) -> tuple[MaterialFit, float, bool]:
+    """Fit Mueller or Stokes products, see `fit_values`: fit, wavelength, simulated.
 
     Raises
     ------
@@ -51,11 +55,12 @@ def fit_products(sources: Sequence[Path], geometry_file: Path) -> tuple[Material
     if len(simulated) > 1:
         raise ProcessError("simulated and measured products were given together; fit them one by one.")
     view = ViewingGeometry.load(geometry_file)
-    fit = _fit_mueller(sources, view) if kinds == {"mueller"} else _fit_stokes(sources, view)
+    points, data, rows, covariance = (_of_mueller if kinds == {"mueller"} else _of_stokes)(sources, view)
+    fit = fit_values(points, data, rows, covariance, max_pixels=len(covariance), correlation=correlation)
     return fit, float(wavelengths.pop()), simulated.pop()
 
 
-def _fit_mueller(sources: Sequence[Path], view: ViewingGeometry) -> MaterialFit:
+def _of_mueller(sources: Sequence[Path], view: ViewingGeometry) -> _Data:
     parts, data, covariances = [], [], []
     rows: NDArray[np.float64] | None = None
     for source in sources:
@@ -71,7 +76,7 @@ def _fit_mueller(sources: Sequence[Path], view: ViewingGeometry) -> MaterialFit:
         covariances.append(covariance_by_light(image, seen))
     if rows is None or len(rows) < LEAST_VALUES:
         raise ProcessError(f"a fit needs {LEAST_VALUES} elements of M or more; see what `process reduce` determined.")
-    return _fit(parts, data, rows, covariances)
+    return _joined(parts), np.concatenate(data, axis=1), rows, np.concatenate(covariances)
 
 
 def determined_values(image: MuellerImage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -105,7 +110,7 @@ def covariance_by_light(image: MuellerImage, rows: NDArray[np.float64]) -> NDArr
     return np.asarray(np.einsum("np,in,jn->pij", variance, solve, solve, optimize=True))
 
 
-def _fit_stokes(sources: Sequence[Path], view: ViewingGeometry) -> MaterialFit:
+def _of_stokes(sources: Sequence[Path], view: ViewingGeometry) -> _Data:
     parts, signals, covariances = [], [], []
     w = analyzers = None
     for source in sources:
@@ -120,17 +125,8 @@ def _fit_stokes(sources: Sequence[Path], view: ViewingGeometry) -> MaterialFit:
         covariances.append(image.covariance.reshape(-1, 3, 3)[index].astype(float))
     if w is None or analyzers is None:
         raise ProcessError("no product was given; there is nothing to fit.")
-    return _fit(parts, signals, np.linalg.pinv(analyzers) @ w, covariances)
-
-
-def _fit(
-    parts: Sequence[ScatteringGeometry],
-    values: Sequence[NDArray[np.float64]],
-    rows: NDArray[np.float64],
-    covariances: Sequence[NDArray[np.float64]],
-) -> MaterialFit:
-    covariance = np.concatenate(covariances)
-    return fit_values(_joined(parts), np.concatenate(values, axis=1), rows, covariance, max_pixels=len(covariance))
+    rows = np.linalg.pinv(analyzers) @ w
+    return _joined(parts), np.concatenate(signals, axis=1), rows, np.concatenate(covariances)
 
 
 def _sample(view: ViewingGeometry, product: Product) -> tuple[ScatteringGeometry, np.ndarray]:

@@ -1,15 +1,18 @@
 """Material constants n + i k, a, b of the polarized diffuse model from Mueller elements or Stokes vectors.
 
-At each pixel P = alpha_0 W m0 + alpha_ID W mID, so the right constants make the measured and the modelled values most
-linearly related (paper, conclusion); the two coefficients of each pixel are projected out, with alpha_0 >= 0: a
-negative correlation is no agreement. In units of the noise, where it is alike in all directions, what it adds to the
-sum of squares does not depend on the constants: the fit has no noise bias. A fit to dominant processes has.
+Two methods (paper, conclusion). Of whole Mueller matrices, weighted least squares on the dominant process: the
+distance of M/m00 from m0 depends on m0 by <M, m0> alone, for all Mueller-Jones matrices are of one length. That is
+linear in M, so noise does not bias it, and largest at the dominant process, however the small eigenvalues differ.
+
+Of fewer numbers, linear correlation: P = alpha_0 W m0 + alpha_ID W mID at each pixel, the two coefficients projected
+out, with alpha_0 >= 0. It needs triple degeneracy: small eigenvalues that differ look like another m0. Their usual
+spread, or what the residual shows of it, is in the errors.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from processing.arrays import Array, ComplexArray
 from processing.errors import NotDetermined
 from processing.geometry.frames import ScatteringGeometry
+from processing.polarization.mueller import coherency, coherency_to_mueller
 from processing.reflectance import fresnel, polarized_diffuse
 from processing.reflectance.base import normalized_mueller
 
@@ -26,6 +30,16 @@ LOWER, UPPER = np.array([1.01, 0.0, 0.0, 0.3]), np.array([4.0, 4.0, 3.0, 8.0])
 STARTS = ((1.3, 0.1, 0.1, 2.0), (1.6, 0.02, 0.3, 1.5), (1.2, 0.4, 0.05, 3.0), (2.0, 1.0, 0.5, 2.0))
 #: A constant counts as identified when its standard error is below this part of it (k: or below 0.02).
 RELATIVE_LIMIT, K_LIMIT = 0.3, 0.02
+#: Standard deviation of the small eigenvalues from their mean, of the sum of all four: 3 % apart, as of the paper's
+#: sphere at 662 nm, is 0.012.
+DEPARTURE = 0.012
+#: Part of its range within which a constant is at its bound, and steps of derivatives.
+NEAR, STEPS = 1e-4, np.array([1e-4, 1e-4, 1e-4, 1e-3])
+#: Blocks of pixels in a row whose misfit may be alike.
+BLOCKS = 20
+#: Probability of a chi-square, were the model right, below which it is not.
+UNLIKELY = 1e-3
+_PAULI = np.array([[[1, 0], [0, -1]], [[0, 1], [1, 0]], [[0, -1j], [1j, 0]]])
 
 
 @dataclass(frozen=True)
@@ -35,25 +49,33 @@ class MaterialFit:
     Attributes
     ----------
     constants : n, k, a, b.
-    covariance : (4, 4); NaN for a constant at its bound. From the scatter of whole pixels, whose elements are
-        correlated; it holds noise and misfit, not errors of the geometry.
+    covariance : (4, 4); NaN for a constant at its bound. From the scatter of whole pixels, of blocks of them where the
+        model does not describe the data; it holds noise and misfit, not errors of the geometry.
+    departure : (4, 4), covariance by small eigenvalues that differ; zero where they do not matter.
     identified : which constants the data fix at all; an unidentified one may be anything.
-    correlation : mean linear correlation between data and model.
-    residual : root mean square of the residual over that of the data's polarized part.
+    correlation : mean linear correlation between data and model; NaN for the dominant process.
+    residual : root mean square of the residual over that of the data's polarized part; NaN likewise.
+    chi_square : what the model does not describe over the noise, 1 if it is noise alone.
+    describes : whether noise makes such a chi-square.
+    method : "dominant process" or "linear correlation".
     """
 
     constants: Array
     covariance: Array
+    departure: Array
     identified: dict[str, bool]
     condition: float
     residual: float
     correlation: float
+    chi_square: float
+    describes: bool
+    method: str
     pixels: int
 
     @property
     def stderr(self) -> Array:
         """(4,), standard errors."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
+        return np.asarray(np.sqrt(np.diag(self.covariance + self.departure)))
 
     def notes(self, sources: Sequence[str]) -> list[str]:
         """Lines for the material file: where the constants come from, their errors and correlations."""
@@ -64,11 +86,25 @@ class MaterialFit:
         between = ", ".join(f"{NAMES[i]} {NAMES[j]} {correlation[i, j]:+.2f}" for i, j in pairs)
         lost = ", ".join(name for name in NAMES if not self.identified[name])
         return [
-            f"fitted to {', '.join(sources)}: {self.pixels} pixels, condition number {self.condition:.3g}",
+            f"fitted to {', '.join(sources)} by the {self.method}",
+            f"{self.pixels} pixels, condition number {self.condition:.3g}",
             f"standard errors: {errors} (noise and misfit, not errors of the geometry)",
+            *self._doubts,
             f"correlations: {between or 'not known'}",
             *([f"NOT IDENTIFIED by these data: {lost}"] if lost else []),
         ]
+
+    @property
+    def _doubts(self) -> list[str]:
+        out = []
+        if not self.describes:
+            out.append(f"THE MODEL DOES NOT DESCRIBE THESE DATA: reduced chi-square {self.chi_square:.3g}")
+        if self.departure.any():
+            by = ", ".join(f"{n} {e:.2g}" for n, e in zip(NAMES, np.sqrt(np.diag(self.departure)), strict=True))
+            out.append(
+                f"of these, small eigenvalues {250 * DEPARTURE:.0f} % apart: {by}; a Mueller image does not have it"
+            )
+        return out
 
     def model(self, name: str, wavelength_nm: float) -> polarized_diffuse.Model:
         """The fitted reflectance model."""
@@ -83,6 +119,8 @@ def fit_values(
     rows: ArrayLike,
     covariance: ArrayLike,
     max_pixels: int = 5000,
+    *,
+    correlation: bool = False,
 ) -> MaterialFit:
     """Constants from values that are linear in M, with correlated noise: Mueller elements or Stokes vectors.
 
@@ -93,30 +131,123 @@ def fit_values(
     covariance : (N, K, K) of the values. Where it is made from the noisy values themselves, the weights follow the
         noise; the level of the light alone is enough.
     max_pixels : use at most so many, evenly spread.
+    correlation : by linear correlation, also where all elements are given.
 
     Raises
     ------
     NotDetermined : fewer than 10 pixels are finite.
     """
-    x, c = np.asarray(values, dtype=float), np.asarray(covariance, dtype=float)
+    x, c, r = (np.asarray(a, dtype=float) for a in (values, covariance, rows))
     keep = _some(np.isfinite(x).all(axis=0) & np.isfinite(c).all(axis=(1, 2)), max_pixels)
     # The ridge is for values without noise.
-    ridge = 1e-9 * np.trace(c[keep], axis1=1, axis2=2)[:, None, None] * np.eye(len(x))
-    whiten = np.linalg.inv(np.linalg.cholesky(c[keep] + ridge))
-    data = np.einsum("nij,jn->ni", whiten, x[:, keep])
-    return _fit(geometry[keep], data, whiten @ np.asarray(rows, dtype=float))
+    c = c[keep] + 1e-9 * np.trace(c[keep], axis1=1, axis2=2)[:, None, None] * np.eye(len(x))
+    model = _Forward(geometry[keep])
+    if not correlation and np.linalg.matrix_rank(r) == 16:
+        back = np.linalg.pinv(r)
+        return _fit_dominant(model, (back @ x[:, keep]).T, back @ c @ back.T)
+    whiten = np.linalg.inv(np.linalg.cholesky(c))
+    return _fit_correlation(model, np.einsum("nij,jn->ni", whiten, x[:, keep]), whiten @ r)
 
 
-def _fit(geometry: ScatteringGeometry, data: Array, rows: Array) -> MaterialFit:
+def _fit_dominant(model: _Forward, data: Array, covariance: Array) -> MaterialFit:
+    """Fit Mueller matrices (N, 16), whose noise has the covariance (N, 16, 16)."""
+    from scipy.optimize import minimize
+
+    level = np.maximum(data[:, 0], 0.0)
+    # M/m00 weighs as m00^2 over its variance; <M, m0> has one m00 of it.
+    weight = level / np.trace(covariance, axis1=1, axis2=2)
+    scaled = data * (weight / np.sum(weight * level))[:, None]
+
+    def unlike(q: Array) -> float:
+        return -float(np.sum(scaled * model.mueller(q).reshape(-1, 16)))
+
+    bounds = list(zip(LOWER.tolist(), UPPER.tolist(), strict=True))
+    fits = [minimize(unlike, np.array(s), method="L-BFGS-B", bounds=bounds, tol=1e-13) for s in STARTS]
+    found = np.asarray(min(fits, key=lambda fit: float(fit.fun)).x)
+    for _ in range(2):
+        # The search ends where its sum stops changing; the root of its slope is sharper.
+        slope, curvature = (np.sum(part, axis=0) for part in _slopes(model, found, scaled))
+        inside = (found > LOWER + NEAR * (UPPER - LOWER)) & (found < UPPER - NEAR * (UPPER - LOWER))
+        if inside.any():
+            step = np.linalg.lstsq(curvature[np.ix_(inside, inside)], slope[inside], rcond=1e-10)[0]
+            found[inside] = np.clip(found[inside] - step, LOWER[inside], UPPER[inside])
+    scores, curvature = _slopes(model, found, scaled)
+    parts = _neighbours(model.mueller(found).reshape(-1, 16))
+    seen = np.einsum("nki,ni->nk", parts, data)
+    noise = np.einsum("nki,nij,nlj->nkl", parts, covariance, parts, optimize=True)
+    square = np.einsum("nk,nk->n", seen, np.linalg.solve(noise, seen[..., None])[..., 0])
+    return _result(found, -curvature.sum(axis=0), scores, float(square.sum()), 6 * len(data) - 4, "dominant process")
+
+
+def _slopes(model: _Forward, q: Array, scaled: Array) -> tuple[Array, Array]:
+    """First (N, 4) and second (N, 4, 4) derivatives of sum(scaled * m0) by the constants, pixel by pixel."""
+
+    def overlap(*steps: tuple[int, float]) -> Array:
+        moved = q.copy()
+        for k, sign in steps:
+            moved[k] += sign * STEPS[k]
+        return np.asarray(np.sum(scaled * model.mueller(moved).reshape(-1, 16), axis=1))
+
+    still = overlap()
+    first, second = np.empty((len(scaled), 4)), np.empty((len(scaled), 4, 4))
+    for i in range(4):
+        up, down = overlap((i, 1)), overlap((i, -1))
+        first[:, i] = (up - down) / (2 * STEPS[i])
+        second[:, i, i] = (up - 2 * still + down) / STEPS[i] ** 2
+        for j in range(i):
+            mixed = overlap((i, 1), (j, 1)) - overlap((i, 1), (j, -1)) - overlap((i, -1), (j, 1))
+            mixed = mixed + overlap((i, -1), (j, -1))
+            second[:, i, j] = second[:, j, i] = mixed / (4 * STEPS[i] * STEPS[j])
+    return first, second
+
+
+def _vectors(m0: Array) -> ComplexArray:
+    """Orthonormal vectors (N, 4, 4) of Jones matrices, that of m0 (N, 16) first, all smooth over the pixels."""
+    found = [np.linalg.eigh(coherency(m0.reshape(-1, 4, 4)))[1][..., -1]]
+    jones = found[0].reshape(-1, 2, 2)
+    for pauli in _PAULI:
+        vector = (jones @ pauli).reshape(-1, 4)
+        for other in found:
+            vector = vector - other * np.sum(other.conj() * vector, axis=1, keepdims=True)
+        found.append(vector / np.linalg.norm(vector, axis=1, keepdims=True))
+    return np.stack(found, axis=1)
+
+
+def _mixed(first: ComplexArray, second: ComplexArray) -> Array:
+    """Matrix (N, 16) of the coherency |first><second| + |second><first|."""
+    h = first[:, :, None] * second[:, None, :].conj()
+    return coherency_to_mueller(h + np.swapaxes(h.conj(), 1, 2)).reshape(-1, 16)
+
+
+def _neighbours(m0: Array) -> Array:
+    """Directions (N, 6, 16) in which a matrix has another dominant process than m0 (N, 16)."""
+    v = _vectors(m0)
+    return np.stack([_mixed(v[:, 0], turn * v[:, k]) for k in (1, 2, 3) for turn in (1, 1j)], axis=1)
+
+
+def _departures(m0: Array) -> Array:
+    """Changes (8, N, 16) of M/m00 by small eigenvalues that differ, one standard deviation each."""
+    v = _vectors(m0)
+    own = [_mixed(v[:, k], v[:, k]) for k in (1, 2, 3)]
+    parts = [(own[0] - own[1]) / 2, (own[0] + own[1] - 2 * own[2]) / np.sqrt(12)]
+    parts += [_mixed(v[:, i], turn * v[:, j]) / np.sqrt(2) for i, j in ((1, 2), (1, 3), (2, 3)) for turn in (1, 1j)]
+    # Hermitian matrices of unit norm, over sqrt(2); with 8 of them the three eigenvalues have this deviation.
+    return np.asarray(DEPARTURE * np.sqrt(3 / 8) * np.sqrt(2) * np.stack(parts))
+
+
+def _fit_correlation(model: _Forward, data: Array, rows: Array) -> MaterialFit:
     """Fit data (N, K) in units of the noise; rows (N, K, 16) lead from the Mueller matrix to them."""
-    model = _Forward(geometry)
     # What the ideal depolarizer explains is projected out of the data and of the model.
     flat = rows[:, :, 0] / np.linalg.norm(rows[:, :, 0], axis=1, keepdims=True)
-    data = data - flat * np.sum(flat * data, axis=1, keepdims=True)
+    light = np.sum(flat * data, axis=1) / np.linalg.norm(rows[:, :, 0], axis=1)
+
+    def polarized(values: Array) -> Array:
+        return np.asarray(values - flat * np.sum(flat * values, axis=1, keepdims=True))
+
+    data = polarized(data)
 
     def parts(q: Array) -> tuple[Array, Array]:
-        modelled = np.einsum("nki,ni->nk", rows, model.mueller(q).reshape(-1, 16))
-        modelled = modelled - flat * np.sum(flat * modelled, axis=1, keepdims=True)
+        modelled = polarized(np.einsum("nki,ni->nk", rows, model.mueller(q).reshape(-1, 16)))
         return modelled, np.sum(modelled * data, axis=1, keepdims=True)
 
     def residual(q: Array) -> Array:
@@ -129,7 +260,23 @@ def _fit(geometry: ScatteringGeometry, data: Array, rows: Array) -> MaterialFit:
     modelled, overlap = parts(found)
     with np.errstate(invalid="ignore", divide="ignore"):
         rho = overlap[:, 0] / (np.linalg.norm(modelled, axis=1) * np.linalg.norm(data, axis=1))
-    return _result(found, jacobian, left, float(np.sqrt(np.sum(left**2) / np.sum(data**2))), float(np.nanmean(rho)))
+    slopes = jacobian.reshape(*left.shape, 4)
+    unit = modelled / np.maximum(np.linalg.norm(modelled, axis=1, keepdims=True), 1e-300)
+    moved, unlike = [], 0.0
+    for change in _departures(model.mueller(found).reshape(-1, 16)):
+        extra = polarized(light[:, None] * np.einsum("nki,ni->nk", rows, change))
+        extra -= unit * np.sum(unit * extra, axis=1, keepdims=True)
+        moved.append(np.einsum("nkp,nk->p", slopes, extra))
+        unlike += float(np.sum(extra**2))
+    square, free = float(np.sum(left**2)), left.size - 2 * len(left) - 4
+    # Eigenvalues may differ by more than usual: by as much as makes the residual.
+    more = max(1.0, float(np.sqrt(max(square - free, 0) / unlike)))
+    scores = np.einsum("nkp,nk->np", slopes, left)
+    result = _result(
+        found, jacobian.T @ jacobian, scores, square, free, "linear correlation", departures=more * np.array(moved)
+    )
+    share = float(np.sqrt(square / np.sum(data**2)))
+    return replace(result, residual=share, correlation=float(np.nanmean(rho)))
 
 
 class _Forward:
@@ -171,26 +318,55 @@ def _search(residual: Callable[[Array], Array]) -> tuple[Array, Array]:
     return np.asarray(best.x), np.asarray(best.jac)
 
 
-def _scaled(jacobian: Array) -> Array:
-    return np.asarray(jacobian / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300))
+def _result(
+    found: Array,
+    curvature: Array,
+    scores: Array,
+    square: float,
+    free: int,
+    method: str,
+    departures: Array | None = None,
+) -> MaterialFit:
+    """A fit from the curvature (4, 4) of its sum and the slopes (N, 4) of the pixels.
 
+    `square`, of `free` numbers, is what it does not describe in units of the noise; `departures` (D, 4) are slopes by
+    what the model leaves out.
+    """
+    from scipy.special import chdtrc
 
-def _result(found: Array, jacobian: Array, left: Array, residual: float, correlation: float) -> MaterialFit:
-    width = UPPER - LOWER
-    free = (found > LOWER + 1e-4 * width) & (found < UPPER - 1e-4 * width)
-    singular = np.linalg.svd(_scaled(jacobian[:, free]), compute_uv=False)
-    condition = float(singular[0] / max(singular[-1], 1e-300)) if free.any() else np.inf
-    covariance = np.full((4, 4), np.nan)
-    if free.any() and condition < 1e7:
+    pixels, width = len(scores), UPPER - LOWER
+    inside = (found > LOWER + NEAR * width) & (found < UPPER - NEAR * width)
+    size = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
+    values = np.linalg.eigvalsh((curvature / np.outer(size, size))[np.ix_(inside, inside)])
+    condition = float(np.sqrt(values[-1] / max(values[0], 1e-300))) if inside.any() else np.inf
+    describes = bool(chdtrc(free, square) > UNLIKELY)
+    if not describes:
+        block = np.arange(len(scores)) * BLOCKS // len(scores)
+        scores = np.stack([scores[block == k].sum(axis=0) for k in range(BLOCKS)])
+    covariance, departure = np.full((4, 4), np.nan), np.zeros((4, 4))
+    if inside.any() and condition < 1e7:
         # A constant at its bound is not known there: without its share the others would look sure.
-        prior = np.diag(np.where(free, 0.0, 1 / width**2))
-        bread = np.linalg.inv(jacobian.T @ jacobian + prior)
-        score = np.einsum("nkp,nk->np", jacobian.reshape(*left.shape, 4), left)
-        whole = bread @ (score.T @ score + prior) @ bread
-        covariance[np.ix_(free, free)] = whole[np.ix_(free, free)]
-    stderr = np.sqrt(np.diag(covariance))
+        bread = np.linalg.inv(curvature + np.diag(np.where(inside, 0.0, 1 / width**2)))
+        prior = np.diag(np.where(inside, 0.0, 1 / width**2))
+        whole = bread @ (scores.T @ scores + prior) @ bread
+        covariance[np.ix_(inside, inside)] = whole[np.ix_(inside, inside)]
+        if departures is not None:
+            departure = bread @ departures.T @ departures @ bread
+    stderr = np.sqrt(np.diag(covariance + departure))
     limit = RELATIVE_LIMIT * np.abs(found)
     limit[1] = max(limit[1], K_LIMIT)
     # k and a may well be 0; an n at the end of its range is no surface, and what was fitted beside it means nothing.
-    identified = {name: bool(s <= m and free[0]) for name, s, m in zip(NAMES, stderr, limit, strict=True)}
-    return MaterialFit(found, covariance, identified, condition, residual, correlation, len(left))
+    identified = {name: bool(s <= m and inside[0]) for name, s, m in zip(NAMES, stderr, limit, strict=True)}
+    return MaterialFit(
+        constants=found,
+        covariance=covariance,
+        departure=departure,
+        identified=identified,
+        condition=condition,
+        residual=np.nan,
+        correlation=np.nan,
+        chi_square=square / max(free, 1),
+        describes=describes,
+        method=method,
+        pixels=pixels,
+    )

@@ -46,18 +46,22 @@ class MaterialFitting(OfFiles):
         File of camera, source and shape.
     name
         Of the material, for its file.
+    correlation
+        See `processing.reflectance.material_fit.fit_values`.
     """
 
     sources: tuple[Path, ...]
     geometry: Path
     name: str = "fitted material"
+    correlation: bool = False
 
     def record(self) -> Step:
         """Name, sources and geometry."""
         inputs = [file_identity(source, "source") for source in self.sources]
-        return Step("fit-material", {"name": self.name}, (*inputs, *geometry_identities(self.geometry)))
+        options = {"name": self.name} | ({"correlation": True} if self.correlation else {})
+        return Step("fit-material", options, (*inputs, *geometry_identities(self.geometry)))
 
     def fitted(self) -> FittedMaterial:
         """Fit, see `processing.maps.material_fit.fit_products`."""
-        fit, wavelength_nm, simulated = fit_products(self.sources, self.geometry)
+        fit, wavelength_nm, simulated = fit_products(self.sources, self.geometry, correlation=self.correlation)
         return FittedMaterial(fit, wavelength_nm, simulated, self.name, self.record())
