@@ -37,6 +37,10 @@ def require_belongs(capture: Capture, model: InstrumentModel) -> None:
     elif missing := [axis for axis in model.axes if axis not in capture.angles_deg]:
         have = ", ".join(sorted(capture.angles_deg)) or "none"
         difference = f"instrument {model.name!r} turns {', '.join(missing)}, but the capture has angles of: {have}"
+    elif fixed := [
+        f"{axis} ({span:g} degrees)" for axis, span in capture.turned_deg().items() if axis not in model.axes
+    ]:
+        difference = f"its states turn {', '.join(fixed)}, but instrument {model.name!r} has no element on that axis"
     else:
         return
     raise CaptureError(f"{capture.path}: {difference}. Use the instrument file that belongs to the capture.")

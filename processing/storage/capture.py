@@ -170,10 +170,13 @@ class Capture(OpenH5):
             return "mueller"
         if self.instrument is None:
             return "stokes"
+        return "mueller" if self.turned_deg().keys() & set(self.instrument.axes) else "stokes"
+
+    def turned_deg(self) -> dict[str, float]:
+        """Degrees through which each axis was sent between the states with light; of those that moved."""
         light = np.array([role not in ("dark", "flat") for role in self.role], dtype=bool)
-        targets = self.planned_targets_deg()
-        turned = [targets[axis][self.done][light] for axis in self.instrument.axes if axis in targets]
-        return "mueller" if any(np.ptp(angles) > 0 for angles in turned if angles.size) else "stokes"
+        targets = {axis: angles[self.done][light] for axis, angles in self.planned_targets_deg().items()}
+        return {axis: span for axis, angles in targets.items() if angles.size and (span := float(np.ptp(angles))) > 0}
 
     def seen(self, model: InstrumentModel) -> InstrumentModel:
         """The model with the mosaic as this capture's frames have it: an odd offset of the region shifts it."""

@@ -305,6 +305,17 @@ def test_missing_axis_is_named(rgb950: InstrumentModel, synthetic_capture) -> No
         reduced(path, rgb950)
 
 
+def test_an_axis_that_turned_and_that_the_model_lacks_is_named(rgb950, configs, synthetic_capture) -> None:
+    path = synthetic_capture(
+        np.ones((40, 1, 4, 6)), table() | {"lamp": np.full(40, 7.0), "shutter": 90.0 * (np.arange(40) > 0)}
+    )
+    with pytest.raises(CaptureError, match=r"states turn shutter \(90 degrees\).*has no element on that axis"):
+        reduced(path, rgb950)
+    fixed = InstrumentModel.load(configs / "instruments/rotating_retarder_stokes.yaml").at(662)
+    with pytest.raises(CaptureError, match=r"turn psg \(351 degrees\), shutter"):
+        reduced(path, fixed)
+
+
 SLOW_CHILD = """
 import sys, time
 import subprocess
