@@ -4,14 +4,16 @@ Each instrument is wrong by what its file does not say. One capture of air is di
 capture of another sample is reduced with the nominal and with the written file. The references are no part of any fit:
 the emulated sample, or the ratio of the channels of measured data.
 
-    python benchmarks/instrument_chain.py          prints the table of docs/studies/instrument-chain.md
+    python benchmarks/instrument_chain.py             prints the table of docs/studies/instrument-chain.md
+    python benchmarks/instrument_chain.py --starts    five instruments, each from two nominal files 100 degrees apart
 """
 
 from __future__ import annotations
 
 import os
+import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -283,6 +285,73 @@ def ratio_of_channels(air: Array, plate: Array) -> Array:
     return np.asarray((m / m[0]).reshape(4, 4))
 
 
+@dataclass(frozen=True)
+class Starts:
+    """What two nominal files make of the same captures, whose azimuths of some plates are 100 degrees apart.
+
+    Attributes
+    ----------
+    mueller : (2, 16) M/m00 of another sample, with the file near the truth and with the other.
+    stated : (16,) its standard errors.
+    ratio : largest ratio of the standard errors of a value of the train, either way round.
+    branch : what the second report says of the sign.
+    """
+
+    name: str
+    mueller: Array
+    stated: Array
+    ratio: float
+    branch: str | None
+
+    @property
+    def apart(self) -> float:
+        """Largest difference of an element, in standard errors."""
+        return float(np.max(np.abs(self.mueller[1] - self.mueller[0])[1:] / self.stated[1:]))
+
+    @property
+    def same_signs(self) -> bool:
+        """Whether row 3 and column 3 have the same sign."""
+        first, second = (m.reshape(4, 4)[[1, 2, 3, 3], [3, 3, 1, 2]] for m in self.mueller)
+        return bool(first @ second > 0)
+
+
+PLATES = ("psg_retarder", "psa_retarder")
+#: Instruments with two plates, one of them wrong by 100 degrees in the second file.
+TWO_PLATES = ("drr_wollaston", "drr_5to1", "drr_single_detector", "drr_imaging_630nm", "rgb950")
+
+
+def two_starts(name: str, folder: Path, plates: Sequence[str] = PLATES[1:]) -> Starts:
+    """Diagnose one capture of air from two nominal files; reduce one capture of another sample with both results."""
+    bench, random = BENCHES[name], np.random.default_rng(2)
+    calibrate = tuple(f"{plate}.{field}_deg" for plate in PLATES for field in ("azimuth", "retardance"))
+    nominal = InstrumentModel.load(INSTRUMENTS / f"{name}.yaml").at(bench.nm)
+    nominal = nominal.model_copy(update={"beams": None, "calibrate": calibrate, "belongs_to": {}})
+    true = _turned(nominal, psg_retarder=3.0, psa_retarder=-2.0)
+    file = folder / f"{name}.yaml"
+    file.write_text(dump_yaml(nominal), encoding="utf-8")
+    air, other = (_capture(true, bench, m, kind, file, random) for m, kind in ((np.eye(4), "air"), (SAMPLE, "unknown")))
+    found, products = [], []
+    for by in (0.0, 100.0):
+        model, new = _turned(nominal, **dict.fromkeys(plates, by)), folder / f"{name}_{by:g}.yaml"
+        found.append(diagnose_captures([air], model)[0].diagnosis)
+        write_instrument(new, model, found[-1])
+        products.append(_relative(_product(Reduction(other, new).make(new.with_suffix(".h5"), True))))
+    errors = [{key: value.stderr or 0.0 for key, value in d.calibrated.items()} for d in found]
+    ratios = [errors[1][key] / errors[0][key] for key in errors[0]]
+    return Starts(
+        name,
+        np.array([values for values, _ in products]),
+        products[0][1],
+        max(max(r, 1 / r) for r in ratios),
+        found[1].branch,
+    )
+
+
+def _turned(model: InstrumentModel, **by_deg: float) -> InstrumentModel:
+    azimuths = {p: {"azimuth_deg": float(model.value_of(f"{p}.azimuth_deg") or 0.0) + by} for p, by in by_deg.items()}  # type: ignore[arg-type]
+    return model.with_values(azimuths)  # type: ignore[arg-type]
+
+
 def _capture(
     model: InstrumentModel, bench: Bench, sample: Array, kind: str, file: Path, random: np.random.Generator
 ) -> Path:
@@ -358,6 +427,16 @@ def rows(folder: Path) -> Iterator[Row]:
 
 def main() -> None:
     """Print the table."""
+    if "--starts" in sys.argv[1:]:
+        print("| instrument | plates off | difference / standard error | same sign | ratio of standard errors |")
+        print("|---|---|---|---|---|")
+        for name in TWO_PLATES:
+            for plates in (PLATES[1:], PLATES):
+                with tempfile.TemporaryDirectory() as folder:
+                    found = two_starts(name, Path(folder), plates)
+                same = "yes" if found.same_signs else "no"
+                print(f"| {name} | {len(plates)} | {found.apart:.2f} | {same} | {found.ratio:.2f} |", flush=True)
+        return
     print(
         "| instrument | reference | nominal file | fitted train alone | written file | stated error | verdict on air |"
     )

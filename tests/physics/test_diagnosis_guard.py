@@ -1,8 +1,11 @@
 """The guard of a correction: how likely it is that it makes M worse."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from processing.diagnosis.instrument import in_part
 from processing.diagnosis.instrument.cautious import less_far
 from processing.diagnosis.instrument.doubts import OF_THE_SAMPLE, PART_OF_LEFT
 from processing.diagnosis.instrument.guard import chances, lasts, predicted_change_of_part
@@ -85,3 +88,47 @@ def test_what_a_correction_does_to_each_of_several_captures_is_told_and_does_not
     assert told.name == "predicted error of M/m00 of flat (flat.h5), rms (it grows with a chance of 0.31)"
     assert (told.before, told.after) == (flat.before, flat.after)
     assert told.holds
+
+
+@pytest.mark.parametrize(
+    ("probability", "kept"),
+    [
+        ((1.0, 0.7, 0.4), ["a"]),
+        # Without the least certain one it holds.
+        ((1.0, 0.4, 0.7), ["a", "c"]),
+        # Nothing is sure: the correction stays as it is, and is refused as a whole.
+        ((0.9, 0.9, 0.9), ["a", "b", "c"]),
+        # What may make M worse is itself sure.
+        ((1.0, 1.0, 1.0), ["a", "b", "c"]),
+    ],
+)
+def test_a_correction_is_applied_in_part(monkeypatch, probability, kept) -> None:
+    """M may get worse by effect b: the least certain effects go first, what is sure stays with its own value."""
+    covariance = np.array([[1.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    slices = [slice(k, k + 1) for k in range(3)]
+    values = np.array([2.0, 1.0, 3.0])
+
+    def solved(now, without):
+        left = [k for k, name in enumerate("abc") if name not in without]
+        space = SimpleNamespace(candidates=["abc"[k] for k in left], slices=[slice(n, n + 1) for n in range(len(left))])
+        return SimpleNamespace(effects=space.candidates, space=space, fit=SimpleNamespace(values=now[left]))
+
+    def outcome(now, without):
+        found = SimpleNamespace(
+            space=SimpleNamespace(candidates=list("abc"), slices=slices),
+            samples=SimpleNamespace(probability=probability),
+            members=[[0], [1], [2]],
+            values=values,
+            covariance=covariance,
+        )
+        return SimpleNamespace(asked=None, found=found, solved=solved(now, without), corrected_by=outcome)
+
+    def changes(asked, found, solution):
+        return (SimpleNamespace(chance_worse=0.3 if "b" in solution.effects else 0.0),)
+
+    monkeypatch.setattr(in_part, "predicted_changes", changes)
+    used = in_part.in_part(outcome(values, []))
+    assert used.solved.effects == kept
+    # As the covariance has them: a takes half of what b no longer explains.
+    first = 2.0 if "b" in kept else 1.5
+    assert used.solved.fit.values[0] == pytest.approx(first)
