@@ -14,7 +14,9 @@ from processing.errors import ProcessError
 from processing.reduction.noise import NoiseModel
 from processing.reports.colours import ALL, LIGHT, SIGNED, Scale, period_deg, scale_of, steps
 from processing.storage.capture import Capture
+from processing.storage.images import MuellerImage, difference_errors
 from processing.storage.product import LIT_ERRORS, Product, is_product
+from processing.storage.provenance import content_of
 from viewer.frames import chosen
 from viewer.pages import file_of, pages_of
 from viewer.planes import Window, sent
@@ -77,10 +79,12 @@ def difference(request: Request) -> Response:
             _same_shape(first.shape, second.shape)
             window = Window.asked(query, first.shape, most=640)
             one, other = (_of_product(product, query, window) for product in (first, second))
+            shared = _shared_errors(first, second, query, window)
             name, index = named(first, query)
             units = "" if name == "mueller" else first.units(name)
             scale = scale_of("m00" if name == "mueller" and index == 0 else name, units, one[0])
     else:
+        shared = None
         with Capture(a) as early, Capture(b) as late:
             _same_shape(early.frame_shape, late.frame_shape)
             window = Window.asked(query, early.frame_shape, most=640)
@@ -90,7 +94,7 @@ def difference(request: Request) -> Response:
     if (period := None if name is None else period_deg(name, units)) is not None:
         apart = (apart + period / 2) % period - period / 2
     with np.errstate(divide="ignore", invalid="ignore"):
-        over = apart / np.hypot(one[1], other[1])
+        over = apart / (np.hypot(one[1], other[1]) if shared is None else shared)
     wide = scale_of("deviation", "", apart)
     scales = [scale, scale, wide, Scale(SIGNED, -ERRORS_SHOWN, ERRORS_SHOWN)]
     known = over[np.isfinite(over)]
@@ -123,6 +127,24 @@ def _of_product(product: Product, query: Any, window: Window) -> Measured:
     if f"{name}_errors" not in product.names:
         return values, np.full_like(values, np.nan)
     return values, read_map(product, f"{name}_errors", index, window)
+
+
+def _shared_errors(first: Product, second: Product, query: Any, window: Window) -> NDArray[np.floating] | None:
+    """Errors of a difference of products of one capture, which share its noise; None of two captures.
+
+    NaN where the share is not known: maps of which a product holds no gradient.
+    """
+    inputs = [p.steps[0].inputs if p.steps else () for p in (first, second)]
+    captures = [[content_of(i) for i in every if i.get("role") == "capture"] for every in inputs]
+    if captures[0] != captures[1] or not any(captures[0]):
+        return None
+    name, index = named(first, query)
+    if name != "mueller" or not first.kind == second.kind == "mueller":
+        return np.full(window.shape, np.nan)
+    rows, columns = (np.arange(part.start, part.stop, window.step) for part in (window.rows, window.columns))
+    pixels = ((rows - window.rows.start)[:, None] * first.shape[1] + columns).reshape(-1)
+    images = [MuellerImage.of(product, window.rows).at(pixels) for product in (first, second)]
+    return difference_errors(images[0], images[1], index).reshape(window.shape)
 
 
 def _of_capture(capture: Capture, query: Any, window: Window) -> Measured:

@@ -39,7 +39,7 @@ Say = Callable[[str], None]
 class SphereStudy:
     """The sphere three times: as the files say, found in the images, and with the bench's own material as well.
 
-    `fits` holds fitted constants by wavelength, from the Mueller captures and from the Stokes captures. Products are in
+    `fits` holds fitted constants by wavelength, and by the images and the method that they come from. Products are in
     `folder`.
     """
 
@@ -167,7 +167,11 @@ def _fits(captures: Path, products: Path, geometries: Mapping[str, Path]) -> dic
     for (nm, kind), several in by_kind.items():
         step = max(1, -(-len(several) // FITTED_ANGLES))
         sources = tuple(path for _, path in sorted(several)[::step])
-        fits.setdefault(nm, {})[kind] = MaterialFitting(sources, geometries[kind], "fitted red print").fitted()
+        # Of Mueller images both ways that the paper's conclusions propose; Stokes images allow the second alone.
+        for correlation in (False, True) if kind == "mueller" else (False,):
+            fitting = MaterialFitting(sources, geometries[kind], "fitted red print", correlation)
+            found = fitting.fitted()
+            fits.setdefault(nm, {})[f"{kind} images by the {found.fit.method}"] = found
     return fits
 
 

@@ -30,6 +30,7 @@ from processing.maps.intervals import (
 )
 from processing.maps.partial_quantities import Pairs, determined_maps, partial_block, partial_facts
 from processing.maps.sent_back import OF_MATRICES, sent_back_block, sent_back_facts, sent_back_planes
+from processing.maps.xi0 import VALID, is_valid
 from processing.polarization import gradients
 from processing.polarization.decompositions.differential import differential
 from processing.polarization.decompositions.lu_chipman import lu_chipman
@@ -264,6 +265,7 @@ def _planes(extra: Sequence[str], pairs: Pairs) -> dict[str, Plane]:
         found |= _DIFFERENTIAL
     for name in defined:
         found[f"{name}_defined"] = Plane((), "", f"1 = the {name.replace('_', '-')} decomposition exists", np.uint8)
+    found["valid"] = VALID
     found["lit"] = Plane((), "", f"1 = m00 is above {LIT_ERRORS:g} of its standard errors", np.uint8)
     found["negative_determinant"] = Plane((), "", "1 = det M < 0: Lu-Chipman's depolarizer is negative there", np.uint8)
     return found
@@ -332,8 +334,10 @@ def _set_intervals(
     diattenuation_error = found["diattenuation_errors"]
     factor: NDArray[np.float64] | float = 1.0
     found["td_missed_noise"] = np.zeros_like(found["td_missed"])
+    found["valid"] = np.isfinite(found["td_missed"]).astype(np.uint8)
     if isinstance(image, MuellerImage):
         noise = coherency_noise(image)
+        found["valid"] &= is_valid(image, noise)
         xi = np.moveaxis(found["coherency_eigenvalues"], 0, -1).astype(float)
         set_eigenvalues(found, noise, corrected(xi, noise, image.covariance_of_depolarizer()))
         factor = widen_dominant(found, noise)
@@ -397,12 +401,15 @@ def _facts(writer: ProductWriter, maps: Mapping[str, Plane]) -> dict[str, Any]:
         )
         return facts
     names = ("depolarization_index", "entropy", "td_missed", "diattenuation_linear", "polarizance_linear")
-    facts["median_xi0"], facts["median_xi0_error"] = _median(xi[0][known]), _median(xi_errors[0][known])
+    # Of the same pixels as in `process xi0`; without standard errors all that have light.
+    valid = writer.get("valid") > 0
+    valid = valid if valid.any() else known
+    facts["median_xi0"], facts["median_xi0_error"] = _median(xi[0][valid]), _median(xi_errors[0][valid])
     for name in names:
         facts[f"median_{name}"] = _median(writer.get(name)[known])
         facts[f"median_{name}_error"] = _median(writer.get(f"{name}_errors")[known])
     if "entropy_systematic" in writer.planes:
-        facts["median_xi0_systematic"] = _median(writer.get("coherency_eigenvalues_systematic")[0][known])
+        facts["median_xi0_systematic"] = _median(writer.get("coherency_eigenvalues_systematic")[0][valid])
         facts |= {f"median_{name}_systematic": _median(writer.get(f"{name}_systematic")[known]) for name in names}
     for name in maps:
         if name.endswith("_defined") or name == "negative_determinant":

@@ -16,7 +16,7 @@ from processing.geometry.viewing import ViewingGeometry
 from processing.maps.coherency_noise import coherency_noise
 from processing.maps.intervals import moves_of, widened
 from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
-from processing.polarization.eigenvalue_noise import corrected
+from processing.polarization.eigenvalue_noise import EigenvalueNoise, corrected
 from processing.polarization.xi0 import Xi0Estimate, estimate
 from processing.reduction.mosaic.methods import REACH
 from processing.reduction.mueller import Progress
@@ -41,9 +41,7 @@ _INTERVALS = {
     f"xi0_{level}": Plane((2,), "", f"lower and upper bound of the {level} % interval of xi0, not clipped at 1/4 or 1")
     for level in (68, 95)
 }
-_VALID = Plane(
-    (), "", "1 = the noise is small enough for xi0 to say something; does not depend on xi0 itself", np.uint8
-)
+VALID = Plane((), "", "1 = the noise is small enough for xi0 to say something; does not depend on xi0 itself", np.uint8)
 MUELLER_PLANES = {
     "xi0": _XI0,
     "xi0_errors": _XI0_ERRORS,
@@ -56,7 +54,7 @@ MUELLER_PLANES = {
         "root of the sum of squares of xi1, xi2, xi3 minus their mean, the noise taken off; 0 if it explains all",
     ),
     "eigenvalue_spread_noise": Plane((), "", "the same of a triply degenerate matrix, by noise alone"),
-    "valid": _VALID,
+    "valid": VALID,
 }
 STOKES_PLANES = {
     "xi0": _XI0,
@@ -68,7 +66,7 @@ STOKES_PLANES = {
     "unphysical": Plane(
         (), "", "1 = outside [1/4, 1] by more than its standard error: speaks against the model", np.uint8
     ),
-    "valid": _VALID,
+    "valid": VALID,
 }
 
 
@@ -110,7 +108,7 @@ def eigenvalue_block(image: MuellerImage) -> dict[str, NDArray[Any]]:
     known = np.isfinite(found.xi0)
     # Without standard errors nothing can be taken off.
     xi0 = np.where(known, found.xi0, eigenvalues[..., 0])
-    valid = known & (image.values[0, 0] > 0) & (noise.overall <= MAX_STDERR) & (noise.m00 <= MAX_M00_ERROR)
+    valid = known & is_valid(image, noise)
     return {
         "xi0": xi0,
         "xi0_errors": found.stderr,
@@ -122,6 +120,11 @@ def eigenvalue_block(image: MuellerImage) -> dict[str, NDArray[Any]]:
         "eigenvalue_spread_noise": np.sqrt(noise.others),
         "valid": valid.astype(np.uint8),
     }
+
+
+def is_valid(image: MuellerImage, noise: EigenvalueNoise) -> NDArray[np.bool_]:
+    """Whether noise is small enough for xi0 to say something, (rows, columns); does not depend on xi0 itself."""
+    return np.asarray((image.values[0, 0] > 0) & (noise.overall <= MAX_STDERR) & (noise.m00 <= MAX_M00_ERROR))
 
 
 def systematic_planes(systematic: Systematic | None) -> dict[str, Plane]:

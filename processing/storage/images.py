@@ -275,6 +275,26 @@ class MuellerImage:
         return np.asarray(np.linalg.pinv(self.w, rcond=SMALLEST))
 
 
+def difference_errors(first: MuellerImage, second: MuellerImage, element: int) -> NDArray[np.float64]:
+    """Standard errors (rows, columns) of the difference of an element over m00, or of m00, of one capture's products.
+
+    Both come from the same intensities, which they only weigh differently. NaN where that is not known: weighted
+    products, or products of other states.
+    """
+    if len(first.w) != len(second.w) or first.facts["weighted"] or second.facts["weighted"]:
+        return np.full(first.mask.shape, np.nan)
+    weights = []
+    for image in (first, second):
+        m = image.values.reshape(16, -1).astype(float)
+        gradient = np.zeros_like(m)
+        gradient[element] = 1.0 if element == 0 else 1 / m[0]
+        if element:
+            gradient[0] = -m[element] / m[0] ** 2
+        weights.append(image._inverse.T @ gradient)
+    apart = np.einsum("np,np->p", np.square(weights[0] - weights[1]), first.told_variance)
+    return np.asarray(np.sqrt(apart).reshape(first.mask.shape))
+
+
 def neighbour_correlation(product: Product) -> NDArray[np.float64]:
     """Correlation (2 R + 1, 2 R + 1) of the noise of pixels by their distance; [[1]] where a product holds none."""
     if product.has_array("neighbour_correlation"):

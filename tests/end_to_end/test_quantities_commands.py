@@ -88,12 +88,17 @@ def test_all_maps_with_errors(process: Run, capture: Path, tmp_path: Path) -> No
         xi = product.get("coherency_eigenvalues")
         np.testing.assert_allclose(xi.sum(axis=0)[lit], 1, atol=1e-5)
         assert product.get("dominant_mueller_jones").shape == (4, 4, ROWS, COLUMNS)
+        median = product.facts["median_xi0"]
         for name in ("lu_chipman_defined", "symmetric_defined", "differential_defined"):
             assert product.get(name)[lit].all(), name
         for name in ("symmetric_d1", "differential_retardance_deg"):
             assert np.isfinite(product.get(name)[lit]).all()
             # Elements of the depolarizer that noise may have exchanged have no error bar.
             assert np.isfinite(product.get(f"{name}_errors")[lit]).mean() > 0.75
+    # One sample has one median of xi0.
+    assert process("xi0", capture, "--out", tmp_path / "xi0.h5")[0] == 0
+    with Product(tmp_path / "xi0.h5") as product:
+        assert product.facts["median_xi0"] == pytest.approx(median, abs=1e-6)
 
 
 def test_pairs_and_refusals(process: Run, capture: Path, tmp_path: Path) -> None:

@@ -117,6 +117,21 @@ def test_two_products_of_the_same_scene_differ_by_their_errors(client, lab, drr_
     assert other["rms_over"] > 2
 
 
+def test_products_of_one_capture_share_its_noise(client, lab, drr_capture, configs, tmp_path):
+    """Two instrument files: the difference scatters by far less than the noise of each, and by its own errors."""
+    capture = drr_capture("one.h5")
+    other = tmp_path / "other.yaml"
+    other.write_text((configs / "instruments/rgb950.yaml").read_text().replace("662: 127.12", "662: 129.12"))
+    Reduction(capture).make()
+    Reduction(capture, other).make(out=lab / "other.mueller.h5")
+    asked = {"a": "one.mueller.h5", "b": "other.mueller.h5", "name": "mueller", "index": 10}
+    (_, _, apart, over), _ = plane(client.get("/difference", params=asked))
+    with Product(lab / "one.mueller.h5") as product:
+        alone = np.median(product.get("mueller_errors")[2, 2] / product.get("mueller")[0, 0])
+    assert np.nanstd(apart) < 0.3 * alone
+    assert np.nanstd(over) == pytest.approx(1, abs=0.2)
+
+
 @pytest.mark.parametrize("asked", [{"index": 16}, {"index": "x"}, {"name": "nothing"}, {"name": ""}])
 def test_a_map_that_is_not_there_is_not_compared(client, products, asked):
     both = {"a": "one.mueller.h5", "b": "one.mueller.h5", "name": "mueller"}
