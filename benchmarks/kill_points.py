@@ -12,6 +12,8 @@ run in all but times and segments, and `acquire verify` must find nothing. Exit 
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import hashlib
 import os
 import random
@@ -46,6 +48,8 @@ LIMIT_S = float(os.environ.get("UMOV_LIMIT_S", "inf"))
 GO_ON = os.environ.get("UMOV_GO_ON", "")
 #: Runs of a night that may end by themselves before something is taken to be wrong.
 MOST_ENDED = 20
+#: Of prctl: processes whose parent has ended become children of this one.
+PR_SET_CHILD_SUBREAPER = 36
 #: What differs between two runs of one plan.
 TIMES = ("host_time_s", "camera_time_ns", "frame_id", "start_time", "closing/json", "segments/json", "segment", "crc32")
 
@@ -85,9 +89,17 @@ def run(options: list[str], out: Path, before: Callable[[DiscCalls], None] = lam
             os._exit(code)
     os.close(writer)
     status = os.waitpid(child, 0)[1]
+    _wait_for_orphans()
     with os.fdopen(reader) as pipe:
         made = pipe.read()
     return status, int(made or 0)
+
+
+def _wait_for_orphans() -> None:
+    """Wait for the disc process of what has ended, which becomes a child of this program; it dies a moment later."""
+    with contextlib.suppress(ChildProcessError):
+        while True:
+            os.waitpid(-1, 0)
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -309,6 +321,7 @@ def image(options: list[str], cuts: int, seed: int = 1) -> int:
         if os.WIFSTOPPED(status):
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
+            _wait_for_orphans()
         subprocess.run(["umount", mount], check=True)
         copy = WORK / "copy"
         copy.mkdir(exist_ok=True)
@@ -344,6 +357,7 @@ def main() -> None:
             shutil.rmtree(WORK, ignore_errors=True)
         (WORK / "captures").mkdir(parents=True, exist_ok=True)
         restart_watched(build(WORK), WORK / "captures")
+    ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1)
     captures = (numbers or [300])[0] if which == "night" else 1
     options = write_files(WORK, captures)
     every, first = [*numbers, *(1, 1)[len(numbers) :]][:2] if which in ("kill", "error") else (1, 1)

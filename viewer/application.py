@@ -12,7 +12,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from processing.errors import ProcessError
-from viewer import browsing, comparing, following, frames, probes, products, starting, verdicts
+from viewer import alarms, browsing, comparing, following, frames, probes, products, starting, verdicts
 from viewer.guard import Guard
 from viewer.library import Library, NotHere
 from viewer.pages import Pages, pages_of, whole_style
@@ -32,6 +32,8 @@ def application(folder: Path, token: str) -> Starlette:
         Route("/campaign", browsing.campaign),
         Route("/events", following.events),
         Route("/stop", following.stop, methods=["POST"]),
+        Route("/alarms", alarms.alarms_now),
+        Route("/acknowledge", alarms.acknowledge, methods=["POST"]),
         Route("/capture", frames.capture),
         Route("/states", frames.states),
         Route("/frame", frames.frame),

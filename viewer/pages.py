@@ -11,6 +11,7 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from starlette.requests import Request
 from starlette.responses import HTMLResponse
 
+from acquisition.rig.alarms import unacknowledged
 from processing.doors import parse_json
 from processing.errors import ProcessError
 from processing.reports.design import style
@@ -43,6 +44,7 @@ class Pages:
             "plotly": plotly,
             "folder": library.root,
             "address": self.address,
+            "unacknowledged": unacknowledged,
             "ago": ago,
         }
         self._templates.filters |= {"megabytes": megabytes, "when": when}

@@ -16,6 +16,7 @@ import numpy as np
 
 from acquisition.campaign.identity import IDENTITY
 from acquisition.campaign.plan import Campaign, CampaignCapture
+from acquisition.capture.state_file import KILLED_S
 from acquisition.capture.synced import make_folder, sync
 from acquisition.disc import on_disc
 from acquisition.errors import AcquisitionError
@@ -110,7 +111,7 @@ _held: dict[Path, filelock.BaseFileLock] = {}
 
 def _hold(folder: Path) -> None:
     lock = filelock.FileLock(folder / ".lock")
-    lock.acquire(timeout=0)
+    lock.acquire(timeout=KILLED_S)
     _held[folder] = lock
 
 

@@ -11,6 +11,7 @@ import contextlib
 import errno
 import fcntl
 import os
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,8 @@ from processing.storage.capture_schema import STATUS_TYPE, Status, fitted_json, 
 from processing.storage.checksums import row_crc32, state_crc32
 from processing.storage.segments import decode_lines, encode_line
 
+#: How long the disc process of a run that was killed may have the file open.
+KILLED_S = 2.0
 #: Checksum, blank and line break of a line of the journal.
 LINE_BYTES = 10
 #: An image is written in pieces of so many bytes: the disc works on one while the next is copied.
@@ -83,7 +86,7 @@ class StateFile:
     def _lock(self) -> None:
         """Take the lock that HDF5 takes as well, so that nobody opens the file while it is written."""
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(self._file)
         except OSError as error:
             # Some file systems of other machines have no locks; HDF5 goes without there too.
             if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
@@ -249,6 +252,28 @@ class StateFile:
             # Pages that are not needed are written at once, and nobody waits for it. Some file systems do not know it.
             with contextlib.suppress(OSError):
                 os.posix_fadvise(self._file, offset + start, len(piece), os.POSIX_FADV_DONTNEED)
+
+
+def lock(file: int) -> None:
+    """Lock an open file; that of a run that was killed is free once its disc process has ended. Raises OSError."""
+    end_s = time.monotonic() + KILLED_S
+    while True:
+        try:
+            return fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() > end_s:
+                raise
+            time.sleep(0.02)
+
+
+def wait_until_free(path: Path) -> None:
+    """Return when no other program writes a file, or after a while."""
+    with contextlib.suppress(OSError):
+        file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            lock(file)
+        finally:
+            os.close(file)
 
 
 def _bytes_of(values: NDArray[Any]) -> memoryview:

@@ -24,6 +24,7 @@ from acquisition.capture.job import Job, Result, check_with_devices, job_of, pre
 from acquisition.capture.machine_checks import check_machine
 from acquisition.capture.operator import Operator
 from acquisition.capture.plan import MeasurementPlan
+from acquisition.capture.state_file import wait_until_free
 from acquisition.capture.synced import make_folder
 from acquisition.capture.writer import PARTIAL, seal_whole
 from acquisition.commands.defaults import CONFIGS, DEFAULT_RIG, INTERRUPTED
@@ -79,7 +80,10 @@ def run(options: Options, stop: StopRequest) -> int:
 
 def _run(options: Options, stop: StopRequest) -> int:
     console = Console(stderr=True)
-    if options.resume is not None and (sealed := _sealed(options.resume)) is not None:
+    if (
+        options.resume is not None
+        and (sealed := on_disc(f"look at {options.resume}", _sealed, options.resume)) is not None
+    ):
         typer.echo(f"every state was there already; sealed as {sealed}")
         return 0
     job, path, resuming = _job(options)
@@ -165,6 +169,7 @@ def given_rig(file: Path) -> RigConfig:
 
 
 def _sealed(path: Path) -> Path | None:
+    wait_until_free(path)
     return seal_whole(path) if path.name.endswith(PARTIAL) and path.exists() else None
 
 

@@ -5,6 +5,8 @@ import time
 
 import h5py
 
+from acquisition.capture.state_file import wait_until_free
+
 OMEGA = ("--omega", 35)
 
 
@@ -21,6 +23,7 @@ def test_killed_at_random_and_resumed(spawn, partial_of, quick_rig, acquire, int
         time.sleep(chance.uniform(0.0, 2.5))
         child.kill()
         child.wait()
+        wait_until_free(partial)
         # A run that was quicker than the kill is complete already.
         if partial.exists():
             before = intact(partial)
@@ -38,6 +41,8 @@ def test_a_kill_leaves_the_states_done_to_any_reader(spawn, partial_of, quick_ri
     size = partial.stat().st_size
     child.kill()
     child.wait()
+    # Its disc process ends a moment later.
+    wait_until_free(partial)
     with h5py.File(partial) as file:
         done = file["entry/states/done"][...]
         assert done[:8].all()

@@ -15,6 +15,7 @@ from PIL import Image
 from playwright.sync_api import ConsoleMessage, Page, Route, expect, sync_playwright
 from ruamel.yaml import YAML
 
+from acquisition.rig.alarms import give_alarm
 from acquisition.rig.own_rigs import note_rig
 
 #: However long a busy machine takes; the limit of a test ends a hang.
@@ -113,6 +114,22 @@ def test_a_button_waits_for_its_script(address, window):
     expect(page.get_by_role("button", name="Start")).to_be_disabled()
     held[0].continue_()
     expect(page.get_by_role("button", name="Start")).to_be_enabled()
+
+
+@pytest.fixture
+def own_alarms(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+
+def test_an_alarm_that_comes_while_a_page_is_open_is_shown_and_acknowledged(own_alarms, address, window):
+    page = window()
+    page.goto(f"{address}/")
+    expect(page.get_by_role("button", name="Start")).to_be_enabled()
+    alarm = give_alarm("bench", "THE LIGHT IS NOT SHUT")
+    expect(page.get_by_role("alert")).to_contain_text("THE LIGHT IS NOT SHUT")
+    page.get_by_role("button", name="Acknowledge").click()
+    expect(page.get_by_role("alert")).to_have_count(0)
+    assert not alarm.exists()
 
 
 @pytest.mark.long
