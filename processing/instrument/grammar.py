@@ -64,7 +64,7 @@ GENERATORS: Mapping[str, Array] = {
     "depolarization": -np.diag([0.0, 1.0, 1.0, 1.0]),
     "retardance at 0 degrees": _unit(2, 3) - _unit(3, 2),
 }
-#: [degree] or [1] or [pixel] Size of each quantity on a decent bench.
+#: [degree], [1], [of full scale] or [pixel] Size of each quantity on a decent bench.
 SIZES: Mapping[str, tuple[str, float]] = {
     "azimuth": ("degree", 0.3),
     "retardance": ("degree", 0.6),
@@ -78,6 +78,9 @@ SIZES: Mapping[str, tuple[str, float]] = {
     "gain": ("1", 0.005),
     "stray": ("1", 0.003),
     "lag": ("1", 0.005),
+    "offset": ("1", 0.0005),
+    "shift right": ("pixel", 0.2),
+    "shift down": ("pixel", 0.2),
 }
 
 
@@ -181,6 +184,10 @@ def _add(changes: Changes, model: InstrumentModel, site: str, quantity: str, par
         changes.stray = changes.stray + value
     elif quantity == "lag":
         changes.lag += float(value[0])
+    elif quantity == "offset":
+        changes.response["one"] = changes.response["one"] - value[:, None] * np.ones(len(changes.conditions.channels))
+    elif quantity in ("shift right", "shift down"):
+        changes.shift_px = changes.shift_px + np.outer(value, (1, 0) if quantity == "shift right" else (0, 1))
     else:
         _bend(changes, model, site, quantity, value)
 
@@ -221,6 +228,8 @@ def sentences(model: InstrumentModel, conditions: Conditions) -> tuple[Sentence,
     for element in model.analyzer:
         out += _of_element(element, turning, passed, times, front=False)
     out += _of_source_and_detector(conditions.states if times else 0, times)
+    # Once a turn it has a name.
+    out += _waves("image", ("shift right", "shift down"), turning, (2,))
     return tuple(dict.fromkeys(out))
 
 
@@ -274,6 +283,6 @@ def _of_source_and_detector(states: int, times: Sequence[str]) -> Iterator[Sente
     yield from (Sentence("source", ("gain",), f"from state {k}", PRICE + float(np.log(states))) for k in choices)
     beats = np.arange(1.5, states / 2, 0.5)
     yield from (Sentence("source", ("gain",), f"beating {n:g} times", PRICE + float(np.log(beats.size))) for n in beats)
-    yield from (Sentence("detector", ("stray",), time) for time in times)
+    yield from (Sentence("detector", (quantity,), time) for quantity in ("stray", "offset") for time in times)
     if states:
         yield Sentence("detector", ("lag",))

@@ -24,11 +24,13 @@ def bench(configs: Path) -> Bench:
     return declared_bench(model, NM, PIXELS, False, 20_000.0)
 
 
-def diagnosed(folder: Path, configs: Path, bench: Bench) -> Diagnosis:
-    """A bright disc before a dark background, of unknown Mueller matrix."""
+def diagnosed(folder: Path, configs: Path, bench: Bench, drift_counts: float = 0.0) -> Diagnosis:
+    """A bright disc before a dark background, of unknown Mueller matrix; the black level may drift."""
     file, random = configs / "instruments/rgb950.yaml", np.random.default_rng(4)
     angles = state_angles(STATES, False, False)
     counts = digitize(bench, expose(bench, Disc(random), angles), random)
+    moved = np.round(np.linspace(0, drift_counts, STATES)).reshape(-1, *(1,) * (counts.ndim - 1))
+    counts = (counts + moved).astype(counts.dtype)
     path = folder / "capture.h5"
     write_capture(path, bench, counts, angles, Sample(kind="unknown"), file.read_text())
     return diagnose_captures([path], InstrumentModel.load(file))[0].diagnosis
@@ -54,6 +56,20 @@ def test_an_image_that_moves_is_told_from_a_ghost_that_goes_round(configs, tmp_p
     found = diagnosed(tmp_path, configs, bench)
     assert "beam_wander" in [e.kind for e in found.effects]
     assert not sure(found)
+
+
+def test_an_image_that_moves_twice_a_turn_is_corrected_without_a_name(configs, tmp_path, bench):
+    turn = 4 * np.pi / STATES
+    bench.shift.append(lambda k, a: (0.15 * np.cos(turn * k), 0.15 * np.sin(turn * k)))
+    found = diagnosed(tmp_path, configs, bench)
+    assert not sure(found)
+    assert [e.element for e in found.applied()] == ["shift right and shift down of image by 2 x psg"]
+
+
+def test_a_black_level_that_drifts_is_no_bent_response(configs, tmp_path, bench):
+    found = diagnosed(tmp_path, configs, bench, drift_counts=200)
+    assert not sure(found)
+    assert sentences(found) == ["offset of detector over time"]
 
 
 def test_a_plate_whose_retardance_changes_twice_a_turn_is_not_called_a_transmission(configs, tmp_path, bench):

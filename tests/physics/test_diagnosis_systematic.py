@@ -5,7 +5,7 @@ from types import SimpleNamespace as Some
 import numpy as np
 import pytest
 
-from processing.diagnosis.instrument.systematic import _leading, _missed
+from processing.diagnosis.instrument.systematic import MuellerErrors, _leading
 from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.search.likely_set import likely_set
 from processing.diagnosis.search.rules import MOST_STORED
@@ -44,8 +44,12 @@ def test_what_varies_over_the_image_is_asked_for_beside_all_groups():
 
 
 def test_what_is_found_and_not_used_is_uncertain_as_a_whole():
-    candidates = ["drift", "flicker", "path"]
-    slices = (slice(0, 1), slice(1, 3), slice(3, 4))
-    found = Some(values=np.array([1.0, 2.0, 3.0, 4.0]), space=Some(candidates=candidates, slices=slices))
-    used = Some(space=Some(candidates=candidates[1:2], slices=(slice(0, 2),)), fit=Some(values=np.array([2.0, 2.5])))
-    assert _missed(found, used).tolist() == [1.0, 0.0, 0.5, 4.0]
+    """A path that was found and is not applied: the correction of the drift changes M by less than the path does."""
+    space = Some(candidates=("drift", "path"), slices=(slice(0, 1), slice(1, 2)), size=2)
+    own = (np.array([0, 1]), np.eye(2))
+    errors = MuellerErrors(space, np.array([1.0, 4.0]), np.diag([0.01, 0.09]), np.zeros((16, 2, 2)), (own,))
+    used = Some(space=Some(candidates=("drift",), slices=(slice(0, 1),)), fit=Some(values=np.array([1.0])))
+    assert errors.given(used).tolist() == [1.0, 0.0]
+    change = errors._change(*own[:1], errors.given(used), own[1])
+    assert change.before == pytest.approx(np.sqrt(17.1))
+    assert change.after == pytest.approx(np.sqrt(16.1))

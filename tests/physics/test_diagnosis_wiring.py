@@ -56,6 +56,14 @@ def test_what_is_no_mistake_is_not_called_one(configs, tmp_path, air, degrees):
     assert miswired(problem(tmp_path, configs, bench, lambda a: a, air)) is None
 
 
+@pytest.mark.parametrize("degrees", [18.0, 22.0])
+def test_a_plate_that_is_far_off_is_no_other_wavelength(configs, tmp_path, degrees):
+    """Its retardance is nearer to the one at 524 nm: that would leave a third of the residual, the plate nothing."""
+    bench = Bench(da=np.deg2rad(94.78 + degrees))
+    declared = InstrumentModel.load(configs / "instruments/rgb950.yaml")
+    assert miswired(problem(tmp_path, configs, bench, lambda a: a, True), declared) is None
+
+
 @pytest.mark.parametrize("air", [True, False])
 def test_the_filter_of_another_wavelength_is_told(configs, tmp_path, air):
     # The plates of this bench have the retardances of 451 nm; the file says 662.

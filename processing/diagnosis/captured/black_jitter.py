@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.common_rest import NORMAL_MAD
-from processing.diagnosis.search.range_of import inside_and_outside
-from processing.diagnosis.search.rules import DIM, FEWEST_DIM, LIT, NOISE_SURE
+from processing.diagnosis.search.range_of import inside_and_outside, range_of
+from processing.diagnosis.search.rules import DIM, FEWEST_DIM, LIT, MOSTLY, NOISE_SURE
+from processing.instrument.grammar import TIMES, course
 
 #: [1, fixed] Variance of a median over that of a mean.
 MEDIAN = np.pi / 2
@@ -46,9 +47,19 @@ def black_jitter(data: CaptureData, a: Array) -> tuple[Array, float] | None:
     # Nearer to light than to an offset, which bright pixels follow once.
     if follows**2 > light:
         return None
+    if _is_a_course(data, seen, outside):
+        return None
     offsets = np.zeros(data.values_per_pixel)
     offsets[rows] = outside @ (seen - bright / light)
     return offsets, float(np.sum(offsets**2)) / free
+
+
+def _is_a_course(data: CaptureData, seen: Array, outside: Array) -> bool:
+    """Whether most of it is a course over time: a fault, of which to take off a part alone would hide the rest."""
+    conditions = data.conditions
+    courses = np.concatenate([course(name, conditions) for name in TIMES]).repeat(len(conditions.channels), axis=1)
+    along = range_of(outside.T @ courses[:, data.row_counts].T)
+    return bool(np.sum((along.T @ seen) ** 2) > MOSTLY * (seen @ seen))
 
 
 def _alike_in_halves(y: NDArray[np.float32], mean: Array, outside: Array, noise: float) -> bool:

@@ -5,21 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from processing.diagnosis.instrument.cautious import cautious
 from processing.diagnosis.instrument.empirical import empirical
-from processing.diagnosis.instrument.guard import (
-    chances,
-    checks,
-    lasts,
-    predicted_change_of_each,
-    predicted_changes,
-)
-from processing.diagnosis.instrument.in_part import in_part
+from processing.diagnosis.instrument.guard import chances, checks, lasts
 from processing.diagnosis.instrument.names import Names, names_of
-from processing.diagnosis.instrument.outcome import Outcome, left_of, outcome_of
+from processing.diagnosis.instrument.outcome import Outcome, outcome_of
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.recommend import recommended
 from processing.diagnosis.instrument.structure import Residual, descriptions
+from processing.diagnosis.instrument.systematic import MuellerErrors
 from processing.diagnosis.instrument.telling import (
     calibrated,
     capture_report,
@@ -37,7 +30,7 @@ from processing.diagnosis.instrument.telling import (
 from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.instrument.wiring import Wiring, miswired, miswired_train
 from processing.diagnosis.search.evidence import wanted_for_evidence, would_be_seen
-from processing.diagnosis.search.guard import PredictedChange
+from processing.diagnosis.search.guard import refusal
 from processing.diagnosis.search.judge import Judgement
 from processing.diagnosis.search.posterior import Say
 from processing.diagnosis.search.result import Diagnosis, FoundEffect, Unexplained
@@ -70,11 +63,8 @@ def diagnose(problem: InstrumentProblem, say: Say, declared: InstrumentModel | N
     wiring, bench = _wired(problem, say, declared)
     found = bench.run()
     say("testing what is left over")
-    first = outcome_of(bench, found)
-    names = names_of(first)
-    careful = cautious(first.asked, first.found, first.solved)
-    used = in_part(first if careful is None else first.corrected_by(careful, ()))
-    return _told(used, names, told_switches(used.asked, used.solved), wiring)
+    used = outcome_of(bench, found)
+    return _told(used, names_of(used), told_switches(used.asked, used.solved), wiring)
 
 
 def _wired(problem: InstrumentProblem, say: Say, declared: InstrumentModel | None) -> tuple[Wiring | None, WholeBench]:
@@ -94,22 +84,11 @@ def _wired(problem: InstrumentProblem, say: Say, declared: InstrumentModel | Non
     return wiring, WholeBench(wiring.problem, say)
 
 
-def _changes(used: Outcome, names: Names) -> tuple[PredictedChange, PredictedChange, dict[str, PredictedChange]]:
-    """What the correction does to M here, in later captures, and in each of several."""
-    asked, solved = used.asked, used.solved
-    here, later = predicted_changes(asked, used.found, solved)
-    each = predicted_change_of_each(asked, used.found, solved)
-    if names.sure:
-        return here, later, each
-    left = sum(left_of(asked, r) for r in used.after)
-    explained = solved.before.excess - solved.after.excess
-    here, later = (c.beside(left, explained) for c in (here, later))
-    return here, later, {name: c.beside(left, explained) for name, c in each.items()}
-
-
 def _told(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring: Wiring | None) -> Judged:
     problem, asked, found, solved = used.bench.problem, used.asked, used.found, used.solved
-    here, later, each = _changes(used, names)
+    errors = MuellerErrors.of(asked, found, solved)
+    here, later, of_each = errors.changes(solved)
+    each = dict(zip((c.name for c in problem.captures), of_each, strict=True)) if len(of_each) > 1 else {}
     lasting = lasts(later, names.doubt.values())
     judgement = Judgement(
         named=bool(names.named or switched),
@@ -122,6 +101,8 @@ def _told(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring: 
         first=None if wiring is None else wiring.told,
     )
     any_cause = judgement.named or bool(names.untold)
+    # What makes the residual worse is no cause, however well it fits.
+    worse = refusal(judgement.figures)
     kept, verdict = judgement.kept(solved, any_cause), judgement.verdict
     unseen = unobservable(used.bench.whole, found)
     diagnosis = Diagnosis(
@@ -130,7 +111,11 @@ def _told(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring: 
         error_after=error(asked, kept, kept.after),
         noise_floor_percent=floor(asked, kept),
         effects=(
-            *(e for c in names.named for e in told_effects(asked, solved, c, names.doubt.get(c), judgement.refused)),
+            *(
+                e
+                for c in names.named
+                for e in told_effects(asked, solved, c, worse or names.doubt.get(c), judgement.refused)
+            ),
             *switched,
         ),
         unobservable=(
@@ -150,7 +135,7 @@ def _told(used: Outcome, names: Names, switched: Sequence[FoundEffect], wiring: 
         instrument=problem.model.name,
         wavelengths_nm=tuple(sorted(set(problem.wavelengths_nm))),
         simulated=any(c.simulated for c in problem.captures),
-        correction=correction(problem, found, solved, any_cause, judgement, lasting, kept),
+        correction=correction(problem, found, solved, any_cause, judgement, lasting, kept, errors),
         wiring=judgement.first,
         branch=used.bench.branch,
         left_out=not_measured(problem),

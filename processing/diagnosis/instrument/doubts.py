@@ -28,7 +28,6 @@ from processing.instrument.effects.base import (
     CountsEffect,
     FieldEffect,
     GeneralEffect,
-    ImageShift,
     PointwiseEffect,
     SourceEffect,
     ValuePerState,
@@ -113,7 +112,7 @@ def _of_itself(
 
 def _standing(problem: InstrumentProblem, solved: Solution, causes: Sequence[Cause]) -> list[Cause]:
     """Shifts of which the edges show too little: an image that moves does so at its edges too."""
-    shifts = [c for c in causes if isinstance(c.candidates[0].effect, ImageShift)]
+    shifts = [c for c in causes if c.candidates[0].moves_image]
     shifts = [c for c in shifts if all(one in solved.space.candidates for one in c.candidates)]
     if not shifts or not problem.noise_known:
         return []

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.instrument.problem import InstrumentProblem
@@ -12,24 +14,25 @@ from processing.diagnosis.search.range_of import RANK
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import Changes
 
+#: [elements, fixed] Of M/m00 that can be wrong.
+ELEMENTS = 15
+
 
 def mueller_slopes(
-    problem: InstrumentProblem, space: Space, values: Array, left: Array | None = None, only: int | None = None
-) -> tuple[Array, float]:
-    """Products (16, K, K) of the derivatives of each element of M, and the sum of m00 squared, over all pixels.
+    problem: InstrumentProblem, space: Space, values: Array, left: Array | None = None
+) -> Iterator[tuple[NDArray[np.int64], Array]]:
+    """Of each capture: the J values that act on it, and products (16, J, J) of the slopes of each element of M/m00.
 
-    The products are summed over the pixels of all captures, or of `only` one, a common factor of M left out. `left`
-    (captures,) is what the intensities of each are known to, in units of noise (default: 1). What they do not tell of
-    M, within the size of its elements, is not made wrong by an instrument either.
+    A common factor of M is left out. Products are means over the elements, and over the pixels by their brightness.
+    `left` (captures,) is what the intensities of each are known to, in units of noise (default: 1). What they do not
+    tell of M, within the size of its elements, is not made wrong by an instrument either.
     """
     left = np.ones(len(problem.captures)) if left is None else left
     problem, values = problem.near(space, values)
-    products, light = np.zeros((16, space.size, space.size)), 0.0
     for k, moments in enumerate(problem.moments):
-        if only not in (None, k):
-            continue
         acting = space.acting(k, problem.wavelengths_nm[k])
         mine, own = acting.space, acting.of(values)
+        products, light = np.zeros((16, acting.index.size, acting.index.size)), 0.0
         changes = problem.changes(k, mine, own)
         columns = partial(_all_columns, problem, k)
         w, c = columns(changes), problem.coefficients(k, changes)
@@ -53,9 +56,9 @@ def mueller_slopes(
             bright = float(m[0] @ m[0])
             slopes -= (slopes[:, 0] @ m[0] / max(bright, 1e-300))[:, None, None] * m
             for element, of_all in enumerate(np.moveaxis(slopes, 1, 0)):
-                products[element][np.ix_(acting.index, acting.index)] += acting.spread_products(of_all @ of_all.T)
+                products[element] += acting.spread_products(of_all @ of_all.T)
             light += bright
-    return products, light
+        yield acting.index, products / (max(light, 1e-300) * ELEMENTS)
 
 
 def _decomposed(w: Array) -> tuple[Array, Array, Array]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,7 +11,6 @@ from processing.arrays import Array
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.structure import Residual, residual
 from processing.diagnosis.instrument.whole_bench import WholeBench, predicts, solution
-from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.judge import beyond_chance
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import GROWTH, WHITE
@@ -36,11 +35,6 @@ class Outcome:
     after: tuple[Residual, ...]
     structure: bool
     left: float
-
-    def corrected_by(self, values: Array, without: Sequence[Candidate]) -> Outcome:
-        """With other values of the posterior's space, and without some of its effects."""
-        solved = solution(self.bench, replace(self.found, values=values), without)
-        return replace(self, solved=solved, after=residuals(self.asked, solved))
 
 
 def outcome_of(bench: WholeBench, found: Posterior) -> Outcome:

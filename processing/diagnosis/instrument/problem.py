@@ -39,7 +39,6 @@ from processing.instrument.applied_effects import apply_to, changes_of
 from processing.instrument.changes import Changes
 from processing.instrument.effects.base import (
     FieldEffect,
-    ImageShift,
     LevelEffect,
     PointwiseEffect,
     SourceEffect,
@@ -175,7 +174,7 @@ class InstrumentProblem:
     def _shift_px(self, capture: int, undone: Mapping[Candidate, Array]) -> Array:
         changes = Changes(self.captures[capture].conditions)
         for candidate, values in undone.items():
-            if isinstance(candidate.effect, ImageShift) and candidate.acts(capture, self.wavelengths_nm[capture]):
+            if candidate.moves_image and candidate.acts(capture, self.wavelengths_nm[capture]):
                 candidate.apply(changes, self.models[capture], values)
         return changes.shift_px / self.captures[capture].pitch
 
@@ -304,7 +303,7 @@ class InstrumentProblem:
         c = np.zeros((len(FEATURES), rows))
         c[0] = 1.0
         for name, value in changes.response.items():
-            c[FEATURES.index(name)] += value
+            c[FEATURES.index(name)] += np.ravel(value)
         # What the shift took away, to second order, from derivatives of the fitted image (which has no shift).
         x, y = np.repeat(changes.shift_px / self.captures[capture].pitch, channels, axis=0).T
         for name, value in (("dx", x), ("dy", y), ("dxx", -x * x / 2), ("dxy", -x * y), ("dyy", -y * y / 2)):

@@ -22,7 +22,6 @@ from processing.diagnosis.search.range_of import range_of
 from processing.diagnosis.search.rules import FEWEST_FOR_PATTERNS, FEWEST_PAIRS, HARMONICS, PATCHES
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import FIELD_TERMS, Changes, field_terms
-from processing.instrument.effects.base import ImageShift
 from processing.reduction.move_image import neighbour_noise
 
 #: [of the largest] Eigenvalues of the light below this are none.
@@ -87,7 +86,7 @@ def residual(problem: InstrumentProblem, capture: int, space: Space, fit: Fit) -
     rows = a.shape[0]
     height, width = data.signal.shape[2:]
     usable = data.usable
-    if data.steep is not None and not any(isinstance(c.effect, ImageShift) for c in space.candidates):
+    if data.steep is not None and not any(c.moves_image for c in space.candidates):
         # Where nothing is said to move, edges must fit as well: a focus that changes shows nowhere else.
         usable = usable | data.steep
     used = (usable & ~data.clipped if changes.drop_clipped else usable) & inside(height, width)

@@ -12,20 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
-from processing.diagnosis.instrument.mueller_slopes import mueller_slopes
+from processing.diagnosis.instrument.mueller_slopes import ELEMENTS, mueller_slopes
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate, SourceLevel
-from processing.diagnosis.search.odds import MOST_ODDS
+from processing.diagnosis.search.guard import PredictedChange, predicted_change
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import MOST_STORED, SMALL_PART, STORED_SHARE, TAKES_PART, UNSEEN
+from processing.diagnosis.search.rules import MOST_STORED, SMALL_PART, STORED_SHARE, TAKES_PART
 from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.search.stored import by_wavelength, parameters_of, scope_of
 from processing.instrument.effects.base import FieldEffect, Switch
 from processing.instrument.model import AppliedEffect, EffectParameter, SystematicError
-
-#: [elements, fixed] Of M/m00 that can be wrong.
-ELEMENTS = 15
 
 
 @dataclass(frozen=True)
@@ -44,51 +41,99 @@ class Uncertain:
     most: Candidate
 
 
-def systematic_error(problem: InstrumentProblem, found: Posterior, used: Solution) -> Uncertain | None:
-    """Second moments of all values about those `used`, in directions of one standard deviation; None without any."""
-    chosen = [k for k, c in enumerate(found.space.candidates) if _takes_part(found, k)]
-    space = Space(tuple(found.space.candidates[k] for k in chosen))
-    if not space.size:
-        return None
-    index = np.concatenate([np.r_[found.space.slices[k]] for k in chosen])
-    products, light = mueller_slopes(problem, space, found.values[index])
-    missed = _missed(found, used)
-    covariance = (found.covariance + _unseen(found) + np.outer(missed, missed))[np.ix_(index, index)]
-    of_elements = np.sum(covariance * products, axis=(1, 2))
-    # That of M/m00 is one, whatever m00 is.
-    of_elements[0] = 0.0
-    if of_elements.sum() <= 0 or light <= 0:
-        return None
-    largest = products[int(np.argmax(of_elements))]
-    products = products.sum(axis=0)
-    lasts = np.array([c.capture is None for c in space.candidates for _ in c.parameters])
-    size, directions = _leading(covariance, products, lasts)
-    enough = int(np.searchsorted(np.cumsum(size), STORED_SHARE * size.sum())) + 1
-    names = tuple(c.name for c in problem.captures)
-    told = []
-    for direction in directions.T[: min(enough, MOST_STORED)]:
-        weight = np.abs(direction) * np.sqrt(np.maximum(np.diag(products), 0.0))
-        told.append(_as_effects(space, direction, weight > SMALL_PART * weight.max(), names))
-    error = SystematicError(
-        directions=tuple(told),
-        rms_over_m00=float(np.sqrt(of_elements.sum() / light / ELEMENTS)),
-        wavelength_nm=problem.wavelengths_nm[0] if len(set(problem.wavelengths_nm)) == 1 else None,
-    )
-    alone = [float(np.sum((covariance * largest)[p, p])) for p in space.slices]
-    return Uncertain(
-        error,
-        np.sqrt(np.maximum(of_elements, 0.0) / light).reshape(4, 4),
-        space.candidates[int(np.argmax(alone))],
-    )
+@dataclass(frozen=True, eq=False)
+class MuellerErrors:
+    """Errors of M/m00 that the posterior expects, by one covariance for guard, error bar and report.
+
+    What the captures do not show keeps its prior in it: an unknown sample takes up a common azimuth or a retardance.
+
+    Attributes
+    ----------
+    space : candidates that may move M; values (K,), covariance (K, K) : of the posterior.
+    products : (16, K, K) of the slopes of each element of M/m00, mean over elements and captures.
+    of_captures : of each capture, the values that act on it and products (J, J) of their slopes.
+    """
+
+    space: Space
+    values: Array
+    covariance: Array
+    products: Array
+    of_captures: tuple[tuple[NDArray[np.int64], Array], ...]
+
+    @classmethod
+    def of(cls, problem: InstrumentProblem, found: Posterior, solved: Solution) -> MuellerErrors:
+        """Of a posterior, with slopes where its mean is; `solved` says to what the intensities are known."""
+        chosen = [k for k, c in enumerate(found.space.candidates) if _moves_mueller(found, k, c in solved.effects)]
+        space = Space(tuple(found.space.candidates[k] for k in chosen))
+        index = np.concatenate([np.zeros(0, dtype=np.int64), *(np.r_[found.space.slices[k]] for k in chosen)])
+        index = index.astype(np.int64)
+        values, captures = found.values[index], len(problem.captures)
+        products, each = np.zeros((16, index.size, index.size)), []
+        for own, part in mueller_slopes(problem, space, values, _left(problem, solved)):
+            products[:, own[:, None], own] += part / captures
+            each.append((own, part.sum(axis=0)))
+        return cls(space, values, found.covariance[np.ix_(index, index)], products, tuple(each))
+
+    def given(self, used: Solution) -> Array:
+        """Values (K,) that a correction applies."""
+        part, out = dict(zip(used.space.candidates, used.space.slices, strict=True)), np.zeros(self.space.size)
+        for candidate, own in zip(self.space.candidates, self.space.slices, strict=True):
+            if candidate in part:
+                out[own] = used.fit.values[part[candidate]]
+        return out
+
+    def changes(self, used: Solution) -> tuple[PredictedChange, PredictedChange, tuple[PredictedChange, ...]]:
+        """What a correction does to M of these captures, of later ones, and of each of these."""
+        given, lasts = self.given(used), np.flatnonzero(self._of("instrument"))
+        products = self.products.sum(axis=0)
+        return (
+            self._change(np.arange(given.size), given, products),
+            self._change(lasts, given, products[np.ix_(lasts, lasts)]),
+            tuple(self._change(own, given, part) for own, part in self.of_captures),
+        )
+
+    def _change(self, own: NDArray[np.int64], given: Array, products: Array) -> PredictedChange:
+        return predicted_change(given[own], self.values[own], self.covariance[np.ix_(own, own)], products)
+
+    def _of(self, scope: str) -> NDArray[np.bool_]:
+        return np.array([scope_of(c) == scope for c in self.space.candidates for _ in c.parameters], dtype=bool)
+
+    def uncertain(self, problem: InstrumentProblem, used: Solution) -> Uncertain | None:
+        """What stays uncertain of M/m00 about the values that are applied; None where nothing does."""
+        missed = self.values - self.given(used)
+        covariance = self.covariance + np.outer(missed, missed)
+        of_elements = np.sum(covariance * self.products, axis=(1, 2)) * ELEMENTS
+        # That of M/m00 is one, whatever m00 is.
+        of_elements[0] = 0.0
+        if of_elements.sum() <= 0:
+            return None
+        largest, products = self.products[int(np.argmax(of_elements))], self.products.sum(axis=0)
+        lasts = np.array([c.capture is None for c in self.space.candidates for _ in c.parameters])
+        size, directions = _leading(covariance, products, lasts)
+        enough = int(np.searchsorted(np.cumsum(size), STORED_SHARE * size.sum())) + 1
+        names = tuple(c.name for c in problem.captures)
+        several = len(set(problem.wavelengths_nm)) > 1
+        slopes = np.sqrt(np.maximum(np.diag(products), 0.0))
+        error = SystematicError(
+            directions=tuple(
+                _as_effects(self.space, d, slopes * np.abs(d), names) for d in directions.T[: min(enough, MOST_STORED)]
+            ),
+            rms_over_m00=float(np.sqrt(of_elements.sum() / ELEMENTS)),
+            wavelength_nm=None if several else problem.wavelengths_nm[0],
+        )
+        alone = [float(np.sum((covariance * largest)[p, p])) for p in self.space.slices]
+        return Uncertain(
+            error,
+            np.sqrt(np.maximum(of_elements, 0.0)).reshape(4, 4),
+            self.space.candidates[int(np.argmax(alone))],
+        )
 
 
-def _missed(found: Posterior, used: Solution) -> Array:
-    """By how much the mean of the posterior differs from what is applied (K,)."""
-    missed = found.values.copy()
-    part = dict(zip(found.space.candidates, found.space.slices, strict=True))
-    for candidate, values in zip(used.space.candidates, used.space.slices, strict=True):
-        missed[part[candidate]] -= used.fit.values[values]
-    return missed
+def _left(problem: InstrumentProblem, solved: Solution) -> Array:
+    """What is left over of each capture (captures,) after the correction, in units of its noise; noise at least."""
+    noise = np.array([m.noise_floor for m in problem.moments])
+    left = np.array([solved.after.rms_of(k) for k in range(noise.size)])
+    return np.asarray(np.maximum(left / np.maximum(noise, 1e-300), 1.0))
 
 
 def _leading(covariance: Array, products: Array, lasts: NDArray[np.bool_]) -> tuple[Array, Array]:
@@ -106,38 +151,23 @@ def _leading(covariance: Array, products: Array, lasts: NDArray[np.bool_]) -> tu
     return np.maximum(size[::-1], 0.0), (root @ turn)[:, ::-1]
 
 
-def _unseen(found: Posterior) -> Array:
-    """Variance (K, K) of groups that are in no correction: what their prior leaves, in the units of the parameters."""
-    typical = found.space.joined("typical")
-    out = np.zeros((typical.size, typical.size))
-    for k, (s, q) in found.sets.given_others(found.samples.best).items():
-        group = found.sets.groups[k]
-        if found.samples.probability[k] > TAKES_PART or group.share > 1:
-            continue
-        own = np.linalg.inv(s + np.eye(q.size))
-        # Evidence for the group at its typical size, against none.
-        gain = 0.5 * float(q @ own @ q - np.linalg.slogdet(np.eye(q.size) + s)[1])
-        chance = 1 / (1 + (1 - UNSEEN) / UNSEEN * np.exp(group.price - np.clip(gain, -MOST_ODDS, MOST_ODDS)))
-        scale = typical[group.index]
-        out[np.ix_(group.index, group.index)] += chance * own * np.outer(scale, scale)
-    return out
-
-
-def _takes_part(found: Posterior, k: int) -> bool:
+def _moves_mueller(found: Posterior, k: int, applied: bool) -> bool:
+    """Whether a candidate may make M wrong by values that do not differ over the image."""
     candidate = found.space.candidates[k]
     # Levels of a source are projected out by each reduction, which carries their errors itself.
     if isinstance(candidate.effect, FieldEffect | Switch | SourceLevel):
         return False
-    if not candidate.state_chosen:
-        return True
+    spread = np.diag(found.covariance)[found.space.slices[k]]
+    if applied or not candidate.state_chosen:
+        return applied or bool(spread.any())
     group = next(g for g, members in enumerate(found.members) if k in members)
     return bool(found.samples.probability[group] > TAKES_PART)
 
 
-def _as_effects(space: Space, direction: Array, matters: Array, names: tuple[str, ...]) -> tuple[AppliedEffect, ...]:
+def _as_effects(space: Space, direction: Array, size: Array, names: tuple[str, ...]) -> tuple[AppliedEffect, ...]:
     effects = []
     for candidate, part in zip(space.candidates, space.slices, strict=True):
-        if not matters[part].any():
+        if size[part].max() <= SMALL_PART * size.max():
             continue
         own = direction[part]
         for one, values, _ in by_wavelength(candidate, own, np.zeros((own.size, own.size))):

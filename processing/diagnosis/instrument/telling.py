@@ -11,7 +11,7 @@ from processing.diagnosis.instrument.combinations import combinations
 from processing.diagnosis.instrument.doubts import PART_OF_LEFT
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.structure import Residual
-from processing.diagnosis.instrument.systematic import Uncertain, systematic_error
+from processing.diagnosis.instrument.systematic import MuellerErrors, Uncertain
 from processing.diagnosis.search.candidate import Candidate, SourceLevel
 from processing.diagnosis.search.causes import Answer, Cause, shown
 from processing.diagnosis.search.evidence import information
@@ -36,7 +36,6 @@ from processing.diagnosis.search.stored import by_wavelength, parameters_of, sco
 from processing.instrument.effects.base import (
     CountsEffect,
     FieldEffect,
-    ImageShift,
     InstrumentEffect,
     Switch,
 )
@@ -175,6 +174,7 @@ def correction(
     judgement: Judgement,
     lasts: bool,
     used: Solution,
+    errors: MuellerErrors,
 ) -> Correction:
     """What an instrument file would hold: means, with the spread over the sets; for these captures alone unless it
     `lasts`. Of it `used` is applied."""
@@ -200,7 +200,7 @@ def correction(
     # Values that are merely nominal are nowhere near what is true.
     nominal = any(c.place for c in solved.base.candidates)
     known = judgement.refused is None or not nominal or (judgement.first is None and solved.before.rms < FAR_OFF)
-    uncertain = systematic_error(problem, found, used) if known else None
+    uncertain = errors.uncertain(problem, used) if known else None
     return Correction(
         effects=tuple(effects),
         systematic=None if uncertain is None else uncertain.error,
@@ -279,7 +279,7 @@ def unobservable(problem: InstrumentProblem, found: Posterior) -> list[Candidate
         if candidate.state_chosen or isinstance(candidate.effect, Switch) or np.isin(part.start, always):
             continue
         least = np.full(candidate.size, SEEN)
-        if isinstance(candidate.effect, ImageShift):
+        if candidate.moves_image:
             # Noise alone has slopes too, from one pixel to the next, which a shift would change.
             one = Space((candidate,))
             noise = np.diag(problem.noise_information(one, np.zeros(one.size))) * candidate.typical**2

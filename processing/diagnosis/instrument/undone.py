@@ -11,7 +11,7 @@ from processing.diagnosis.captured.capture_data import CaptureData, Correct
 from processing.diagnosis.instrument.features import MARGIN
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.space import Space
-from processing.instrument.effects.base import ImageShift, PointwiseEffect
+from processing.instrument.effects.base import PointwiseEffect
 
 
 def movable(shift_px: Array) -> bool:
@@ -30,7 +30,7 @@ def distance(undone: Mapping[Candidate, Array], space: Space, values: Array, *, 
 
 def _exactly_undone(candidate: Candidate, pointwise: bool) -> bool:
     """Whether a correction can be undone exactly; with `pointwise`, in each pixel by itself."""
-    return isinstance(candidate.effect, PointwiseEffect if pointwise else PointwiseEffect | ImageShift)
+    return isinstance(candidate.effect, PointwiseEffect) or (candidate.moves_image and not pointwise)
 
 
 def exactly_undone(space: Space, values: Array, *, pointwise: bool = False) -> dict[Candidate, Array]:

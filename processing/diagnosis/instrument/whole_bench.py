@@ -35,7 +35,6 @@ from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import (
     FieldEffect,
-    ImageShift,
     PointwiseEffect,
     SourceEffect,
     Switch,
@@ -222,7 +221,7 @@ class WholeBench:
         captures = self.whole.captures
         acting = [k for k, c in enumerate(captures) if candidate.acts(k, c.wavelength_nm)]
         mine = [captures[k] for k in acting]
-        if isinstance(effect, ImageShift):
+        if candidate.moves_image:
             return all(min(c.signal.shape[2:]) > 2 * MARGIN + 2 for c in mine)
         if isinstance(effect, PointwiseEffect):
             # With one number a pixel to test, a bend of the response and gains of the channels explain each other. So
@@ -312,7 +311,7 @@ class WholeBench:
         return self._posterior([*fixed, *plain, *fields], fixed)
 
 
-def applied(found: Posterior, base: Space, unfit: Sequence[Candidate] = ()) -> tuple[Space, Array]:
+def applied(found: Posterior, base: Space, unfit: Collection[Candidate] = ()) -> tuple[Space, Array]:
     """Space and values of the correction: the mean of the posterior, of what is likely enough to take part."""
     keep = set(base.candidates)
     by_label = {found.label(g): g for g in range(len(found.members))}
@@ -352,12 +351,12 @@ def _least_needed(found: Posterior, keep: Collection[Candidate]) -> list[int]:
     return out
 
 
-def solution(bench: WholeBench, found: Posterior, unfit: Sequence[Candidate] = ()) -> Solution:
-    """The correction of a posterior without what is `unfit` for it, and how well it predicts what it did not see."""
+def solution(bench: WholeBench, found: Posterior) -> Solution:
+    """The correction of a posterior, and how well it predicts what it did not see."""
     asked = predicts(bench.problem)
     base_fit = minimize(asked, bench.base, _values_of(bench, bench.base))
     before = held_out(asked, bench.base, base_fit)
-    space, values = applied(found, bench.base, [*unfit, *bench.as_many_as_intensities(found, SHARES)])
+    space, values = applied(found, bench.base, bench.as_many_as_intensities(found, SHARES))
     asked.relinearize(space, values)
     sums = asked.sums(space, values)
     fit = Fit(values, sums, float(sums.excess.sum()))

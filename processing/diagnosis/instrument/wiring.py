@@ -17,6 +17,7 @@ from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.starts import best_of_starts
+from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.rules import DECISIVE, FEW_STARTS, WIRING, WIRING_SCATTER
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
@@ -50,7 +51,16 @@ def miswired(problem: InstrumentProblem, declared: InstrumentModel | None = None
         return None
     nothing, none = Space(()), np.zeros(0)
     mistakes = [*_mistakes(problem), *_other_wavelengths(problem, declared)]
-    return _best(mistakes, [_left(w.problem, nothing, none) for w in mistakes], _left(problem, nothing, none))
+    found = _best(mistakes, [_left(w.problem, nothing, none) for w in mistakes], _left(problem, nothing, none))
+    # Plates that are far off, or another mount, may come nearer to a mistake than to what is declared.
+    return None if found is None or _fits_better(problem, found.problem) else found
+
+
+def _fits_better(problem: InstrumentProblem, other: InstrumentProblem) -> bool:
+    """Whether values of the train as it is declared leave far less than another train does as it stands."""
+    space = Space(tuple(c for c in problem.pool() if c.shifts(problem.model)))
+    values = minimize(problem, space, np.zeros(space.size)).values
+    return _left(problem, space, values) * WIRING < _left(other, Space(()), np.zeros(0))
 
 
 def miswired_train(problem: InstrumentProblem, declared: InstrumentModel | None = None) -> Wiring | None:

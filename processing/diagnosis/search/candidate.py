@@ -57,6 +57,15 @@ class Candidate:
         return isinstance(self.effect, FromAState)
 
     @property
+    def moves_image(self) -> bool:
+        """Whether it moves the image, and is undone by moving the frames back."""
+        return isinstance(self.effect, InstrumentEffect) and self.effect.moves_image(self.place)
+
+    def shifts(self, model: InstrumentModel) -> tuple[str, ...]:
+        """Values of the train that it shifts and does nothing else."""
+        return self.effect.shifts(model, self.place) if isinstance(self.effect, InstrumentEffect) else ()
+
+    @property
     def family(self) -> str:
         """Name without the state that a slip starts at."""
         where = self.effect.axis(self.place) if isinstance(self.effect, FromAState) else self.place

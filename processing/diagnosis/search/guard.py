@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import ndtr
@@ -73,14 +73,6 @@ class PredictedChange:
     def rounded_chance(self) -> float:
         """The same with no more digits than a calibration can show."""
         return round(self.chance_worse, 4)
-
-    def beside(self, left: float, explained: float) -> PredictedChange:
-        """Where no cause is beyond doubt and structure is left: as wrong, along itself, as that is to what it explains.
-
-        `left` and `explained` are chi-squares, of which the roots are amounts.
-        """
-        wrong = np.sqrt(left / explained) if explained > 0 else 1.0
-        return replace(self, stderr=float(np.hypot(self.stderr, wrong * self.size)))
 
 
 NOTHING = PredictedChange(0.0, 0.0, 0.0, 0.0, 0.0)

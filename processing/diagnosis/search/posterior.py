@@ -19,8 +19,8 @@ from processing.diagnosis.search.likely_set import climb, likely_set
 from processing.diagnosis.search.linearized import grouped, noise_of, quadratic
 from processing.diagnosis.search.problem import Problem
 from processing.diagnosis.search.rules import (
-    ALTERNATIVE,
     BENT,
+    CERTAIN,
     CHANGES,
     FEWER_ROUNDS,
     GROWTH,
@@ -216,7 +216,8 @@ def _of_bends(
     def there(one: _Round) -> set[int]:
         return {g for g in bends if one.state.tau[g] > 0}
 
-    own, likely = there(best), [there(one) for one in rounds if one.score > best.score - ALTERNATIVE]
+    # The noise is that of the light which the first of them tells: it is preferred by more than its evidence.
+    own, likely = there(best), [there(one) for one in rounds if one.score > best.score - CERTAIN]
     return best, {k: tuple(sorted({j for on in likely if k not in on for j in on - own})) for k in own}
 
 

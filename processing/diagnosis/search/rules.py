@@ -38,9 +38,6 @@ NOMINAL_GAIN = 0.1
 SMOOTH = 0.3
 #: [of the variance of the largest] Principal curves of such values below which nothing is told of them.
 FLAT = 1e-6
-#: [probability] Share of benches on which an effect is there at its typical size, for what the data say nothing of: a
-#: bench that is new has a third of the list.
-UNSEEN = 0.3
 
 # ---- noise ---------------------------------------------------------------------------------------------------------
 #: [standard deviations] Total excess over the noise's own chi-square up to which it is no structure.
@@ -212,18 +209,15 @@ SHARES = 0.01
 MISSED = 4.0
 #: [1] Growth of the residual on held-out data that is still put down to chance.
 WORSE = 1.002
-#: [probability] That the error of M grows by a correction, up to which it is written. The mean of the posterior has the
-#: least expected error whatever the chance; this is what a user accepts in a single case.
-CHANCE_WORSE = 0.1
+#: [probability] That the error of what the user reads grows by a correction, up to which it is written: the mean of the
+#: posterior has the least expected error, and harm counts twice as much as a gain.
+CHANCE_WORSE = 0.33
 #: [of the largest] Singular value of W from which on a direction is measured.
 MEASURED = 1e-6
 #: [nm] Difference below which two wavelengths are the same in a file that is written.
 SAME_NM = 0.5
 #: [of m00] Least change of M/m00 that is asked for its error: less is the rounding of counts.
 LEAST_CHANGE = 2e-5
-#: [standard deviations] From the mean of the posterior, up to which another correction is as good: one that changes M
-#: less, where the data hardly tell how it changes.
-AS_GOOD_AS = 1.0
 #: [1] Growth of the condition number of W that a correction may cause: beyond it the states would be other ones.
 WORSE_CONDITION = 1.5
 #: [of the excess] What a correction without a name (an empirical one) has to take away.

@@ -26,5 +26,8 @@ class SentenceEffect(OpticsEffect):
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         grammar.parsed(place).apply(changes, model, values)
 
+    def moves_image(self, place: str) -> bool:
+        return grammar.parsed(place).site == "image"
+
     def log_price(self, model: InstrumentModel, conditions: Conditions, place: str) -> float:
         return next(s.price for s in grammar.sentences(model, conditions) if s.text == place)

@@ -47,6 +47,10 @@ class InstrumentEffect(Effect, ABC):
         """Log odds by which it is rarer at this place than an effect of the list."""
         return 0.0
 
+    def moves_image(self, place: str) -> bool:
+        """Whether it moves the image at this place, which is undone by moving the frames back."""
+        return False
+
     def shifts(self, model: InstrumentModel, place: str) -> tuple[str, ...]:
         """Values of the train ("element.field") that it shifts and does nothing else."""
         return ()
@@ -92,6 +96,9 @@ class ResponseCurve(PointwiseEffect):
 
 class ImageShift(CountsEffect):
     """Moves the image (`Changes.shift_px`); undone by moving the frames back."""
+
+    def moves_image(self, place: str) -> bool:
+        return True
 
 
 class OfOneCapture(InstrumentEffect):

@@ -26,7 +26,8 @@ class DetectorOffset(PointwiseEffect):
 
     def parameters(self, model: InstrumentModel, conditions: Conditions, place: str) -> tuple[Parameter, ...]:
         top = conditions.full_scale
-        return (Parameter("offset", "count", -0.1 * top, 0.1 * top, 0.002 * top),)
+        # Four counts of twelve bits: a black level is read off dark frames, or off the sheet of the camera.
+        return (Parameter("offset", "count", -0.1 * top, 0.1 * top, 0.001 * top),)
 
     def apply(self, changes: Changes, model: InstrumentModel, place: str, values: Array) -> None:
         full_scale = changes.conditions.full_scale
