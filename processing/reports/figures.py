@@ -49,8 +49,8 @@ def draw_product(path: Path, figure: Path) -> None:
 
 def product_figure(product: Product) -> Figure:
     """Matplotlib figure of a product; raises ProcessError for a kind without one."""
-    if product.kind == "mueller" and "stokes" in product.names:
-        return _sent_figure(product)
+    if product.kind == "mueller" and (light := _stokes_of(product)) is not None:
+        return _polarimeter_figure(product, *light)
     if product.kind in ("mueller", "extrapolated"):
         elements = thin(product.get("mueller"))
         lit = _lit(elements[0, 0], thin(product.get("mueller_errors")[0, 0]))
@@ -114,6 +114,9 @@ def mueller_figure(elements: NDArray[Any], lit: NDArray[np.bool_], title: str, s
             if i == j == 0:
                 panel.imshow(m00, cmap="gray", vmin=0, vmax=max(percentile(m00, 99.5), 1e-30))
                 continue
+            if not np.isfinite(elements[i, j]).any():
+                panel.text(0.5, 0.5, "not\ndetermined", ha="center", va="center", fontsize=8, transform=panel.transAxes)
+                continue
             shown = panel.imshow(normalized[i, j], cmap=SIGNED, vmin=-limit, vmax=limit, interpolation="nearest")
     label = "$m_{ij}/m_{00}$, instrument frames (first panel: $m_{00}$; plain grey: too dark)"
     figure.colorbar(shown, ax=panels, shrink=0.8, label=label, extend=clipped(rest, -limit, limit))
@@ -170,17 +173,43 @@ def _title(product: Product) -> str:
     return header.title if wavelength in header.title else f"{header.title}, {wavelength}"
 
 
-def _sent_figure(product: Product) -> Figure:
-    """S0 and what is polarized of the light that a sample sends back, lit in one state."""
-    stokes, errors = thin(product.get("stokes")), thin(product.get("stokes_errors"))
-    lit = _lit(stokes[0], errors[0])
+def _stokes_of(product: Product) -> tuple[NDArray[Any], NDArray[Any]] | None:
+    """Stokes vector and standard errors (4, rows, columns) of a product that determines no more than these.
+
+    Of the light that is sent back, or of unpolarized light: the first column of M. None where M has other elements.
+    """
+    if "stokes" in product.names:
+        return thin(product.get("stokes")), thin(product.get("stokes_errors"))
+    elements = thin(product.get("mueller"))
+    if np.isfinite(elements[:, 1:]).any() or not np.isfinite(elements[1:, 0]).any():
+        return None
+    return elements[:, 0], thin(product.get("mueller_errors")[:, 0])
+
+
+def _polarimeter_figure(product: Product, stokes: NDArray[Any], errors: NDArray[Any]) -> Figure:
+    """S0, S1..S3 over S0, and the degrees, angle and ellipticity that they determine; dark pixels stay empty."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s1, s2, s3 = np.where(_lit(stokes[0], errors[0]), stokes[1:] / stokes[0], np.nan)
+        linear, degree = np.hypot(s1, s2), np.sqrt(s1**2 + s2**2 + s3**2)
+        noise = np.hypot(s1 * errors[2], s2 * errors[1]) / (2 * linear**2 * stokes[0])
+        known = ~(np.rad2deg(noise) > WORST_ORIENTATION_DEG)
+        angle = np.where(known, np.rad2deg(np.arctan2(s2, s1)) / 2 % 180, np.nan)
+        ellipticity = np.where(known, np.rad2deg(np.arctan2(s3, linear)) / 2, np.nan)
     panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = [
         ("$S_0$ / counts", stokes[0], {"cmap": "gray", "vmin": 0})
     ]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for k in range(1, 4):
-            shown = np.where(lit, stokes[k] / stokes[0], np.nan)
-            if np.isfinite(shown).any():
-                limit = max(percentile(np.abs(shown), 99.5), 1e-6)
-                panels.append((f"$S_{k} / S_0$", shown, {"cmap": SIGNED, "vmin": -limit, "vmax": limit}))
-    return grid_figure(panels, _title(product), product.simulated)
+    for k, shown in enumerate((s1, s2, s3), 1):
+        limit = max(percentile(np.abs(shown), 99.5), 1e-6) if np.isfinite(shown).any() else 1.0
+        panels.append((f"$S_{k} / S_0$", shown, {"cmap": SIGNED, "vmin": -limit, "vmax": limit}))
+    for label, shown in (
+        ("degree of polarization", degree),
+        ("degree of linear polarization", linear),
+        ("degree of circular polarization", np.abs(s3)),
+    ):
+        panels.append((label, shown, {"cmap": "viridis", "vmin": 0, "vmax": upper_end(shown)}))
+    panels += [
+        ("angle of linear polarization, PSA frame / degrees", angle, CYCLIC),
+        ("ellipticity angle / degrees", ellipticity, {"cmap": SIGNED, "vmin": -45, "vmax": 45}),
+    ]
+    shown_panels = [panel for panel in panels if np.isfinite(panel[1]).any()]
+    return grid_figure(shown_panels, _title(product), product.simulated)

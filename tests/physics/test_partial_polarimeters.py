@@ -1,5 +1,7 @@
 """Polarimeters that determine a part of the Mueller matrix: that part with its errors, nothing of the rest."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -199,6 +201,32 @@ def test_polarized_light_has_maps_of_what_the_sample_sends_back(name, weighted, 
             assert abs(pulls.mean()) < 5 / np.sqrt(pulls.size), map_
             assert pulls.std() == pytest.approx(1, abs=5 / np.sqrt(2 * pulls.size)), map_
         assert product_figure(product)
+
+
+def titles(product):
+    return [panel.get_title() for panel in product_figure(product).axes if panel.get_title()]
+
+
+def test_a_stokes_polarimeter_has_a_figure_of_the_stokes_vector(noisy, tmp_path):
+    name = "rotating_retarder_stokes"
+    path, model, _ = noisy(name, INSTRUMENTS[name][1])
+    with Capture(path) as capture:
+        reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
+    with Product(tmp_path / "m.h5") as product:
+        shown = " ".join(titles(product))
+    assert re.findall(r"S_\d / S_0", shown) == ["S_1 / S_0", "S_2 / S_0", "S_3 / S_0"]
+    for quantity in ("degree of polarization", "linear pol", "circular pol", "angle of linear", "ellipticity"):
+        assert quantity in shown
+    assert "m_" not in shown
+
+
+def test_the_figure_of_a_partial_mueller_image_says_what_is_not_determined(noisy, tmp_path):
+    path, model, _ = noisy("linear_mueller", INSTRUMENTS["linear_mueller"][1])
+    with Capture(path) as capture:
+        reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
+    with Product(tmp_path / "m.h5") as product:
+        texts = [text.get_text() for panel in product_figure(product).axes for text in panel.texts]
+    assert texts.count("not\ndetermined") == 7
 
 
 def test_states_that_see_less_than_the_instrument_can_are_refused(noisy, tmp_path):
