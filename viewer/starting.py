@@ -197,7 +197,18 @@ def job(request: Request) -> HTMLResponse:
     """The page of a job."""
     pages, jobs = pages_of(request), jobs_of(request)
     found = jobs.job(request.query_params.get("name", ""))
-    return pages.draw("job.html", job=found, now=told(pages, jobs, found))
+    return pages.draw("job.html", simulated=_simulated(pages, found), job=found, now=told(pages, jobs, found))
+
+
+def _simulated(pages: Pages, found: Job) -> bool:
+    """Whether the captures that a job reads, or the devices that it drives, are simulated."""
+    if "file" in found.about:
+        return pages.library.entry(found.about["file"]).simulated
+    rig = dict(zip(found.command, found.command[1:], strict=False)).get("--rig")
+    try:
+        return rig is not None and load_rig(rig).simulated
+    except ProcessError:
+        return False
 
 
 def told(pages: Pages, jobs: Jobs, found: Job) -> dict[str, Any]:

@@ -32,6 +32,8 @@ def export(source: Path, to: str, out: Path, planes: Sequence[str] = (), overwri
     ProcessError
         The format or a plane is unknown, a file exists, or the format cannot hold the data.
     """
+    if to.lower() in ("nexus", "nxs", "hdf5", "h5"):
+        raise ProcessError(f"{source} is a NeXus file (HDF5) already: open it as it is, or copy it to the name wanted.")
     if to not in (*FORMATS, *FIGURES):
         raise ProcessError(f"unknown format {to!r}; there are: {', '.join((*FORMATS, *FIGURES))}")
     if out.suffix.lower() in (f".{to}", ".tif" if to == "tiff" else None):

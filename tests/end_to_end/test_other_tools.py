@@ -323,6 +323,7 @@ def test_figures_are_written_and_nothing_is_replaced(exported, product, tmp_path
     for options, told in (
         (["--to", "pdf", "--plane", "mueller"], "exists"),
         (["--to", "doc"], "unknown format"),
+        (["--to", "nexus"], "is a NeXus file (HDF5) already"),
         (["--to", "csv", "--plane", "nothing"], "has no 'nothing'"),
     ):
         with pytest.raises(SystemExit) as end:
