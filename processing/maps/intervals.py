@@ -150,25 +150,27 @@ def set_systematic(planes: Planes, derived: Mapping[str, Derived], moves: Array)
 
     Returns
     -------
-    Of each map (..., pixels..., D), what each direction does to it, to first order.
+    Of each map (n, pixels, D), what each direction does to its n numbers, to first order.
     """
     names = [name for name in derived if name in planes]
-    size = int(np.prod(moves.shape[2:]))
-    gradients = [np.moveaxis(derived[name].gradient.reshape(-1, size, 16), 0, 1) for name in names]
-    each = np.ascontiguousarray(np.moveaxis(moves.reshape(len(moves), 16, size), 2, 0).swapaxes(1, 2), dtype=np.float32)
-    with np.errstate(invalid="ignore", over="ignore"):
-        moved = np.concatenate(gradients, axis=1).astype(np.float32) @ each
-    out, start = {}, 0
+    pixels, inputs = int(np.prod(moves.shape[2:])), len(moves)
+    gradients = [derived[name].gradient.reshape(-1, pixels, 16) for name in names]
+    each = np.empty((pixels, sum(map(len, gradients)), 16), np.float32)
+    parts, start = {}, 0
     for name, gradient in zip(names, gradients, strict=True):
-        shape = np.shape(derived[name].value)
-        part = np.moveaxis(moved[:, start : start + gradient.shape[1]], 0, 1).reshape(*shape, len(moves))
-        start += gradient.shape[1]
-        out[name] = part
-        systematic = np.sqrt(np.square(part).sum(axis=-1))
+        parts[name] = slice(start, start + len(gradient))
+        each[:, parts[name]] = gradient.swapaxes(0, 1)
+        start += len(gradient)
+    by = np.ascontiguousarray(moves.reshape(inputs, 16, pixels).transpose(2, 1, 0), dtype=np.float32)
+    with np.errstate(invalid="ignore", over="ignore"):
+        moved = each @ by
+        total = np.sqrt(np.einsum("pqd,pqd->qp", moved, moved))
+    for name, part in parts.items():
+        systematic = total[part].reshape(np.shape(derived[name].value))
         planes[f"{name}_systematic"] = systematic
         if f"{name}_95" in planes:
             planes[f"{name}_95"] = widened(planes[name], planes[f"{name}_95"], systematic)
-    return out
+    return {name: moved[:, part].swapaxes(0, 1) for name, part in parts.items()}
 
 
 def widened(value: Array, bounds: Array, systematic: Array) -> NDArray[np.float32]:

@@ -283,7 +283,7 @@ def quantities_block(
     Parameters
     ----------
     moves : (D, 16, rows, columns), what each uncertain input of the instrument does to M; see `moves_of`.
-    by_input : filled with what each does to each map, (..., rows, columns, D).
+    by_input : filled with what each does to the n numbers of each map, (n, pixels, D).
     """
     m = image.matrices.astype(float)
     # Where there is no light an eigenvalue solver only works on noise, slowly.

@@ -13,6 +13,7 @@ from processing.errors import ProcessError
 from processing.geometry.frames import GeometryImage
 from processing.geometry.viewing import ViewingGeometry
 from processing.reduction.mueller import Progress
+from processing.reduction.systematic import INPUTS
 from processing.reflectance.pbsdf import MUELLER, to_renderer_frames
 from processing.reflectance.shared_noise import shared_variance
 from processing.reflectance.table_axes import Layout
@@ -43,6 +44,30 @@ def xi0_samples(
     return np.stack([xi0, shared_variance(bins, sigma, correlation)[image.mask]]).astype(float)
 
 
+def _xi0_values(table: ScatteringTable, image: GeometryImage, product: Product) -> NDArray[np.float64]:
+    """Values (quantities, N) of a table from a whole xi0 product; NaN where that is not valid."""
+    valid = product.get("valid")[image.mask] > 0
+    xi0, error = (product.get(name)[image.mask] for name in ("xi0", "xi0_errors"))
+    values = xi0_samples(table, image, xi0, np.where(valid, error, np.nan), noise_between(product))
+    if len(table.quantities) > len(values):
+        if table.quantities[2:] != _directions(product):
+            raise ProcessError(
+                f"{product.path} was reduced with an instrument of other uncertain values than those in the table. "
+                "Reduce all captures with one file: process reduce --instrument FILE"
+            )
+        values = np.concatenate([values, product.get("xi0_directions")[:, image.mask]])
+    values[:, ~valid] = np.nan
+    return values
+
+
+def _directions(product: Product) -> tuple[str, ...]:
+    """Quantities of a table: what one standard uncertainty of each uncertain input of the instrument does to xi0."""
+    if product.kind != "xi0" or INPUTS not in product.facts:
+        return ()
+    labels = str(product.facts[INPUTS]).replace(", ", "+").split("; ")
+    return tuple(f"xi0_direction_{k}_{label}" for k, label in enumerate(labels))
+
+
 def tabulate(
     sources: Sequence[Path],
     geometry_file: Path,
@@ -54,7 +79,9 @@ def tabulate(
 
     Mueller matrices are turned into the renderer's axes pixel by pixel, so that pixels of one bin are alike.
     xi0 products add their valid pixels, with the variance of each and its covariances with the other pixels of the bin,
-    so that tables can be compared with their noise. Those of Mueller images are not averaged over neighbours.
+    so that tables can be compared with their noise. Those of Mueller images are not averaged over neighbours. The
+    mean of each direction of the instrument's uncertainty is in the table: the root of their sum of squares is the
+    systematic uncertainty of a bin's mean xi0.
 
     Raises
     ------
@@ -71,7 +98,8 @@ def tabulate(
             if header.omega_deg is None:
                 raise ProcessError(f"{source}: the capture does not say its arm angle; it belongs to no bin.")
             if table is None:
-                names, frames = (MUELLER, "renderer") if kind == "mueller" else (("xi0", "xi0_variance"), "")
+                of_xi0 = ("xi0", "xi0_variance", *_directions(product))
+                names, frames = (MUELLER, "renderer") if kind == "mueller" else (of_xi0, "")
                 table = ScatteringTable(names, header.wavelength_nm, layout, simulated, frames)
             if abs(table.wavelength_nm - header.wavelength_nm) > 0.5:
                 raise ProcessError(
@@ -88,10 +116,7 @@ def tabulate(
                     m = np.moveaxis(product.get("mueller", rows), (0, 1), (-2, -1))[image.mask]
                     values = to_renderer_frames(m, image.points).reshape(-1, 16).T
                 else:
-                    valid = product.get("valid", rows)[image.mask] > 0
-                    xi0, error = (product.get(name, rows)[image.mask] for name in ("xi0", "xi0_errors"))
-                    values = xi0_samples(table, image, xi0, np.where(valid, error, np.nan), noise_between(product))
-                    values[:, ~valid] = np.nan
+                    values = _xi0_values(table, image, product)
                 table.add(image.points.angles, values, simulated)
         if progress:
             progress(done, len(sources))

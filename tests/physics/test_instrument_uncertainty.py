@@ -5,10 +5,12 @@ import pytest
 from typer.testing import CliRunner
 
 from processing.commands.application import app
+from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
 from processing.instrument.uncertainty import value_directions
 from processing.maps.quantities import quantities_of_mueller
+from processing.maps.tables import tabulate
 from processing.maps.xi0 import xi0_of_mueller
 from processing.polarization import mueller
 from processing.reduction.mueller import reduce_mueller
@@ -56,14 +58,14 @@ def drawn(model, random):
     return model.with_values(values)
 
 
-def products(synthetic_capture, tmp_path, model, truth, random, name="a"):
+def products(synthetic_capture, tmp_path, model, truth, random, name="a", rows=4, **header):
     """Mueller image, quantities and xi0 of a sample that another instrument than the model's measured."""
     light = COUNTS * truth.rows(ANGLES).reshape(-1, 16) @ SAMPLE.reshape(16)
-    frames = np.broadcast_to(light[:, None, None, None], (40, 1, 4, 4)).astype(np.float32)
+    frames = np.broadcast_to(light[:, None, None, None], (40, 1, rows, rows)).astype(np.float32)
     if random is not None:
         frames = random.poisson(frames).astype(np.float32)
     detector = {"gain_e_per_count": 1.0, "read_noise_e": 1.0, "black_level_counts": 0.0}
-    path = synthetic_capture(frames, ANGLES, name=f"{name}.h5", detector=detector)
+    path = synthetic_capture(frames, ANGLES, name=f"{name}.h5", detector=detector, **header)
     paths = [tmp_path / f"{name}.{kind}.h5" for kind in ("mueller", "quantities", "xi0")]
     with Capture(path) as capture:
         reduce_mueller(capture, model, paths[0], (STEP,))
@@ -146,3 +148,21 @@ def test_calibrate_writes_what_it_does_not_know(synthetic_capture, configs, tmp_
     with Product(paths[1]) as product:
         assert "psg_retarder.retardance_deg" in product.facts["uncertain_in_the_instrument"]
         assert (product.get("diattenuation_systematic") > 0).all()
+
+
+def test_a_table_holds_what_each_direction_does_to_its_means(stated, synthetic_capture, tmp_path, configs):
+    """The instrument's part of the mean over a bin is as large as that of one pixel; noise is not."""
+    model = InstrumentModel.load(stated).at(662)
+    header = {"omega_deg": 35.0, "rows": 48}
+    geometry = configs / "geometries/one_inch_sphere.yaml"
+    paths = products(synthetic_capture, tmp_path, model, model, np.random.default_rng(4), **header)
+    table = tabulate([paths[2]], geometry, "degree")
+    assert [name.split("_", 3)[3] for name in table.quantities[2:]] == list(model.stderr)
+    of_mean = np.sqrt(np.square(table.mean[2:]).sum(axis=0))
+    with Product(paths[2]) as product:
+        of_pixel = np.median(product.get("xi0_systematic"))
+    assert np.median(of_mean) == pytest.approx(of_pixel, rel=0.05)
+    known = model.model_copy(update={"stderr": {}})
+    plain = products(synthetic_capture, tmp_path, known, known, None, "plain", **header)
+    with pytest.raises(ProcessError, match="process reduce --instrument"):
+        tabulate([plain[2]], geometry, "degree", table)
