@@ -4,10 +4,12 @@ As SQLite's tests do, a counter runs through the calls of each kind. After each 
 intact and at the angles that their pixels show, and the capture goes on.
 """
 
+import errno
 import multiprocessing
 import os
 import random
 import threading
+import time
 
 import pytest
 
@@ -15,6 +17,7 @@ from acquisition.capture.state_file import StateFile
 from acquisition.errors import AcquisitionError
 from drivers.cameras.aravis import AravisCamera
 from drivers.errors import DeviceError
+from drivers.motion import MotionAxis
 from drivers.serial_link import SerialLink
 
 SHORT = {"states": {"kind": "rotating_retarders", "states": 18, "step_deg": 20, "ratio": 4.91}, "darks": 1}
@@ -27,6 +30,8 @@ CALLS = {
     "disc": (StateFile, "write_state", (MemoryError, OSError), 10),
     "disc probe": (os, "utime", (OSError,), 3),
     "thread": (threading.Thread, "start", (RuntimeError,), 6),
+    # A clock does not fail: it is set, or one reading of it is wrong.
+    "clock": (time, "time", (lambda now: now + 3600.0, lambda now: now - 90.0), 60),
 }
 
 
@@ -48,6 +53,8 @@ class Injected:
                 self._left.value -= 1
                 if self._left.value <= 0 and self._until.value > 0:
                     self._until.value -= 1
+                    if not isinstance(self._error, type):
+                        return self._error(call(*arguments, **options))
                     raise self._error("injected")
             return call(*arguments, **options)
 
@@ -82,3 +89,30 @@ def test_after_any_failure_the_light_is_off_and_the_capture_goes_on(run_with, in
             error, path = run_with(resume=path, plan=SHORT)
             assert error is None
         assert intact(path) == 19
+
+
+@pytest.mark.parametrize("times", [1, 10**9])
+def test_without_a_process_for_the_disc_nothing_moves_and_the_same_command_goes_on(
+    acquire, quick_rig, monkeypatch, tmp_path, times
+):
+    failed, moved = [], []
+    fork, start = os.fork, MotionAxis.start_move
+
+    def no_fork():
+        if len(failed) < times:
+            failed.append(1)
+            raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+        return fork()
+
+    command = ("--omega", 35, "--mode", "stokes", "--rig", quick_rig(), "--out", tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fork", no_fork)
+        patch.setattr(MotionAxis, "start_move", lambda *arguments: moved.append(1) or start(*arguments))
+        code, _, err = acquire(*command)
+    assert code == 1
+    assert "no process can be started that writes the captures" in err
+    assert "then give the same command" in err
+    assert not moved
+    assert not list(tmp_path.glob("*.h5*"))
+    code, _, err = acquire(*command)
+    assert code == 0, err
