@@ -51,7 +51,7 @@ def end_record(
         "messages": runner.messages.texts,
         "messages_dropped": runner.messages.dropped,
         "interlocks": runner.interlocks.events,
-        "evidence": [asdict(finding) for finding in runner.evidence.found],
+        "evidence": [asdict(finding) for finding in runner.checks.evidence.found],
         "camera_settings": rig.require_camera().settings.model_dump(exclude_none=True),
     }
     if failure is not None:

@@ -7,16 +7,16 @@ written, while the axes turn. A frame that did not arrive whole puts its state b
 from __future__ import annotations
 
 import logging
-import time
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from acquisition.capture.auto_exposure import find_exposure
+from acquisition.capture.frame_checks import FrameChecks
+from acquisition.capture.messages import Messages
 from acquisition.capture.plan import ARM, AutoExposure
-from acquisition.capture.repeated_state import RepeatedState
 from acquisition.capture.time_ledger import Entry, TimeLedger
 from acquisition.capture.wall_clock import WallClock
 from acquisition.capture.writer import CaptureWriter, StateRecord
@@ -24,15 +24,14 @@ from acquisition.errors import RunFailed
 from acquisition.rig.continuous_rotation import states_deg, turned
 from acquisition.rig.interlocks import Interlocks
 from acquisition.rig.rig import Rig
-from acquisition.screen.observer import Observer, StateReport
+from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
-from drivers.camera import CameraSettings, Exposure, Frame
+from drivers.camera import CameraSettings, Exposure
 from drivers.errors import FrameLost
 from drivers.motion import Motion, Position
 from processing.arrays import Array
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import StateTable
-from processing.reduction.frame_evidence import Finding, FrameEvidence
 from processing.reduction.lit_darks import LitDarks
 from processing.storage.capture_schema import Detector
 
@@ -40,10 +39,6 @@ log = logging.getLogger(__name__)
 
 #: Factor on the exposure after a saturated state.
 DARKER = 0.6
-#: Settings that are read back with each frame, and by how much they may differ: of the exposure a part of it.
-APPLIED = {"exposure_s": 0.002, "gain_db": 0.02, "black_level": 0.5, "reverse_x": 0.5, "reverse_y": 0.5}
-#: A pixel below this part of full scale, above the black level, counts as near-black.
-NEAR_BLACK = 0.01
 
 
 class TooBright(RunFailed):
@@ -62,21 +57,6 @@ class _Exposed:
     temperature_c: float
     clock_ahead_s: float
     settings: CameraSettings
-
-
-@dataclass
-class Messages:
-    """What the capture's closing record tells besides numbers; the oldest are kept."""
-
-    texts: list[str] = field(default_factory=list)
-    dropped: int = 0
-
-    def add(self, text: str) -> None:
-        """Note a message with its time."""
-        if len(self.texts) < 200:
-            self.texts.append(f"{time.strftime('%H:%M:%S')} {text[:500]}")
-        else:
-            self.dropped += 1
 
 
 class CaptureRunner:
@@ -129,12 +109,10 @@ class CaptureRunner:
         self._pending: deque[int] = deque()
         self._saturation_limit = saturation_limit
         lights = sum(role != "dark" for role in table.role)
-        self._lit_darks = lit_darks or LitDarks(detector.black_level_counts, mosaic=mosaic, lights=lights)
-        self._repeated = RepeatedState(detector.black_level_counts)
+        lit_darks = lit_darks or LitDarks(detector.black_level_counts, mosaic=mosaic, lights=lights)
+        self.checks = FrameChecks(detector.black_level_counts, rows, lit_darks, self.warn)
         self._wall_clock = WallClock()
-        self.evidence = FrameEvidence(detector.black_level_counts, rows)
         self._rested: dict[str, Position] = {}
-        self._began_with: CameraSettings | None = None
 
     def run(self, pending: Iterable[int]) -> bool:
         """Take these states; True if all are done, False if a stop was asked for.
@@ -209,7 +187,7 @@ class CaptureRunner:
         """Forget the states taken and go on with a shorter exposure."""
         self.warn(f"{why}; beginning again at {DARKER:g} of the exposure")
         self.writer.forget()
-        self.evidence.forget()
+        self.checks.evidence.forget()
         self.ledger.states = 0
         self._scale_exposure(DARKER)
 
@@ -225,11 +203,6 @@ class CaptureRunner:
         self.messages.add(text)
         for observer in self.observers:
             observer.warning(text)
-
-    @property
-    def _full_scale(self) -> int:
-        """Largest count that a pixel can have, as far as the frames so far have shown."""
-        return self.rig.require_camera().full_scale
 
     # --- one state ---------------------------------------------------------------------------------------
 
@@ -312,29 +285,24 @@ class CaptureRunner:
         with self.ledger.time("transfer"):
             try:
                 frame = exposed.exposure.frame()
-                self._require_as_reported(exposed, frame)
+                self.checks.require_as_reported(exposed.state, frame, exposed.settings, self.rig)
             except FrameLost as error:
                 self._again(exposed.state, error)
                 return
-        report = self._report(exposed, frame)
+        role, full_scale = self.table.role[exposed.state], self.rig.require_camera().full_scale
+        report = self.checks.report(exposed.state, role, exposed.positions, exposed.exposure_s, frame, full_scale)
         # In a bracket the longer exposures are meant to saturate.
         shortest = self.table.exposure_s[exposed.state] <= 1.001 * self.table.exposure_s.min()
         if self._saturation_limit is not None and shortest and report.saturated_fraction > self._saturation_limit:
-            raise TooBright(
-                f"state {exposed.state}: {100 * report.saturated_fraction:.2f} % of the pixels are saturated"
-            )
+            percent = 100 * report.saturated_fraction
+            raise TooBright(f"state {exposed.state}: {percent:.2f} % of the pixels are saturated")
         blocked = self.interlocks.judge(report, meant_to_saturate=not shortest)
         if blocked is not None:
             self._discard(exposed.state, blocked)
             return
-        self._check_light(report)
-        light = report.role not in ("dark", "flat")
-        self._tell_findings(
-            self.evidence.look(
-                exposed.state, frame.pixels, number=frame.frame_id, camera_ns=frame.camera_time_ns,
-                exposure_s=exposed.exposure_s, light=light,
-            )
-        )  # fmt: skip
+        planned_s = float(self.table.exposure_s[exposed.state])
+        pose = tuple(float(column[exposed.state]) for column in self.table.angles_deg.values())
+        self.checks.look(report, frame, planned_s, pose)
         columns = {
             "exposure_s": exposed.exposure_s,
             "host_time_s": frame.host_time_s - exposed.clock_ahead_s,
@@ -345,7 +313,7 @@ class CaptureRunner:
             "near_black_fraction": report.near_black_fraction,
             "monitor": report.monitor,
             "camera_temperature_c": exposed.temperature_c,
-            "full_scale_counts": self._full_scale,
+            "full_scale_counts": full_scale,
         }
         with self.ledger.time("writing"):
             self._wait_for_disc()
@@ -361,20 +329,6 @@ class CaptureRunner:
         self._set_light(False)
         self.warn("the disc takes no data: the light is shut until it does")
         self.writer.settle()
-
-    def _report(self, exposed: _Exposed, frame: Frame) -> StateReport:
-        state, black = exposed.state, self.detector.black_level_counts
-        dim = black + NEAR_BLACK * (self._full_scale - black)
-        return StateReport(
-            state=state,
-            role=self.table.role[state],
-            positions=exposed.positions,
-            exposure_s=exposed.exposure_s,
-            saturated_fraction=float(np.count_nonzero(frame.pixels >= self._full_scale)) / frame.pixels.size,
-            near_black_fraction=float(np.count_nonzero(frame.pixels < dim)) / frame.pixels.size,
-            monitor=(float(frame.pixels.mean()) - black) / exposed.exposure_s,
-            pixels=frame.pixels,
-        )
 
     # --- what can be wrong with it -----------------------------------------------------------------------
 
@@ -392,64 +346,6 @@ class CaptureRunner:
         self.warn(f"{what}; times in the capture go on evenly")
         self.rig.require_camera().forget_clock()
         return True
-
-    def _check_light(self, report: StateReport) -> None:
-        exposure_s = float(self.table.exposure_s[report.state])
-        pose = tuple(float(column[report.state]) for column in self.table.angles_deg.values())
-        if report.role == "dark":
-            self._lit_darks.dark(exposure_s, pose, report.pixels)
-            return
-        changed = self._repeated.look(report.state, exposure_s, pose, report.pixels)
-        if changed is not None:
-            self.warn(changed)
-        wrong = self._lit_darks.light(exposure_s, pose, report.pixels)
-        if wrong is not None:
-            raise RunFailed(
-                f"state {report.state}: {wrong}. The light was not shut off for them, or the black level is wrong. "
-                "Make sure that the source darkens the sample, or correct detector.black_level_counts in the rig file, "
-                "and begin the capture again."
-            )
-        unlit = self._lit_darks.without_light(exposure_s)
-        if unlit is not None:
-            self.warn(
-                f"{unlit}: is the source on at this wavelength, its shutter open, the lens free? The capture goes on"
-            )
-
-    def judge_frames(self) -> None:
-        """Report what the frames of the run together say against the camera."""
-        self._tell_findings(self.evidence.judge())
-
-    def _tell_findings(self, findings: Sequence[Finding]) -> None:
-        for finding in findings:
-            self.warn(f"false frame: {finding.text}")
-
-    def _require_as_reported(self, exposed: _Exposed, frame: Frame) -> None:
-        """Refuse a frame that came before, or that the camera took with other settings than it was set to.
-
-        Raises
-        ------
-        FrameLost
-        """
-        asked = f"camera, frame of state {exposed.state}"
-        again = self.evidence.repeats(frame.pixels)
-        if again is not None:
-            raise FrameLost(asked, again, "Switch the camera off and on")
-        applied = self.rig.require_camera().applied()
-        # The exposure is that of the state; all else as at the first frame, not as another program left it meanwhile.
-        self._began_with = self._began_with or exposed.settings
-        was = self._began_with.model_copy(update={"exposure_s": exposed.settings.exposure_s})
-        changed = [
-            f"{name} {now:g} instead of {set_to:g}"
-            for name, step in APPLIED.items()
-            if (now := getattr(applied, name)) is not None
-            and (set_to := getattr(was, name)) is not None
-            and abs(now - set_to) > step * (set_to if name == "exposure_s" else 1.0)
-        ]
-        if changed:
-            self.rig.forget_exposure()
-            raise FrameLost(
-                asked, f"the camera has {', '.join(changed)}: something changed its settings", "End other programs"
-            )
 
     def _require_rested(self, state: int, motions: Mapping[str, Motion]) -> None:
         """Refuse to go on with an axis that has moved, or lost its count, since the state before. Raises RunFailed."""

@@ -203,7 +203,7 @@ def _run(
     light = run_all([("shut off the light", _shut(rig))])
     if light is not None:
         runner.warn(f"the light could not be shut off: {light}")
-    judged = run_all([("judge the frames", runner.judge_frames)])
+    judged = run_all([("judge the frames", runner.checks.judge)])
     if judged is not None:
         runner.warn(f"the frames could not be compared: {judged}")
     closing, path = _end_segment(runner, rig, status, failure)

@@ -7,7 +7,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -19,11 +19,10 @@ from acquisition.rig.alarms import ACKNOWLEDGE
 from acquisition.rig.config import RigConfig, clock_of, has_own_emulators
 from acquisition.rig.guard import TRY_S
 from acquisition.rig.guarded import BEAT_S, Guarding, WatchedSource
-from acquisition.rig.way import Pose, concerned, find_homing_obstacle, find_obstacle, find_way
+from acquisition.rig.joint_axes import JointAxes
 from drivers.camera import Camera, CameraSettings
-from drivers.clock import Clock
-from drivers.errors import DeviceError, LimitError, MotionFailed
-from drivers.motion import Limits, Motion, MotionAxis, Position
+from drivers.errors import DeviceError
+from drivers.motion import MotionAxis
 from drivers.registry import open_axis, open_camera, open_source
 from drivers.serial_link import LineRegistry
 from drivers.sources.manual import Ask, ManualSource
@@ -32,11 +31,6 @@ from simulators.rig.model import SCHEME
 from simulators.rig.rig import SimulatedRig
 
 log = logging.getLogger(__name__)
-
-#: Shortest pause between two looks at a moving axis.
-SHORTEST_LOOK_S = 0.002
-#: Longest wait for moves that were started and given up.
-REST_WITHIN_S = 60.0
 
 
 @contextmanager
@@ -50,7 +44,7 @@ def _said_of(device: str) -> Iterator[None]:
         raise
 
 
-class Rig:
+class Rig(JointAxes):
     """Named axes, a camera and a light source, opened from a rig file; a context manager.
 
     Attributes
@@ -75,8 +69,7 @@ class Rig:
         with_camera: bool = True,
         ask: Ask | None = None,
     ) -> None:
-        self.config = config
-        self.axes: dict[str, MotionAxis] = {}
+        super().__init__(config, clock_of(config))
         self.camera: Camera | None = None
         self.source: WatchedSource | None = None
         self.simulation: SimulatedRig | None = None
@@ -84,7 +77,6 @@ class Rig:
         self._read_back = CameraSettings()
         self._with_camera = with_camera
         self._ask = ask
-        self.clock: Clock = clock_of(config)
         self._lines = LineRegistry(config.wire_log, self.clock)
         self._guarding: Guarding | None = None
         self._stop_failed: str | None = None
@@ -276,168 +268,6 @@ class Rig:
                     ) from error
                 time.sleep(BEAT_S)
 
-    # --- motion ------------------------------------------------------------------------------------------
-
-    def homing_order(self) -> list[str]:
-        """Names of all axes: those of the rig file's `home_order` first."""
-        return [*self.config.home_order, *(name for name in self.axes if name not in self.config.home_order)]
-
-    def unhomed(self) -> list[str]:
-        """Names of the axes without a reference, in homing order."""
-        return [name for name in self.homing_order() if not self.axes[name].is_homed()]
-
-    def home(self, names: list[str]) -> None:
-        """Home the axes one after another.
-
-        Raises
-        ------
-        AcquisitionError
-            One of them may meet a forbidden pose or bring solids together on its way; nothing was moved.
-        MotionFailed
-            Every axis has been sent a stop by then.
-        """
-        found = find_homing_obstacle(self.config, names, self.where_known())
-        if found is not None:
-            raise AcquisitionError(f"{found}. Nothing was moved.")
-        for name in names:
-            self.wait({name: self.axes[name].home()})
-
-    def move(self, targets_deg: Mapping[str, float]) -> dict[str, Position]:
-        """Move axes at the same time and wait; returns the positions read back at rest.
-
-        An axis with backlash comes to its target from below, if its limits leave room for that.
-        """
-        below = {}
-        for name, slack in self.config.backlash_deg.items():
-            if name in targets_deg and targets_deg[name] < self.axes[name].read_position().deg - 1e-6:
-                below[name] = targets_deg[name] - slack
-        beyond = dict(targets_deg) | below
-        if below and self._allowed(beyond):
-            self.wait(self.start_moves(beyond))
-        return self.wait(self.start_moves(targets_deg))
-
-    def go(self, targets_deg: Pose, by: Sequence[Pose] = (), first: str | None = None) -> None:
-        """Move to a pose by the way that `find_way` finds, if need be round what is forbidden.
-
-        Raises
-        ------
-        AcquisitionError
-            There is no such way; nothing was moved.
-        """
-        way = find_way(self.config, self.where_known(), targets_deg, by, self.limits, first)
-        if way is None:
-            # Says what is met.
-            self._check_way(targets_deg)
-        for targets in way or []:
-            self.move(targets)
-
-    def _allowed(self, targets_deg: Mapping[str, float]) -> bool:
-        try:
-            for name, target in targets_deg.items():
-                self.axes[name].check(target)
-            self._check_way(targets_deg)
-        except (LimitError, AcquisitionError):
-            return False
-        return True
-
-    def start_moves(self, targets_deg: Mapping[str, float]) -> dict[str, Motion]:
-        """Start axes at the same time; those that stand within a count of their target are started too."""
-        for name, target in targets_deg.items():
-            self.axes[name].check(target)
-        self._check_way(targets_deg)
-        motions: dict[str, Motion] = {}
-        try:
-            for name, target in targets_deg.items():
-                motions[name] = self.axes[name].start_move(target)
-        except BaseException:
-            self.stop()
-            raise
-        return motions
-
-    def _check_way(self, targets_deg: Mapping[str, float]) -> None:
-        found = self._met(targets_deg)
-        if found is not None:
-            raise AcquisitionError(f"move to {dict(targets_deg)} meets {found}. Nothing was moved.")
-
-    def is_free(self, targets_deg: Mapping[str, float]) -> bool:
-        """Whether the axes can move there straight away."""
-        return self._met(targets_deg) is None
-
-    def _met(self, targets_deg: Mapping[str, float]) -> str | None:
-        if not concerned(self.config) & targets_deg.keys():
-            # Not even a position is read then: most moves are of rotators that nothing can hit.
-            return None
-        here = self.where_known()
-        return find_obstacle(self.config, here, here | dict(targets_deg), targets_deg, self.limits)
-
-    @property
-    def limits(self) -> dict[str, Limits]:
-        """Limits of every axis, the tighter ones of controller and rig file."""
-        return {name: axis.limits for name, axis in self.axes.items()}
-
-    def where_known(self) -> dict[str, float]:
-        """Angles of the axes that forbidden poses and solids speak of, as far as they are known."""
-        # Where an axis without a reference stands is not known, whatever it reads.
-        axes = {name: self.axes[name] for name in concerned(self.config) if name in self.axes}
-        return {name: axis.read_position().deg for name, axis in axes.items() if axis.is_homed()}
-
-    def where_once_homed(self) -> dict[str, float]:
-        """Angle of every axis after those without a reference have been homed, as far as the rig file tells.
-
-        Where it does not, an axis is taken to end at its controller's zero.
-        """
-        ends = {name: path.ends_deg for name, path in self.config.homing.items()}
-        return {
-            name: axis.read_position().deg if axis.is_homed() else ends.get(name, axis.controller_zero_deg)
-            for name, axis in self.axes.items()
-        }
-
-    def wait(self, motions: Mapping[str, Motion]) -> dict[str, Position]:
-        """Wait for all motions and return the positions read back at rest.
-
-        Raises
-        ------
-        MotionFailed
-            As the first axis that failed has it; every axis has been sent a stop.
-        """
-        left = dict(motions)
-        positions: dict[str, Position] = {}
-        start_s = self.clock.now_s()
-        try:
-            while left:
-                for name, motion in list(left.items()):
-                    if motion.done():
-                        positions[name] = motion.wait()
-                        del left[name]
-                if left:
-                    self.clock.sleep_s(self._next_look_s(left, self.clock.now_s() - start_s))
-        except MotionFailed as failure:
-            others = self.stop()
-            if others is not None:
-                failure.add_note(f"stopping the other axes failed too: {others}")
-            raise
-        except BaseException:
-            self.stop()
-            raise
-        return {name: positions[name] for name in motions}
-
-    def rest(self) -> None:
-        """Wait until no axis moves, for moves that nobody waits for any more."""
-        for axis in self.axes.values():
-            end_s = self.clock.now_s() + REST_WITHIN_S
-            while axis.is_moving():
-                if self.clock.now_s() > end_s:
-                    self.stop()
-                    raise AcquisitionError(f"axis {axis.name} still moves after {REST_WITHIN_S:g} s; it was stopped")
-                self.clock.sleep_s(axis.config.poll_s)
-
-    def _next_look_s(self, left: Mapping[str, Motion], elapsed_s: float) -> float:
-        """Pause before the next look at moving axes: short around the time at which the last should arrive."""
-        slowest = max(left.values(), key=lambda motion: motion.expected_s)
-        off_s = abs(slowest.expected_s / self.time_scale - elapsed_s)
-        longest_s = min(self.axes[name].config.poll_s for name in left)
-        return min(max(off_s / 2, SHORTEST_LOOK_S), longest_s)
-
     def stop(self) -> Exception | None:
         """Shut the light that this program has lit and stop every axis, whatever they answer; the first failure.
 
@@ -449,7 +279,7 @@ class Rig:
         except RuntimeError:
             # No thread to be had: one after the other, then.
             shut.run()
-        failure = run_all([(f"stop axis {name}", axis.stop) for name, axis in self.axes.items()])
+        failure = super().stop()
         with contextlib.suppress(RuntimeError):
             shut.join()
         self._stop_failed = None if failure is None else str(failure)

@@ -1,0 +1,21 @@
+"""What a run says in words, for its closing record."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+
+@dataclass
+class Messages:
+    """What the capture's closing record tells besides numbers; the oldest are kept."""
+
+    texts: list[str] = field(default_factory=list)
+    dropped: int = 0
+
+    def add(self, text: str) -> None:
+        """Note a message with its time."""
+        if len(self.texts) < 200:
+            self.texts.append(f"{time.strftime('%H:%M:%S')} {text[:500]}")
+        else:
+            self.dropped += 1
