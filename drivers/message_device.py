@@ -17,7 +17,8 @@ from pathlib import Path
 
 from drivers.clock import REAL, Clock
 from drivers.errors import PermissionRefused, PortBusy, PortLost, PortNotFound
-from drivers.serial_link import HELD, end_the_holder, held_descriptor, line_framer, port_holders
+from drivers.serial_link import line_framer
+from drivers.serial_ports import HELD, end_the_holder, held_descriptor, port_holders
 
 # _IOW(91, 10, __u32), milliseconds; the kernel takes no less than 100.
 _SET_TIMEOUT = 0x40045B0A

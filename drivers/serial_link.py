@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import io
 import os
 import select
-import struct
 import termios
 import threading
 import time
@@ -19,17 +17,14 @@ from typing import Any, Protocol, Self, TypeVar
 import serial
 
 from drivers.clock import REAL, Clock
-from drivers.errors import DeviceError, PermissionRefused, PortBusy, PortLost, PortNotFound, ReplyError
+from drivers.errors import DeviceError, PortBusy, PortLost, ReplyError
+from drivers.serial_ports import WRITE_S, open_port
 
 # A framer takes one whole frame off the front of the buffer, or returns None until there is one.
 Framer = Callable[[bytearray], bytes | None]
 
 # No protocol here has a longer frame; noise without an end is dropped beyond it.
 LONGEST_FRAME = 1024
-# Reads wait in slices, so that a deadline is met to within one slice.
-READ_SLICE_S = 0.02
-# Counted by the real clock: a machine that stands still for a moment is no lost port.
-WRITE_S = 10.0
 
 
 def line_framer(buffer: bytearray) -> bytes | None:
@@ -63,60 +58,6 @@ class Transcript:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-
-
-class HeldPort:
-    """A port that another process opened and handed over as a descriptor; it stays open when this is closed.
-
-    A driver opens it under the address ``fd://NUMBER/dev/...``: the guard of `acquire` then needs neither the port's
-    name nor the consent of the process that holds it.
-    """
-
-    rts = True
-
-    def __init__(self, port: str) -> None:
-        self._file = held_descriptor(port)
-
-    def fileno(self) -> int:
-        """The descriptor."""
-        return self._file
-
-    @property
-    def in_waiting(self) -> int:
-        """Bytes that wait to be read."""
-        return int(struct.unpack("i", fcntl.ioctl(self._file, termios.FIONREAD, b"\0\0\0\0"))[0])
-
-    def read(self, size: int) -> bytes:
-        """At most `size` bytes, after READ_SLICE_S at most."""
-        if not select.select([self._file], [], [], READ_SLICE_S)[0]:
-            return b""
-        with contextlib.suppress(BlockingIOError):
-            return os.read(self._file, size)
-        return b""
-
-    def write(self, data: bytes) -> None:
-        """Send all bytes. Raises SerialTimeoutException if the device takes none for WRITE_S."""
-        while data:
-            if not select.select([], [self._file], [], WRITE_S)[1]:
-                raise serial.SerialTimeoutException(f"it takes nothing for {WRITE_S:g} s")
-            with contextlib.suppress(BlockingIOError):
-                data = data[os.write(self._file, data) :]
-
-    def reset_input_buffer(self) -> None:
-        """Drop what waits to be read."""
-        termios.tcflush(self._file, termios.TCIFLUSH)
-
-    def close(self) -> None:
-        """Nothing: whoever received the descriptor closes it."""
-
-
-#: Start of the address of a port that was handed over.
-HELD = "fd://"
-
-
-def held_descriptor(port: str) -> int:
-    """The descriptor in an address ``fd://NUMBER/dev/...``."""
-    return int(port.removeprefix(HELD).partition("/")[0])
 
 
 class SerialLink:
@@ -170,7 +111,7 @@ class SerialLink:
         self._framer = framer
         self._buffer = bytearray()
         self._transcript = transcript
-        self._serial: Any = _open_port(port, baudrate, held_by, xonxoff, rtscts, two_stop_bits)
+        self._serial: Any = open_port(port, baudrate, held_by, xonxoff, rtscts, two_stop_bits)
         self.purge(0.0)
 
     def write(self, data: bytes) -> None:
@@ -246,87 +187,6 @@ class SerialLink:
             raise PortLost(
                 f"use port {self.port}", f"it is gone ({error})", "Check cable and power, then start again"
             ) from error
-
-
-def _open_port(port: str, baudrate: int, held_by: str | None, xonxoff: bool, rtscts: bool, two_stop_bits: bool) -> Any:
-    asked = f"open port {port}"
-    if port.startswith(HELD):
-        return HeldPort(port)
-    if "://" not in port:
-        if not Path(port).exists():
-            raise PortNotFound(asked, "there is no such port", _ports_hint())
-        holders = [(pid, who) for pid, who in port_holders(port) if pid != os.getpid()]
-        others = [who for pid, who in holders if who != f"{held_by} (pid {pid})"]
-        if others:
-            raise PortBusy(asked, f"it is in use by {', '.join(others)}", f"{end_the_holder(port)}; nothing was sent")
-    try:
-        options: dict[str, Any] = {} if "://" in port else {"exclusive": True}
-        return serial.serial_for_url(
-            port,
-            baudrate=baudrate,
-            stopbits=serial.STOPBITS_TWO if two_stop_bits else serial.STOPBITS_ONE,
-            timeout=READ_SLICE_S,
-            write_timeout=WRITE_S,
-            xonxoff=xonxoff,
-            rtscts=rtscts,
-            **options,
-        )
-    except (serial.SerialException, OSError, ValueError) as error:
-        number = getattr(error, "errno", None)
-        if number in (errno.EACCES, errno.EPERM):
-            raise PermissionRefused(
-                asked, f"this user may not; {_owner(port)}", "Join that group and log in again"
-            ) from error
-        if number in (errno.EWOULDBLOCK, errno.EAGAIN, errno.EBUSY):
-            named = ", ".join(who for _, who in port_holders(port)) or "a program that this user may not see"
-            raise PortBusy(asked, f"it is in use by {named}", "End that program; nothing was sent") from error
-        raise PortNotFound(asked, str(error), _ports_hint()) from error
-
-
-def port_holders(port: str) -> list[tuple[int, str]]:
-    """Find the processes that have a device open, as (pid, "name (pid N)"); touches no device.
-
-    Only processes that this user may look into are seen.
-    """
-    wanted = os.path.realpath(port)
-    holders = []
-    for process in Path("/proc").glob("[0-9]*"):
-        try:
-            held = any(os.readlink(entry) == wanted for entry in (process / "fd").iterdir())
-            if held:
-                name = (process / "comm").read_text().strip()
-                holders.append((int(process.name), f"{name} (pid {process.name})"))
-        except OSError:
-            continue
-    return holders
-
-
-def end_the_holder(port: str) -> str:
-    """What to do about a program that has a port open."""
-    if not os.path.realpath(port).startswith("/dev/pts/"):
-        return "End that program"
-    return "End that program or, if it is the simulator behind this port, write its name as `held_by` in the rig file"
-
-
-def _owner(port: str) -> str:
-    import grp
-
-    status = os.stat(port)
-    try:
-        group = grp.getgrgid(status.st_gid).gr_name
-    except KeyError:
-        group = str(status.st_gid)
-    return f"it belongs to group {group}"
-
-
-def _ports_hint() -> str:
-    from serial.tools.list_ports import comports
-
-    # pyserial says "n/a" of what has no description.
-    names = [e.device if e.description == "n/a" else f"{e.device} ({e.description})" for e in comports()]
-    by_id = sorted(str(path) for path in Path("/dev/serial/by-id").glob("*"))
-    found = ", ".join(names + by_id) or "none"
-    return f"Serial ports found: {found}. Correct `port` in the rig file or plug the device in"
 
 
 T = TypeVar("T")

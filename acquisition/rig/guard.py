@@ -11,7 +11,6 @@ through a pipe to a process of its own, which may hang.
 from __future__ import annotations
 
 import contextlib
-import datetime
 import json
 import os
 import select
@@ -27,10 +26,12 @@ from typing import Any
 
 from acquisition.rig import alarms
 from acquisition.rig.config import RigConfig
+from acquisition.rig.journal import Journal
 from acquisition.rig.stop_axes import stop_axes
 from drivers.errors import DeviceError
 from drivers.registry import open_source
-from drivers.serial_link import HELD, LineRegistry
+from drivers.serial_link import LineRegistry
+from drivers.serial_ports import HELD
 from drivers.source import LightSource
 from processing.yaml_file import parse_yaml
 
@@ -55,47 +56,6 @@ LONGEST_S = 86_400.0
 MOST_PORTS = 64
 #: What the guard says of axes that obey.
 AT_REST = "axes at rest"
-#: What the journal keeps in memory while its disc takes nothing.
-JOURNAL_BYTES = 1 << 20
-
-
-class Journal:
-    """A log in JSON lines, appended to its file, if it has one, by a process of its own."""
-
-    def __init__(self, path: Path | None) -> None:
-        self._waiting = b""
-        self._lock = threading.Lock()
-        self._appending: subprocess.Popen[bytes] | None = None
-        if path is not None:
-            with contextlib.suppress(OSError):
-                self._appending = subprocess.Popen(
-                    ["tee", "-a", str(path)],
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,
-                    start_new_session=True,
-                )
-                os.set_blocking(self._pipe(), False)
-
-    def note(self, event: str, **details: Any) -> None:
-        """Add a line; a log that cannot be written holds up nothing."""
-        when = datetime.datetime.now().astimezone().isoformat(timespec="milliseconds")
-        with self._lock:
-            self._waiting = (self._waiting + json.dumps({"time": when, "event": event} | details).encode() + b"\n")[
-                -JOURNAL_BYTES:
-            ]
-        self.flush()
-
-    def flush(self) -> None:
-        """Pass on what waits, as far as it is taken now."""
-        with self._lock, contextlib.suppress(OSError):
-            if self._appending is not None and self._waiting:
-                self._waiting = self._waiting[os.write(self._pipe(), self._waiting) :]
-
-    def _pipe(self) -> int:
-        assert self._appending is not None
-        assert self._appending.stdin is not None
-        return self._appending.stdin.fileno()
 
 
 class Guard:

@@ -19,7 +19,8 @@ from acquisition.rig.config import RigConfig, clock_of
 from drivers.errors import CommandRejected, DeviceError, PortBusy
 from drivers.motion import AxisConfig, MotionAxis
 from drivers.registry import open_axis
-from drivers.serial_link import LineRegistry, port_holders
+from drivers.serial_link import LineRegistry
+from drivers.serial_ports import port_holders
 
 #: Longest wait for a running `acquire` to seal its file and let go of the ports.
 LET_GO_S = 15.0

@@ -10,7 +10,8 @@ import pytest
 
 from acquisition.rig import alarms
 from acquisition.rig.config import load_rig
-from acquisition.rig.guard import Guard, Journal, with_held_ports
+from acquisition.rig.guard import Guard, with_held_ports
+from acquisition.rig.journal import Journal
 from acquisition.rig.rig import Rig
 from processing.storage.capture import Capture
 from processing.yaml_file import dump_yaml
