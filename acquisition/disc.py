@@ -125,7 +125,7 @@ class DiscProcess:
             if since_s is not None and time.monotonic() - since_s > self._patience_s:
                 raise AcquisitionError(
                     f"{what}: the disc has not answered for {time.monotonic() - since_s:.0f} s. The light is off. Go "
-                    "on with the same command, or --resume, when the disc is well."
+                    "on with the same command, or --resume, when the disc works again."
                 )
         return future.result()
 

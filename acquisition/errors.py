@@ -37,7 +37,7 @@ class Unforeseen(RunFailed):
         where = f" ({Path(lines[-1].filename).name}, line {lines[-1].lineno})" if lines else ""
         super().__init__(
             f"an unforeseen error ended the run: {type(error).__name__}: {error}{where}. The light was shut and the "
-            "axes stopped; the same command, or --resume, goes on. Please report the traceback in the log."
+            "axes stopped; continue with the same command, or --resume. Please report the traceback in the log."
         )
         self.trace = "".join(traceback.format_exception(error))
 
@@ -60,9 +60,9 @@ class Differs(AcquisitionError):
 
     def __init__(self, what: str, found: list[str]) -> None:
         super().__init__(
-            f"{what} was begun with something else:\n"
+            f"{what} was begun with another set-up:\n"
             + "\n".join(f"  - {line}" for line in found)
-            + "\nNothing was moved or changed. Go on with what began it, or keep what comes now apart with --as-new."
+            + "\nNothing was moved or changed. Restore the first set-up, or start a separate file with --as-new."
         )
         self.what, self.found = what, found
 

@@ -46,5 +46,5 @@ def take_capture(
         with free_name(Path(folder) / default_name(plan)) as path:
             result = session.take(job, devices, path, stop, observers, home=home)
     if result.status != "complete":
-        raise AcquisitionError(f"{result.path} was stopped ({result.status}); `acquire --resume` goes on with it.")
+        raise AcquisitionError(f"{result.path} was stopped ({result.status}); `acquire --resume` continues it.")
     return result.path

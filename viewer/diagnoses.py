@@ -32,11 +32,11 @@ from viewer.library import OWN, Library, NotHere
 
 #: What is said of a verdict; `{model}` is what the captures were compared with.
 VERDICTS = {
-    "consistent": "The captures agree with {model}: what is left over is noise.",
-    "explained": "The captures disagree with {model}, and what was found explains all of it.",
-    "partly_explained": "Something was found, but more is left over than noise.",
-    "unexplained": "The captures disagree with {model}, and nothing that is known explains it.",
-    "undetermined": "Nothing can be said: a fault of typical size would not have been seen in these captures.",
+    "consistent": "The captures agree with {model}: the residual is noise.",
+    "explained": "The captures disagree with {model}; the effects found explain all of it.",
+    "partly_explained": "Effects were found, but the residual exceeds the noise.",
+    "unexplained": "The captures disagree with {model}, and no known effect explains it.",
+    "undetermined": "No verdict: a fault of typical size would not be visible in these captures.",
 }
 
 
@@ -137,7 +137,7 @@ class Diagnoses:
         try:
             diagnosis = kind.model_validate_json(read_text(folder / "diagnosis.json"))
         except ValidationError as error:
-            raise ProcessError(f"diagnosis {name}: this version cannot read it; diagnose anew") from error
+            raise ProcessError(f"diagnosis {name}: this version cannot read it; run the diagnosis again") from error
         return Story(
             name=name,
             diagnosis=diagnosis,
@@ -193,7 +193,7 @@ class Diagnoses:
     def _undecided(self, name: str) -> Story:
         story = self.story(name)
         if story.decision is not None:
-            raise ProcessError("this diagnosis was decided already; load the page anew")
+            raise ProcessError("this diagnosis was decided already; reload the page")
         return story
 
     def _decide(self, name: str, decision: dict[str, Any]) -> None:

@@ -69,6 +69,6 @@ async def stop(request: Request) -> JSONResponse:
     folder = pages_of(request).library.path(asked.get("folder", ""))
     run = running_in(folder)
     if run is None:
-        raise ProcessError("nothing runs in this folder any more")
+        raise ProcessError("no run is active in this folder")
     os.kill(int(run["pid"]), signal.SIGINT)
     return JSONResponse({"stopping": True})

@@ -35,10 +35,10 @@ def capture(request: Request) -> HTMLResponse:
         facts = [
             *facts_of(opened),
             ("begun", opened.start_time),
-            ("checksums", "every state is held against them" if opened.checked else "none in the file"),
+            ("checksums", "every state is verified against them" if opened.checked else "none in the file"),
         ]
         if segments := len(opened.segments) - 1:
-            facts.append(("interrupted", f"{segments} time(s), and gone on with"))
+            facts.append(("interrupted", f"{segments} time(s) and resumed"))
         notes = papers_of(opened.header)
         states = states_of(opened)
         warnings = [str(message) for message in opened.closing.get("messages", [])]

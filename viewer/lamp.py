@@ -40,7 +40,7 @@ def lamp(capture: Capture) -> dict[str, Any]:
     if same.sum() > 1:
         told = f"dark-corrected mean of the {int(same.sum())} states that repeat the pose of the first one"
         return _told(capture, light[same], signal[same] / signal[same][0], told)
-    told = "told once enough states are done to tell the lamp from polarization"
+    told = "shown once enough states separate the lamp from polarization"
     return {"states": [], "ratio": [], "told": told}
 
 

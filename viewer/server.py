@@ -29,7 +29,7 @@ def serve(folder: Path, port: int, browser: bool) -> None:
         raise ProcessError(f"port {port} cannot be had ({error.strerror}); leave --port away for any other.") from error
     address = f"http://127.0.0.1:{listener.getsockname()[1]}/{token}/"
     typer.echo(f"view: {address}")
-    typer.echo("Ctrl-C ends it; runs started from the page go on.", err=True)
+    typer.echo("Ctrl-C ends it; runs started from the page continue.", err=True)
     sys.stdout.flush()
     # A browser that never asks holds a connection; those who ask must find one more.
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]

@@ -79,9 +79,7 @@ def _resume(library: Library, jobs: Jobs, asked: dict[str, str]) -> Job:
             f"{folder.name} was not begun by you on this machine, and what it names is not run. In a terminal: acquire "
             f"--campaign {shlex.quote(str(folder / PLAN))} --rig RIG.yaml --out {shlex.quote(str(folder.parent))}"
         )
-    return jobs.start(
-        f"campaign {folder.name}, gone on with", command, {"campaign": library.name(folder)}, library.root
-    )
+    return jobs.start(f"campaign {folder.name}, resumed", command, {"campaign": library.name(folder)}, library.root)
 
 
 def resume_command(folder: Path) -> list[str] | None:

@@ -152,7 +152,7 @@ def read_index(folder: Path) -> dict[str, dict[str, Any]]:
             return index
     except ProcessError as error:
         log.warning("%s", error)
-    log.warning("%s is damaged: it is made anew from the captures", path)
+    log.warning("%s is damaged: it is rebuilt from the captures", path)
     return {}
 
 

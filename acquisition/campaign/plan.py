@@ -101,7 +101,7 @@ class Campaign(_Part):
         ):  # fmt: skip
             for k, value in enumerate(values):
                 if value in values[:k]:
-                    raise ValueError(f"the {what} {value} is there twice; each is taken once")
+                    raise ValueError(f"the {what} {value} is listed twice; each is taken once")
         return self
 
     @classmethod

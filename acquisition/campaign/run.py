@@ -185,7 +185,7 @@ class CampaignRun:
                     raise error from unknown
                 self._close_rig(will_retry=True)
                 for observer in self.observers:
-                    observer.warning(f"{error}; going on in {self.campaign.retry_wait_s:g} s")
+                    observer.warning(f"{error}; retrying in {self.campaign.retry_wait_s:g} s")
                 self._pause(self.campaign.retry_wait_s)
                 continue
             finally:
@@ -204,11 +204,11 @@ class CampaignRun:
             return
         if not self.campaign.continue_after_interlock:
             raise InterlockOpened(
-                f"the door is open before {capture.name}. Nothing was moved. Close it, then the same command goes on."
+                f"the door is open before {capture.name}. Nothing was moved. Close it, then repeat the same command."
             )
         self.folder.log("waiting", capture=capture.name, why="the door is open")
         for observer in self.observers:
-            observer.warning("the door is open; going on when it is closed")
+            observer.warning("the door is open; waiting until it is closed")
         while rig.source.interlock_open() and not self.stop.requested:
             rig.clock.sleep_s(LOOK_S)
 

@@ -46,7 +46,7 @@ def closing_of_killed(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "time": now(),
         "status": "complete",
         "ledger": {},
-        "messages": ["every state was there, but the run was cut off before its end; sealed afterwards"],
+        "messages": ["all states were complete, but the run was cut off before its end; sealed afterwards"],
         "messages_dropped": 0,
         "interlocks": [],
     }

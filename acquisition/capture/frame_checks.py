@@ -135,7 +135,7 @@ class FrameChecks:
         unlit = self._lit_darks.without_light(planned_s)
         if unlit is not None:
             self._warn(
-                f"{unlit}: is the source on at this wavelength, its shutter open, the lens free? The capture goes on"
+                f"{unlit}: is the source on at this wavelength, its shutter open, the lens free? The capture continues"
             )
 
     def judge(self) -> None:

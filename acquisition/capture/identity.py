@@ -108,7 +108,7 @@ def require_same(capture: Capture, plan: MeasurementPlan, config: RigConfig, ins
     """
     header, began = capture.header, capture.segments[0].identity
     if began is None:
-        raise Differs(str(capture.path), ["it does not tell what it was made with: an older version or an import"])
+        raise Differs(str(capture.path), ["it has no record of its set-up: an older version or an import"])
     mode = header.mode
     then_rig = parse_yaml(header.rig_yaml, RigConfig, source=f"{capture.path}: rig")
     then_plan = parse_yaml(header.plan_yaml, MeasurementPlan, source=f"{capture.path}: plan")

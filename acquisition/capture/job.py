@@ -158,7 +158,7 @@ def job_of(path: Path, rig: RigConfig | None = None, plan: MeasurementPlan | Non
     """
     with Capture(path) as capture:
         if capture.status == "complete":
-            raise AcquisitionError(f"{path} is complete; there is nothing to go on with.")
+            raise AcquisitionError(f"{path} is complete; there is nothing to resume.")
         exposure_s = capture.planned_column("exposure_s")
         targets = capture.planned_targets_deg()
         done = set(capture.done.tolist())
@@ -210,5 +210,5 @@ def frame_shape(rig: Rig) -> tuple[int, int]:
     """(rows, columns) of the frames that the camera is set to."""
     settings = rig.require_camera().settings
     if settings.height is None or settings.width is None:
-        raise AcquisitionError("the camera does not tell the size of its frames")
+        raise AcquisitionError("the camera does not report the size of its frames")
     return settings.height, settings.width

@@ -65,7 +65,7 @@ def colours_of(instrument: InstrumentModel, camera: Camera) -> tuple[tuple[str, 
 
 def _unknown(settings: CameraSettings, bins_like_with_like: bool) -> str | None:
     if settings.offset_x is None or settings.offset_y is None:
-        return "the camera does not tell where its region begins, so which filter a pixel has is not known"
+        return "the camera does not report the offset of its region, so the filter of each pixel is unknown"
     if settings.reverse_x or settings.reverse_y:
         return (
             "the camera mirrors its frames (ReverseX or ReverseY), and makers differ in where the mosaic then begins. "
@@ -97,7 +97,7 @@ def _named_otherwise(mosaic: tuple[tuple[str, ...], ...], who: CameraIdentity) -
         return None
     told, declared = (" / ".join(" ".join(line) for line in layout) for layout in (who.analyzers, mosaic))
     return (
-        f"pixel format {who.pixel_format} tells the analyzer of each count, which makes super-pixels of {told}; the "
-        f"instrument file has {declared}. Write `mosaic: {[list(line) for line in who.analyzers]}` there and name the "
-        "channels as the camera does, each with the azimuth that it has on your bench; or choose a raw format"
+        f"pixel format {who.pixel_format} identifies the analyzer of each count, which makes super-pixels of {told}; "
+        f"the instrument file has {declared}. Write `mosaic: {[list(line) for line in who.analyzers]}` there and name "
+        "the channels as the camera does, each with the azimuth that it has on your bench; or choose a raw format"
     )

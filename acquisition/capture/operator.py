@@ -69,7 +69,7 @@ class Operator:
             return ""
         if not sys.stdin.isatty():
             raise AcquisitionError(
-                f"somebody has to do this: {what}. There is no terminal to ask at; use --yes if it is done."
+                f"this needs an operator: {what}. No terminal is available to ask; use --yes if it is done."
             )
         self._tell(prompt)
         while not select.select([sys.stdin], [], [], LOOK_S)[0]:

@@ -343,7 +343,7 @@ class CaptureRunner:
         what = self._wall_clock.look()
         if what is None:
             return False
-        self.warn(f"{what}; times in the capture go on evenly")
+        self.warn(f"{what}; times in the capture continue evenly")
         self.rig.require_camera().forget_clock()
         return True
 
@@ -358,7 +358,7 @@ class CaptureRunner:
                 raise RunFailed(
                     f"state {state}: axis {axis} rested at {before.deg:.4f} deg in the state before and reads "
                     f"{start.deg:.4f} deg before its next move: its controller restarted, or something turned it. Home "
-                    f"it (acquire home {axis}), then go on with --resume."
+                    f"it (acquire home {axis}), then continue with --resume."
                 )
 
     def _again(self, state: int, error: FrameLost) -> None:
@@ -368,7 +368,7 @@ class CaptureRunner:
         if tries > allowed:
             raise RunFailed(
                 f"state {state}: {tries} frames in a row were lost, the last: {error.came_back}. {error.what_to_do}. "
-                "Then go on with --resume."
+                "Then continue with --resume."
             ) from error
         self.warn(f"state {state}: frame lost ({error.came_back}), taken again, try {tries} of {allowed}")
         self._pending.appendleft(state)

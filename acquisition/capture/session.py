@@ -112,17 +112,17 @@ def _earlier(
         if capture.stored_shape != shape:
             raise AcquisitionError(
                 f"{partial} has frames of {capture.stored_shape}, the camera gives {shape}. "
-                "Go on with the camera and the settings that began it."
+                "Use the camera and the settings of its first run."
             )
         if capture.header.mosaic != mosaic:
             raise AcquisitionError(
-                f"{partial} has the mosaic {capture.header.mosaic}, the camera's region now gives {mosaic}. Go on with "
-                "the region that began it."
+                f"{partial} has the mosaic {capture.header.mosaic}, the camera's region now gives {mosaic}. Use the "
+                "region of its first run."
             )
         require_same_devices(capture, *devices)
         look, wrong = seen_so_far(capture, lights)
         if wrong is not None:
-            raise AcquisitionError(f"{partial}: {wrong}. There is nothing to go on with: begin the capture again.")
+            raise AcquisitionError(f"{partial}: {wrong}. It cannot be resumed: begin the capture again.")
         return Earlier(set(capture.done.tolist()), len(capture.segments), light_so_far(capture), look)
 
 
@@ -211,7 +211,7 @@ def _run(
     if told is not None and failure is None:
         raise as_known(told)
     if failure is not None:
-        failure.add_note(f"States done so far are in {path}. Go on with: acquire --resume {path}")
+        failure.add_note(f"States done so far are in {path}. Continue with: acquire --resume {path}")
         raise failure
     return _result(path, status, job, runner)
 
@@ -251,7 +251,7 @@ def _require_reference(rig: Rig, home: bool) -> None:
     unhomed = rig.unhomed()
     if unhomed and not (home or rig.config.home_at_start):
         raise AcquisitionError(
-            f"no reference position: {', '.join(unhomed)}. Nothing was moved. Look whether the way is free, then "
+            f"no reference position: {', '.join(unhomed)}. Nothing was moved. Check that the way is free, then "
             "home the axes with `acquire home` (or --home)."
         )
 
@@ -288,7 +288,7 @@ def _begin_segment(job: Job, rig: Rig, runner: CaptureRunner, earlier: Earlier) 
     writer = runner.writer
     runner.interlocks.remember(earlier.light)
     writer.segment = earlier.segments
-    runner.warn(f"gone on with as segment {writer.segment}")
+    runner.warn(f"resumed as segment {writer.segment}")
     try:
         writer.add_segment_record(begin_record(job, rig, writer.segment))
     except BaseException:

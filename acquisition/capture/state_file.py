@@ -67,19 +67,19 @@ class StateFile:
         try:
             self._file = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         except OSError as error:
-            raise AcquisitionError(f"{path} cannot be opened to go on ({error.strerror}).") from error
+            raise AcquisitionError(f"{path} cannot be opened to resume ({error.strerror}).") from error
         try:
             self._find_places()
             self._lock()
         except BlockingIOError:
             os.close(self._file)
             raise AcquisitionError(
-                f"{path} cannot be opened to go on: another program has it open. End that one first."
+                f"{path} cannot be opened to resume: another program has it open. End that one first."
             ) from None
         except UNREADABLE as error:
             os.close(self._file)
             raise AcquisitionError(
-                f"{path} cannot be opened to go on ({error}). If another program has it open, end that one; if the "
+                f"{path} cannot be opened to resume ({error}). If another program has it open, end that one; if the "
                 "file is damaged, begin a new capture."
             ) from error
 
@@ -168,7 +168,7 @@ class StateFile:
         raw = json_bytes(record) if part == 1 else fitted_json(record, max(room, 0))
         if len(raw) > room:
             raise AcquisitionError(
-                f"{self.path} was gone on with so often that its journal is full. Begin it anew with --as-new."
+                f"{self.path} was resumed so often that its journal is full. Start it again with --as-new."
             )
         # What a line that was cut off has left goes with it.
         self._write_text(self._segments, end, encode_line(raw))
@@ -194,8 +194,8 @@ class StateFile:
             if os.path.samestat(os.fstat(self._file), os.stat(path)):
                 return
         raise AcquisitionError(
-            f"{path} was deleted or moved while it was written. Put it back where it was, then go on with --resume; if "
-            "it is gone, begin a new capture."
+            f"{path} was deleted or moved while it was written. Put it back where it was, then continue with "
+            "--resume; if it is lost, begin a new capture."
         )
 
     def write_status(self, status: Status) -> None:

@@ -257,14 +257,14 @@ class CaptureWriter:
     def _blocked(self, waited_s: float) -> AcquisitionError:
         return AcquisitionError(
             f"{self.path}: the disc has not taken a state for {waited_s:g} s. States done before it are "
-            "intact; go on with --resume when the disc is well."
+            "intact; continue with --resume when the disc works again."
         )
 
     def _failure(self, error: BaseException) -> AcquisitionError:
         why = str(error) or type(error).__name__
         return AcquisitionError(
             f"{self.path} could not be written ({why}). States done before it are intact; "
-            "go on with --resume when the disc is well."
+            "continue with --resume when the disc works again."
         )
 
 

@@ -39,10 +39,10 @@ def capture(
     seed: Annotated[int | None, typer.Option(help="of the simulated noise")] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="check everything, move nothing")] = False,
     home: Annotated[bool, typer.Option("--home", help="home axes that have no reference")] = False,
-    campaign: Annotated[Path | None, typer.Option(help="campaign file: run what is missing of it")] = None,
-    resume: Annotated[Path | None, typer.Option(help="go on with this partial capture")] = None,
+    campaign: Annotated[Path | None, typer.Option(help="campaign file: take its missing captures")] = None,
+    resume: Annotated[Path | None, typer.Option(help="resume this partial capture")] = None,
     as_new: Annotated[
-        bool, typer.Option("--as-new", help="where what is there was begun with something else: begin anew beside it")
+        bool, typer.Option("--as-new", help="start again in a new file if the existing one has another set-up")
     ] = False,
     live: Annotated[bool, typer.Option("--live", help="show the run on a local web page")] = False,
     yes: Annotated[bool, typer.Option("--yes", help="answer every question with yes")] = False,

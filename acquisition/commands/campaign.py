@@ -86,7 +86,7 @@ def _run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Ob
     typer.echo(f"in {folder}: captures, {SUMMARY}, {INDEX}, {LOG}")
     words = ["process", "campaign", str(folder), "--geometry", "FILE", "--material", "FILE"]
     after = shlex.join(filter(None, [os.environ.get("UMOV_DOOR"), *words]))
-    typer.echo(f"next: {after}" if done else "next: the same command goes on where it stopped")
+    typer.echo(f"next: {after}" if done else "next: repeat the same command; it continues where it stopped")
     return 0 if done else INTERRUPTED
 
 

@@ -24,7 +24,9 @@ def verify(folder: Path) -> Iterator[Finding]:
     """
     for path in sorted(folder.iterdir()):
         if path.name.endswith(NEW):
-            yield Finding(path.name, None, "left by a program that was killed while it made a file; repair removes it")
+            yield Finding(
+                path.name, None, "remains of a program that was killed while it wrote a file; repair removes it"
+            )
         elif _is_capture(path):
             yield _capture(path)
     if (folder / PLAN).exists():
@@ -51,7 +53,7 @@ def _capture(path: Path) -> Finding:
     text += f", {runs} runs" if runs > 1 else ""
     text += "" if summed else "; without checksums, so a change on the disc would not show"
     if path.name.endswith(PARTIAL):
-        text += "; repair seals it" if done == planned else "; go on with acquire --resume"
+        text += "; repair seals it" if done == planned else "; continue with acquire --resume"
     return Finding(path.name, True if status == "complete" and not path.name.endswith(PARTIAL) else None, text)
 
 
@@ -135,12 +137,12 @@ def _mended(path: Path) -> Finding:
             partial = mark_not_taken(path, damaged)
             return Finding(path.name, None, f"state {', '.join(map(str, damaged))} marked as not taken; {partial.name}")
         if not path.name.endswith(PARTIAL):
-            return Finding(path.name, True, "whole" if summed else "whole, as far as a file without checksums tells")
+            return Finding(path.name, True, "whole" if summed else "complete; the file has no checksums to verify")
         final = seal_whole(path)
     except (CaptureError, AcquisitionError) as error:
         return Finding(path.name, False, str(error))
     if final is None:
-        return Finding(path.name, None, "states are missing; go on with acquire --resume")
+        return Finding(path.name, None, "states are missing; continue with acquire --resume")
     return Finding(path.name, True, f"sealed as {final.name}")
 
 

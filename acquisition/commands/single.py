@@ -84,7 +84,7 @@ def _run(options: Options, stop: StopRequest) -> int:
         options.resume is not None
         and (sealed := on_disc(f"look at {options.resume}", _sealed, options.resume)) is not None
     ):
-        typer.echo(f"every state was there already; sealed as {sealed}")
+        typer.echo(f"all states were complete; sealed as {sealed}")
         return 0
     job, path, resuming = _job(options)
     sample = job.plan.sample.name or job.plan.sample.kind

@@ -81,4 +81,4 @@ def _write(out: Path, pixels: NDArray[np.uint16], black: float) -> None:
         top = max(float(np.percentile(pixels, 99.8)), black + 1)
         shown = np.clip((pixels.astype(np.float32) - black) / (top - black) * 255, 0, 255).astype(np.uint8)
     if not cv2.imwrite(str(out), shown):
-        raise AcquisitionError(f"{out} cannot be written. Is the folder there, and is there room?")
+        raise AcquisitionError(f"{out} cannot be written. Check that its folder exists and that the disc has space.")

@@ -88,5 +88,5 @@ def load_rig(path: Path | str) -> RigConfig:
     simulator = rig.simulator.below(folder) if rig.simulator else None
     wire_log = folder / rig.wire_log if rig.wire_log else None
     if wire_log is not None and wire_log.exists() and not wire_log.is_dir():
-        raise ConfigError(f"{path}: wire_log: {wire_log} is a file, and a folder is asked for")
+        raise ConfigError(f"{path}: wire_log: {wire_log} is a file; it must be a folder")
     return rig.model_copy(update={"modes": modes, "simulator": simulator, "wire_log": wire_log})

@@ -171,7 +171,7 @@ class Guard:
         said = "light shut" if light.result() is None else f"LIGHT NOT SHUT: {light.result()}"
         if self.config.source is None:
             said = "this rig has no source to shut"
-        text = f"{why}. The guard: {said}, {axes.result()}. Go on with --resume, or the same campaign"
+        text = f"{why}. The guard: {said}, {axes.result()}. Continue with --resume, or the same campaign"
         if alarm is None and light.result() is None and axes.result() == AT_REST:
             self.call(text)
             return False

@@ -79,7 +79,7 @@ class Guarding:
         if self._hopeless is not None or not self._watching.wait(START_S):
             raise RunFailed(
                 f"no guard confirms that it watches ({self._hopeless or f'no answer in {START_S:g} s'}). The light "
-                "stays off. Look whether the machine has memory and processes to spare, then go on with --resume."
+                "stays off. Free memory or processes, then continue with --resume."
             )
         if self._is_dark_due:
             raise RunFailed("the light could not be shut when the guard was lost. Look at the source and its cable.")

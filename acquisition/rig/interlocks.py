@@ -121,9 +121,9 @@ class Interlocks:
         if not (self.go_on and waiting_helps):
             raise InterlockOpened(
                 f"interlock: {why}. State {state} was discarded and the axes stopped. "
-                "Remove the cause, then go on with --resume."
+                "Remove the cause, then continue with --resume."
             )
         while self.open_now() is not None and not stop.requested:
             self.rig.clock.sleep_s(LOOK_S)
         event["duration_s"] = round(self.rig.clock.now_s() - start_s, 3)
-        self.warn(f"interlock: closed after {event['duration_s']} s, going on")
+        self.warn(f"interlock: closed after {event['duration_s']} s, continuing")

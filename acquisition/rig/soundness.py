@@ -189,9 +189,9 @@ def _interlocks(rig: RigSections) -> Iterator[Mistake]:
     kinds = [entry.kind for entry in rig.interlocks]
     for k, entry in enumerate(rig.interlocks):
         if entry.kind in kinds[:k]:
-            yield ("interlocks", k), f"{entry.kind} is there twice; one would be forgotten"
+            yield ("interlocks", k), f"{entry.kind} is listed twice; one would be ignored"
         if entry.kind == "door" and getattr(rig, "source", None) is None:
-            yield ("interlocks", k), "door: the rig has no source whose interlock circuit could tell"
+            yield ("interlocks", k), "door: no source of the rig has an interlock circuit"
         if entry.kind == "door" and entry.limit:
             yield ("interlocks", k), "door: it is open or closed and has no limit"
         if entry.kind in ("temperature", "drift", "lamp") and entry.limit == 0:

@@ -67,7 +67,7 @@ def _tell_running(ports: list[str], tell: Tell) -> set[int]:
         except PermissionError:
             tell(f"{who} measures on this rig under another user: stop it there, with Ctrl-C twice")
             continue
-        tell(f"{who} measures on this rig: told to stop at once, as by Ctrl-C twice")
+        tell(f"{who} measures on this rig: asked to stop at once, as by Ctrl-C twice")
         told.add(pid)
     return told
 

@@ -90,7 +90,7 @@ class Notifier(Observer):
         try:
             urllib.request.urlopen(request, timeout=PATIENCE_S).close()
         except (OSError, ValueError) as error:
-            log.warning("notify: %s cannot be told (%s)", config.webhook, error)
+            log.warning("notify: %s cannot be reached (%s)", config.webhook, error)
 
     def settle(self) -> None:
         """Wait until what was sent has arrived, but not for long."""

@@ -64,7 +64,7 @@ def test_analyzers_that_the_camera_names_are_those_of_the_instrument(told, decla
         update={"mosaic": declared}
     )
     if wrong:
-        with pytest.raises(AcquisitionError, match="tells the analyzer of each count"):
+        with pytest.raises(AcquisitionError, match="identifies the analyzer of each count"):
             seen_by_camera(stokes, camera)
     else:
         assert seen_by_camera(stokes, camera).mosaic == declared

@@ -116,7 +116,7 @@ def test_a_lost_frame_is_taken_again_next_and_counted(rig, runner_of):
 def test_a_state_that_is_lost_in_every_try_ends_the_run(rig, runner_of):
     rig.lost = set(range(3, 30))
     runner = runner_of(psg=(0.0, 10.0, 20.0))
-    lost = "state 2: 3 frames in a row were lost, the last: no frame within 1 s. Capture the state again. Then go on"
+    lost = "state 2: 3 frames in a row were lost, the last: no frame within 1 s. Capture the state again. Then continue"
     with pytest.raises(RunFailed, match=re.escape(lost)):
         runner.run(range(3))
     assert runner.writer.states() == [0, 1]

@@ -251,7 +251,7 @@ def test_a_file_system_without_locks_is_good_enough_and_a_broken_one_is_not(path
     assert (opened.states, opened.frame_shape) == (STATES, SHAPE)
     opened.close()
     refuse(errno.EIO)
-    with pytest.raises(AcquisitionError, match="cannot be opened to go on"):
+    with pytest.raises(AcquisitionError, match="cannot be opened to resume"):
         StateFile(path)
 
 
@@ -261,7 +261,7 @@ def test_one_program_at_a_time_and_nothing_but_whole_captures(path, file, tmp_pa
     file.close()
     file.close()
     StateFile(path).close()
-    with pytest.raises(AcquisitionError, match=r"cannot be opened to go on \(No such file"):
+    with pytest.raises(AcquisitionError, match=r"cannot be opened to resume \(No such file"):
         StateFile(tmp_path / "nowhere.h5")
     (tmp_path / "text.h5").write_text("no HDF5")
     with pytest.raises(AcquisitionError, match="begin a new capture"):

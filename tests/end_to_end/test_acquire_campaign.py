@@ -88,7 +88,7 @@ def test_stopped_campaign_goes_on_with_the_state_it_stopped_at(acquire, small_ri
     arguments = ("--campaign", campaign(), "--rig", small_rig(), "--out", tmp_path)
     code, out, err = acquire(*arguments)
     assert code == 130, err
-    assert "goes on where it stopped" in out
+    assert "continues where it stopped" in out
     with Capture(tmp_path / "small" / NAMES[1]) as capture:
         stopped_at = len(capture.done)
         assert capture.status == "aborted"

@@ -56,7 +56,7 @@ def test_a_running_capture_is_stopped_and_kept(acquire, served, tmp_path):
         _wait_until(lambda: all(axis.homed for axis in rotators) and _moving(simulation), running)
         code, out, err = acquire("stop", "--rig", rig)
         assert code == 0, out + err
-        assert f"(pid {running.pid}) measures on this rig: told to stop at once" in out
+        assert f"(pid {running.pid}) measures on this rig: asked to stop at once" in out
         for axis in ("psg", "psa", "arm"):
             assert f"{axis}: stop sent, at rest at " in out
         assert not _moving(simulation)

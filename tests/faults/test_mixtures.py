@@ -188,7 +188,7 @@ def test_a_resume_is_a_recorded_segment_and_nothing_is_forgotten(run_with, tmp_p
     assert [event["why"] for event in first.interlocks] == ["the door is open in state 4"]
     assert closing["interlocks"] == list(first.interlocks)
     assert closing["messages"] == [*first.messages, *second.messages]
-    assert any("gone on with as segment 1" in text for text in closing["messages"])
+    assert any("resumed as segment 1" in text for text in closing["messages"])
     assert closing["ledger"]["total_s"] == pytest.approx(first.ledger["total_s"] + second.ledger["total_s"], abs=1e-3)
     assert closing["segments"] == 2
     assert "the door is open" in json.dumps(closing)

@@ -275,7 +275,7 @@ def test_a_file_system_without_locks_is_no_obstacle(new_writer, monkeypatch, num
 
     monkeypatch.setattr(state_file.fcntl, "flock", flock)
     if refused:
-        with pytest.raises(AcquisitionError, match="cannot be opened to go on"):
+        with pytest.raises(AcquisitionError, match="cannot be opened to resume"):
             new_writer()
     else:
         new_writer().abandon()

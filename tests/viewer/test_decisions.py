@@ -111,7 +111,7 @@ def test_a_diagnosis_begins_with_a_copy_of_its_model(lab, diagnosed, configs):
 def test_a_diagnosis_that_cannot_be_read_takes_no_other_page_away(lab, client, diagnosed):
     (Diagnoses(Library(lab)).folder(diagnosed) / "diagnosis.json").write_text('{"verdict": "of another version"}')
     answer = client.get("/diagnosis", params={"name": diagnosed})
-    assert (answer.status_code, "diagnose anew" in answer.text) == (422, True)
+    assert (answer.status_code, "run the diagnosis again" in answer.text) == (422, True)
     assert client.get("/capture", params={"file": "one.h5"}).status_code == 200
 
 

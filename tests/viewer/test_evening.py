@@ -174,7 +174,7 @@ def _start_watch_stop_resume(page: Page, other: Page, lab: Path, address: str) -
     expect(page.locator("#run")).to_be_hidden()
     _ended(lab)
     expect(page.locator("#resume")).to_be_visible()
-    page.get_by_role("button", name="Go on").click()
+    page.get_by_role("button", name="Take what is missing").click()
     page.set_viewport_size({"width": 390, "height": 844})
     expect(page.get_by_role("link", name="The campaign")).to_be_visible()
     assert fits(page)

@@ -46,7 +46,7 @@ def test_our_own_page_may_ask_and_is_told_what_is_wrong(lab):
     (lab / "night").mkdir()
     headers = {"origin": "http://127.0.0.1:8000"}
     answer = browser(lab).post(f"/{TOKEN}/stop", headers=headers, json={"folder": "night"})
-    assert (answer.status_code, answer.text) == (422, "nothing runs in this folder any more")
+    assert (answer.status_code, answer.text) == (422, "no run is active in this folder")
 
 
 def test_pages_take_nothing_from_elsewhere_and_tell_nobody_where_they_are(lab):
