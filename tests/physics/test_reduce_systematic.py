@@ -8,8 +8,9 @@ from bench_capture import bench_capture
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel, SystematicError
 from processing.reduction.mueller import reduce_mueller
 from processing.reduction.stokes import reduce_stokes
+from processing.reduction.systematic import Systematic
 from processing.storage.capture import Capture
-from processing.storage.product import Step
+from processing.storage.product import Product, Step
 from processing.yaml_file import dump_yaml
 from simulators.blind.undeclared_captures import Bench
 
@@ -128,3 +129,20 @@ def test_a_nominal_value_that_is_open_shows_in_whatever_the_instrument_determine
     told = (found["mueller_systematic"] / found["mueller"][0, 0])[seen]
     assert moved.max() > 0.003
     assert told == pytest.approx(moved, abs=3e-4)
+
+
+def test_a_product_holds_the_directions_that_its_errors_are_made_of(air, configs, tmp_path):
+    """Also those that bend the counts: what is read back moves M as the reduction did."""
+    bent = uncertain("detector_nonlinearity", None, lost_at_full_scale=0.02)
+    turned = uncertain("psg_retardance", "psg_retarder", retardance=0.3)
+    error = bent.model_copy(update={"directions": (*bent.directions, *turned.directions)})
+    model = InstrumentModel.load(configs / "instruments/rgb950.yaml").model_copy(update={"systematic": (error,)})
+    stored = reduced(air, model, tmp_path / "m.h5")
+    with Product(tmp_path / "m.h5") as product:
+        found = Systematic.of_product(product)
+        assert found.labels == ("detector_nonlinearity", "psg_retardance psg_retarder")
+        values = product.get("mueller").reshape(16, -1)
+    moves = list(found.moves(values))
+    assert np.abs(moves[0]).max() > 0.001 * values[0].mean()
+    again = found.errors(values).reshape(stored["mueller_systematic"].shape)
+    assert again == pytest.approx(stored["mueller_systematic"], rel=1e-3, abs=1e-3)
