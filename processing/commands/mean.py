@@ -69,6 +69,12 @@ def mean_command(
     if simulated:
         typer.echo("SIMULATED data")
     typer.echo(f"mean of {place} of {captures}; intervals of 95 %")
+    if all(len(one.budget) == 1 for one in found):
+        typer.echo(
+            "warning: the instrument file states no uncertainty, so the intervals contain none. Write values as "
+            "{value: ..., u: ...}, or run: process calibrate AIR.h5 --instrument FILE --free NAMES --write NEW.yaml",
+            err=True,
+        )
     if budget is None:
         _print_means(found)
     else:

@@ -62,6 +62,7 @@ OWN_95 = (
     *(f"{name}{part}" for name in ("diattenuation", "polarizance") for part in ("", "_linear")),
     *(f"dominant_{name}_{part}" for name in ("diattenuation", "polarizance") for part in ("linear", "circular")),
     "coherency_eigenvalues",
+    "entropy",
     "depolarization_index",
     "depolarization_power",
     "retardance_deg",
@@ -311,7 +312,21 @@ def set_eigenvalues(planes: Planes, noise: EigenvalueNoise, found: CorrectedXi0)
     widest = np.sqrt(np.sum(np.square(slopes * errors), axis=0))
     edge = (xi < SEEN * errors).any(axis=0)
     planes["entropy"] = entropy(np.moveaxis(physical, 0, -1)).astype(np.float32)
-    planes["entropy_errors"] = np.where(edge, widest, planes["entropy_errors"]).astype(np.float32)
+    spread = np.where(edge, widest, planes["entropy_errors"])
+    half = NORMAL_95 * spread
+    # There it bends by more than that: as far as xi0 reaches, the others in proportion.
+    rest = np.nan_to_num(physical[1:] / physical[1:].sum(axis=0), nan=1 / 3)
+    least, most = (entropy_of(np.clip(end, 0.25, 1.0), rest) for end in found.interval_95[::-1])
+    value = planes["entropy"].astype(float)
+    low, high = (
+        np.where(edge, f(v, e), v) for f, v, e in ((np.fmin, value - half, least), (np.fmax, value + half, most))
+    )
+    _put(planes, "entropy", value, spread, np.maximum(low, 0.0), np.minimum(high, 1.0))
+
+
+def entropy_of(xi0: Array, rest: Array) -> Array:
+    """Entropy (...) of eigenvalues: the largest is xi0, the others share what it leaves as `rest` (3, ...)."""
+    return np.asarray(entropy(np.moveaxis(np.concatenate([xi0[None], (1 - xi0) * rest]), 0, -1)))
 
 
 def set_symmetric(planes: Planes, relative: Array) -> None:
