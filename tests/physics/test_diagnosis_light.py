@@ -9,6 +9,7 @@ from bench_capture import bench_capture, read
 from processing.diagnosis.captured.steep_pixels import without_steep_pixels
 from processing.diagnosis.instrument.noise_of_light import scatter_prefers
 from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.search.rules import REFUTED
 from processing.diagnosis.search.space import Space
 from simulators.blind.undeclared_captures import Bench
@@ -90,3 +91,26 @@ def test_pixels_at_an_edge_are_left_out_and_those_of_a_slope_are_not(configs, tm
     # All edges: there is nothing else to look at than the flattest quarter.
     stripes = 0.2 + 0.4 * np.arange(SIDE) / SIDE * (np.arange(SIDE) % 2)
     assert left(stripes).usable.mean() == pytest.approx(0.25, abs=0.05)
+
+
+def test_a_mean_that_only_its_linearization_explains_is_not_taken(configs, tmp_path, monkeypatch):
+    """The search with the noise of the light ends far off in a capture of air: what was found before it stays."""
+    bench = Bench(rows=SIDE, columns=SIDE, electrons=6000.0)
+    bench.ellipticity = np.deg2rad(3.0)
+    model, data = captured(tmp_path, configs, bench)
+    whole = WholeBench(InstrumentProblem(model, [data], folds=2), lambda step: None)
+    search, again = whole._posterior, []
+
+    def far_off(candidates, fixed, old=None):
+        found = search(candidates, fixed, old)
+        if old is None:
+            return found
+        again.append(found)
+        return replace(found, values=2 * found.values)
+
+    monkeypatch.setattr(whole, "_posterior", far_off)
+    monkeypatch.setattr(whole, "_adopt_noise", lambda space, values: True)
+    found = whole.run()
+    assert again
+    part = dict(zip((c.kind for c in found.space.candidates), found.space.slices, strict=True))
+    assert np.abs(found.values[part["generator_ellipticity"]]) == pytest.approx(3.0, abs=0.1)

@@ -56,7 +56,7 @@ def show(d: Diagnosis, details: bool = False, written: bool = False) -> None:
         _say(short, f"left out of {left_out.capture}: {left_out.told}")
     for number, effect in enumerate(d.effects, 1):
         _show_effect(short, number, effect, noise)
-    _show_uncertainty(d)
+    _show_uncertainty(d, written)
     if d.unexplained is not None:
         _show_unexplained(short, d.unexplained)
     if details:
@@ -124,7 +124,7 @@ def _name_capture(short: Mapping[str, str], c: CaptureReport) -> None:
         _say(short, f"     false frames: {text}")
 
 
-def _show_uncertainty(d: Diagnosis) -> None:
+def _show_uncertainty(d: Diagnosis, written: bool) -> None:
     """How wrong M may be, before and after, with everything that these captures do not show."""
     correction = d.correction
     if correction is None:
@@ -134,7 +134,7 @@ def _show_uncertainty(d: Diagnosis) -> None:
     if correction.refused is not None and not any(e.not_applied for e in d.effects):
         what = "but for the fitted train, nothing" if d.corrects else "nothing"
         typer.echo(f"{what} is applied, because {correction.refused}")
-    elif not d.corrects and not d.effects:
+    elif not (d.corrects or d.effects or written):
         typer.echo("nothing is corrected")
 
 

@@ -133,8 +133,18 @@ class WholeBench:
             self.say("the same with the noise that this light has")
             again = self._posterior(list(found.space.candidates), fixed, found)
             # Nobody knows the noise to a thousandth, and of many pixels that would be structure: what was found stays.
-            found = again if again.samples.best.unit <= GROWTH * found.samples.best.unit else found
+            # So it does where the new mean leaves more of the counts than its linearization promised.
+            same_unit = again.samples.best.unit <= GROWTH * found.samples.best.unit
+            found = again if same_unit and self._left_by(again) <= GROWTH * self._left_by(found) else found
         return found
+
+    def _left_by(self, found: Posterior) -> float:
+        """Chi-square for each degree of freedom that the correction of a posterior leaves of the counts."""
+        space, values = applied(found, self.base)
+        # Counts undone there, not the series about another point, which can promise anything.
+        self.whole.relinearize(space, values)
+        sums = self.whole.sums(space, values, derivatives=False)
+        return 1 + float(sums.excess.sum() / sums.freedom.sum())
 
     def _take_noise_of_light(self, candidates: Sequence[Candidate], fixed: Sequence[Candidate]) -> None:
         """Take the noise from the light that a first look tells, until it stays, or what is left of the counts grows.

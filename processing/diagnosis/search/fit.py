@@ -181,7 +181,8 @@ class HeldOut:
 
     def and_more(self, excess: float, square: float) -> HeldOut:
         """The same with more left over, in units of the noise and of the signal."""
-        return HeldOut(self.excess + excess, self.freedom, self.square + square, self.count)
+        # Fits to other folds may end elsewhere than the fit to all, whose difference this is.
+        return HeldOut(self.excess + excess, self.freedom, max(self.square + square, 0.0), self.count)
 
     @property
     def chi2_reduced(self) -> float:
