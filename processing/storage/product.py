@@ -192,12 +192,8 @@ class ProductWriter(OpenH5):
             return np.asarray(self._h5["entry/data"][name][..., rows, :])
 
     def array(self, name: str, values: NDArray[Any], units: str, long_name: str) -> None:
-        """Store something that is not per pixel (W, a curve) in /entry/reduction."""
-        group = self._h5["entry"].require_group("reduction")
-        group.attrs["NX_class"] = "NXcollection"
-        if name in group:
-            del group[name]
-        group.create_dataset(name, data=values).attrs.update({"units": units, "long_name": long_name})
+        """Store something that is not per pixel (W, a curve) in /entry/reduction; its dimensions bear its name."""
+        _add_array(self._h5["entry"], name, values, {"units": units, "long_name": long_name})
 
     def seal(self, facts: Mapping[str, Any]) -> Path:
         """Add the facts (JSON-able: numbers, warnings), compress where it pays, close, and give the file its name."""
@@ -241,8 +237,9 @@ class ProductWriter(OpenH5):
                     pack(whole["data"][name], entry["data"][name], packings[name])
                 else:
                     entry["data"][name][...] = whole["data"][name][...]
-            if "reduction" in whole:
-                whole.copy("reduction", entry)
+            for name, there in whole.get("reduction", {}).items():
+                if not there.is_scale:
+                    _add_array(entry, name, there[()], {key: there.attrs[key] for key in ("units", "long_name")})
             entry["rows_done"][...] = whole["rows_done"][()]
             entry.attrs["facts_json"] = whole.attrs["facts_json"]
         return path
@@ -341,6 +338,19 @@ class Product(OpenH5):
         """Row slices of about `pixels` pixels."""
         step = max(1, pixels // max(self.shape[1], 1))
         return [slice(k, min(k + step, self.shape[0])) for k in range(0, self.shape[0], step)]
+
+
+def _add_array(entry: h5py.Group, name: str, values: NDArray[Any], words: Mapping[str, str]) -> None:
+    """Write an array of /entry/reduction; without scales of its own xarray takes equal lengths for one dimension."""
+    group = entry.require_group("reduction")
+    group.attrs["NX_class"] = "NXcollection"
+    sizes = {f"{name}_axis_{k}": size for k, size in enumerate(np.shape(values))}
+    for earlier in (name, *sizes):
+        if earlier in group:
+            del group[earlier]
+    add_scales(group, sizes)
+    group.create_dataset(name, data=values).attrs.update(words)
+    attach(group[name], group, [*sizes])
 
 
 def _a(kind: str) -> str:

@@ -102,6 +102,16 @@ def test_a_whole_capture_is_a_tree_for_xarray(capture):
         assert tree["entry/instrument/detector/row_crc32"].dims == ("state", "channel", "y")
 
 
+def test_a_whole_product_is_a_tree_for_xarray_with_names_for_all_dimensions(product):
+    with xr.open_datatree(product, engine="h5netcdf") as tree:
+        dims = {dim for node in tree.subtree for dim in node.ds.dims}
+        assert "measurement_matrix_axis_0" in dims
+        assert not [dim for dim in dims if str(dim).startswith("phony")]
+        np.testing.assert_array_equal(
+            tree["entry/reduction/measurement_matrix"], Product(product).array("measurement_matrix")
+        )
+
+
 def test_the_default_plot_has_its_axes_and_coordinates(capture, product, table):
     for path in (capture, product, table):
         with h5py.File(path) as h5:
