@@ -225,9 +225,12 @@ def sentences(model: InstrumentModel, conditions: Conditions) -> tuple[Sentence,
         out += _of_element(element, turning, passed, times, front=True)
     if len(model.generator) > 1:
         out += _of_path(passed, times)
+    states = conditions.states if times else 0
     for element in model.analyzer:
         out += _of_element(element, turning, passed, times, front=False)
-    out += _of_source_and_detector(conditions.states if times else 0, times)
+        if not isinstance(element, Retarder):
+            out += _jumps(element.name, "azimuth", states)
+    out += _of_source_and_detector(states, times)
     # Once a turn it has a name.
     out += _waves("image", ("shift right", "shift down"), turning, (2,))
     return tuple(dict.fromkeys(out))
@@ -277,10 +280,15 @@ def _of_path(passed: Sequence[str], times: Sequence[str]) -> Iterator[Sentence]:
     yield from (Sentence("sample", ("azimuth",), time) for time in times)
 
 
+def _jumps(site: str, quantity: str, states: int) -> Iterator[Sentence]:
+    """From one state on, of which any may be it."""
+    price = PRICE + float(np.log(max(states, 1)))
+    yield from (Sentence(site, (quantity,), f"from state {k}", price) for k in range(2, states - 1))
+
+
 def _of_source_and_detector(states: int, times: Sequence[str]) -> Iterator[Sentence]:
     yield from (Sentence("source", ("gain",), time) for time in times[1:])
-    choices = range(2, states - 1)
-    yield from (Sentence("source", ("gain",), f"from state {k}", PRICE + float(np.log(states))) for k in choices)
+    yield from _jumps("source", "gain", states)
     beats = np.arange(1.5, states / 2, 0.5)
     yield from (Sentence("source", ("gain",), f"beating {n:g} times", PRICE + float(np.log(beats.size))) for n in beats)
     yield from (Sentence("detector", (quantity,), time) for quantity in ("stray", "offset") for time in times)

@@ -7,6 +7,9 @@ import pytest
 
 from processing.diagnosis.instrument.run import diagnose_captures
 from processing.diagnosis.search.result import Diagnosis
+from processing.instrument.changes import Conditions
+from processing.instrument.grammar import parsed
+from processing.instrument.grammar import sentences as sentences_of
 from processing.instrument.model import InstrumentModel
 from processing.storage.capture_schema import Sample
 from simulators.blind.outside_list import ghost, image_lag, lamp_jump
@@ -70,6 +73,18 @@ def test_a_black_level_that_drifts_is_no_bent_response(configs, tmp_path, bench)
     found = diagnosed(tmp_path, configs, bench, drift_counts=200)
     assert not sure(found)
     assert sentences(found) == ["offset of detector over time"]
+
+
+def test_every_sentence_is_read_back_from_its_text(configs):
+    """The text is the place of the effect in an instrument file; a knocked analyzer is among them."""
+    angles = state_angles(STATES, False, False)
+    conditions = Conditions.of({axis: np.rad2deg(angle) for axis, angle in angles.items()})
+    model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(NM)
+    every = sentences_of(model, conditions)
+    for sentence in every:
+        read = parsed(sentence.text)
+        assert (read.site, read.quantities, read.course) == (sentence.site, sentence.quantities, sentence.course)
+    assert "azimuth of analyzer from state 5" in [s.text for s in every]
 
 
 def test_a_plate_whose_retardance_changes_twice_a_turn_is_not_called_a_transmission(configs, tmp_path, bench):
