@@ -5,9 +5,8 @@ import fcntl
 import os
 import socket
 import struct
-import sys
-from collections.abc import Callable, Iterator
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -136,27 +135,35 @@ def dim_instrument(configs: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def acquire(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., tuple[int, str, str]]:
-    """Runs `acquire` in this process; returns exit code, standard output and standard error."""
-    from acquisition.commands.application import main
+def run_main(capfd: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Runs an entry point in this process; returns exit code, standard output and standard error."""
 
-    def run(*arguments: object) -> tuple[int, str, str]:
+    def run(main: Callable[[list[str]], None], *arguments: object, traceback: bool = False) -> tuple[int, str, str]:
         capfd.readouterr()
         with pytest.raises(SystemExit) as end:
             main([str(argument) for argument in arguments])
         out, err = capfd.readouterr()
+        assert traceback or "Traceback" not in err
         code = end.value.code
         return (code if isinstance(code, int) else 0), out, err
 
     return run
 
 
-@pytest.fixture(autouse=True)
-def _disc_of_one_test() -> Iterator[None]:
-    """A disc process has inherited what its test has patched: it ends with the test."""
-    yield
-    if "acquisition.disc" in sys.modules:
-        sys.modules["acquisition.disc"].end_disc()
+@pytest.fixture
+def acquire(run_main: Callable[..., tuple[int, str, str]]) -> Callable[..., tuple[int, str, str]]:
+    """Runs `acquire`, as `run_main` does; a thread of it may fail with a traceback."""
+    from acquisition.commands.application import main
+
+    return partial(run_main, main, traceback=True)
+
+
+@pytest.fixture
+def process(run_main: Callable[..., tuple[int, str, str]]) -> Callable[..., tuple[int, str, str]]:
+    """Runs `process`, as `run_main` does."""
+    from processing.commands.application import main
+
+    return partial(run_main, main)
 
 
 class SyntheticCapture:

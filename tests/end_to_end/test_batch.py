@@ -11,7 +11,6 @@ import h5py
 import numpy as np
 import pytest
 
-from processing.commands.application import main
 from processing.steps.reduction import Reduction
 from processing.storage.product import Product
 
@@ -34,15 +33,12 @@ def lab(synthetic_capture, configs, tmp_path) -> Path:
 
 
 @pytest.fixture
-def process(capsys):
-    """Run `process ARGS`; returns exit code, lines of stdout, lines of stderr."""
+def process(process):
+    """Runs `process ARGS`; returns exit code, lines of stdout, lines of stderr."""
 
     def run(*args: object) -> tuple[int, list[str], list[str]]:
-        with pytest.raises(SystemExit) as ended:
-            main([str(a) for a in args])
-        out, err = capsys.readouterr()
-        assert "Traceback" not in err
-        return int(ended.value.code or 0), out.splitlines(), err.splitlines()
+        code, out, err = process(*args)
+        return code, out.splitlines(), err.splitlines()
 
     return run
 

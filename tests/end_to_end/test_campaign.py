@@ -1,7 +1,6 @@
 """A small campaign from simulated captures of both instruments through every command that reflectance has."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -49,22 +48,6 @@ def here(folder: Path, configs: Path, tmp_path_factory: pytest.TempPathFactory) 
     files = configs / "geometries/one_inch_sphere.yaml", configs / "materials/red_print.yaml"
     with executor(1) as pool:
         return Campaign(folder, tmp_path_factory.mktemp("here"), *files).run(pool)
-
-
-@pytest.fixture
-def process(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """Runs `process` in this process; exit code, standard output, standard error."""
-    from processing.commands.application import main
-
-    def run(*arguments: object) -> tuple[int, str, str]:
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as end:
-            main([str(a) for a in arguments])
-        out, err = capsys.readouterr()
-        code = end.value.code
-        return (code if isinstance(code, int) else 0), out, err
-
-    return run
 
 
 def options(configs: Path) -> list[object]:

@@ -40,18 +40,6 @@ def dark_frames():
 
 
 @pytest.fixture
-def process(capsys):
-    """Runs `process` in this process; exit code, standard output, standard error."""
-
-    def run(*arguments):
-        with pytest.raises(SystemExit) as end:
-            main([str(a) for a in arguments])
-        return end.value.code or 0, *capsys.readouterr()
-
-    return run
-
-
-@pytest.fixture
 def drr():
     turn = np.arange(36) * 6.0
     return {"psg": turn, "psa": 5 * turn % 360}

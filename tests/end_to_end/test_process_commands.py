@@ -9,26 +9,11 @@ import h5py
 import numpy as np
 import pytest
 
-from processing.commands.application import main
 from processing.instrument.model import InstrumentModel
 from processing.storage.images import MuellerImage
 from processing.storage.product import Product
 
 Run = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def process(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run `process ARGS`; returns exit code, stdout, stderr. No traceback may ever be printed."""
-
-    def run(*args: object) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as ended:
-            main([str(a) for a in args])
-        out, err = capsys.readouterr()
-        assert "Traceback" not in err
-        return int(ended.value.code or 0), out, err
-
-    return run
 
 
 @pytest.fixture

@@ -22,19 +22,11 @@ PAGE = Path(__file__).parents[2] / "docs" / "measured-data.md"
 
 
 @pytest.fixture
-def data(capsys, tmp_path, monkeypatch):
+def data(run_main, tmp_path, monkeypatch):
     """Run `data ARGS` in a folder of its own; returns exit code, stdout, stderr."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("UMOV_DATA", raising=False)
-
-    def run(*args: object) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as ended:
-            main([str(a) for a in args])
-        said = capsys.readouterr()
-        assert "Traceback" not in said.err
-        return int(ended.value.code or 0), said.out, said.err
-
-    return run
+    return partial(run_main, main)
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processing.commands.application import main
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
 from processing.polarization import mueller, quantities
@@ -18,18 +17,6 @@ from processing.storage.product import Product
 
 ROWS, COLUMNS = 40, 60
 Run = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def process(capfd: pytest.CaptureFixture[str]) -> Run:
-    def run(*arguments: object) -> tuple[int, str, str]:
-        capfd.readouterr()
-        with pytest.raises(SystemExit) as end:
-            main([str(a) for a in arguments])
-        out, err = capfd.readouterr()
-        return int(end.value.code or 0), out, err
-
-    return run
 
 
 def truth() -> np.ndarray:
