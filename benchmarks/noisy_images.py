@@ -17,7 +17,6 @@ from processing.storage.images import MuellerImage
 
 READ_NOISE_E = 2.3
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
-LIGHT_LEVELS = (20.0, 200.0, 20_000.0)
 
 
 def rgb950(wavelength_nm: float = 662) -> np.ndarray:
