@@ -209,9 +209,9 @@ SHARES = 0.01
 MISSED = 4.0
 #: [1] Growth of the residual on held-out data that is still put down to chance.
 WORSE = 1.002
-#: [probability] That the error of what the user reads grows by a correction, up to which it is written: the mean of the
-#: posterior has the least expected error, and harm counts twice as much as a gain.
-CHANCE_WORSE = 0.33
+#: [probability] That the error of what the user reads grows by a correction, up to which it is written: below it the
+#: expected error falls.
+CHANCE_WORSE = 0.5
 #: [of the largest] Singular value of W from which on a direction is measured.
 MEASURED = 1e-6
 #: [nm] Difference below which two wavelengths are the same in a file that is written.
