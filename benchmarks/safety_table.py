@@ -190,10 +190,12 @@ def once(number: int, faults: list[str], gap_s: float, discs: Discs, *, cutoff: 
         out = discs.folder(f"run{number}") if discs.can_hang else work / "out"
         run = Run(rig, out, work, guard="guard missing" not in faults)
         if "guard missing" in faults:
-            # Nothing may be lit at all.
-            end_s, lit = time.monotonic() + 25, False
+            # Nothing may be lit at all, until the loss is reported and for a while after it.
+            end_s, lit, reported = time.monotonic() + 90, False, False
             while time.monotonic() < end_s and run.child.poll() is None and not lit:
                 lit = simulation.light() > 0
+                if not reported and (reported := "guard" in run.errors.read_text()):
+                    end_s = time.monotonic() + 10
                 time.sleep(0.01)
             said = run.end([], work)
             return {"dark_s": 99.0 if lit else 0.0, "reported": "guard" in said}
