@@ -15,6 +15,7 @@ import queue
 import signal
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, wait
 from contextlib import contextmanager
@@ -84,7 +85,10 @@ class DiscProcess:
         dies_with = self.owner if threading.current_thread() is threading.main_thread() else 0
         before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
         try:
-            self._pid = os.fork()
+            with warnings.catch_warnings():
+                # Python 3.12 warns of any thread, those of the linear algebra too. The child takes no lock of theirs.
+                warnings.simplefilter("ignore", DeprecationWarning)
+                self._pid = os.fork()
             if self._pid == 0:
                 _serve(theirs, self._frame, dies_with)
         except OSError as error:
