@@ -41,6 +41,12 @@ def begun(small_rig, spawn, tmp_path, monkeypatch):
         out = tmp_path / "captures"
         child = spawn("--omega", 35, "--rig", tmp_path / "served.yaml", "--out", out)
         yield simulation, child, out
+        # While the rig is there still: a guard that cannot shut the light gives the alarm for a day.
+        child.kill()
+        child.wait()
+        _wait_for(
+            lambda: any(end in (out / "guard.jsonl").read_text() for end in ("guard rests", '"alert"', "at rest"))
+        )
 
 
 def _wait_for(what, child=None, limit_s=60.0):
