@@ -44,8 +44,9 @@ def begun(small_rig, spawn, tmp_path, monkeypatch):
         # While the rig is there still: a guard that cannot shut the light gives the alarm for a day.
         child.kill()
         child.wait()
+        journal = out / "guard.jsonl"
         _wait_for(
-            lambda: any(end in (out / "guard.jsonl").read_text() for end in ("guard rests", '"alert"', "at rest"))
+            lambda: "guard rests" in (said := journal.read_text()) or ("light shut" in said and "at rest" in said)
         )
 
 
