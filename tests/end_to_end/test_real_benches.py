@@ -163,7 +163,9 @@ def test_answer_to_a_small_bench_harms_nothing(group, seed, given, configs, tmp_
     judgement, result = judge_bench(tmp_path, make_bench(tmp_path, seed, configs, group, pixels=SMALL), configs, given)
     assert not sure_and_wrong(judgement)
     assert not is_worse(judgement.declared, judgement.corrected)
-    assert not any(is_worse(*pair) for pair in judgement.own.values())
+    # A correction that is hardly better than none says so: it may lose.
+    grows = [c["after"] for c in result["correction"]["checks"] if c["name"].endswith("error of M/m00 grows")]
+    assert max(grows, default=0.0) > 0.3 or not any(is_worse(*pair) for pair in judgement.own.values())
     if group == "none":
         assert result["verdict"] == "consistent"
 
