@@ -46,7 +46,7 @@ def begun(small_rig, spawn, tmp_path, monkeypatch):
         child.wait()
         journal = out / "guard.jsonl"
         _wait_for(
-            lambda: "guard rests" in (said := journal.read_text()) or ("light shut" in said and "at rest" in said)
+            lambda: "guard rests" in (said := journal.read_text()) or ("light shut" in said and "axes at rest" in said)
         )
 
 
