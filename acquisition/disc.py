@@ -154,7 +154,7 @@ class DiscProcess:
             future, asked, frame = job
             self._busy_since_s = time.monotonic()
             try:
-                self._line.send((*asked, self._shared(frame)))
+                self._line.send((*asked, self._shared(frame), _folder()))
                 is_well, answer = self._line.recv()
             except (EOFError, ConnectionError):
                 self.has_ended = True
@@ -181,6 +181,13 @@ class DiscProcess:
             return None
         np.copyto(self._frame.array(frame.shape, frame.dtype.str), frame)
         return frame.shape, frame.dtype.str
+
+
+def _folder() -> str | None:
+    """The working folder; None of one that is gone."""
+    with contextlib.suppress(OSError):
+        return os.getcwd()
+    return None
 
 
 def _ended() -> AcquisitionError:
@@ -243,8 +250,11 @@ def _serve(line: Connection, frame: SharedFrame, dies_with: int) -> NoReturn:
         # What is here already is never collected: its pages stay shared.
         gc.freeze()
         while dies_with in (0, os.getppid()):
-            function, arguments, shared = line.recv()
+            function, arguments, shared, folder = line.recv()
             try:
+                # Relative names are those of the program, which may have changed its folder since.
+                if folder is not None:
+                    os.chdir(folder)
                 answer = True, function(*arguments, *([] if shared is None else [frame.array(*shared)]))
             except BaseException as error:  # noqa: BLE001 - raised again by the caller
                 answer = False, ExceptionWithTraceback(error, error.__traceback__)

@@ -5,7 +5,8 @@ import fcntl
 import os
 import socket
 import struct
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -164,6 +165,14 @@ def process(run_main: Callable[..., tuple[int, str, str]]) -> Callable[..., tupl
     from processing.commands.application import main
 
     return partial(run_main, main)
+
+
+@pytest.fixture(autouse=True)
+def _disc_of_one_test() -> Iterator[None]:
+    """A disc process has inherited what its test has patched: it ends with the test."""
+    yield
+    if "acquisition.disc" in sys.modules:
+        sys.modules["acquisition.disc"].end_disc()
 
 
 class SyntheticCapture:

@@ -28,6 +28,7 @@ from acquisition.capture.writer import (
     mark_not_taken,
     seal_whole,
 )
+from acquisition.disc import on_disc
 from acquisition.errors import AcquisitionError
 from drivers.motion import Position
 from processing.instrument.states import StateTable
@@ -322,3 +323,10 @@ def test_a_long_time_without_a_state_is_no_failure_of_the_disc(create):
     clock.sleep_s(10 * DEAD_S)
     create(clock=clock).on_failure = lambda _: heard.set()
     assert not heard.wait(3 * LOOK_S)
+
+
+def test_relative_names_are_of_the_folder_that_the_program_is_in_now(tmp_path, monkeypatch):
+    on_disc("any call", os.getpid)
+    monkeypatch.chdir(tmp_path)
+    on_disc("a file", Path("here.txt").write_text, "x")
+    assert (tmp_path / "here.txt").exists()

@@ -82,7 +82,7 @@ def test_one_of_many_alternatives_is_left_where_less_is_likelier(monkeypatch, sp
     assert asked == [[1.0, 0.0]]
 
 
-@pytest.mark.parametrize(("second", "best", "others"), [(60.0, 1, ()), (45.0, 0, (1,)), (52.0, 1, (0,)), (40.0, 0, ())])
+@pytest.mark.parametrize(("second", "best", "others"), [(80.0, 1, ()), (45.0, 0, (1,)), (52.0, 1, (0,)), (20.0, 0, ())])
 def test_another_bend_is_asked_about_its_own_values(monkeypatch, space, second, best, others):
     """About one bend another looks worse than it is; both are told where they do as well."""
     form = Quadratic(0.0, np.zeros(2), np.eye(2))

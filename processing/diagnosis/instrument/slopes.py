@@ -79,7 +79,7 @@ def slopes_of_counts(
     """Derivatives (values, F, L) of the coefficients c (F, L) of the corrected counts."""
     dc = np.zeros((space.size, *c.shape))
     for candidate, part in fitted(space):
-        if isinstance(candidate.effect, CountsEffect) or candidate.price:
+        if isinstance(candidate.effect, InstrumentEffect) and candidate.effect.acts_on_counts(candidate.place):
             for j, (moved, step) in enumerate(stepped(candidate, part, values)):
                 dc[part.start + j] = (coefficients(changes_of(moved)) - c) / step
     return dc

@@ -29,5 +29,8 @@ class SentenceEffect(OpticsEffect):
     def moves_image(self, place: str) -> bool:
         return grammar.parsed(place).site == "image"
 
+    def acts_on_counts(self, place: str) -> bool:
+        return grammar.parsed(place).site in ("detector", "image")
+
     def log_price(self, model: InstrumentModel, conditions: Conditions, place: str) -> float:
         return next(s.price for s in grammar.sentences(model, conditions) if s.text == place)

@@ -51,6 +51,10 @@ class InstrumentEffect(Effect, ABC):
         """Whether it moves the image at this place, which is undone by moving the frames back."""
         return False
 
+    def acts_on_counts(self, place: str) -> bool:
+        """Whether it changes the counts at this place: the image is moved, or the response is bent or shifted."""
+        return False
+
     def shifts(self, model: InstrumentModel, place: str) -> tuple[str, ...]:
         """Values of the train ("element.field") that it shifts and does nothing else."""
         return ()
@@ -80,6 +84,9 @@ class CountsEffect(InstrumentEffect):
     """Undone in the counts; it does not change the rows of W."""
 
     belongs_to: ClassVar[Belongs] = "detector"
+
+    def acts_on_counts(self, place: str) -> bool:
+        return True
 
 
 class PointwiseEffect(CountsEffect):
