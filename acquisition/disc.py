@@ -166,8 +166,8 @@ class DiscProcess:
             if is_well:
                 future.set_result(answer)
             else:
-                self_made: BaseException = answer
-                future.set_exception(self_made)
+                failure: BaseException = answer
+                future.set_exception(failure)
         self.has_ended = True
         with contextlib.suppress(queue.Empty):
             while True:

@@ -66,21 +66,19 @@ def open_campaign(folder: Path | str, kind: str = "mueller") -> xr.Dataset:
 
     files = [path for path in sorted(Path(folder).rglob("*.h5")) if is_product(path)]
     places: dict[tuple[str, float, float], list[Path]] = {}
-    first = None
+    first: tuple[Path, tuple[int, int]] | None = None
     for path in files:
         with Product(path) as product:
             if product.kind != kind:
                 continue
             header, sample = product.header, product.header.sample
-            omega = np.nan if header.omega_deg is None else header.omega_deg
-            places.setdefault((sample.name or sample.kind, header.wavelength_nm, omega), []).append(path)
-            first = first or path
-            with Product(first) as other:
-                if product.shape != other.shape:
-                    raise ProcessError(
-                        f"{path}: {product.shape} pixels, but {first} has {other.shape}. Give a folder with images of "
-                        "one size"
-                    )
+            first = first or (path, product.shape)
+            if product.shape != first[1]:
+                raise ProcessError(
+                    f"{path}: {product.shape} pixels, but {first[0]} has {first[1]}. Give images of one size"
+                )
+        omega = np.nan if header.omega_deg is None else header.omega_deg
+        places.setdefault((sample.name or sample.kind, header.wavelength_nm, omega), []).append(path)
     if first is None:
         raise ProcessError(f"{folder}: no product of kind {kind!r}. Make them with: ./lab process reduce {folder}")
     # NaN is not equal to itself: angles are compared as text.
@@ -90,7 +88,7 @@ def open_campaign(folder: Path | str, kind: str = "mueller") -> xr.Dataset:
     for place, paths in places.items():
         where = tuple([text for text, _ in axis].index(str(value)) for axis, value in zip(axes, place, strict=True))
         grid[where][: len(paths)] = [str(path) for path in paths]
-    one = _of_product(first)
+    one = _of_product(first[0])
     leading = ("sample", "wavelength", "omega", "repeat")
     variables = {
         str(name): ((*leading, *plane.dims), _on_demand(grid, str(name), plane.dtype, plane.shape), plane.attrs)

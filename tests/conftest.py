@@ -3,6 +3,7 @@
 import ctypes
 import fcntl
 import os
+import shutil
 import socket
 import struct
 import sys
@@ -165,6 +166,17 @@ def process(run_main: Callable[..., tuple[int, str, str]]) -> Callable[..., tupl
     from processing.commands.application import main
 
     return partial(run_main, main)
+
+
+@pytest.fixture(scope="session")
+def chromium() -> str:
+    """Path of the browser; CI has one."""
+    program = shutil.which("chromium")
+    if program is None:
+        if os.environ.get("CI"):
+            pytest.fail("CI needs chromium")
+        pytest.skip("no chromium here")
+    return program
 
 
 @pytest.fixture(autouse=True)

@@ -6,19 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
 from playwright.sync_api import sync_playwright
 from ruamel.yaml import YAML
 
 ROOT = Path(__file__).parents[2]
 
 
-def test_the_search_of_the_site_works_without_a_server(tmp_path):
-    program = shutil.which("chromium")
-    if program is None:
-        if os.environ.get("CI"):
-            pytest.fail("CI needs chromium")
-        pytest.skip("no chromium here")
+def test_the_search_of_the_site_works_without_a_server(tmp_path, chromium):
     yaml = YAML()
     settings = yaml.load(ROOT / "mkdocs.yml")
     # Two pages of it, without the interface: that imports and renders the program.
@@ -33,7 +27,7 @@ def test_the_search_of_the_site_works_without_a_server(tmp_path):
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
     subprocess.run([sys.executable, "-m", "mkdocs", "build", "--quiet"], cwd=tmp_path, env=environment, check=True)
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         page = browser.new_page()
         page.goto((tmp_path / "build/site/index.html").as_uri())
         page.locator(".md-search__input").click()
