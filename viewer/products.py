@@ -10,6 +10,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response
 
 from processing.errors import ProcessError
+from processing.maps.stokes_vector import is_stokes_vector
 from processing.reports.colours import ALL, LIGHT, SIGNED, Scale, period_deg, scale_of, steps
 from processing.reports.fact_words import fact_words
 from processing.storage.product import COMPANIONS, LIT_ERRORS, Product
@@ -35,6 +36,7 @@ def product(request: Request) -> HTMLResponse:
         facts = [(name.replace("_", " "), fact_words(v)) for name, v in opened.facts.items() if name != "warnings"]
         provenance = steps_text(opened.steps)
         shape, kind = opened.shape, opened.kind
+        matrices = kind in MATRICES and not is_stokes_vector(opened)
     return pages.draw(
         "product.html",
         simulated=entry.simulated,
@@ -42,7 +44,7 @@ def product(request: Request) -> HTMLResponse:
         kind=kind,
         facts=facts,
         provenance=provenance,
-        look={"maps": maps, "shape": shape, "matrices": kind in MATRICES},
+        look={"maps": maps, "shape": shape, "matrices": matrices},
         colours={name: steps(name) for name in ALL},
         sources=[
             (role, path, e, pages.shown_at(e) if e else None)
@@ -57,6 +59,12 @@ def maps_of(opened: Product) -> list[dict[str, Any]]:
     """Maps of a product, its main one first: each dataset without its errors, one entry for each number of a vector."""
     found = []
     first = FIRST.get(opened.kind, opened.kind)
+    if is_stokes_vector(opened) and "stokes" not in opened.names:
+        # The first column of M, which is the Stokes vector.
+        column = {"name": "mueller", "about": opened.long_name("mueller"), "units": "count", "errors": True}
+        found = [column | {"index": 4 * k, "label": f"S{k}"} for k in range(4)]
+    if "stokes" in opened.names:
+        first = "stokes"
     for name in sorted(opened.names, key=lambda name: name != first):
         if name.endswith(COMPANIONS) or name in ("mueller", "mueller_covariance"):
             continue

@@ -61,6 +61,7 @@ OWN_95 = (
     *SIGNED,
     *(f"{name}{part}" for name in ("diattenuation", "polarizance") for part in ("", "_linear")),
     *(f"dominant_{name}_{part}" for name in ("diattenuation", "polarizance") for part in ("linear", "circular")),
+    "polarizance_ellipticity_deg",
     "coherency_eigenvalues",
     "entropy",
     "depolarization_index",
@@ -133,6 +134,25 @@ def set_angles(planes: Planes) -> None:
         half_68, half_95 = (np.rad2deg(h) / 2 for h in halves)
         value = planes[name]
         _put(planes, name, value, half_68, value - half_95, value + half_95)
+
+
+def set_ellipticity(planes: Planes) -> None:
+    """Interval of the ellipticity, -45 to 45 degrees; circular light where its linear part may be zero.
+
+    `set_magnitudes` is done.
+    """
+    name = "polarizance_ellipticity_deg"
+    if name not in planes:
+        return
+    linear, circular = planes["polarizance_linear"].astype(float), planes["polarizance_circular"].astype(float)
+    # Noise is taken off the linear part: else circular light has less ellipticity than 45 degrees.
+    value = np.rad2deg(0.5 * np.arctan2(circular, linear))
+    halves = directions(np.deg2rad(2 * planes[f"{name}_errors"].astype(float)))
+    half_68, half_95 = (np.rad2deg(half) / 2 for half in halves)
+    may_be_circular = planes["polarizance_linear_95"][0] == 0
+    low = np.where(may_be_circular & (circular < 0), -45.0, np.maximum(value - half_95, -45.0))
+    high = np.where(may_be_circular & (circular > 0), 45.0, np.minimum(value + half_95, 45.0))
+    _put(planes, name, value, np.minimum(half_68, 45.0), low, high)
 
 
 def moves_of(systematic: Systematic, image: MuellerImage) -> Array:

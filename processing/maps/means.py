@@ -18,9 +18,10 @@ from scipy.special import stdtrit
 
 from processing.arrays import Array
 from processing.errors import ProcessError
-from processing.maps.intervals import ANGLES, EITHER_AXIS, moves_of
+from processing.maps.intervals import ANGLES, EITHER_AXIS
 from processing.maps.partial_quantities import determined_maps, partial_block
 from processing.maps.quantities import quantities_block
+from processing.maps.stokes_vector import is_first_column, light_of, light_quantities, moves_of_light, named
 from processing.polarization.magnitude import NORMAL_95
 from processing.polarization.quantities import PAPER_PAIRS
 from processing.reduction.stokes import linear_polarization, moved_polarization
@@ -160,8 +161,6 @@ class _Mean:
         with Product(source) as product:
             product.require("mueller", "stokes")
             rows, columns = region
-            if "stokes" in product.names:
-                raise ProcessError(f"{source} has no elements of M; `process quantities` gives what it has.")
             systematic = Systematic.of_product(product)
             inputs = () if systematic is None else tuple((d.label, d.u) for d in systematic.directions)
             if product.kind == "stokes":
@@ -171,9 +170,14 @@ class _Mean:
                 values = stokes.values.reshape(3, 1)
                 moved = () if systematic is None else list(systematic.moves(values))
                 return cls(stokes, np.reshape(moved, (len(inputs), 3, 1, 1)), inputs)
-            image = _mueller_mean(MuellerImage.of(product, rows), columns, source)
-        moves = np.zeros((0, 16, 1, 1)) if systematic is None else moves_of(systematic, image)
-        return cls(image, moves, inputs)
+            whole = MuellerImage.of(product, rows)
+            errors = product.get("stokes_errors", rows) if whole.sent is not None else None
+        image = _mueller_mean(light_of(whole, errors), columns, source)
+        if systematic is None:
+            return cls(image, np.zeros((0, 16, 1, 1)), inputs)
+        # What was fitted is the light where no element is determined alone.
+        fitted = image if whole.sent is None else replace(whole, sent=image.values[:, 0], mask=image.mask)
+        return cls(image, moves_of_light(systematic, fitted), inputs)
 
     def numbers(self) -> dict[str, _Number]:
         if isinstance(self.image, StokesImage):
@@ -278,6 +282,7 @@ def _stokes_numbers(image: StokesImage, moves: Array) -> dict[str, _Number]:
 
 def _mueller_numbers(image: MuellerImage, moves: Array) -> dict[str, _Number]:
     found, m = {}, image.values.reshape(16).astype(float)
+    light = is_first_column(image.seen)
     for k in np.flatnonzero(image.seen).tolist():
         gradient = np.zeros(16)
         # A common gain is not measured: the error of m00 is noise alone.
@@ -287,7 +292,10 @@ def _mueller_numbers(image: MuellerImage, moves: Array) -> dict[str, _Number]:
             gradient[k] = 1 / m[0]
         error = float(np.sqrt(image.variance_of(gradient.reshape(1, 1, 16)).item()))
         moved = np.asarray(moves[..., 0, 0] @ gradient) if k else np.zeros(len(moves))
-        name, unit = ("m00", "count") if k == 0 else (f"m{k // 4}{k % 4}_over_m00", "")
+        if light:
+            name, unit = ("s0", "count") if k == 0 else (f"s{k // 4}_over_s0", "")
+        else:
+            name, unit = ("m00", "count") if k == 0 else (f"m{k // 4}{k % 4}_over_m00", "")
         found[name] = _Number(float(value), error, moved, unit)
     by_input: dict[str, NDArray[Any]] = {}
     # Intervals by noise alone first: those of the second are wider by the instrument's uncertainty.
@@ -295,9 +303,11 @@ def _mueller_numbers(image: MuellerImage, moves: Array) -> dict[str, _Number]:
         planes = quantities_block(image, (), PAPER_PAIRS)
         quantities_block(image, (), PAPER_PAIRS, moves, by_input)
     else:
-        names = determined_maps(image.seen, PAPER_PAIRS)
+        names = light_quantities(image.seen) if light else determined_maps(image.seen, PAPER_PAIRS)
         planes = partial_block(image, names, PAPER_PAIRS)
         partial_block(image, names, PAPER_PAIRS, moves, by_input)
+    if light:
+        planes, by_input = named(planes), named(by_input)
     for name in by_input:
         # 16 elements of the dominant process would make a table that nobody reads.
         if planes[name].size == 16:

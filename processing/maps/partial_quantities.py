@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import BoolArray
-from processing.maps.intervals import set_angles, set_magnitudes, set_systematic
+from processing.maps.intervals import set_angles, set_ellipticity, set_magnitudes, set_systematic
 from processing.polarization import gradients
 from processing.polarization.quantities import POLARIZATIONS, NamedStokes
 from processing.storage.images import MuellerImage
@@ -59,11 +59,13 @@ def partial_block(
     found: dict[str, NDArray[Any]] = {}
     with np.errstate(divide="ignore", invalid="ignore"):
         derived = gradients.diattenuation(m) | gradients.polarizance(m) | gradients.pairs(m, pairs)
+        derived |= gradients.ellipticity(m)
         for name in names:
             found[name] = derived[name].value.astype(np.float32)
             found[f"{name}_errors"] = np.sqrt(image.variance_of(derived[name].gradient)).astype(np.float32)
         set_magnitudes(found, derived, m, image)
         set_angles(found)
+        set_ellipticity(found)
         if moves is not None:
             moved = set_systematic(found, {name: derived[name] for name in names}, moves)
             if by_input is not None:

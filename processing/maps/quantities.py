@@ -29,7 +29,7 @@ from processing.maps.intervals import (
     widen_dominant,
 )
 from processing.maps.partial_quantities import Pairs, determined_maps, partial_block, partial_facts
-from processing.maps.sent_back import OF_MATRICES, sent_back_block, sent_back_facts, sent_back_planes
+from processing.maps.stokes_vector import OF_MATRICES, is_stokes_vector, light_block, light_facts, light_planes
 from processing.maps.xi0 import VALID, is_valid
 from processing.polarization import gradients
 from processing.polarization.decompositions.differential import differential
@@ -160,7 +160,7 @@ class _Maps(NamedTuple):
 
 
 def _maps(product: Product, extra: Sequence[str], pairs: Pairs) -> _Maps:
-    """Of whole matrices, of the elements of a partial polarimeter, or of the light that one polarized state sends back.
+    """Of whole matrices, of the elements of a partial polarimeter, or of a Stokes vector.
 
     Raises
     ------
@@ -172,14 +172,20 @@ def _maps(product: Product, extra: Sequence[str], pairs: Pairs) -> _Maps:
             "With a model of the surface, `process xi0` and `process extrapolate` take it."
         )
     product.require("mueller", EXTRAPOLATED)
-    sent = {} if extra else sent_back_planes(product)
     systematic = Systematic.of_product(product) if product.kind == "mueller" else None
     told = {} if systematic is None else {INPUTS: product.facts[INPUTS]}
-    if sent:
+    if is_stokes_vector(product) and not extra:
+        light = light_planes(product)
+        own_95 = {name for name, of_matrices in OF_MATRICES.items() if has_own_95(of_matrices)}
+        planes = with_errors(
+            {name: plane for name, plane in light.items() if name != "stokes_covariance"},
+            lambda name: name in own_95,
+            systematic=systematic is not None,
+        )
         return _Maps(
-            with_errors(sent, lambda name: has_own_95(OF_MATRICES.get(name, name)), systematic=systematic is not None),
-            lambda rows: sent_back_block(product, rows, sent, systematic),
-            lambda writer: sent_back_facts(writer, sent) | told,
+            planes | {"stokes_covariance": light["stokes_covariance"]},
+            lambda rows: light_block(product, rows, systematic),
+            lambda writer: light_facts(writer, product, light) | told,
         )
     maps = _planes(extra, pairs)
     partial = _determined(product, extra, pairs)

@@ -65,6 +65,17 @@ def polarizance(m: RealArray) -> dict[str, Derived]:
     return _vector("polarizance", quantities.polarizance_vector(m), m[..., 0, 0], (4, 8, 12))
 
 
+def ellipticity(m: RealArray) -> dict[str, Derived]:
+    """Ellipticity angle of the light that M (..., 4, 4) makes of unpolarized light, -45 to 45 degrees."""
+    parts = polarizance(m)
+    linear, circular = parts["polarizance_linear"], parts["polarizance_circular"]
+    x, y = np.asarray(linear.value)[..., None], np.asarray(circular.value)[..., None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        gradient = np.rad2deg(0.5) * (x * circular.gradient - y * linear.gradient) / (x**2 + y**2)
+    value = np.rad2deg(0.5 * np.arctan2(circular.value, linear.value))
+    return {"polarizance_ellipticity_deg": Derived(value, gradient)}
+
+
 def _vector(name: str, v: RealArray, m00: RealArray, elements: tuple[int, int, int]) -> dict[str, Derived]:
     slope = np.zeros((3, *v.shape[:-1], 16))  # d v_i = d m_i / m00 - v_i d m00 / m00
     for i, element in enumerate(elements):

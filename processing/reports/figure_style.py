@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 #: Longest side of a panel in pixels; larger images are thinned before drawing, which changes no file.
 PANEL_PIXELS = 600
+#: Most pixels that the Poincare sphere shows.
+SPHERE_PIXELS = 3000
 SIMULATED = "SIMULATED"
 PAGE_DPI = 100
 #: Orientation is drawn in grey where its standard error is above this: it is not known there.
@@ -37,13 +39,20 @@ def map_figure(panels: Sequence[tuple[str, NDArray[Any], dict[str, Any]]], title
 
 
 def grid_figure(
-    panels: Sequence[tuple[str, NDArray[Any], dict[str, Any]]], title: str, simulated: bool, columns: int = 4
+    panels: Sequence[tuple[str, NDArray[Any], dict[str, Any]]],
+    title: str,
+    simulated: bool,
+    columns: int = 4,
+    sphere: NDArray[np.floating] | None = None,
 ) -> Figure:
-    """Maps in rows of `columns`, as in `map_figure`; where no `vmax` is given it is the 99.5th percentile."""
+    """Maps in rows of `columns`, as in `map_figure`; where no `vmax` is given it is the 99.5th percentile.
+
+    `sphere` (3, n): Stokes vectors over S0, for a last panel with the Poincare sphere.
+    """
     from matplotlib.figure import Figure
 
     shape = panels[0][1].shape
-    rows = -(-len(panels) // columns)
+    rows = -(-(len(panels) + (sphere is not None)) // columns)
     high = 0.5 + 3.6 * max(0.4, shape[0] / max(shape[1], 1))
     figure = Figure(figsize=(4.25 * min(columns, len(panels)), 0.6 + rows * high), layout="constrained")
     axes = figure.subplots(rows, min(columns, len(panels)), squeeze=False)
@@ -51,6 +60,8 @@ def grid_figure(
         axis.set_axis_off()
     for axis, (label, values, keywords) in zip(axes.flat, panels, strict=False):
         _map(figure, axis, values, label, **({"vmax": max(percentile(values, 99.5), 1e-30)} | keywords))
+    if sphere is not None:
+        _poincare(figure.add_subplot(axes.flat[len(panels)].get_subplotspec(), projection="3d"), sphere)
     entitle(figure, title, simulated)
     return figure
 
@@ -75,6 +86,30 @@ def _map(figure: Figure, axis: Any, values: NDArray[Any], label: str, **keywords
     axis.set_xticks([])
     axis.set_yticks([])
     figure.colorbar(shown, ax=axis, shrink=0.85, extend=clipped(values, *shown.get_clim()))
+
+
+def _poincare(axis: Any, stokes: NDArray[np.floating]) -> None:
+    """Pixels (3, n) inside the Poincare sphere: full polarization lies on its surface, none at its centre."""
+    known = stokes[:, np.isfinite(stokes).all(axis=0)]
+    known = known[:, :: max(1, known.shape[1] // SPHERE_PIXELS)]
+    turn, height = np.linspace(0, 2 * np.pi, 73), np.linspace(-np.pi / 2, np.pi / 2, 13)
+    round_ = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)])
+    for angle in height[2:-1:2]:
+        axis.plot(*(round_ * np.cos(angle) + [[0], [0], [np.sin(angle)]]), color="0.8", linewidth=0.5)
+    for angle in turn[:36:6]:
+        axis.plot(np.cos(turn) * np.cos(angle), np.cos(turn) * np.sin(angle), np.sin(turn), color="0.8", linewidth=0.5)
+    axis.plot(*round_, color="0.4", linewidth=0.8)
+    for k in range(3):
+        line = np.zeros((3, 2))
+        line[k] = (0, 1.25)
+        axis.plot(*line, color="black", linewidth=0.8)
+        axis.text(*line[:, 1] * 1.08, f"$S_{k + 1}/S_0$", fontsize=8, ha="center")
+    axis.scatter(*known, s=3, c="tab:red", depthshade=False, linewidths=0)
+    axis.set_title("Poincaré sphere", fontsize=10)
+    axis.set_box_aspect((1, 1, 1))
+    axis.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-1, 1))
+    axis.view_init(elev=20, azim=30)
+    axis.set_axis_off()
 
 
 def clipped(values: NDArray[Any], low: float, high: float) -> str:

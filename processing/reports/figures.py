@@ -49,7 +49,7 @@ def draw_product(path: Path, figure: Path) -> None:
 
 def product_figure(product: Product) -> Figure:
     """Matplotlib figure of a product; raises ProcessError for a kind without one."""
-    if product.kind == "mueller" and (light := _stokes_of(product)) is not None:
+    if product.kind in ("mueller", "quantities") and (light := _stokes_of(product)) is not None:
         return _polarimeter_figure(product, *light)
     if product.kind in ("mueller", "extrapolated"):
         elements = thin(product.get("mueller"))
@@ -180,6 +180,8 @@ def _stokes_of(product: Product) -> tuple[NDArray[Any], NDArray[Any]] | None:
     """
     if "stokes" in product.names:
         return thin(product.get("stokes")), thin(product.get("stokes_errors"))
+    if product.kind != "mueller":
+        return None
     elements = thin(product.get("mueller"))
     if np.isfinite(elements[:, 1:]).any() or not np.isfinite(elements[1:, 0]).any():
         return None
@@ -187,29 +189,41 @@ def _stokes_of(product: Product) -> tuple[NDArray[Any], NDArray[Any]] | None:
 
 
 def _polarimeter_figure(product: Product, stokes: NDArray[Any], errors: NDArray[Any]) -> Figure:
-    """S0, S1..S3 over S0, and the degrees, angle and ellipticity that they determine; dark pixels stay empty."""
+    """S0, S1..S3 over S0, the degrees, angle and ellipticity that they determine, and the Poincare sphere.
+
+    Dark pixels stay grey. A product of `process quantities` has its own maps, without the noise in magnitudes.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
-        s1, s2, s3 = np.where(_lit(stokes[0], errors[0]), stokes[1:] / stokes[0], np.nan)
-        linear, degree = np.hypot(s1, s2), np.sqrt(s1**2 + s2**2 + s3**2)
+        lit = _lit(stokes[0], errors[0])
+        s1, s2, s3 = np.where(lit, stokes[1:] / stokes[0], np.nan)
+        linear = np.hypot(s1, s2)
         noise = np.hypot(s1 * errors[2], s2 * errors[1]) / (2 * linear**2 * stokes[0])
-        known = ~(np.rad2deg(noise) > WORST_ORIENTATION_DEG)
-        angle = np.where(known, np.rad2deg(np.arctan2(s2, s1)) / 2 % 180, np.nan)
-        ellipticity = np.where(known, np.rad2deg(np.arctan2(s3, linear)) / 2, np.nan)
+        degree = np.sqrt(s1**2 + s2**2 + s3**2)
+        found = {
+            "dop": degree,
+            "dolp": linear,
+            "docp": s3,
+            "aolp_deg": np.rad2deg(np.arctan2(s2, s1)) / 2 % 180,
+            "ellipticity_deg": np.rad2deg(np.arctan2(s3, linear)) / 2,
+        }
+    found |= {name: np.where(lit, thin(product.get(name)), np.nan) for name in found if name in product.names}
+    for name, error in (("aolp_deg", noise), ("ellipticity_deg", errors[1:].max(axis=0) / (2 * degree * stokes[0]))):
+        found[name] = np.where(np.rad2deg(error) > WORST_ORIENTATION_DEG, np.nan, found[name])
     panels: list[tuple[str, NDArray[Any], dict[str, Any]]] = [
         ("$S_0$ / counts", stokes[0], {"cmap": "gray", "vmin": 0})
     ]
-    for k, shown in enumerate((s1, s2, s3), 1):
+    for label, shown in (("$S_1 / S_0$", s1), ("$S_2 / S_0$", s2), ("$S_3 / S_0$", s3)):
         limit = max(percentile(np.abs(shown), 99.5), 1e-6) if np.isfinite(shown).any() else 1.0
-        panels.append((f"$S_{k} / S_0$", shown, {"cmap": SIGNED, "vmin": -limit, "vmax": limit}))
-    for label, shown in (
-        ("degree of polarization", degree),
-        ("degree of linear polarization", linear),
-        ("degree of circular polarization", np.abs(s3)),
-    ):
-        panels.append((label, shown, {"cmap": "viridis", "vmin": 0, "vmax": upper_end(shown)}))
+        panels.append((label, shown, {"cmap": SIGNED, "vmin": -limit, "vmax": limit}))
+    for label, name in (("degree of polarization", "dop"), ("degree of linear polarization", "dolp")):
+        panels.append((label, found[name], {"cmap": "viridis", "vmin": 0, "vmax": upper_end(found[name])}))
+    circular = np.abs(found["docp"])
     panels += [
-        ("angle of linear polarization, PSA frame / degrees", angle, CYCLIC),
-        ("ellipticity angle / degrees", ellipticity, {"cmap": SIGNED, "vmin": -45, "vmax": 45}),
+        ("degree of circular polarization", circular, {"cmap": "viridis", "vmin": 0, "vmax": upper_end(circular)}),
+        ("angle of linear polarization, PSA frame / degrees", found["aolp_deg"], CYCLIC),
+        ("ellipticity angle / degrees", found["ellipticity_deg"], {"cmap": SIGNED, "vmin": -45, "vmax": 45}),
     ]
+    # Where S3 is not determined, nothing follows from it.
     shown_panels = [panel for panel in panels if np.isfinite(panel[1]).any()]
-    return grid_figure(shown_panels, _title(product), product.simulated)
+    sphere = np.stack([s1, s2, np.nan_to_num(s3) if np.isnan(s3).all() else s3]).reshape(3, -1)
+    return grid_figure(shown_panels, _title(product), product.simulated, sphere=sphere)

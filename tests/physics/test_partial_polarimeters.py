@@ -12,6 +12,7 @@ from processing.errors import NotDetermined, ProcessError
 from processing.instrument.determined import determined_basis, determined_elements
 from processing.instrument.model import InstrumentModel, Polarizer
 from processing.maps import xi0 as maps
+from processing.maps.means import mean_of
 from processing.maps.quantities import quantities_of_mueller
 from processing.maps.tables import tabulate
 from processing.maps.xi0 import xi0_of_mueller
@@ -117,15 +118,22 @@ def test_quantities_are_those_that_the_elements_give(name, noisy, tmp_path):
         "polarizance_orientation_deg": np.rad2deg(np.arctan2(-0.3, 0.15)) / 2 + 180,
         "crossed_linear": (1 - 0.2 + 0.15 - 0.6) / 2,
         "aligned_linear": (1 - 0.2 - 0.15 + 0.6) / 2,
+        "dop": np.linalg.norm([0.15, 0.3, 0.2]),
+        "dolp": np.hypot(0.15, 0.3),
+        "docp": 0.2,
+        "aolp_deg": np.rad2deg(np.arctan2(-0.3, 0.15)) / 2 + 180,
+        "ellipticity_deg": np.rad2deg(np.arctan2(0.2, np.hypot(0.15, 0.3))) / 2,
     }
     there = {
-        "rotating_retarder_stokes": {"polarizance", "polarizance_linear", "polarizance_circular"},
-        "rotating_analyzer": {"polarizance_linear"},
-        "linear_mueller": {"polarizance_linear", "diattenuation_linear", "crossed_linear", "aligned_linear"},
-    }[name] | {"polarizance_orientation_deg"}
+        "rotating_retarder_stokes": {"dop", "dolp", "docp", "aolp_deg", "ellipticity_deg"},
+        "rotating_analyzer": {"dolp", "aolp_deg"},
+        "linear_mueller": {"polarizance_linear", "diattenuation_linear", "crossed_linear", "aligned_linear"}
+        | {"polarizance_orientation_deg"},
+    }[name]
     with Product(tmp_path / "q.h5") as product:
         assert truth.keys() & set(product.names) == there
         assert not [other for other in product.names if "eigen" in other or "retard" in other]
+        assert ("polarizance" in " ".join(product.names)) == (name == "linear_mueller")
         for quantity in there:
             pulls = (product.get(quantity) - truth[quantity]) / product.get(f"{quantity}_errors")
             assert abs(pulls.mean()) < 5 / np.sqrt(pulls.size)
@@ -192,15 +200,75 @@ def test_polarized_light_has_maps_of_what_the_sample_sends_back(name, weighted, 
     truth = {"dolp": dolp, "aolp_deg": np.rad2deg(np.arctan2(s[2], s[1])) / 2 % 180}
     if name == "rotating_retarder_stokes":
         truth |= {"dop": np.hypot(dolp, s[3] / s[0]), "docp": s[3] / s[0]}
+        truth["ellipticity_deg"] = np.rad2deg(np.arctan2(s[3] / s[0], dolp)) / 2
     with Product(tmp_path / "q.h5") as product:
-        own = {f"{map_}_95" for map_ in truth if map_ != "docp"}
-        assert set(product.names) == {"lit", *truth, *(f"{map_}_errors" for map_ in truth), *own}
+        own = {f"{map_}_95" for map_ in truth if map_ != "docp"} | {"stokes_covariance"}
+        assert set(product.names) == {"lit", "stokes", *truth, *(f"{m}_errors" for m in ("stokes", *truth)), *own}
         assert product.get("lit").all()
         for map_, true in truth.items():
             pulls = (product.get(map_) - true) / product.get(f"{map_}_errors")
             assert abs(pulls.mean()) < 5 / np.sqrt(pulls.size), map_
             assert pulls.std() == pytest.approx(1, abs=5 / np.sqrt(2 * pulls.size)), map_
         assert product_figure(product)
+
+
+@pytest.mark.parametrize("sent_deg", [None, 20.0])
+def test_the_covariance_of_the_stokes_vector_is_that_of_its_scatter(sent_deg, noisy, tmp_path):
+    angles = {"psa": np.array([-51.7, -15.1, 15.1, 51.7, 20.0, 70.0])}
+    path, model, _ = noisy("rotating_retarder_stokes", angles, sent_deg=sent_deg)
+    with Capture(path) as capture:
+        reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
+    quantities_of_mueller(tmp_path / "m.h5", tmp_path / "q.h5", Step("quantities", {}))
+    with Product(tmp_path / "q.h5") as product:
+        packed = product.get("stokes_covariance").reshape(10, -1).mean(axis=1)
+        stokes = product.get("stokes").reshape(4, -1)
+        errors = product.get("stokes_errors").reshape(4, -1)
+    scatter = np.cov(stokes)
+    found = np.diag(packed[:4])
+    found[np.triu_indices(4, 1)] = packed[4:]
+    found += np.triu(found, 1).T
+    assert np.sqrt(packed[:4]) == pytest.approx(errors.mean(axis=1), rel=0.01)
+    spread = np.sqrt(np.outer(np.diag(scatter), np.diag(scatter)) / stokes.shape[1])
+    assert np.abs((found - scatter) / spread).max() < 6
+    # States at unequal angles: some of it is no diagonal.
+    assert np.abs(np.triu(found, 1) / np.sqrt(np.outer(packed[:4], packed[:4]))).max() > 0.1
+
+
+@pytest.mark.parametrize("sent_deg", [None, 20.0])
+@pytest.mark.parametrize("vector", [(0, 0, 1.0), (0, 0, -0.3), (0.3, 0, 0), (0, 0.01, 0.005), (0, 0, 0)])
+def test_the_ellipticity_is_in_its_interval_for_any_light(vector, sent_deg, noisy, tmp_path):
+    sample = np.zeros((4, 4))
+    sample[:, 0] = 1, *vector
+    path, model, _ = noisy("rotating_retarder_stokes", {"psa": 22.5 * np.arange(16)}, sample=sample, sent_deg=sent_deg)
+    with Capture(path) as capture:
+        reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
+    quantities_of_mueller(tmp_path / "m.h5", tmp_path / "q.h5", Step("quantities", {}))
+    truth = np.rad2deg(np.arctan2(vector[2], np.hypot(*vector[:2]))) / 2
+    with Product(tmp_path / "q.h5") as product:
+        (low, high), value = product.get("ellipticity_deg_95"), product.get("ellipticity_deg")
+    assert (low >= -45).all()
+    assert (high <= 45).all()
+    inside = np.mean((low - 1e-3 <= truth) & (truth <= high + 1e-3))
+    # 1200 pixels scatter by 0.6 %; an interval that also holds the end of the range holds more than 95 %.
+    assert inside > 0.95 - 5 * 0.0063
+    assert (value >= low).all()
+    assert (value <= high).all()
+
+
+@pytest.mark.parametrize("sent_deg", [None, 20.0])
+def test_the_mean_of_a_stokes_polarimeter_has_the_names_of_light(sent_deg, noisy, tmp_path):
+    sample = np.zeros((4, 4))
+    sample[:, 0] = 1, 0.3, 0.2, -0.4
+    path, model, _ = noisy("rotating_retarder_stokes", {"psa": 22.5 * np.arange(16)}, sample=sample, sent_deg=sent_deg)
+    with Capture(path) as capture:
+        reduce_mueller(capture, model, tmp_path / "m.h5", (Step("reduce", {}),))
+    found = {one.name: one for one in mean_of([tmp_path / "m.h5"], (slice(0, 30), slice(0, 40)))}
+    truth = {"s1_over_s0": 0.3, "s2_over_s0": 0.2, "s3_over_s0": -0.4, "dolp": np.hypot(0.3, 0.2), "docp": -0.4}
+    truth |= {"dop": np.sqrt(0.29), "aolp_deg": np.rad2deg(np.arctan2(0.2, 0.3)) / 2}
+    truth["ellipticity_deg"] = np.rad2deg(np.arctan2(-0.4, np.hypot(0.3, 0.2))) / 2
+    assert found.keys() == {"s0", *truth}
+    for name, true in truth.items():
+        assert abs(found[name].value - true) < 4 * found[name].u, name
 
 
 def titles(product):
@@ -215,7 +283,14 @@ def test_a_stokes_polarimeter_has_a_figure_of_the_stokes_vector(noisy, tmp_path)
     with Product(tmp_path / "m.h5") as product:
         shown = " ".join(titles(product))
     assert re.findall(r"S_\d / S_0", shown) == ["S_1 / S_0", "S_2 / S_0", "S_3 / S_0"]
-    for quantity in ("degree of polarization", "linear pol", "circular pol", "angle of linear", "ellipticity"):
+    for quantity in (
+        "degree of polarization",
+        "linear pol",
+        "circular pol",
+        "angle of linear",
+        "ellipticity",
+        "sphere",
+    ):
         assert quantity in shown
     assert "m_" not in shown
 
