@@ -29,8 +29,8 @@ from processing.diagnosis.search.space import Space
 from processing.geometry.frames import ScatteringGeometry, change_frames
 from processing.instrument.model import InstrumentModel
 from processing.polarization import mueller
-from processing.storage.capture import Capture
-from processing.storage.importing import ImportRequest, import_capture, read_sample
+from processing.storage.captures.capture import Capture
+from processing.storage.formats.importing import ImportRequest, import_capture, read_sample
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared/data"

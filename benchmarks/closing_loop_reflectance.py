@@ -22,9 +22,9 @@ from processing.instrument.model import InstrumentModel
 from processing.maps.xi0 import estimate_from_stokes
 from processing.polarization.image_difference import linear_diattenuation, magnitude, orientation_difference, rmsd
 from processing.reduction.stokes import reduce_stokes
-from processing.storage.capture import Capture
-from processing.storage.images import StokesImage
-from processing.storage.product import Step
+from processing.storage.captures.capture import Capture
+from processing.storage.products.images import StokesImage
+from processing.storage.products.product import Step
 from simulators.bench.scene import Scene
 from simulators.blind.sphere_suite import SphereFault, first_surface_of, take
 

@@ -13,7 +13,7 @@ from processing.maps import quantities
 from processing.maps.xi0 import eigenvalue_block
 from processing.polarization import gradients
 from processing.polarization.quantities import PAPER_PAIRS
-from processing.storage.images import MuellerImage
+from processing.storage.products.images import MuellerImage
 
 PIXELS = 40_000
 #: Honest error bars may take this much longer.

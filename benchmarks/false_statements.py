@@ -33,7 +33,7 @@ from drivers import genicam
 from drivers.camera import Frame
 from drivers.errors import DeviceError
 from processing.reduction.counts_to_signal import Correction
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 
 TOP = 4095
 FAST = {"speed_deg_s": 50_000, "acceleration_deg_s2": 1e7}

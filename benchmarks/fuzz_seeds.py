@@ -28,12 +28,12 @@ from processing.reduction.mueller import reduce_mueller
 from processing.reflectance.base import load_reflectance
 from processing.reflectance.pbsdf import load as load_pbsdf
 from processing.reflectance.tables import ScatteringTable
-from processing.storage.axostep import read_mueller_file, read_rmmd
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import CaptureHeader, create_layout, write_closing
-from processing.storage.importing import ImportRequest, import_capture, read_sample
-from processing.storage.product import Product, Step
-from processing.storage.tensor_file import create_tensor_file, read_tensor_file
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import CaptureHeader, create_layout, write_closing
+from processing.storage.formats.axostep import read_mueller_file, read_rmmd
+from processing.storage.formats.importing import ImportRequest, import_capture, read_sample
+from processing.storage.formats.tensor_file import create_tensor_file, read_tensor_file
+from processing.storage.products.product import Product, Step
 from simulators.bench.scene import Scene
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -28,9 +28,9 @@ from processing.polarization import mueller
 from processing.public_data.conversion import StateTable, mirror_means, tables_of
 from processing.public_data.sets import SHIPPED, find_files
 from processing.steps.reduction import Reduction
-from processing.storage.capture_schema import Detector
-from processing.storage.importing import ImportRequest, import_capture, read_sample
-from processing.storage.product import Product
+from processing.storage.captures.schema import Detector
+from processing.storage.formats.importing import ImportRequest, import_capture, read_sample
+from processing.storage.products.product import Product
 from processing.yaml_file import dump_yaml
 
 Array = NDArray[np.float64]

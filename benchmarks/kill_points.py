@@ -36,7 +36,7 @@ import acquisition.screen.quicklook  # noqa: F401
 import processing.reflectance.material_fit  # noqa: F401
 from acquisition.commands.application import main as acquire
 from acquisition.commands.custody import verify
-from processing.storage.capture import Capture, CaptureError
+from processing.storage.captures.capture import Capture, CaptureError
 from simulators.disc.power_cut import Disc, read_record
 from simulators.disc.watched import RECORD, DiscCalls, build, restart_watched
 

@@ -12,8 +12,8 @@ import numpy as np
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
 from processing.polarization import mueller, triply_degenerate
-from processing.storage.capture_schema import CaptureHeader
-from processing.storage.images import MuellerImage
+from processing.storage.captures.schema import CaptureHeader
+from processing.storage.products.images import MuellerImage
 
 READ_NOISE_E = 2.3
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"

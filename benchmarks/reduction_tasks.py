@@ -26,8 +26,8 @@ from processing.reduction.solvers.field import FieldSolver
 from processing.reduction.solvers.inversion import Inversion
 from processing.reduction.solvers.plain import MuellerSolver
 from processing.reduction.solvers.weighted import WeightedSolver
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import CaptureHeader, Detector, Sample
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import CaptureHeader, Detector, Sample
 from simulators.blind.suite import state_angles
 from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
 

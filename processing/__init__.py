@@ -38,16 +38,16 @@ if TYPE_CHECKING:
     from processing.steps.material import MaterialFitting as MaterialFitting
     from processing.steps.reduction import Reduction as Reduction
     from processing.steps.table import Tabulation as Tabulation
-    from processing.storage.capture import Capture as Capture
-    from processing.storage.images import MuellerImage as MuellerImage
-    from processing.storage.images import StokesImage as StokesImage
-    from processing.storage.product import Product as Product
+    from processing.storage.captures.capture import Capture as Capture
+    from processing.storage.products.images import MuellerImage as MuellerImage
+    from processing.storage.products.images import StokesImage as StokesImage
+    from processing.storage.products.product import Product as Product
 
 _PUBLIC = {
-    "Capture": "processing.storage.capture",
-    "Product": "processing.storage.product",
-    "MuellerImage": "processing.storage.images",
-    "StokesImage": "processing.storage.images",
+    "Capture": "processing.storage.captures.capture",
+    "Product": "processing.storage.products.product",
+    "MuellerImage": "processing.storage.products.images",
+    "StokesImage": "processing.storage.products.images",
     "open_campaign": "processing.labelled",
     "open_dataset": "processing.labelled",
     "reduce_to_dataset": "processing.labelled",

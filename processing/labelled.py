@@ -12,9 +12,9 @@ import numpy as np
 from processing.doors import require_new
 from processing.errors import ProcessError
 from processing.steps.reduction import Reduction
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import CaptureHeader, create_layout, write_closing
-from processing.storage.product import Product, is_product, leading_dimensions
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import CaptureHeader, create_layout, write_closing
+from processing.storage.products.product import Product, is_product, leading_dimensions
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -208,7 +208,7 @@ class SyntheticCapture:
         """Write frames (states, channels, rows, columns) and angles; `header` are fields of CaptureHeader."""
         import h5py
 
-        from processing.storage.capture_schema import CaptureHeader, create_layout, write_closing
+        from processing.storage.captures.schema import CaptureHeader, create_layout, write_closing
 
         defaults = {"title": "synthetic", "simulated": True, "mode": "test", "wavelength_nm": 662.0}
         path = self.folder / name

@@ -13,10 +13,10 @@ from starlette.responses import HTMLResponse, Response
 from processing.errors import ProcessError
 from processing.reduction.noise import NoiseModel
 from processing.reports.colours import ALL, LIGHT, SIGNED, Scale, period_deg, scale_of, steps
-from processing.storage.capture import Capture
-from processing.storage.images import MuellerImage, difference_errors
-from processing.storage.product import LIT_ERRORS, Product, is_product
-from processing.storage.provenance import content_of
+from processing.storage.captures.capture import Capture
+from processing.storage.products.images import MuellerImage, difference_errors
+from processing.storage.products.product import LIT_ERRORS, Product, is_product
+from processing.storage.products.provenance import content_of
 from viewer.frames import chosen
 from viewer.pages import file_of, pages_of
 from viewer.planes import Window, sent

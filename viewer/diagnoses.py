@@ -26,7 +26,7 @@ from processing.errors import ProcessError
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
 from processing.reflectance.base import load_reflectance
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from processing.yaml_file import dump_yaml
 from viewer.library import OWN, Library, NotHere
 

@@ -13,7 +13,7 @@ from starlette.responses import JSONResponse, StreamingResponse
 from acquisition.capture.writer import PARTIAL
 from acquisition.screen.run_file import running_in
 from processing.errors import ProcessError
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from viewer.campaigns import read_campaign, seconds_left
 from viewer.event_stream import event_stream
 from viewer.lamp import lamp

@@ -12,7 +12,7 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 from processing.errors import ProcessError
 from processing.reduction.counts_to_signal import saturation
 from processing.reports.capture_facts import facts_of, papers_of
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from viewer.diagnoses import Diagnoses
 from viewer.library import Entry, made_into
 from viewer.pages import file_of, pages_of

@@ -14,10 +14,10 @@ from acquisition.campaign.identity import IDENTITY
 from acquisition.capture.writer import PARTIAL
 from processing.errors import ProcessError
 from processing.reflectance.tables import ScatteringTable, is_table, table_steps
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import CaptureHeader
-from processing.storage.product import Product, is_product
-from processing.storage.provenance import MADE_OF, Step, content_of, file_identity, made_of
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import CaptureHeader
+from processing.storage.products.product import Product, is_product
+from processing.storage.products.provenance import MADE_OF, Step, content_of, file_identity, made_of
 
 #: Part of the pixels of a state beyond which its saturation is pointed out.
 SATURATED = 0.001

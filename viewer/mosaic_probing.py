@@ -12,7 +12,7 @@ from processing.errors import ProcessError
 from processing.reduction.mosaic.layout import MosaicLayout
 from processing.reduction.mueller import relative_exposure
 from processing.reduction.stokes import channel_rows
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from viewer.probing import MOST, Region, analyzer_names, finite
 from viewer.sample_states import SampleStates
 

@@ -16,9 +16,9 @@ from processing.maps.extrapolation import EXTRAPOLATED
 from processing.maps.quantities import image_of
 from processing.reflectance.shared_noise import shared_variance
 from processing.reports.colours import period_deg
-from processing.storage.capture import Capture
-from processing.storage.images import neighbour_correlation
-from processing.storage.product import COMPANIONS, Product
+from processing.storage.captures.capture import Capture
+from processing.storage.products.images import neighbour_correlation
+from processing.storage.products.product import COMPANIONS, Product
 from viewer.frames import chosen
 from viewer.library import Library, input_of
 from viewer.mosaic_probing import SuperPixelReducer

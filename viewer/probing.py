@@ -20,9 +20,9 @@ from processing.reduction.facts import determined_words
 from processing.reduction.mueller import Choice, field_of, measurement_matrix
 from processing.reduction.solvers.inversion import Inversion
 from processing.reduction.solvers.plain import MuellerSolver
-from processing.storage.capture import Capture
-from processing.storage.images import MuellerImage
-from processing.storage.pixel_mask import Mask
+from processing.storage.captures.capture import Capture
+from processing.storage.products.images import MuellerImage
+from processing.storage.products.pixel_mask import Mask
 from viewer.sample_states import SampleStates
 
 #: Most intensities that a region may have, states x pixels.

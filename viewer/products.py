@@ -13,8 +13,8 @@ from processing.errors import ProcessError
 from processing.maps.stokes_vector import is_stokes_vector
 from processing.reports.colours import ALL, LIGHT, SIGNED, Scale, period_deg, scale_of, steps
 from processing.reports.fact_words import fact_words
-from processing.storage.product import COMPANIONS, LIT_ERRORS, Product
-from processing.storage.provenance import steps_text
+from processing.storage.products.product import COMPANIONS, LIT_ERRORS, Product
+from processing.storage.products.provenance import steps_text
 from viewer.frames import others
 from viewer.library import made_from, made_into
 from viewer.pages import file_of, pages_of

@@ -14,7 +14,7 @@ from processing.reduction.effects_of_capture import capture_changes, counts_corr
 from processing.reduction.instrument_of_capture import choose_model, require_one_colour
 from processing.reduction.noise import NoiseModel, noise_of
 from processing.reduction.sample_states import sample_states
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 
 
 class SampleStates:

@@ -19,7 +19,7 @@ from acquisition.rig.config import load_rig
 from acquisition.rig.own_rigs import is_own_rig, own_campaign
 from processing.errors import ProcessError
 from processing.reflectance.base import kinds
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from viewer.diagnoses import Diagnoses
 from viewer.event_stream import event_stream
 from viewer.jobs import Job, Jobs

@@ -23,8 +23,8 @@ from acquisition.capture.writer import PARTIAL
 from acquisition.errors import AcquisitionError
 from acquisition.rig.rig import Rig
 from acquisition.stop_request import StopRequest
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import COLUMN_UNITS
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import COLUMN_UNITS
 
 #: Columns of the file that tell of each state, beside the angles.
 COLUMNS = ("exposure_s", "host_time_s", "monitor", "saturated_fraction")

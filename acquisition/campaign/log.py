@@ -22,7 +22,7 @@ from acquisition.disc import on_disc
 from acquisition.errors import AcquisitionError
 from processing.doors import read_json, read_text
 from processing.errors import ProcessError
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from processing.whole_file import open_plain
 from processing.yaml_file import ConfigError, dump_yaml, load_yaml
 

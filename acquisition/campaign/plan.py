@@ -9,7 +9,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
 from acquisition.capture.plan import Auto, AutoExposure, MeasurementPlan, Mode, Seconds, exposure_kind
-from processing.storage.capture_schema import Sample
+from processing.storage.captures.schema import Sample
 from processing.yaml_file import load_yaml
 from processing.yaml_words import NAME_PATTERN
 

@@ -32,7 +32,7 @@ from acquisition.rig.rig import Rig
 from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture, CaptureError
+from processing.storage.captures.capture import Capture, CaptureError
 
 #: Room for log and index, bytes.
 BOOKS = 4 << 20

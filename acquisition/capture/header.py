@@ -12,7 +12,7 @@ from acquisition.capture.plan import MeasurementPlan
 from acquisition.rig.config import RigConfig
 from acquisition.rig.rig import Rig
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture_schema import CaptureHeader
+from processing.storage.captures.schema import CaptureHeader
 from processing.yaml_file import dump_yaml
 
 

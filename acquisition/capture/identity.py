@@ -22,8 +22,8 @@ from acquisition.rig.config import RigConfig
 from acquisition.rig.rig import Rig
 from drivers.camera import CameraSettings
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture
-from processing.storage.segments import Identity
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.segments import Identity
 from processing.yaml_file import named_files, parse_yaml
 
 #: Keys of a rig file that tell where something is or who hears of it, not what it is.

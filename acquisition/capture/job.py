@@ -30,9 +30,9 @@ from acquisition.rig.folded_angles import folded
 from acquisition.rig.rig import Rig
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import StateTable
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import Status
-from processing.storage.frame_layout import Beams
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.frame_layout import Beams
+from processing.storage.captures.schema import Status
 from processing.yaml_file import parse_yaml
 
 

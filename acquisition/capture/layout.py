@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 
 from acquisition.capture.text_box import TextBox
-from processing.storage.capture_schema import STATUS_TYPE, reserve_texts
+from processing.storage.captures.schema import STATUS_TYPE, reserve_texts
 from processing.whole_file import open_plain
 
 #: Attribute of the entry: at which byte of the file its status stands.

@@ -18,7 +18,7 @@ from processing.instrument.states import (
     StateTable,
     rotating_retarders,
 )
-from processing.storage.capture_schema import Sample
+from processing.storage.captures.schema import Sample
 from processing.yaml_file import ConfigError, load_yaml
 from processing.yaml_words import NAME_PATTERN, mistakes_of, words_of
 

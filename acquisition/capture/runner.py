@@ -33,7 +33,7 @@ from processing.arrays import Array
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import StateTable
 from processing.reduction.lit_darks import LitDarks
-from processing.storage.capture_schema import Detector
+from processing.storage.captures.schema import Detector
 
 log = logging.getLogger(__name__)
 

@@ -32,8 +32,8 @@ from processing.arrays import Array
 from processing.instrument.applied_effects import changes_at
 from processing.instrument.model import InstrumentModel
 from processing.reduction.lit_darks import LitDarks, seen_so_far
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import Status
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import Status
 
 #: How often a capture with auto exposure begins again because a state saturated.
 DARKER_TRIES = 3

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from acquisition.capture.layout import STATUS_AT, write_whole
 from acquisition.capture.text_box import TextBox
 from acquisition.errors import AcquisitionError
-from processing.storage.capture_schema import STATUS_TYPE, Status, fitted_json, json_bytes
-from processing.storage.checksums import row_crc32, state_crc32
-from processing.storage.segments import decode_lines, encode_line
+from processing.storage.captures.schema import STATUS_TYPE, Status, fitted_json, json_bytes
+from processing.storage.captures.segments import decode_lines, encode_line
+from processing.storage.integrity.checksums import row_crc32, state_crc32
 
 #: How long the disc process of a run that was killed may have the file open.
 KILLED_S = 2.0

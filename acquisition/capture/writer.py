@@ -30,9 +30,9 @@ from acquisition.errors import AcquisitionError
 from drivers.clock import REAL, Clock
 from drivers.motion import Position
 from processing.instrument.states import StateTable
-from processing.storage.capture import Capture, CaptureError
-from processing.storage.capture_schema import CaptureHeader, Status, create_layout, json_bytes
-from processing.storage.segments import encode_line
+from processing.storage.captures.capture import Capture, CaptureError
+from processing.storage.captures.schema import CaptureHeader, Status, create_layout, json_bytes
+from processing.storage.captures.segments import encode_line
 
 PARTIAL = ".partial"
 NEW = ".new"

@@ -11,9 +11,9 @@ from acquisition.capture.writer import NEW, PARTIAL, mark_not_taken, seal_whole
 from acquisition.commands.doctor import Finding
 from acquisition.errors import AcquisitionError
 from processing.errors import ProcessError
-from processing.storage.capture import Capture, CaptureError, made_of_captures
-from processing.storage.h5_door import mark_of
-from processing.storage.packed_capture import pack_capture
+from processing.storage.captures.capture import Capture, CaptureError, made_of_captures
+from processing.storage.captures.packed_capture import pack_capture
+from processing.storage.integrity.h5_door import mark_of
 from processing.yaml_file import load_yaml
 
 

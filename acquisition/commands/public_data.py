@@ -44,7 +44,7 @@ def get_command(
     from processing.commands.progress_bar import progress_bar
     from processing.public_data.conversion import tables_of
     from processing.public_data.sets import catalogue, get_files
-    from processing.storage.importing import ImportRequest, import_capture, read_sample
+    from processing.storage.formats.importing import ImportRequest, import_capture, read_sample
 
     folder = out or Path("data") / name
     with progress_bar(f"getting {name}", "files") as tick:

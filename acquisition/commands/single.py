@@ -42,8 +42,8 @@ from acquisition.screen.run_file import RunFile
 from acquisition.stop_request import StopRequest
 from processing.doors import one_line
 from processing.errors import ProcessError
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import Sample
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import Sample
 from processing.yaml_file import ConfigError
 
 

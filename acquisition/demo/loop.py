@@ -23,7 +23,7 @@ from processing.diagnosis.search.result import FoundEffect
 from processing.instrument.model import InstrumentModel
 from processing.steps.maps import Xi0
 from processing.steps.reduction import Reduction
-from processing.storage.capture_schema import Sample
+from processing.storage.captures.schema import Sample
 from processing.whole_file import write_new_text
 from processing.yaml_file import ConfigError, dump_yaml
 from simulators.bench.scene import Scene

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.storage.images import MuellerImage
-from processing.storage.product import Product
+from processing.storage.products.images import MuellerImage
+from processing.storage.products.product import Product
 from processing.yaml_file import ConfigError
 from simulators.bench.effects.base import BenchEffect
 from simulators.bench.scene import Scene

@@ -11,7 +11,7 @@ from acquisition.errors import InterlockOpened
 from acquisition.rig.rig import Rig
 from acquisition.screen.observer import StateReport
 from acquisition.stop_request import StopRequest
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 
 #: Exposure in seconds, then the angles of the axes in the order of their names, whole turns apart the same.
 Pose = tuple[float, ...]

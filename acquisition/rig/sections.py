@@ -14,7 +14,7 @@ from acquisition.rig.solids import Solids
 from acquisition.screen.notify import NotifyConfig
 from drivers.motion import AxisConfig
 from drivers.registry import Family, device_kinds
-from processing.storage.capture_schema import Detector
+from processing.storage.captures.schema import Detector
 from simulators.rig.model import SimulatorConfig
 
 

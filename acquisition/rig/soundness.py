@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from acquisition.rig.way import find_homing_obstacle, find_obstacle
 from drivers.motion import AxisConfig
-from processing.storage.capture_schema import NOT_AXES
-from processing.storage.state_csv import NAME
+from processing.storage.captures.schema import NOT_AXES
+from processing.storage.formats.state_csv import NAME
 from simulators.rig.model import SCHEME
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from processing.reduction.black import Black
 from processing.reports.colours import upper_end
 from processing.reports.figure_style import clipped
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from processing.whole_file import whole_file
 
 #: Longest side of the maps in the figure, pixels; a larger frame is thinned out.

@@ -23,8 +23,8 @@ from processing.reflectance.polarized_diffuse import diffuse_jones
 from processing.reflectance.tables import ScatteringTable
 from processing.reports.figure_style import CYCLIC, entitle, grid_figure, percentile
 from processing.reports.reflectance_figures import STYLES, tables_figure
-from processing.storage.images import MuellerImage
-from processing.storage.product import LIT_ERRORS, Product
+from processing.storage.products.images import MuellerImage
+from processing.storage.products.product import LIT_ERRORS, Product
 
 Panels = list[tuple[str, NDArray[Any], dict[str, Any]]]
 FRAMES = "Instrument frames; rows and columns of tiles are those of the matrix."

@@ -19,7 +19,7 @@ from processing.reflectance.base import load_reflectance
 from processing.reflectance.tables import ScatteringTable
 from processing.reports.figure_style import png
 from processing.reports.template import Figure, Section, render
-from processing.storage.product import Product
+from processing.storage.products.product import Product
 
 LABELS = {"psi_deg": "psi / degrees", "magnitude_percent": "|D| / %", "xi0_percent": "xi0 / %"}
 #: Largest deviations from triple degeneracy that the paper tells, of the light.

@@ -21,8 +21,8 @@ from processing.reflectance.tables import ScatteringTable
 from processing.steps.maps import Extrapolation, Quantities, Xi0
 from processing.steps.material import FittedMaterial, MaterialFitting
 from processing.steps.reduction import reduced
-from processing.storage.capture import Capture
-from processing.storage.product import Product
+from processing.storage.captures.capture import Capture
+from processing.storage.products.product import Product
 from processing.yaml_file import dump_yaml
 
 SPHERE, BODY = CONFIGS / "geometries/one_inch_sphere.yaml", Path(__file__).parent / "body_geometry.yaml"

@@ -19,8 +19,8 @@ from processing.reduction.counts_to_signal import Correction
 from processing.reduction.flat import FEW
 from processing.reduction.mueller import relative_exposure
 from processing.reduction.sample_states import sample_states
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import Sample
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import Sample
 
 
 class CalibrationError(ProcessError):

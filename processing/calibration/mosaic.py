@@ -20,9 +20,9 @@ from processing.reduction.mosaic.layout import MosaicLayout
 from processing.reduction.mueller import relative_exposure
 from processing.reduction.sample_states import sample_states
 from processing.reduction.solvers.inversion import multiply_tiles
-from processing.storage.capture import Capture
-from processing.storage.pixel_mask import Mask
-from processing.storage.product import Plane, ProductWriter, Step
+from processing.storage.captures.capture import Capture
+from processing.storage.products.pixel_mask import Mask
+from processing.storage.products.product import Plane, ProductWriter, Step
 
 LINEAR = 3
 

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from processing.errors import NotDetermined, ProcessError
 from processing.reduction.black import Black
 from processing.reduction.noise import QUANTIZATION, NoiseModel
-from processing.storage.capture import Capture
-from processing.storage.pixel_mask import Mask
-from processing.storage.product import Plane, Product, ProductWriter, Step
+from processing.storage.captures.capture import Capture
+from processing.storage.products.pixel_mask import Mask
+from processing.storage.products.product import Plane, Product, ProductWriter, Step
 
 #: Levels between black and the brightest pixel at which the variance is taken.
 LEVELS = 48

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from processing.doors import read_json
 from processing.errors import ProcessError
 from processing.reduction.flat import FlatCapture
-from processing.storage.capture import Capture, CaptureError, made_of_captures
+from processing.storage.captures.capture import Capture, CaptureError, made_of_captures
 
 
 class ObjectCapture(NamedTuple):

@@ -25,8 +25,8 @@ from processing.polarization.image_difference import rmsd
 from processing.reduction.flat import flat_captures, nearest_flat
 from processing.reduction.mueller import Progress
 from processing.reflectance.tables import ScatteringTable
-from processing.storage.capture import Capture
-from processing.storage.provenance import Step, file_identity
+from processing.storage.captures.capture import Capture
+from processing.storage.products.provenance import Step, file_identity
 
 #: The default demosaicing reaches so far across the outline (`processing.reduction.mosaic.methods.REACH`).
 BORDER_PX = 4

@@ -26,9 +26,9 @@ from processing.reflectance.base import load_reflectance
 from processing.reflectance.tables import ScatteringTable
 from processing.steps.maps import geometry_identities
 from processing.steps.reduction import Reduction
-from processing.storage.images import MuellerImage, StokesImage, neighbour_correlation, require_all_elements
-from processing.storage.product import Product
-from processing.storage.provenance import Step, file_identity
+from processing.storage.products.images import MuellerImage, StokesImage, neighbour_correlation, require_all_elements
+from processing.storage.products.product import Product
+from processing.storage.products.provenance import Step, file_identity
 
 #: Standard error of the Mueller image's xi0 above which a pixel does not count: beyond it the largest eigenvalue is
 #: noise's choice, and biased upwards.

@@ -31,7 +31,7 @@ def from_axostep_command(
     overwrite: Overwrite = False,
 ) -> None:
     """Make Mueller products out of calibrated AxoStep images. They have no standard errors: the files hold none."""
-    from processing.storage.axostep_product import product_of_axostep
+    from processing.storage.formats.axostep_product import product_of_axostep
 
     inputs = files_of(sources, lambda path: True, "AxoStep images", (".cmmi", ".bmmi"))
     place = place_for(inputs, out)
@@ -52,8 +52,8 @@ def to_axostep_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file of that name.")] = False,
 ) -> None:
     """Write Mueller products in AxoStep's format, for the lab's own tools."""
-    from processing.storage.axostep_product import axostep_of_product
-    from processing.storage.product import Product, is_product
+    from processing.storage.formats.axostep_product import axostep_of_product
+    from processing.storage.products.product import Product, is_product
 
     def is_mueller(path: Path) -> bool:
         if not is_product(path):

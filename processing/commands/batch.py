@@ -222,8 +222,8 @@ def files_of(
 
 def captures_and(products: Iterable[str]) -> Callable[[Path], bool]:
     """For `files_of`: captures that reduce to one of these kinds of product, and products without their capture."""
-    from processing.storage.capture import Capture, made_of_captures
-    from processing.storage.product import Product, is_product
+    from processing.storage.captures.capture import Capture, made_of_captures
+    from processing.storage.products.product import Product, is_product
 
     kinds = set(products)
 

@@ -49,7 +49,7 @@ def calibrate_command(
     from processing.doors import require_distinct, require_new
     from processing.instrument.model import InstrumentModel
     from processing.reduction.instrument_of_capture import require_belongs
-    from processing.storage.capture import Capture
+    from processing.storage.captures.capture import Capture
 
     if write is not None:
         require_new(write)
@@ -100,8 +100,8 @@ def calibrate_mosaic_command(
     from processing.calibration.mosaic import fit_response
     from processing.commands.summary import summary
     from processing.reduction.instrument_of_capture import choose_model
-    from processing.storage.capture import Capture
-    from processing.storage.product import Step, file_identity
+    from processing.storage.captures.capture import Capture
+    from processing.storage.products.product import Step, file_identity
 
     product = out or capture.with_suffix(".analyzers.h5")
     with Capture(capture) as source:

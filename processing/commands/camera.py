@@ -28,7 +28,7 @@ def camera_command(
     from processing.calibration.photon_transfer import write_camera
     from processing.commands.summary import summary
     from processing.doors import require_distinct
-    from processing.storage.product import Step, file_identity
+    from processing.storage.products.product import Step, file_identity
 
     require_distinct(captures)
     product = out or captures[0].with_suffix(".camera.h5")

@@ -50,7 +50,7 @@ def diagnose_command(
     from processing.commands.loaded_late.diagnose_summary import show, write_result
     from processing.commands.progress_bar import progress_line
     from processing.diagnosis.instrument.run import diagnose_captures
-    from processing.storage.capture import full_model
+    from processing.storage.captures.capture import full_model
 
     model = full_model(captures[0], instrument)
     with progress_line("diagnose", verbose) as say:

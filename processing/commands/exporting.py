@@ -31,7 +31,7 @@ def export_command(
     from processing.export import export
     from processing.export.figure import FIGURES
     from processing.reflectance.tables import is_table
-    from processing.storage.product import Product, is_product
+    from processing.storage.products.product import Product, is_product
 
     def takes(path: Path) -> bool:
         if not is_product(path):

@@ -68,7 +68,7 @@ def register_command(
     from processing.geometry.outline import find_sphere, registered
     from processing.geometry.pose import refine_pose
     from processing.geometry.viewing import ViewingGeometry
-    from processing.storage.product import Product
+    from processing.storage.products.product import Product
     from processing.yaml_file import dump_yaml
 
     with Product(source) as product:

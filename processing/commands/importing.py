@@ -85,9 +85,9 @@ def import_command(
     """
     from processing.commands.loaded_late.import_preview import show_understood
     from processing.commands.progress_bar import progress_bar
-    from processing.storage.capture_schema import Detector
-    from processing.storage.foreign_arrays import ImportFailed
-    from processing.storage.importing import ImportRequest, import_capture, read_sample
+    from processing.storage.captures.schema import Detector
+    from processing.storage.formats.foreign_arrays import ImportFailed
+    from processing.storage.formats.importing import ImportRequest, import_capture, read_sample
 
     if gain_e_per_count is not None and gain_e_per_count <= 0:
         raise ImportFailed(f"--gain-e-per-count {gain_e_per_count:g}: must be above 0")
@@ -136,8 +136,8 @@ def colours_command(
     out: Annotated[Path | None, typer.Option(help="Folder for the captures; default: that of the capture.")] = None,
 ) -> None:
     """Split each capture of a colour sensor into one for each colour: red, green_a, green_b, blue."""
-    from processing.storage.capture import Capture, made_of_captures
-    from processing.storage.colour_split import split_colours
+    from processing.storage.captures.capture import Capture, made_of_captures
+    from processing.storage.captures.colour_split import split_colours
 
     def has_colours(path: Path) -> bool:
         if made_of_captures(path):

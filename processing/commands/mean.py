@@ -43,7 +43,7 @@ def mean_command(
     from processing.export.means_file import write_means
     from processing.maps.means import mean_of
     from processing.steps.reduction import reduced
-    from processing.storage.product import Product
+    from processing.storage.products.product import Product
 
     if out is not None:
         require_new(out)

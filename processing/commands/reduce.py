@@ -54,7 +54,7 @@ def reduce_command(
 ) -> None:
     """Invert W per pixel: Mueller image, or Stokes image of a polarization mosaic, with standard errors."""
     from processing.steps.reduction import Reduction
-    from processing.storage.capture import made_of_captures
+    from processing.storage.captures.capture import made_of_captures
 
     def step_of(capture: Path, tick: Progress) -> tuple[FileStep, None]:
         flats = tuple(flat or ())

@@ -15,7 +15,7 @@ ERRORS = ("_error", "_stderr")
 
 def summary(product: Path) -> None:
     """Print facts, warnings (stderr) and the name of a product file."""
-    from processing.storage.product import Product
+    from processing.storage.products.product import Product
 
     with Product(product) as opened:
         facts, simulated = opened.facts, opened.simulated
@@ -30,7 +30,7 @@ def summary(product: Path) -> None:
 
 def print_warnings(product: Path, head: str = "") -> None:
     """Print the warnings of a product on stderr, each after `head`."""
-    from processing.storage.product import Product
+    from processing.storage.products.product import Product
 
     with Product(product) as opened:
         for warning in opened.facts["warnings"]:
@@ -39,7 +39,7 @@ def print_warnings(product: Path, head: str = "") -> None:
 
 def one_line(product: Path) -> str:
     """What a batch prints after the name of a product: whether it is simulated, and its first median."""
-    from processing.storage.product import Product
+    from processing.storage.products.product import Product
 
     with Product(product) as opened:
         facts, simulated = opened.facts, opened.simulated

@@ -40,8 +40,8 @@ def xi0_command(
     """xi0 from a Mueller capture (coherency eigenvalues), or from less with a model (two coefficients)."""
     from processing.steps.maps import Xi0
     from processing.steps.reduction import reduced
-    from processing.storage.images import seen_elements
-    from processing.storage.product import Product
+    from processing.storage.products.images import seen_elements
+    from processing.storage.products.product import Product
 
     def step_of(source: Path, tick: Progress) -> tuple[FileStep, Found | None]:
         image = reduced(source, instrument, tick)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.errors import ProcessError
-from processing.storage.product import Product, is_product
+from processing.storage.products.product import Product, is_product
 from processing.whole_file import whole_file
 
 #: Resolution, for print.

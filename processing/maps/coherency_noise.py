@@ -9,7 +9,7 @@ from processing.polarization.cloude import coherency_eigenvalues, xi0_and_domina
 from processing.polarization.eigenvalue_noise import TRIPLE, EigenvalueNoise
 from processing.polarization.quantities import deviation_from_td
 from processing.polarization.triply_degenerate import mueller_matrix
-from processing.storage.images import MuellerImage
+from processing.storage.products.images import MuellerImage
 
 
 def coherency_noise(image: MuellerImage) -> EigenvalueNoise:

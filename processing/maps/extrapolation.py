@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from processing.maps.xi0 import dominant_model, estimate_from_stokes
 from processing.polarization import triply_degenerate
-from processing.storage.images import StokesImage
-from processing.storage.product import Plane, Product, ProductWriter, Step
+from processing.storage.products.images import StokesImage
+from processing.storage.products.product import Plane, Product, ProductWriter, Step
 
 #: Kind of the product.
 EXTRAPOLATED = "extrapolated"

@@ -22,7 +22,7 @@ from processing.polarization.propagation import Derived
 from processing.polarization.quantities import entropy
 from processing.polarization.scalar_files import scalar_quantities
 from processing.reduction.systematic import Systematic
-from processing.storage.images import MuellerImage
+from processing.storage.products.images import MuellerImage
 
 Planes = dict[str, NDArray[Any]]
 

@@ -15,8 +15,8 @@ from processing.geometry.frames import ScatteringGeometry
 from processing.geometry.viewing import ViewingGeometry
 from processing.reduction.sent_light import sent_rows
 from processing.reflectance.material_fit import MaterialFit, fit_values
-from processing.storage.images import SMALLEST, MuellerImage, StokesImage
-from processing.storage.product import Product
+from processing.storage.products.images import SMALLEST, MuellerImage, StokesImage
+from processing.storage.products.product import Product
 
 #: Points, values (K, N), rows (K, 16) and covariance (N, K, K).
 _Data = tuple[ScatteringGeometry, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]

@@ -27,9 +27,9 @@ from processing.polarization.quantities import PAPER_PAIRS
 from processing.reduction.stokes import linear_polarization, moved_polarization
 from processing.reduction.systematic import Systematic
 from processing.reflectance.shared_noise import shared_variance
-from processing.storage.images import MuellerImage, StokesImage, neighbour_correlation
-from processing.storage.pixel_mask import Mask
-from processing.storage.product import Product
+from processing.storage.products.images import MuellerImage, StokesImage, neighbour_correlation
+from processing.storage.products.pixel_mask import Mask
+from processing.storage.products.product import Product
 
 Region = tuple[slice, slice]
 Inputs = tuple[tuple[str, float], ...]

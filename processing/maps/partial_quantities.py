@@ -16,8 +16,8 @@ from processing.arrays import BoolArray
 from processing.maps.intervals import set_angles, set_ellipticity, set_magnitudes, set_systematic
 from processing.polarization import gradients
 from processing.polarization.quantities import POLARIZATIONS, NamedStokes
-from processing.storage.images import MuellerImage
-from processing.storage.product import LIT_ERRORS, ProductWriter
+from processing.storage.products.images import MuellerImage
+from processing.storage.products.product import LIT_ERRORS, ProductWriter
 
 Pairs = Mapping[str, tuple[NamedStokes, NamedStokes]]
 

@@ -41,8 +41,8 @@ from processing.polarization.quantities import PAPER_PAIRS
 from processing.polarization.scalar_files import scalar_quantities
 from processing.reduction.mueller import Progress
 from processing.reduction.systematic import INPUTS, Systematic
-from processing.storage.images import MuellerImage, require_all_elements, seen_elements
-from processing.storage.product import LIT_ERRORS, Plane, Product, ProductError, ProductWriter, Step
+from processing.storage.products.images import MuellerImage, require_all_elements, seen_elements
+from processing.storage.products.product import LIT_ERRORS, Plane, Product, ProductError, ProductWriter, Step
 
 #: Pixels of a block: gradients take 128 bytes a pixel and quantity.
 BLOCK_PIXELS = 1 << 14

@@ -18,8 +18,8 @@ from processing.maps.intervals import moves_of
 from processing.maps.partial_quantities import determined_maps, partial_block, partial_facts
 from processing.reduction.sent_light import sent_rows
 from processing.reduction.systematic import Systematic
-from processing.storage.images import SMALLEST, MuellerImage, seen_elements
-from processing.storage.product import COMPANIONS, LIT_ERRORS, Plane, Product, ProductWriter
+from processing.storage.products.images import SMALLEST, MuellerImage, seen_elements
+from processing.storage.products.product import COMPANIONS, LIT_ERRORS, Plane, Product, ProductWriter
 
 _AXIS = "from +x of the analyzer frame"
 #: By the name that the same quantity of a matrix has: the name here, and what it is.

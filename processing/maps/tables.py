@@ -18,9 +18,9 @@ from processing.reflectance.pbsdf import MUELLER, to_renderer_frames
 from processing.reflectance.shared_noise import shared_variance
 from processing.reflectance.table_axes import Layout
 from processing.reflectance.tables import ScatteringTable
-from processing.storage.images import neighbour_correlation as noise_between
-from processing.storage.images import require_all_elements
-from processing.storage.product import Product
+from processing.storage.products.images import neighbour_correlation as noise_between
+from processing.storage.products.images import require_all_elements
+from processing.storage.products.product import Product
 
 
 def xi0_samples(

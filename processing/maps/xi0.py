@@ -22,10 +22,10 @@ from processing.reduction.mosaic.methods import REACH
 from processing.reduction.mueller import Progress
 from processing.reduction.systematic import INPUTS, Systematic
 from processing.reflectance.base import load_reflectance
-from processing.storage.capture_schema import CaptureHeader
-from processing.storage.images import MuellerImage, StokesImage, require_all_elements
-from processing.storage.pixel_mask import Mask
-from processing.storage.product import Plane, Product, ProductWriter, Step
+from processing.storage.captures.schema import CaptureHeader
+from processing.storage.products.images import MuellerImage, StokesImage, require_all_elements
+from processing.storage.products.pixel_mask import Mask
+from processing.storage.products.product import Plane, Product, ProductWriter, Step
 
 #: Limits of the validity mask (docs/quantities.md, "xi0 and its interval"): on the noise, not on the outcome.
 MAX_CONDITION = 100.0

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from processing.arrays import Array
 from processing.reduction.noise import NoiseModel
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 
 #: Exposures closer than this part of themselves are one exposure: cameras set them in steps.
 SAME_EXPOSURE = 1e-3

@@ -14,8 +14,8 @@ from processing.reduction.effects_of_capture import CountsCorrection
 from processing.reduction.flat import Flat
 from processing.reduction.frame_evidence import evidence_of
 from processing.reduction.lit_darks import leaked_light, seen_so_far
-from processing.storage.capture import Capture, CaptureError
-from processing.storage.pixel_mask import Mask
+from processing.storage.captures.capture import Capture, CaptureError
+from processing.storage.products.pixel_mask import Mask
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.storage.capture import Capture, CaptureError
+from processing.storage.captures.capture import Capture, CaptureError
 
 #: Counts of zero this many standard deviations of the read-out below black are cut off, not noise.
 DEVIATIONS = 6.0

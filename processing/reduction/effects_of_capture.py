@@ -14,7 +14,7 @@ from processing.instrument.changes import Changes, Conditions, elapsed, field_te
 from processing.instrument.model import InstrumentModel
 from processing.instrument.nominal import KIND
 from processing.reduction.sample_states import states_of_sample
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 
 #: Signals below this part of full scale have the logarithm of this.
 _TINY = np.float32(1e-6)

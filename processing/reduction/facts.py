@@ -11,9 +11,9 @@ from processing.instrument.determined import determined_elements
 from processing.reduction.counts_to_signal import Correction
 from processing.reduction.noise import NoiseModel
 from processing.reduction.solvers.inversion import Inversion
-from processing.storage.capture import CaptureError
-from processing.storage.pixel_mask import Mask
-from processing.storage.product import LIT_ERRORS, ProductWriter
+from processing.storage.captures.capture import CaptureError
+from processing.storage.products.pixel_mask import Mask
+from processing.storage.products.product import LIT_ERRORS, ProductWriter
 
 #: Above this median, the model and not the noise makes the residual (the median of a good one is within 0.1 of 1).
 SUSPICIOUS_CHI_SQUARE = 1.5

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from processing.reduction.black import Black
 from processing.reduction.noise import NoiseModel
-from processing.storage.capture import Capture, CaptureError
+from processing.storage.captures.capture import Capture, CaptureError
 
 #: A response below this is a dead pixel; dividing by less would blow its noise up without end.
 LEAST_RESPONSE = 1e-3

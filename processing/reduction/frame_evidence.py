@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from processing.arrays import Array
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 
 #: Every so many-th row is compared; noise makes each row unlike any other.
 ROWS_APART = 8

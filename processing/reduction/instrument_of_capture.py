@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture, CaptureError
+from processing.storage.captures.capture import Capture, CaptureError
 
 
 def choose_model(capture: Capture, instrument: Path | None) -> InstrumentModel:

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from processing.doors import read_json
 from processing.errors import ProcessError
-from processing.storage.capture import Capture, CaptureError
+from processing.storage.captures.capture import Capture, CaptureError
 
 
 class _Entry(BaseModel):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 
 #: Part by which a light frame must rise above a dark one, both above the declared black level.
 LEAST_CONTRAST = 0.1

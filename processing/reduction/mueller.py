@@ -41,10 +41,10 @@ from processing.reduction.solvers.inversion import ELEMENTS, Inversion
 from processing.reduction.solvers.plain import MuellerSolver
 from processing.reduction.source_level import LeveledSource, SourceLevels
 from processing.reduction.systematic import Systematic
-from processing.storage.capture import Capture, CaptureError
-from processing.storage.mueller_planes import MUELLER_PLANES
-from processing.storage.pixel_mask import Mask
-from processing.storage.product import Plane, ProductWriter, Step
+from processing.storage.captures.capture import Capture, CaptureError
+from processing.storage.products.mueller_planes import MUELLER_PLANES
+from processing.storage.products.pixel_mask import Mask
+from processing.storage.products.product import Plane, ProductWriter, Step
 
 if TYPE_CHECKING:
     from processing.reduction.solvers.weighted import WeightedSolver

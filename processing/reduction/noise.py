@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import Detector
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import Detector
 
 #: Variance of rounding to whole counts, counts^2.
 QUANTIZATION = 1.0 / 12.0

@@ -16,7 +16,7 @@ from processing.arrays import BoolArray
 from processing.instrument.determined import determined_elements
 from processing.reduction.solvers.inversion import Inversion
 from processing.reduction.solvers.plain import LEAST, MuellerSolver
-from processing.storage.product import Plane
+from processing.storage.products.product import Plane
 
 PLANES = {
     "stokes": Plane((4,), "count", "Stokes vector S0 to S3 that the sample sends back for the light that it gets"),

@@ -18,7 +18,7 @@ from processing.arrays import Array
 from processing.instrument.model import InstrumentModel
 from processing.reduction.counts_to_signal import BlockReader
 from processing.reduction.solvers.inversion import Inversion
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 
 #: [pixels] From which the levels are found: they are common to all, so these are plenty.
 MOST_PIXELS = 1 << 16

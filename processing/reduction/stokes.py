@@ -28,9 +28,9 @@ from processing.reduction.mueller import Progress
 from processing.reduction.noise import NoiseModel
 from processing.reduction.sample_states import sample_states
 from processing.reduction.systematic import Systematic
-from processing.storage.capture import Capture, CaptureError
-from processing.storage.pixel_mask import Mask
-from processing.storage.product import LIT_ERRORS, Plane, ProductWriter, Step
+from processing.storage.captures.capture import Capture, CaptureError
+from processing.storage.products.pixel_mask import Mask
+from processing.storage.products.product import LIT_ERRORS, Plane, ProductWriter, Step
 
 #: The method that docs/mosaic.md found best.
 DEFAULT_METHOD = "oriented"

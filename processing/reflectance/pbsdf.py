@@ -21,7 +21,7 @@ from processing.geometry.frames import ScatteringGeometry, change_frames
 from processing.geometry.rusinkiewicz import Angles
 from processing.reflectance.table_axes import SHAPE, TableAxes
 from processing.reflectance.tables import ScatteringTable, TableError
-from processing.storage.tensor_file import create_tensor_file, read_tensor_file
+from processing.storage.formats.tensor_file import create_tensor_file, read_tensor_file
 
 MUELLER = tuple(f"m{i}{j}" for i in range(4) for j in range(4))
 #: The renderer's reader takes exactly this many wavelengths.

@@ -19,9 +19,9 @@ from processing.computing.threads import for_ranges
 from processing.errors import ProcessError
 from processing.geometry.rusinkiewicz import Angles
 from processing.reflectance.table_axes import SHAPE, Layout, TableAxes
-from processing.storage.h5_door import damage_as, mark_of, open_h5, require_dataset
-from processing.storage.nexus import add_group, add_scales, attach, declare, default_plot, describe_light
-from processing.storage.provenance import Step, read_steps, sign, write_steps
+from processing.storage.captures.nexus import add_group, add_scales, attach, declare, default_plot, describe_light
+from processing.storage.integrity.h5_door import damage_as, mark_of, open_h5, require_dataset
+from processing.storage.products.provenance import Step, read_steps, sign, write_steps
 
 #: 1 had everything in the root, without NeXus groups.
 SCHEMA_VERSION = 2

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import CaptureHeader
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import CaptureHeader
 
 
 def facts_of(capture: Capture) -> list[tuple[str, str]]:

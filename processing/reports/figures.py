@@ -21,7 +21,7 @@ from processing.reports.figure_style import (
     thin,
 )
 from processing.reports.quantities_figures import quantities_figure
-from processing.storage.product import LIT_ERRORS, Product
+from processing.storage.products.product import LIT_ERRORS, Product
 from processing.whole_file import whole_file
 
 if TYPE_CHECKING:

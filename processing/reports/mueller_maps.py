@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from processing.polarization import gradients
 from processing.reports.figure_style import CYCLIC, PANEL_PIXELS, WORST_ORIENTATION_DEG, grid_figure
-from processing.storage.images import MuellerImage
-from processing.storage.product import LIT_ERRORS, Product
+from processing.storage.products.images import MuellerImage
+from processing.storage.products.product import LIT_ERRORS, Product
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

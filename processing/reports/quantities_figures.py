@@ -11,7 +11,7 @@ from processing.polarization.quantities import PAPER_PAIRS
 from processing.polarization.scalar_files import scalar_quantities
 from processing.reports.colours import SIGNED, colours_of, upper_end
 from processing.reports.figure_style import CYCLIC, WORST_ORIENTATION_DEG, grid_figure, percentile, thin
-from processing.storage.product import COMPANIONS, Product
+from processing.storage.products.product import COMPANIONS, Product
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

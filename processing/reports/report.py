@@ -24,10 +24,10 @@ from processing.reports.figures import product_figure
 from processing.reports.mueller_maps import mueller_maps
 from processing.reports.tables import table_section
 from processing.reports.template import Figure, Section, render
-from processing.storage.capture import Capture, CaptureError
-from processing.storage.h5_door import DAMAGE, open_h5
-from processing.storage.product import Product, is_product
-from processing.storage.provenance import read_steps, steps_text
+from processing.storage.captures.capture import Capture, CaptureError
+from processing.storage.integrity.h5_door import DAMAGE, open_h5
+from processing.storage.products.product import Product, is_product
+from processing.storage.products.provenance import read_steps, steps_text
 from processing.whole_file import write_whole_text
 
 #: File types that a report takes in.

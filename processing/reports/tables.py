@@ -11,7 +11,7 @@ from processing.reflectance.table_axes import SHAPE
 from processing.reflectance.tables import ScatteringTable, table_steps
 from processing.reports.figure_style import map_figure, png
 from processing.reports.template import Figure, Section
-from processing.storage.provenance import steps_text
+from processing.storage.products.provenance import steps_text
 
 
 def table_section(path: Path) -> Section:

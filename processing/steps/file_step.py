@@ -11,7 +11,7 @@ from typing import NamedTuple
 from processing.computing.blas import one_blas_thread
 from processing.doors import require_place
 from processing.errors import ProcessError
-from processing.storage.provenance import Step, made_of
+from processing.storage.products.provenance import Step, made_of
 
 #: Called with (parts done, parts in all).
 Progress = Callable[[int, int], None]

@@ -9,8 +9,8 @@ from processing.errors import ProcessError
 from processing.geometry.viewing import ViewingGeometry
 from processing.polarization.quantities import PAPER_PAIRS, NamedStokes
 from processing.steps.file_step import FileStep, Progress, beside
-from processing.storage.product import Product
-from processing.storage.provenance import Step, file_identity
+from processing.storage.products.product import Product
+from processing.storage.products.provenance import Step, file_identity
 
 
 @dataclass(frozen=True)

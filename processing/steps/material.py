@@ -10,7 +10,7 @@ from processing.maps.material_fit import fit_products
 from processing.reflectance.material_fit import MaterialFit
 from processing.steps.file_step import OfFiles
 from processing.steps.maps import geometry_identities
-from processing.storage.provenance import Step, file_identity, input_text
+from processing.storage.products.provenance import Step, file_identity, input_text
 from processing.whole_file import write_whole_text
 from processing.yaml_file import dump_yaml
 

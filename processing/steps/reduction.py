@@ -15,9 +15,9 @@ from processing.reduction.instrument_of_capture import choose_model
 from processing.reduction.left_out import LeftOut
 from processing.reduction.mueller import Choice, reduce_mueller
 from processing.steps.file_step import FileStep, Found, Progress
-from processing.storage.capture import Capture
-from processing.storage.product import is_product
-from processing.storage.provenance import Step, file_identity
+from processing.storage.captures.capture import Capture
+from processing.storage.products.product import is_product
+from processing.storage.products.provenance import Step, file_identity
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from processing.reflectance.table_axes import Layout
 from processing.reflectance.tables import ScatteringTable, table_steps
 from processing.steps.file_step import FileStep, Progress
 from processing.steps.maps import geometry_identities
-from processing.storage.provenance import Step, content_of, file_identity
+from processing.storage.products.provenance import Step, content_of, file_identity
 
 
 @dataclass(frozen=True)

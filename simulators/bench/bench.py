@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from processing.arrays import Image
 from processing.instrument.applied_effects import changes_at
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture_schema import Detector
+from processing.storage.captures.schema import Detector
 from simulators.bench.effects.base import BenchEffect, Shot
 
 #: The IMX250 and kin, rounded: 12 bits, 10.5 ke full well, 2.3 e read noise.

@@ -10,8 +10,8 @@ import numpy as np
 
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import RGB950_RATIO, RGB950_STATES, RGB950_STEP_DEG
-from processing.storage.capture_schema import CaptureHeader, Sample, create_layout, write_closing
-from processing.storage.checksums import row_crc32, write_checksums
+from processing.storage.captures.schema import CaptureHeader, Sample, create_layout, write_closing
+from processing.storage.integrity.checksums import row_crc32, write_checksums
 from simulators.bench.bench import SimulatedBench
 
 

@@ -22,7 +22,7 @@ from processing.diagnosis.search.fit import PRIOR_WIDTH, minimize
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import ValuePerState
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from simulators.blind.bench_judge import GIVEN, active
 from simulators.blind.lab_priors import PRIORS
 from simulators.blind.mueller_error import error_of

@@ -16,7 +16,7 @@ from processing.diagnosis.search.candidate import pool
 from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from simulators.blind.undeclared_captures import BITS, BLACK, Bench
 from simulators.blind.undeclared_faults import Truth
 

@@ -14,9 +14,9 @@ from processing.arrays import Array
 from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
 from processing.reduction.mueller import reduce_mueller
-from processing.storage.capture import Capture
-from processing.storage.images import MuellerImage
-from processing.storage.product import Product
+from processing.storage.captures.capture import Capture
+from processing.storage.products.images import MuellerImage
+from processing.storage.products.product import Product
 from simulators.blind.real_bench import PATCH
 
 #: Standard errors of M / m00 times m00 that come from the instrument, where the product has them.

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture_schema import Sample
+from processing.storage.captures.schema import Sample
 from simulators.blind.detectable import expected, expected_electrons
 from simulators.blind.detector_cases import DETECTOR
 from simulators.blind.lab_priors import PRIORS, draw_kinds

@@ -16,7 +16,7 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.instrument.model import InstrumentModel, Polarizer, Retarder
-from processing.storage.capture_schema import Sample
+from processing.storage.captures.schema import Sample
 from simulators.blind.detectable import evidence, expected
 from simulators.blind.mosaic_faults import MOSAIC
 from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array, ComplexArray
-from processing.storage.capture_schema import CaptureHeader, Detector, Sample, create_layout, write_closing
+from processing.storage.captures.schema import CaptureHeader, Detector, Sample, create_layout, write_closing
 
 #: Pauli matrices in the order of docs/conventions.md.
 _PAULI = np.array([[[1, 0], [0, 1]], [[1, 0], [0, -1]], [[0, 1], [1, 0]], [[0, 1j], [-1j, 0]]], dtype=complex)

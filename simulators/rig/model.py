@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from processing.storage.capture_schema import Detector
+from processing.storage.captures.schema import Detector
 from simulators.bench.bench import DARK_CURRENT_E_PER_S, DETECTOR
 from simulators.bench.effects import AnyBenchEffect
 from simulators.camera.played.description_file import is_description

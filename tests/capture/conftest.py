@@ -17,7 +17,7 @@ from drivers.camera import CameraSettings, Frame
 from drivers.errors import FrameLost
 from drivers.motion import Position
 from processing.instrument.states import StateTable
-from processing.storage.capture_schema import Detector
+from processing.storage.captures.schema import Detector
 from simulators.clock import ManualClock
 
 MOVE_S, LATE_S = 0.75, 0.125

@@ -15,9 +15,9 @@ from acquisition.capture.state_file import LINE_BYTES, StateFile
 from acquisition.capture.writer import CaptureWriter
 from acquisition.errors import AcquisitionError
 from processing.instrument.states import StateTable
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import CLOSING_BYTES, SEGMENTS_BYTES, CaptureHeader
-from processing.storage.segments import encode_line
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import CLOSING_BYTES, SEGMENTS_BYTES, CaptureHeader
+from processing.storage.captures.segments import encode_line
 
 SHAPE, STATES = (4, 5), 3
 HEADER = CaptureHeader(title="three states", simulated=True, mode="drr", wavelength_nm=662)

@@ -32,8 +32,8 @@ from acquisition.disc import on_disc
 from acquisition.errors import AcquisitionError
 from drivers.motion import Position
 from processing.instrument.states import StateTable
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import CaptureHeader
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import CaptureHeader
 from simulators.clock import ManualClock
 
 HEADER = CaptureHeader(title="three states", simulated=True, mode="drr", wavelength_nm=662)

@@ -11,8 +11,8 @@ import pytest
 
 from drivers.cameras.aravis import AravisCamera
 from processing.commands.application import main as process
-from processing.storage.capture import Capture
-from processing.storage.images import StokesImage
+from processing.storage.captures.capture import Capture
+from processing.storage.products.images import StokesImage
 from simulators.camera.gige_camera import GigeCamera
 from simulators.rig.rig import SimulatedRig
 

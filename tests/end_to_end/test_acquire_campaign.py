@@ -6,7 +6,7 @@ import threading
 import numpy as np
 import pytest
 
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import h5py
 import numpy as np
 import pytest
 
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from simulators.camera.pixel_stamp import read_stamp
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from simulators.clock import Clock
 from simulators.rig.controller_kinds import served_kinds
 from simulators.rig.rig import SimulatedRig

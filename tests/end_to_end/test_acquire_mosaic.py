@@ -17,8 +17,8 @@ import pytest
 
 from drivers.pixel_formats import pixel_format
 from processing.commands.application import main as process
-from processing.storage.capture import Capture
-from processing.storage.images import StokesImage
+from processing.storage.captures.capture import Capture
+from processing.storage.products.images import StokesImage
 from simulators.camera.node_map import node_map
 
 Acquire = Callable[..., tuple[int, str, str]]

@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from processing.commands.application import main as process
-from processing.storage.images import MuellerImage
+from processing.storage.products.images import MuellerImage
 
 PLAN = """
 kind: plan

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from simulators.camera.pixel_stamp import read_stamp
 from simulators.rig.controller_kinds import axis_configs, served_kinds
 from simulators.serial.serve_options import ServeOptions

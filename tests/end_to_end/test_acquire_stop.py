@@ -12,7 +12,7 @@ from ruamel.yaml import YAML
 
 from acquisition.rig.config import load_rig
 from acquisition.rig.rig import Rig
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from simulators.rig.served_rig import serve
 
 #: Far enough that nothing arrives by itself while a test runs, at the emulators' speed.

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from processing.steps.reduction import Reduction
-from processing.storage.product import Product
+from processing.storage.products.product import Product
 
 STATES, SHAPE = 24, (6, 8)
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from processing.commands.application import main
-from processing.storage.images import MuellerImage
-from processing.storage.product import Product
+from processing.storage.products.images import MuellerImage
+from processing.storage.products.product import Product
 from simulators.bench.scene import Scene
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from processing.diagnosis.instrument.run import diagnose_captures
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from processing.yaml_file import parse_yaml
 from simulators.blind.judge import judge, table
 from simulators.blind.suite import make

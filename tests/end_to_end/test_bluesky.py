@@ -23,7 +23,7 @@ from event_model import DocumentNames, schema_validators
 from acquisition.bluesky_devices import open_bench
 from acquisition.bluesky_devices.capture_device import COLUMNS
 from acquisition.capture.plan import MeasurementPlan
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 
 PLAN = MeasurementPlan(omega_deg=35.0)
 BLACK_LEVEL = 64

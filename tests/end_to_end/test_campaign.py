@@ -18,7 +18,7 @@ from processing.instrument.model import InstrumentModel
 from processing.polarization.quantities import between, depolarization_index
 from processing.reflectance.base import load_reflectance
 from processing.reflectance.tables import ScatteringTable
-from processing.storage.product import Product
+from processing.storage.products.product import Product
 from simulators.bench.bench import SimulatedBench
 from simulators.bench.scene import Scene
 from simulators.bench.virtual_capture import write_virtual_capture

@@ -14,8 +14,8 @@ from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
 from processing.polarization.image_difference import linear_diattenuation, magnitude, orientation_difference, rmsd
 from processing.reflectance.base import load_reflectance
-from processing.storage.capture import Capture
-from processing.storage.product import Product
+from processing.storage.captures.capture import Capture
+from processing.storage.products.product import Product
 from simulators.bench.scene import Scene
 from simulators.blind import scene_faults
 from simulators.blind.sphere_suite import SphereFault, first_surface_of, take

@@ -11,9 +11,9 @@ import pytest
 from scipy.ndimage import binary_erosion
 
 from processing.steps.reduction import Reduction
-from processing.storage.capture import Capture
-from processing.storage.images import MuellerImage, StokesImage
-from processing.storage.product import Product
+from processing.storage.captures.capture import Capture
+from processing.storage.products.images import MuellerImage, StokesImage
+from processing.storage.products.product import Product
 from simulators.bench.scene import Scene
 
 SHAPE = (96, 112)

@@ -15,8 +15,8 @@ from processing.commands.application import main
 from processing.commands.diagnose import main as diagnose
 from processing.instrument.elements import Diattenuator, Polarizer, Retarder
 from processing.instrument.model import Channel, InstrumentModel
-from processing.storage.capture import Capture
-from processing.storage.images import MuellerImage
+from processing.storage.captures.capture import Capture
+from processing.storage.products.images import MuellerImage
 
 ROOT = Path(__file__).resolve().parents[2]
 #: A depolarizing sample whose elements are all different; Mueller rows are determined by what an instrument measures.

@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 
 from processing.reports.design import style
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 
 STATES = 1000
 

@@ -17,10 +17,10 @@ from processing.reduction import stokes
 from processing.reflectance.tables import ScatteringTable
 from processing.steps.maps import Quantities, Xi0
 from processing.steps.reduction import Reduction
-from processing.storage.capture_schema import CaptureHeader, write_closing
-from processing.storage.checksums import row_crc32, write_checksums
-from processing.storage.packed_capture import pack_capture
-from processing.storage.product import ProductWriter
+from processing.storage.captures.packed_capture import pack_capture
+from processing.storage.captures.schema import CaptureHeader, write_closing
+from processing.storage.integrity.checksums import row_crc32, write_checksums
+from processing.storage.products.product import ProductWriter
 
 STATES, SHAPE = 24, (6, 8)
 

@@ -17,10 +17,10 @@ from processing.geometry.rusinkiewicz import Angles
 from processing.labelled import open_dataset
 from processing.reflectance.tables import ScatteringTable
 from processing.steps.reduction import Reduction
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import CaptureHeader
-from processing.storage.images import MuellerImage
-from processing.storage.product import Plane, Product, ProductWriter
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import CaptureHeader
+from processing.storage.products.images import MuellerImage
+from processing.storage.products.product import Plane, Product, ProductWriter
 
 DOCS = Path(__file__).parents[2] / "docs"
 STATES, SHAPE = 24, (6, 8)

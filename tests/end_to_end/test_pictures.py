@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from processing.reports import colours, figures
-from processing.storage.capture_schema import CaptureHeader
-from processing.storage.product import Plane, Product, ProductWriter
+from processing.storage.captures.schema import CaptureHeader
+from processing.storage.products.product import Plane, Product, ProductWriter
 
 
 def disc(shape=(80, 80), radius=30):

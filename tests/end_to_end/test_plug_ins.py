@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 
 SAMPLE = Path(__file__).parents[1] / "sample_plugin"
 

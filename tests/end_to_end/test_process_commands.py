@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from processing.instrument.model import InstrumentModel
-from processing.storage.images import MuellerImage
-from processing.storage.product import Product
+from processing.storage.products.images import MuellerImage
+from processing.storage.products.product import Product
 
 Run = Callable[..., tuple[int, str, str]]
 

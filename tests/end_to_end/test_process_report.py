@@ -13,8 +13,8 @@ from processing.commands.application import main
 from processing.instrument.model import InstrumentModel
 from processing.reduction.mueller import reduce_mueller
 from processing.reports.report import collect
-from processing.storage.capture import Capture
-from processing.storage.product import Step
+from processing.storage.captures.capture import Capture
+from processing.storage.products.product import Step
 
 VISIBLE = "n => n.checkVisibility({contentVisibilityAuto: true})"
 

@@ -17,11 +17,11 @@ from processing.instrument.model import InstrumentModel
 from processing.reflectance.tables import ScatteringTable, table_steps
 from processing.steps.maps import Quantities, Xi0, geometry_identities
 from processing.steps.reduction import Reduction, reduced
-from processing.storage import provenance
-from processing.storage.capture import Capture, CaptureError
-from processing.storage.checksums import row_crc32, write_checksums
-from processing.storage.product import Product
-from processing.storage.provenance import content_of, file_identity, made_of
+from processing.storage.captures.capture import Capture, CaptureError
+from processing.storage.integrity.checksums import row_crc32, write_checksums
+from processing.storage.products import provenance
+from processing.storage.products.product import Product
+from processing.storage.products.provenance import content_of, file_identity, made_of
 from simulators.bench.bench import SimulatedBench
 from simulators.bench.scene import Scene
 from simulators.bench.virtual_capture import write_virtual_capture

@@ -15,7 +15,7 @@ import pytest
 from acquisition.commands.public_data import main
 from processing.public_data import sets
 from processing.public_data.sets import SHIPPED, PublicSet, SetFile, catalogue
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 
 NAME, COMMIT = "drr-wollaston-nir", "0123abcd"
 PAGE = Path(__file__).parents[2] / "docs" / "measured-data.md"

@@ -12,8 +12,8 @@ from processing.polarization import mueller, quantities
 from processing.polarization.cloude import coherency_eigenvalues
 from processing.polarization.decompositions.lu_chipman import lu_chipman
 from processing.polarization.triply_degenerate import mueller_matrix
-from processing.storage.axostep import read_mueller_file
-from processing.storage.product import Product
+from processing.storage.formats.axostep import read_mueller_file
+from processing.storage.products.product import Product
 
 ROWS, COLUMNS = 40, 60
 Run = Callable[..., tuple[int, str, str]]
@@ -154,7 +154,7 @@ def test_raw_axostep_frames_are_imported_without_the_closing_repeat(
         *("--instrument", configs / "instruments/rgb950.yaml", "--out", tmp_path / "c.h5"),
     )
     assert code == 0, err
-    from processing.storage.capture import Capture
+    from processing.storage.captures.capture import Capture
 
     with Capture(tmp_path / "c.h5") as capture:
         for k in (0, 17, 39):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel, SystematicError
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from simulators.blind.bench_judge import WIRING_WORDS, Judgement, names_of, told_of, wiring_of
 from simulators.blind.bench_oracle import known_oracle
 from simulators.blind.bench_run import judge_bench

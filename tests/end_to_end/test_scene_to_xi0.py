@@ -10,9 +10,9 @@ from processing.instrument.model import InstrumentModel
 from processing.maps.xi0 import xi0_of_mueller, xi0_of_stokes
 from processing.reduction.mueller import reduce_mueller
 from processing.reduction.stokes import reduce_stokes
-from processing.storage.capture import Capture
-from processing.storage.images import MuellerImage
-from processing.storage.product import Product, Step
+from processing.storage.captures.capture import Capture
+from processing.storage.products.images import MuellerImage
+from processing.storage.products.product import Product, Step
 from simulators.bench.scene import Scene
 
 GAIN, READ_NOISE, BLACK, SIZE = 2.6, 2.3, 64.0, 200

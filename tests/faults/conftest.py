@@ -115,7 +115,7 @@ def quick_rig(small_rig: Callable[..., Path]) -> Callable[..., Path]:
 @pytest.fixture
 def intact(configs: Path) -> Callable[[Path], int]:
     """Checks every state done of a capture: whole frame, true angles in its pixels; returns their number."""
-    from processing.storage.capture import Capture
+    from processing.storage.captures.capture import Capture
     from simulators.camera.pixel_stamp import read_stamp
 
     def check(path: Path) -> int:

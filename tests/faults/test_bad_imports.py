@@ -11,7 +11,7 @@ import pytest
 
 from processing.doors import MOST_PIXELS, ProcessError, require_picture
 from processing.reflectance.pbsdf import load as load_pbsdf
-from processing.storage.tensor_file import create_tensor_file
+from processing.storage.formats.tensor_file import create_tensor_file
 
 ROOT = Path(__file__).resolve().parents[2]
 INSTRUMENT = ROOT / "configs" / "instruments" / "rgb950.yaml"

@@ -12,8 +12,8 @@ from processing.doors import ProcessError, parse_json, read_text
 from processing.instrument.states import rotating_retarders
 from processing.reduction.instrument_of_capture import choose_model
 from processing.reduction.mueller import reduce_mueller
-from processing.storage.capture import Capture, CaptureError
-from processing.storage.product import Product, ProductError, Step
+from processing.storage.captures.capture import Capture, CaptureError
+from processing.storage.products.product import Product, ProductError, Step
 from processing.yaml_file import MOST_BYTES, ConfigError, load_yaml
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -6,7 +6,7 @@ import shutil
 import h5py
 import pytest
 
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 
 #: Where the campaign was taken, once, and a copy of it as it was then: its files name each other by whole paths.
 TAKEN = {}

@@ -14,7 +14,7 @@ from acquisition.errors import RunFailed
 from drivers import aravis_stream
 from drivers.camera_clock import CameraClock
 from drivers.errors import DeviceError
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from simulators.serial.reply_faults import parse_fault
 
 SHORT = {"states": {"kind": "rotating_retarders", "states": 18, "step_deg": 20, "ratio": 4.91}, "darks": 1}

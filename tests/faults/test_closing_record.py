@@ -10,8 +10,8 @@ from acquisition.capture.runner import Messages
 from acquisition.capture.writer import CaptureWriter
 from processing.instrument.states import StateTable
 from processing.reports.report import write_report
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import CaptureHeader
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import CaptureHeader
 
 HEADER = CaptureHeader(title="long", simulated=True, mode="drr", wavelength_nm=662)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from simulators.rig.served_rig import serve
 
 

@@ -14,10 +14,10 @@ from processing import doors
 from processing.commands.application import main as process
 from processing.commands.diagnose import main as diagnose
 from processing.errors import ProcessError
-from processing.storage.capture_schema import CaptureHeader, Detector
-from processing.storage.foreign_arrays import ImportFailed
-from processing.storage.importing import ImportRequest, import_capture
-from processing.storage.product import Plane, ProductError, ProductWriter
+from processing.storage.captures.schema import CaptureHeader, Detector
+from processing.storage.formats.foreign_arrays import ImportFailed
+from processing.storage.formats.importing import ImportRequest, import_capture
+from processing.storage.products.product import Plane, ProductError, ProductWriter
 
 TWICE = {
     "calibrate": (process, ["--instrument", "i.yaml", "--free", "x"]),

@@ -10,9 +10,9 @@ from acquisition.screen.observer import Observer
 from processing.commands.application import main
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.reduction.counts_to_signal import Correction
-from processing.storage.capture import Capture
-from processing.storage.checksums import state_crc32, summed_values
-from processing.storage.product import Product
+from processing.storage.captures.capture import Capture
+from processing.storage.integrity.checksums import state_crc32, summed_values
+from processing.storage.products.product import Product
 from simulators.clock import patient_clock
 
 

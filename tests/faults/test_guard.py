@@ -13,7 +13,7 @@ from acquisition.rig.config import load_rig
 from acquisition.rig.guard import Guard, with_held_ports
 from acquisition.rig.journal import Journal
 from acquisition.rig.rig import Rig
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from processing.yaml_file import dump_yaml
 from simulators.rig.served_rig import serve
 from simulators.serial.reply_faults import parse_fault

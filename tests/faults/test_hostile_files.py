@@ -19,9 +19,9 @@ from acquisition.errors import AcquisitionError
 from acquisition.rig.config import RigConfig
 from acquisition.screen.rows import say
 from acquisition.stop_request import StopRequest
-from processing.storage.capture import CaptureError
-from processing.storage.capture_schema import CaptureHeader
-from processing.storage.h5_door import read_npy
+from processing.storage.captures.capture import CaptureError
+from processing.storage.captures.schema import CaptureHeader
+from processing.storage.integrity.h5_door import read_npy
 from processing.yaml_file import ConfigError, parse_yaml
 
 SHORT = {"states": {"kind": "table", "angles": {"psg": [0.0, 10.0, 20.0]}}, "darks": 1, "mode": "stokes"}

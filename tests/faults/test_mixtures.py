@@ -17,7 +17,7 @@ from drivers.camera import CameraSettings
 from drivers.errors import DeviceError
 from processing.reduction.counts_to_signal import Correction
 from processing.reports.report import write_report
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 
 SHORT = {"states": {"kind": "rotating_retarders", "states": 18, "step_deg": 20, "ratio": 4.91}, "darks": 1}
 

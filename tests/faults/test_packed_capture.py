@@ -8,7 +8,7 @@ import pytest
 
 from acquisition.capture.state_file import StateFile
 from acquisition.errors import AcquisitionError
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 
 SHORT = {"states": {"kind": "rotating_retarders", "states": 18, "step_deg": 20, "ratio": 4.91}, "darks": 1}
 

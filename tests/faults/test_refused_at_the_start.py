@@ -9,7 +9,7 @@ import pytest
 
 from acquisition.capture.writer import bytes_needed
 from drivers.errors import DeviceError
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from simulators.rig.served_rig import serve
 
 

@@ -8,11 +8,11 @@ import pytest
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.instrument.model import InstrumentModel
 from processing.reduction.mueller import Choice, reduce_mueller
-from processing.storage.capture import Capture
-from processing.storage.foreign_arrays import ImportFailed
-from processing.storage.images import MuellerImage
-from processing.storage.importing import ImportRequest, import_capture
-from processing.storage.state_csv import read_states
+from processing.storage.captures.capture import Capture
+from processing.storage.formats.foreign_arrays import ImportFailed
+from processing.storage.formats.importing import ImportRequest, import_capture
+from processing.storage.formats.state_csv import read_states
+from processing.storage.products.images import MuellerImage
 
 HEAD = "state,psg_deg,channel_left,channel_right"
 

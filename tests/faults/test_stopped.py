@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from simulators.rig.served_rig import serve
 
 

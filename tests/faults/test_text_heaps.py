@@ -8,9 +8,9 @@ import h5py
 import pytest
 
 from processing.errors import ProcessError
-from processing.storage.capture import Capture
-from processing.storage.h5_door import mark_of, open_h5
-from processing.storage.text_heaps import endless_heap
+from processing.storage.captures.capture import Capture
+from processing.storage.integrity.h5_door import mark_of, open_h5
+from processing.storage.integrity.text_heaps import endless_heap
 
 
 def _with_texts(path: Path) -> Path:

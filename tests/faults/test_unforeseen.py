@@ -7,7 +7,7 @@ import pytest
 from acquisition.capture import session
 from acquisition.capture.operator import Operator
 from acquisition.errors import Unforeseen
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 
 SHORT = {"states": {"kind": "rotating_retarders", "states": 18, "step_deg": 20, "ratio": 4.91}, "darks": 1}
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from isal import isal_zlib
 
-from processing.storage import packed
-from processing.storage.unpacked import KeptChunks, is_packed, read_rows
+from processing.storage.integrity import packed
+from processing.storage.integrity.unpacked import KeptChunks, is_packed, read_rows
 
 SHAPE = (3, 2, 70, 40)
 

@@ -16,8 +16,8 @@ from acquisition.errors import AcquisitionError
 from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
 from processing.instrument.states import rotating_retarders
-from processing.storage.capture import Capture, CaptureError
-from processing.storage.capture_schema import CaptureHeader
+from processing.storage.captures.capture import Capture, CaptureError
+from processing.storage.captures.schema import CaptureHeader
 
 SHORT = {"states": {"kind": "rotating_retarders", "states": 18, "step_deg": 20, "ratio": 4.91}, "darks": 1}
 

@@ -17,8 +17,8 @@ from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
 from processing.public_data.conversion import StateTable, mirror_means, single_detector, tables_of
 from processing.public_data.sets import SHIPPED
-from processing.storage.capture import Capture
-from processing.storage.importing import ImportRequest, import_capture, read_sample
+from processing.storage.captures.capture import Capture
+from processing.storage.formats.importing import ImportRequest, import_capture, read_sample
 
 pytestmark = pytest.mark.measured
 

@@ -7,10 +7,10 @@ import pytest
 
 from processing.public_data.sets import SHIPPED
 from processing.reduction.stokes import reduce_stokes
-from processing.storage.capture import Capture
-from processing.storage.images import StokesImage
-from processing.storage.importing import ImportRequest, import_capture
-from processing.storage.product import Product, Step
+from processing.storage.captures.capture import Capture
+from processing.storage.formats.importing import ImportRequest, import_capture
+from processing.storage.products.images import StokesImage
+from processing.storage.products.product import Product, Step
 
 pytestmark = pytest.mark.measured
 

@@ -11,10 +11,10 @@ from processing.calibration.train import fit_trains
 from processing.instrument.model import InstrumentModel
 from processing.public_data.conversion import tables_of
 from processing.reduction.mueller import reduce_mueller
-from processing.storage.capture import Capture
-from processing.storage.images import MuellerImage
-from processing.storage.importing import ImportRequest, import_capture, read_sample
-from processing.storage.product import Step
+from processing.storage.captures.capture import Capture
+from processing.storage.formats.importing import ImportRequest, import_capture, read_sample
+from processing.storage.products.images import MuellerImage
+from processing.storage.products.product import Step
 
 pytestmark = pytest.mark.measured
 

@@ -10,9 +10,9 @@ import pytest
 from processing.polarization import gradients
 from processing.polarization.quantities import PAPER_PAIRS
 from processing.reduction.mueller import reduce_mueller
-from processing.storage.capture import Capture
-from processing.storage.images import MuellerImage
-from processing.storage.product import Step
+from processing.storage.captures.capture import Capture
+from processing.storage.products.images import MuellerImage
+from processing.storage.products.product import Step
 
 pytestmark = pytest.mark.measured
 

@@ -7,8 +7,8 @@ import numpy as np
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import Sample
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import Sample
 from simulators.blind.suite import state_angles
 from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
 

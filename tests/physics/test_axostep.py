@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from processing.storage.axostep import (
+from processing.storage.formats.axostep import (
     METADATA,
     AxoStepError,
     MuellerFile,

@@ -7,7 +7,7 @@ import pytest
 
 from processing.diagnosis.instrument.run import diagnose_captures
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture_schema import Sample
+from processing.storage.captures.schema import Sample
 from simulators.blind.real_bench import Disc
 from simulators.blind.suite import declared_bench, state_angles
 from simulators.blind.undeclared_captures import digitize, expose, write_capture

@@ -9,7 +9,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from processing import InstrumentModel, diagnose_captures
 from processing.computing.blas import one_blas_thread
-from processing.storage.capture import CaptureError
+from processing.storage.captures.capture import CaptureError
 
 
 def _blas_threads():

@@ -9,7 +9,7 @@ from processing.calibration.train import fit_trains
 from processing.commands.application import app
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 
 FREE = ["psg_retarder.azimuth_deg", "psg_retarder.retardance_deg", "psa_retarder.retardance_deg"]
 TURNED_DEG = 0.7

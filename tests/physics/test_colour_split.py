@@ -12,8 +12,8 @@ from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
 from processing.reduction.mosaic.layout import MosaicLayout
 from processing.steps.reduction import Reduction
-from processing.storage.capture import Capture, CaptureError
-from processing.storage.colour_split import split_colours
+from processing.storage.captures.capture import Capture, CaptureError
+from processing.storage.captures.colour_split import split_colours
 
 MOSAIC = np.array([["90", "45"], ["135", "0"]])
 COLOURS = np.array([["red", "green"], ["green", "blue"]])

@@ -13,8 +13,8 @@ from processing.diagnosis.instrument.residual_file import read_residuals
 from processing.diagnosis.instrument.run import diagnose_captures
 from processing.diagnosis.search.result import Diagnosis, FoundEffect
 from processing.instrument.model import EffectParameter, InstrumentModel
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import Sample
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import Sample
 from simulators.blind.suite import declared_bench, state_angles
 from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
 
@@ -252,8 +252,8 @@ def test_what_is_written_is_used_and_nothing_is_overwritten(configs, tmp_path, c
 def test_reduce_with_the_written_model_is_closer_to_the_truth(configs, tmp_path):
     from processing.diagnosis.instrument_file import write_instrument
     from processing.reduction.mueller import reduce_mueller
-    from processing.storage.images import MuellerImage
-    from processing.storage.product import Step
+    from processing.storage.products.images import MuellerImage
+    from processing.storage.products.product import Step
 
     path = capture(tmp_path, configs, Bench(dg=np.deg2rad(129.0)), air=True)
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml")

@@ -5,7 +5,7 @@ import pytest
 
 from processing.diagnosis.instrument.run import diagnose_captures
 from processing.instrument.model import InstrumentModel
-from processing.storage.importing import ImportRequest, import_capture, read_sample
+from processing.storage.formats.importing import ImportRequest, import_capture, read_sample
 from simulators.blind.suite import state_angles
 
 STATES = 24

@@ -5,7 +5,7 @@ import pytest
 
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 
 GAIN, READ, BLACK = 2.0, 6.0, 100
 ANGLES = {"psg": 4.7 * np.arange(24), "psa": 23.1 * np.arange(24)}

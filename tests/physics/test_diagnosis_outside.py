@@ -11,7 +11,7 @@ from processing.instrument.changes import Conditions
 from processing.instrument.grammar import parsed
 from processing.instrument.grammar import sentences as sentences_of
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture_schema import Sample
+from processing.storage.captures.schema import Sample
 from simulators.blind.outside_list import ghost, image_lag, lamp_jump
 from simulators.blind.real_bench import Disc
 from simulators.blind.suite import declared_bench, state_angles

@@ -15,7 +15,7 @@ from processing.diagnosis.surface.standard_errors import standard_errors
 from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
 from processing.reflectance.effects.base import ReflectanceEffect
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from simulators.bench.scattering_laws import Xi0Law
 from simulators.bench.scene import Scene
 from simulators.blind import scene_faults

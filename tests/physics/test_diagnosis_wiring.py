@@ -8,8 +8,8 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.instrument.wiring import miswired, miswired_train
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import Sample
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import Sample
 from simulators.blind.suite import state_angles
 from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
 

@@ -14,8 +14,8 @@ from processing.maps.tables import tabulate
 from processing.maps.xi0 import xi0_of_mueller
 from processing.polarization import mueller
 from processing.reduction.mueller import reduce_mueller
-from processing.storage.capture import Capture
-from processing.storage.product import Product, Step
+from processing.storage.captures.capture import Capture
+from processing.storage.products.product import Product, Step
 from processing.yaml_file import ConfigError, parse_yaml
 
 STEP = Step("test", {})

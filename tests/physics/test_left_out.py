@@ -14,11 +14,11 @@ from processing.instrument.model import AppliedEffect, EffectParameter, Instrume
 from processing.reduction.left_out import LeftOut
 from processing.reduction.mueller import reduce_mueller
 from processing.steps.reduction import Reduction
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import Sample
-from processing.storage.images import MuellerImage
-from processing.storage.pixel_mask import Mask
-from processing.storage.product import Product
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import Sample
+from processing.storage.products.images import MuellerImage
+from processing.storage.products.pixel_mask import Mask
+from processing.storage.products.product import Product
 from processing.yaml_file import dump_yaml
 from simulators.blind.detector_cases import DETECTOR
 from simulators.blind.suite import state_angles

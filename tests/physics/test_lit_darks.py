@@ -7,8 +7,8 @@ import pytest
 
 from processing.reduction.counts_to_signal import Correction
 from processing.reduction.lit_darks import LitDarks
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import Detector
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import Detector
 
 BLACK = 64.0
 SHAPE = (64, 80)

@@ -14,8 +14,8 @@ from processing.maps.means import mean_of
 from processing.polarization.quantities import depolarization_index
 from processing.reduction.mueller import reduce_mueller
 from processing.reduction.stokes import reduce_stokes
-from processing.storage.capture import Capture
-from processing.storage.product import Product
+from processing.storage.captures.capture import Capture
+from processing.storage.products.product import Product
 
 WHOLE = (slice(0, 32), slice(0, 32))
 #: Electrons a state: little light, so that means of maps of magnitudes would be off by many of their errors.

@@ -11,8 +11,8 @@ from processing.instrument.model import InstrumentModel
 from processing.reduction.mosaic.layout import MosaicError, MosaicLayout
 from processing.reduction.mosaic.methods import demosaic
 from processing.reduction.mosaic.pixel_response import corrected_frame, read_response
-from processing.storage.capture import Capture
-from processing.storage.product import Step
+from processing.storage.captures.capture import Capture
+from processing.storage.products.product import Step
 from processing.yaml_file import parse_yaml
 
 NAMES = ("0", "45", "90", "135")

@@ -9,8 +9,8 @@ import pytest
 
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import Detector
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import Detector
 
 LEVEL = {"0": 400, "45": 800, "90": 1200, "135": 1600}
 

@@ -14,7 +14,7 @@ from processing.diagnosis.instrument.diagnose import diagnose
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.instrument.effects.field_retardance import FieldRetardance
-from processing.storage.capture_schema import Sample
+from processing.storage.captures.schema import Sample
 from simulators.blind.real_bench import Disc
 from simulators.blind.suite import state_angles
 from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture

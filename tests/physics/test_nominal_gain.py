@@ -6,7 +6,7 @@ import pytest
 from processing.diagnosis.instrument.run import diagnose_captures
 from processing.diagnosis.instrument_file import write_instrument
 from processing.instrument.model import InstrumentModel
-from processing.storage.importing import ImportRequest, import_capture, read_sample
+from processing.storage.formats.importing import ImportRequest, import_capture, read_sample
 from processing.yaml_file import dump_yaml
 
 GAINS = {"45": 0.93, "90": 1.22, "135": 0.84}

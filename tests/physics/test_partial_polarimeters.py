@@ -22,11 +22,11 @@ from processing.reduction.mueller import Choice, reduce_mueller
 from processing.reflectance.base import normalized_mueller
 from processing.reports.figures import product_figure
 from processing.steps.maps import Xi0
-from processing.storage.axostep_product import axostep_of_product
-from processing.storage.capture import Capture, CaptureError
-from processing.storage.images import MuellerImage
-from processing.storage.pixel_mask import Mask
-from processing.storage.product import Product, ProductError, Step
+from processing.storage.captures.capture import Capture, CaptureError
+from processing.storage.formats.axostep_product import axostep_of_product
+from processing.storage.products.images import MuellerImage
+from processing.storage.products.pixel_mask import Mask
+from processing.storage.products.product import Product, ProductError, Step
 from processing.yaml_file import dump_yaml
 
 #: Elements that each instrument determines, and angles of its axes that do it.

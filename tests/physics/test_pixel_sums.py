@@ -12,8 +12,8 @@ from processing.diagnosis.instrument.moments import moments_of
 from processing.diagnosis.instrument.projection import add_block
 from processing.diagnosis.search.space import Sums
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import Sample
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import Sample
 from simulators.blind.suite import state_angles
 from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
 

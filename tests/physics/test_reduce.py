@@ -13,10 +13,10 @@ from processing.instrument.model import InstrumentModel
 from processing.polarization import mueller
 from processing.reduction.counts_to_signal import Correction
 from processing.reduction.mueller import reduce_mueller
-from processing.storage.capture import Capture, CaptureError
-from processing.storage.images import MuellerImage
-from processing.storage.pixel_mask import Mask
-from processing.storage.product import Product, Step
+from processing.storage.captures.capture import Capture, CaptureError
+from processing.storage.products.images import MuellerImage
+from processing.storage.products.pixel_mask import Mask
+from processing.storage.products.product import Product, Step
 
 GAIN, READ_NOISE, BLACK = 2.5, 4.0, 64.0
 STEP = Step("reduce", {"capture": "capture.h5"})
@@ -322,8 +322,8 @@ import subprocess
 import sys
 from pathlib import Path
 import processing.reduction.mueller as r
-from processing.storage.capture import Capture
-from processing.storage.product import Step
+from processing.storage.captures.capture import Capture
+from processing.storage.products.product import Step
 r.BLOCK_PIXELS = 4 * 8
 def slowly(done, total):
     print(done, flush=True)

@@ -8,8 +8,8 @@ import pytest
 from processing.calibration.photon_transfer import bad_pixels, photon_transfer, read_camera, write_camera
 from processing.errors import NotDetermined, ProcessError
 from processing.reduction.counts_to_signal import Correction, saturation
-from processing.storage.capture import Capture, CaptureError
-from processing.storage.product import Step
+from processing.storage.captures.capture import Capture, CaptureError
+from processing.storage.products.product import Step
 
 SHAPE = (120, 160)
 

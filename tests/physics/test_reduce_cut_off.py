@@ -10,8 +10,8 @@ from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
 from processing.polarization import mueller
 from processing.reduction.mueller import reduce_mueller
-from processing.storage.capture import Capture, CaptureError
-from processing.storage.images import MuellerImage
+from processing.storage.captures.capture import Capture, CaptureError
+from processing.storage.products.images import MuellerImage
 
 DETECTOR = {"gain_e_per_count": 1.0, "read_noise_e": 2.0, "black_level_counts": 100.0, "bits": 16}
 

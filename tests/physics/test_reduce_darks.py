@@ -15,9 +15,9 @@ from processing.reduction.mueller import Choice, reduce_mueller
 from processing.reduction.noise import NoiseModel
 from processing.reduction.sample_states import sample_states
 from processing.reduction.stokes import reduce_stokes
-from processing.storage.capture import Capture, CaptureError
-from processing.storage.images import MuellerImage
-from processing.storage.product import Product, Step
+from processing.storage.captures.capture import Capture, CaptureError
+from processing.storage.products.images import MuellerImage
+from processing.storage.products.product import Product, Step
 from processing.yaml_file import dump_yaml
 from simulators.bench.bench import DETECTOR, FixedScene, SimulatedBench
 from simulators.bench.effects.base import with_element

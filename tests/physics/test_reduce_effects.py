@@ -12,9 +12,9 @@ from processing.polarization import mueller
 from processing.reduction.counts_to_signal import BlockReader, Correction
 from processing.reduction.effects_of_capture import CountsCorrection
 from processing.reduction.mueller import reduce_mueller
-from processing.storage.capture import Capture
-from processing.storage.images import MuellerImage
-from processing.storage.product import Step
+from processing.storage.captures.capture import Capture
+from processing.storage.products.images import MuellerImage
+from processing.storage.products.product import Step
 from processing.yaml_file import dump_yaml
 
 SHAPE = (24, 30)

@@ -9,8 +9,8 @@ from processing.instrument.model import AppliedEffect, EffectParameter, Instrume
 from processing.reduction.mueller import reduce_mueller
 from processing.reduction.stokes import reduce_stokes
 from processing.reduction.systematic import Systematic
-from processing.storage.capture import Capture
-from processing.storage.product import Product, Step
+from processing.storage.captures.capture import Capture
+from processing.storage.products.product import Product, Step
 from processing.yaml_file import dump_yaml
 from simulators.blind.undeclared_captures import Bench
 

@@ -12,9 +12,9 @@ from processing.polarization import mueller
 from processing.polarization.physical import most_likely, nearest
 from processing.reduction.mueller import Choice, reduce_mueller
 from processing.reduction.solvers.weighted import PACKED_COLUMN, PACKED_ROW
-from processing.storage.capture import Capture
-from processing.storage.images import MuellerImage
-from processing.storage.product import Product, Step
+from processing.storage.captures.capture import Capture
+from processing.storage.products.images import MuellerImage
+from processing.storage.products.product import Product, Step
 
 GAIN, READ, BLACK = 2.5, 3.0, 64.0
 DETECTOR = {"black_level_counts": BLACK, "gain_e_per_count": GAIN, "read_noise_e": READ, "bits": 16}

@@ -18,8 +18,8 @@ from processing.reduction.solvers import plain, weighted
 from processing.reduction.solvers.inversion import Inversion
 from processing.reduction.solvers.plain import LEAST, MuellerSolver
 from processing.reduction.solvers.weighted import PACKED_COLUMN, PACKED_ROW, WeightedSolver
-from processing.storage.capture import Capture
-from processing.storage.pixel_mask import Mask
+from processing.storage.captures.capture import Capture
+from processing.storage.products.pixel_mask import Mask
 
 STATES, CHANNELS, ROWS, COLUMNS = 30, 2, 3, 25
 DARKS = 6

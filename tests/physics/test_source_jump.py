@@ -6,7 +6,7 @@ from bench_capture import bench_capture
 
 from processing.diagnosis.instrument.run import diagnose_captures
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from simulators.blind.undeclared_captures import Bench
 
 STATES, RESUMED = 40, 22

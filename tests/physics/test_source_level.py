@@ -7,9 +7,9 @@ import pytest
 from processing.instrument.model import InstrumentModel
 from processing.reduction.mueller import Choice, reduce_mueller
 from processing.reduction.noise import NoiseModel
-from processing.storage.capture import Capture
-from processing.storage.images import MuellerImage
-from processing.storage.product import Step
+from processing.storage.captures.capture import Capture
+from processing.storage.products.images import MuellerImage
+from processing.storage.products.product import Step
 from processing.yaml_file import dump_yaml
 
 HALF_WAVE = np.array([[1, 0.01, 0, 0.02], [0, 0.98, -0.1, 0], [0.01, -0.1, -0.97, 0.08], [0, 0, -0.08, -0.96]])

@@ -7,7 +7,7 @@ import pytest
 from processing.geometry.rusinkiewicz import Angles
 from processing.reflectance.table_axes import SHAPE, TableAxes
 from processing.reflectance.tables import ScatteringTable, TableError, table_steps
-from processing.storage.provenance import Step
+from processing.storage.products.provenance import Step
 
 
 def random_angles(count: int, seed: int = 0) -> Angles:

@@ -10,7 +10,7 @@ from processing.geometry.rusinkiewicz import Angles, directions
 from processing.reflectance import fresnel, pbsdf
 from processing.reflectance.base import normalized_mueller
 from processing.reflectance.tables import ScatteringTable, TableError
-from processing.storage.tensor_file import TensorFileError, create_tensor_file, read_tensor_file
+from processing.storage.formats.tensor_file import TensorFileError, create_tensor_file, read_tensor_file
 from simulators.conformance.reflectance import random_geometry
 
 

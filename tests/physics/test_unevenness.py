@@ -10,8 +10,8 @@ from processing.diagnosis.instrument.unevenness import Evenness
 from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import Sample
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import Sample
 from simulators.blind.real_bench import Disc
 from simulators.blind.suite import state_angles
 from simulators.blind.undeclared_captures import Bench, digitize, expose, write_capture

@@ -13,8 +13,8 @@ from acquisition.capture.layout import put_layout
 from acquisition.capture.state_file import StateFile
 from acquisition.capture.writer import finish
 from acquisition.errors import AcquisitionError
-from processing.storage.capture import Capture
-from processing.storage.capture_schema import CaptureHeader, create_layout
+from processing.storage.captures.capture import Capture
+from processing.storage.captures.schema import CaptureHeader, create_layout
 from viewer.library import Library
 
 

@@ -8,8 +8,8 @@ import pytest
 
 from processing.instrument.model import InstrumentModel
 from processing.steps.reduction import Reduction
-from processing.storage.importing import ImportRequest, import_capture
-from processing.storage.product import Product
+from processing.storage.formats.importing import ImportRequest, import_capture
+from processing.storage.products.product import Product
 
 
 def plane(answer):

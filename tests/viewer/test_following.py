@@ -17,7 +17,7 @@ from acquisition.screen.run_file import RunFile, begun_ticks, running_in
 from drivers.motion import Position
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 from viewer.campaigns import read_campaign, seconds_left
 from viewer.following import seen
 from viewer.jobs import Jobs

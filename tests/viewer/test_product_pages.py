@@ -10,8 +10,8 @@ from processing.maps.extrapolation import EXTRAPOLATED, PLANES
 from processing.reports.colours import colours_of, scale_of
 from processing.steps.maps import Quantities
 from processing.steps.reduction import Reduction
-from processing.storage.capture_schema import CaptureHeader, Detector
-from processing.storage.product import Plane, Product, ProductWriter
+from processing.storage.captures.schema import CaptureHeader, Detector
+from processing.storage.products.product import Plane, Product, ProductWriter
 
 
 def plane(answer):

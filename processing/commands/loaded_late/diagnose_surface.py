@@ -31,7 +31,7 @@ def diagnose_reflectance(
     from processing.diagnosis.surface.write import targets, write_surface
     from processing.geometry.viewing import ViewingGeometry
     from processing.reflectance.base import load_reflectance
-    from processing.storage.capture import full_model
+    from processing.storage.captures.capture import full_model
 
     for target in targets(write) if write is not None else ():
         require_new(target)

@@ -7,7 +7,7 @@ from itertools import islice
 import numpy as np
 import typer
 
-from processing.storage.importing import ImportRequest, understand
+from processing.storage.formats.importing import ImportRequest, understand
 
 #: Most frames in the strip and rows in the table.
 SHOWN = 12

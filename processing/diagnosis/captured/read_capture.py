@@ -22,7 +22,7 @@ from processing.reduction.frame_evidence import evidence_of
 from processing.reduction.mueller import angles_of, measurement_matrix, relative_exposure
 from processing.reduction.noise import NoiseModel
 from processing.reduction.sample_states import sample_states
-from processing.storage.capture import Capture, CaptureError
+from processing.storage.captures.capture import Capture, CaptureError
 
 #: [of the mean signal] Noise that counts are weighted with where it is not known; what it is does not matter.
 SOME_NOISE = 1e-3

@@ -14,7 +14,7 @@ from processing.diagnosis.captured.squares import means, side_for, squares
 from processing.diagnosis.search.rules import BELOW_WELL, CUT_OFF, FEW_PIXELS, MANY_VALUES, MOST_READ
 from processing.instrument.model import InstrumentModel
 from processing.reduction.counts_to_signal import Correction
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from processing.diagnosis.instrument.diagnose import Judged
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.errors import ProcessError
-from processing.storage.h5_door import DAMAGE
+from processing.storage.integrity.h5_door import DAMAGE
 from processing.whole_file import whole_file
 
 #: [1, fixed] Largest number of a file in half precision, nearly.

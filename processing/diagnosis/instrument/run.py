@@ -13,7 +13,7 @@ from processing.diagnosis.instrument.diagnose import Judged, diagnose
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.posterior import Say
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture, CaptureError
+from processing.storage.captures.capture import Capture, CaptureError
 
 
 @one_blas_thread()

@@ -42,7 +42,7 @@ from processing.instrument.effects.base import (
 )
 from processing.instrument.elements import number
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture import CaptureError
+from processing.storage.captures.capture import CaptureError
 
 #: [times] That the noise is taken from a first look at the counts before anything is weighed.
 FIRST_LOOKS = 4

@@ -30,7 +30,7 @@ from processing.reduction.counts_to_signal import Correction
 from processing.reduction.noise import NoiseModel
 from processing.reduction.sample_states import sample_states
 from processing.reflectance.base import ReflectanceModel
-from processing.storage.capture import Capture
+from processing.storage.captures.capture import Capture
 
 #: [parts, fixed] Of the object that are held out in turn, as a chessboard has them.
 FOLDS = 2

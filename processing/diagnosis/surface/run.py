@@ -13,7 +13,7 @@ from processing.diagnosis.surface.diagnose import SurfaceJudged, diagnose_surfac
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture, CaptureError
+from processing.storage.captures.capture import Capture, CaptureError
 
 
 @one_blas_thread()

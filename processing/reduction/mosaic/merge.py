@@ -13,8 +13,8 @@ from processing.reduction.counts_to_signal import Correction
 from processing.reduction.effects_of_capture import CountsCorrection
 from processing.reduction.mueller import relative_exposure
 from processing.reduction.noise import NoiseModel
-from processing.storage.capture import Capture
-from processing.storage.pixel_mask import Mask
+from processing.storage.captures.capture import Capture
+from processing.storage.products.pixel_mask import Mask
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from processing.reduction.mosaic.layout import MosaicError, MosaicLayout
 from processing.reduction.mosaic.methods import bilinear
-from processing.storage.product import Product
+from processing.storage.products.product import Product
 
 #: Rounds of the correction; each one leaves a few per cent of what was wrong before.
 ROUNDS = 4

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from processing.computing.threads import for_ranges
 from processing.reduction.solvers.field_matrix import FieldMatrix
 from processing.reduction.solvers.plain import MuellerSolver
-from processing.storage.pixel_mask import Mask
+from processing.storage.products.pixel_mask import Mask
 
 #: Pixels solved at a time, about: whole rows of the image.
 TILE = 2048

@@ -11,7 +11,7 @@ from processing.computing.threads import for_ranges
 from processing.reduction.counts_to_signal import BlockReader
 from processing.reduction.noise import NoiseModel
 from processing.reduction.solvers.inversion import TILE, Inversion
-from processing.storage.pixel_mask import Mask
+from processing.storage.products.pixel_mask import Mask
 
 #: Pixels of which some intensities are left out, solved at a time, each with its own matrix.
 REPAIR_BATCH = 4096

@@ -17,7 +17,7 @@ from processing.polarization.physical import most_likely
 from processing.reduction.noise import NoiseModel
 from processing.reduction.solvers.plain import LEAST, MuellerSolver
 from processing.reduction.solvers.weighted_kernels import ELEMENTS, PACKED, solve_range
-from processing.storage.pixel_mask import Mask
+from processing.storage.products.pixel_mask import Mask
 
 TILE = 2048
 

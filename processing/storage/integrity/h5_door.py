@@ -15,7 +15,7 @@ from numpy.lib.format import MAGIC_PREFIX
 
 from processing.doors import one_line, require_file
 from processing.errors import ProcessError
-from processing.storage.text_heaps import endless_heap
+from processing.storage.integrity.text_heaps import endless_heap
 
 #: What h5py and numpy raise over a damaged file, or one with other things in it than its marks promise.
 DAMAGE = (

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from processing.doors import require_place
-from processing.storage.axostep import AxoStepError, MuellerFile, read_mueller_file, write_mueller_file
-from processing.storage.capture_schema import CaptureHeader
-from processing.storage.images import require_all_elements
-from processing.storage.mueller_planes import MUELLER_PLANES
-from processing.storage.pixel_mask import Mask
-from processing.storage.product import Product, ProductWriter, Step, file_identity
-from processing.storage.provenance import made_of
+from processing.storage.captures.schema import CaptureHeader
+from processing.storage.formats.axostep import AxoStepError, MuellerFile, read_mueller_file, write_mueller_file
+from processing.storage.products.images import require_all_elements
+from processing.storage.products.mueller_planes import MUELLER_PLANES
+from processing.storage.products.pixel_mask import Mask
+from processing.storage.products.product import Product, ProductWriter, Step, file_identity
+from processing.storage.products.provenance import made_of
 
 
 def product_of_axostep(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from processing.storage.foreign_arrays import ImportFailed
-from processing.storage.state_csv import StatesFile
+from processing.storage.formats.foreign_arrays import ImportFailed
+from processing.storage.formats.state_csv import StatesFile
 
 #: An axis whose angles lie in a range of 2 pi or less, in steps below this, is hardly in degrees.
 STEP_DEG = 1.0

@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 from processing.computing.threads import thread_count
 from processing.doors import one_line, read_text, require_place, require_room
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture_schema import CaptureHeader, Detector, Sample, create_layout, write_closing
-from processing.storage.checksums import row_crc32, write_checksums
-from processing.storage.doubtful_units import require_degrees, require_nm
-from processing.storage.foreign_arrays import ImportFailed, frame_files
-from processing.storage.frame_files import check_stack, open_stack, read_frame
-from processing.storage.h5_door import read_npy
-from processing.storage.nexus import attach
-from processing.storage.state_csv import StatesFile, read_states
+from processing.storage.captures.nexus import attach
+from processing.storage.captures.schema import CaptureHeader, Detector, Sample, create_layout, write_closing
+from processing.storage.formats.doubtful_units import require_degrees, require_nm
+from processing.storage.formats.foreign_arrays import ImportFailed, frame_files
+from processing.storage.formats.frame_files import check_stack, open_stack, read_frame
+from processing.storage.formats.state_csv import StatesFile, read_states
+from processing.storage.integrity.checksums import row_crc32, write_checksums
+from processing.storage.integrity.h5_door import read_npy
 
 #: Called with (states done, states in all).
 Progress = Callable[[int, int], None]

@@ -22,8 +22,17 @@ from numpy.typing import NDArray
 
 from processing.doors import require_place, require_room
 from processing.errors import ProcessError
-from processing.storage.capture_schema import CaptureHeader
-from processing.storage.h5_door import (
+from processing.storage.captures.nexus import (
+    PIXEL_AXES,
+    add_group,
+    add_scales,
+    attach,
+    declare,
+    default_plot,
+    describe_light,
+)
+from processing.storage.captures.schema import CaptureHeader
+from processing.storage.integrity.h5_door import (
     OpenH5,
     closed_if_damaged,
     damage_as,
@@ -32,13 +41,12 @@ from processing.storage.h5_door import (
     require_dataset,
     text_attribute,
 )
-from processing.storage.nexus import PIXEL_AXES, add_group, add_scales, attach, declare, default_plot, describe_light
-from processing.storage.packed import Packing, create_packed, pack
-from processing.storage.provenance import Step as Step
-from processing.storage.provenance import file_identity as file_identity
-from processing.storage.provenance import jsonable, read_steps, sign, write_steps
-from processing.storage.text_heaps import endless_heap
-from processing.storage.unpacked import KeptChunks, read_rows
+from processing.storage.integrity.packed import Packing, create_packed, pack
+from processing.storage.integrity.text_heaps import endless_heap
+from processing.storage.integrity.unpacked import KeptChunks, read_rows
+from processing.storage.products.provenance import Step as Step
+from processing.storage.products.provenance import file_identity as file_identity
+from processing.storage.products.provenance import jsonable, read_steps, sign, write_steps
 
 PRODUCT_VERSION = 1
 #: Environment variable that switches compression of products off where it is 0.

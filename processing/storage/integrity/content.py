@@ -8,8 +8,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from processing.storage.checksums import NONE
-from processing.storage.h5_door import DAMAGE, mark_of
+from processing.storage.integrity.checksums import NONE
+from processing.storage.integrity.h5_door import DAMAGE, mark_of
 
 #: Bytes read at once.
 PIECE = 1 << 20

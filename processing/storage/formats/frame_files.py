@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.doors import MOST_PIXELS, one_line, require_file, require_picture
-from processing.storage.axostep import read_rmmd
-from processing.storage.foreign_arrays import ImportFailed, open_array, states_first
-from processing.storage.h5_door import damage_as, read_npy
+from processing.storage.formats.axostep import read_rmmd
+from processing.storage.formats.foreign_arrays import ImportFailed, open_array, states_first
+from processing.storage.integrity.h5_door import damage_as, read_npy
 
 
 def read_frame(file: Path) -> NDArray[Any]:

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.doors import one_line, read_text
-from processing.storage.capture_schema import NOT_AXES
-from processing.storage.foreign_arrays import ImportFailed, is_array, read_column
+from processing.storage.captures.schema import NOT_AXES
+from processing.storage.formats.foreign_arrays import ImportFailed, is_array, read_column
 
 ROLES = ("sample", "air", "dark", "flat")
 CHANNEL_PREFIX = "channel_"

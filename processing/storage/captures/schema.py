@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from processing.doors import is_line
-from processing.storage.nexus import (
+from processing.storage.captures.nexus import (
     PIXEL_AXES,
     add_group,
     add_scales,

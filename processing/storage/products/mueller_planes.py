@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from processing.storage.pixel_mask import Mask
-from processing.storage.product import Plane
+from processing.storage.products.pixel_mask import Mask
+from processing.storage.products.product import Plane
 
 MUELLER_PLANES = {
     "mueller": Plane((4, 4), "count", "Mueller matrix, row-major, not normalized"),

@@ -15,8 +15,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from processing.storage.content import without_frames_sha256
-from processing.storage.h5_door import mark_of
+from processing.storage.integrity.content import without_frames_sha256
+from processing.storage.integrity.h5_door import mark_of
 
 #: Attribute of a product's root: `Step.made_of` of its last step.
 MADE_OF = "made_of"
@@ -35,7 +35,7 @@ def program() -> str:
     A checkout changes while its version stays, and what its numbers are made with changes with it.
     """
     code = hashlib.sha256()
-    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+    for path in sorted(Path(__file__).parents[2].rglob("*.py")):
         code.update(path.read_bytes())
     return f"umov {version('umov')}, code {code.hexdigest()[:12]}"
 

@@ -16,9 +16,9 @@ import numpy as np
 
 from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
-from processing.storage.capture import Capture, CaptureError
-from processing.storage.capture_schema import STATE_COLUMNS, create_layout, write_closing
-from processing.storage.provenance import content_of, file_identity
+from processing.storage.captures.capture import Capture, CaptureError
+from processing.storage.captures.schema import STATE_COLUMNS, create_layout, write_closing
+from processing.storage.products.provenance import content_of, file_identity
 from processing.yaml_file import dump_yaml, parse_yaml
 
 Colours = tuple[tuple[str, ...], ...]

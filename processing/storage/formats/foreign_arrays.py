@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from processing.doors import one_line, require_file
 from processing.errors import ProcessError
-from processing.storage.h5_door import damage_as, open_h5, read_npy, require_dataset
+from processing.storage.integrity.h5_door import damage_as, open_h5, read_npy, require_dataset
 
 
 class ImportFailed(ProcessError):

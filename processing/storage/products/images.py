@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import BoolArray
-from processing.storage.capture_schema import CaptureHeader
-from processing.storage.product import Product, ProductError, Step
+from processing.storage.captures.schema import CaptureHeader
+from processing.storage.products.product import Product, ProductError, Step
 
 #: Relative size below which a singular value of W is rounding.
 SMALLEST = 1e-8
@@ -51,7 +51,7 @@ class MuellerImage:
     values : (4, 4, rows, columns) float32, counts, not normalized; NaN where nothing was determined.
     errors
         Same shape, standard errors; NaN where they are not known.
-    mask : (rows, columns) uint8, bits of `processing.storage.pixel_mask.Mask`.
+    mask : (rows, columns) uint8, bits of `processing.storage.products.pixel_mask.Mask`.
     residual_rms : (rows, columns), counts.
     w : (N, 16), measurement matrix, rows scaled with the exposure.
     noise_slope, noise_floor : (N,), variance of intensity n = slope * signal + floor; NaN where noise is not known.
@@ -311,7 +311,7 @@ class StokesImage:
     values : (3, rows, columns) float32, S0, S1, S2 in counts; NaN where masked.
     covariance : (rows, columns, 3, 3), counts^2.
     w, analyzers : (channels, 16) and (channels, 3), from the Mueller matrix and from S to intensities.
-    mask : (rows, columns) uint8, bits of `processing.storage.pixel_mask.Mask`.
+    mask : (rows, columns) uint8, bits of `processing.storage.products.pixel_mask.Mask`.
     neighbour_correlation : (2 R + 1, 2 R + 1), of the noise of S1 and S2 between pixels, by rows and columns.
     """
 

@@ -6,8 +6,8 @@ import h5py
 import numpy as np
 
 from processing.doors import MOST_PIXELS
-from processing.storage.capture_schema import STATE_COLUMNS, CaptureHeader
-from processing.storage.h5_door import MOST_STATES, require_dataset
+from processing.storage.captures.schema import STATE_COLUMNS, CaptureHeader
+from processing.storage.integrity.h5_door import MOST_STATES, require_dataset
 
 STATUSES = ("running", "complete", "aborted", "failed")
 #: Columns that the first version of the format did not have.

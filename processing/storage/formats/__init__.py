@@ -1,0 +1,1 @@
+"""Files of other programs: tables of states, pictures, stacks, AxoStep, Mitsuba."""

@@ -1,0 +1,1 @@
+"""Product files: planes, masks, images read back, provenance."""
