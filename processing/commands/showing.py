@@ -18,7 +18,7 @@ def register(app: typer.Typer) -> None:
 def show_command(
     instrument: Annotated[Path, typer.Argument(help="Instrument file, as `diagnose --write` makes it.")],
     wavelength_nm: Annotated[
-        float | None, typer.Option(help="Wavelength at which the change of M is taken; default: the file's first.")
+        float | None, typer.Option(help="Wavelength at which the change of M is taken; default: each value's own.")
     ] = None,
 ) -> None:
     """List what `diagnose` found: values, standard errors, the captures they hold for, and their change of M."""
@@ -32,8 +32,9 @@ def show_command(
     for one in found:
         change = "its change of M depends on the capture"
         if one.change is not None:
-            change = f"changes M/m00 of air by {one.change:.2g} rms{', each standard error' if one.fitted else ''}"
+            what = "one standard error" if one.fitted else "it"
+            change = f"{what} changes M/m00 of air by {one.change:.2g} rms"
         typer.echo(f"{one.name}: {one.value}")
-        typer.echo(f"  {one.scope}; {change}")
+        typer.echo(f"  holds for {one.scope}; {change}")
     for error in model.systematic:
         typer.echo(f"still uncertain: M/m00 by {error.rms_over_m00:.2g} rms, in {len(error.directions)} directions")

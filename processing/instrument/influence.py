@@ -11,7 +11,7 @@ from processing.arrays import Array
 from processing.effect import EffectError
 from processing.instrument.applied_effects import changes_of, instrument_effects
 from processing.instrument.changes import Conditions
-from processing.instrument.determined import determined_basis
+from processing.instrument.determined import LEAST, determined_basis
 from processing.instrument.effects.base import CountsEffect
 from processing.instrument.elements import Dispersive, number
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
@@ -47,14 +47,15 @@ def influences(
 
     Parameters
     ----------
-    wavelength_nm : at which the change of M is taken; default: the first of the file.
+    wavelength_nm : at which the change of M is taken; default: of each effect its own, else the first of the file.
     conditions : states of a capture; default: states of no regularity.
 
     Raises
     ------
     WavelengthError : the file has no values at this wavelength.
     """
-    nm = wavelength_nm or (model.wavelengths_nm or (0.0,))[0]
+    own = [e.wavelength_nm for e in model.effects if e.wavelength_nm is not None]
+    nm = wavelength_nm or (*(model.wavelengths_nm or ()), *own, 0.0)[0]
     at = model.at(nm)
     where = conditions or _some_states(at, STATES)
     out = []
@@ -65,15 +66,15 @@ def influences(
         )
         change = _change(at, (*at.effects, shift), at.effects, where)
         value = _numbers(model.value_of(name), stderr)
-        out.append(Influence(name, value, "later captures, all wavelengths", change, fitted=True))
+        out.append(Influence(name, value, "later captures at all wavelengths", change, fitted=True))
     for effect in model.effects:
-        out.append(Influence(_name(effect), _values(effect), _scope(effect), _change_by(at, effect, nm, where)))
+        there = at if wavelength_nm or effect.wavelength_nm is None else model.at(effect.wavelength_nm)
+        out.append(Influence(_name(effect), _values(effect), _scope(effect), _change_by(there, effect, where)))
     return out
 
 
-def _change_by(model: InstrumentModel, effect: AppliedEffect, nm: float, where: Conditions) -> float | None:
-    elsewhere = effect.wavelength_nm is not None and abs(effect.wavelength_nm - nm) >= 0.5
-    if elsewhere or isinstance(instrument_effects().get(effect.kind), CountsEffect):
+def _change_by(model: InstrumentModel, effect: AppliedEffect, where: Conditions) -> float | None:
+    if effect not in model.effects or isinstance(instrument_effects().get(effect.kind), CountsEffect):
         return None
     here = effect.model_copy(update={"scope": "instrument"})
     others = tuple(e for e in model.effects if e != effect and e.scope == "instrument")
@@ -90,16 +91,17 @@ def _change(
     except (EffectError, ValueError):
         # A value for each state of another capture.
         return None
-    air = np.eye(4).reshape(16)
+    air = basis @ (basis.T @ np.eye(4).reshape(16))
+    w, shift = rows[1] @ basis, (rows[0] - rows[1]) @ air
     if model.projects_source:
-        signal = [w @ air for w in rows]
-        level = np.sum(signal[0] * signal[1], axis=1) / np.sum(signal[1] ** 2, axis=1)
-        rows[1] = rows[1] * level[:, None, None]
-    new, old = (w.reshape(-1, 16) @ basis for w in rows)
-    moved = basis @ (np.linalg.pinv(old) @ (new @ basis.T @ air)) - basis @ (basis.T @ air)
-    scale = float((basis @ basis.T @ air)[0])
-    moved = moved - moved[0] * (basis @ basis.T @ air) / scale
-    return float(np.sqrt(np.sum(moved**2) / max(basis.shape[1] - 1, 1)) / scale)
+        # Levels of the source are free: what moves both channels alike moves them.
+        level = rows[1] @ air
+        level /= np.linalg.norm(level, axis=1, keepdims=True)
+        w = w - level[..., None] * np.sum(level[..., None] * w, axis=1, keepdims=True)
+        shift = shift - level * np.sum(level * shift, axis=1, keepdims=True)
+    moved = basis @ np.linalg.lstsq(w.reshape(-1, basis.shape[1]), shift.ravel(), rcond=LEAST)[0]
+    moved = moved - moved[0] * air / air[0]
+    return float(np.sqrt(np.sum(moved**2) / max(basis.shape[1] - 1, 1)) / air[0])
 
 
 def _rows(model: InstrumentModel, effects: tuple[AppliedEffect, ...], where: Conditions) -> Array:
@@ -127,9 +129,9 @@ def _values(effect: AppliedEffect) -> str:
 
 
 def _scope(effect: AppliedEffect) -> str:
-    wavelengths = "all wavelengths" if effect.wavelength_nm is None else "this wavelength"
+    wavelengths = "at all wavelengths" if effect.wavelength_nm is None else f"at {effect.wavelength_nm:g} nm"
     if effect.scope == "instrument":
-        return f"later captures, {wavelengths}"
+        return f"later captures {wavelengths}"
     return f"{' and '.join(effect.captures)} alone, {wavelengths}"
 
 

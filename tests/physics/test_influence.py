@@ -41,8 +41,19 @@ def test_the_command_says_for_which_captures(written, tmp_path):
     path.write_text(dump_yaml(written), encoding="utf-8")
     shown = CliRunner().invoke(app, ["show", str(path), "--wavelength-nm", "662"])
     assert shown.exit_code == 0, shown.output
-    assert "air alone, this wavelength" in shown.output
-    assert "later captures, this wavelength" in shown.output
-    assert "later captures, all wavelengths" in shown.output
+    assert "holds for air alone, at 662 nm" in shown.output
+    assert "holds for later captures at 662 nm" in shown.output
+    assert "holds for later captures at all wavelengths; one standard error changes M" in shown.output
     assert "-0.53" in shown.output
     assert "0.020" in shown.output
+
+
+def test_without_a_wavelength_each_effect_is_taken_at_its_own(configs):
+    train = InstrumentModel.load(configs / "instruments/drr_wollaston.yaml")
+    at = (
+        effect("psg_extinction", "psg_polarizer", unit="1", extinction=0.004, wavelength_nm=nm) for nm in (1200, 1300)
+    )
+    first, second = influences(train.model_copy(update={"effects": tuple(at)}))
+    # A polarizer of 1 : 250 takes 0.8 % from nine elements of M, three of which air has.
+    assert first.change == pytest.approx(0.008 * (3 / 15) ** 0.5, rel=0.1)
+    assert second.change == pytest.approx(first.change, rel=1e-6)
