@@ -39,6 +39,19 @@ def test_light_that_leaks_scatters_and_an_offset_does_not(configs, tmp_path, lea
     assert gain < -REFUTED if leaks else gain > REFUTED
 
 
+@pytest.mark.parametrize("size", [-0.05, 0.05])
+def test_counts_scatter_as_the_bend_says_that_made_them(configs, tmp_path, size):
+    """A bend stretches the photon noise with the counts, whether it compresses them or not."""
+    bench = Bench(rows=2 * SIDE, columns=2 * SIDE, electrons=9000.0)
+    bench.transfer.append(lambda electrons: electrons * (1 - size * electrons / 10_000))
+    model, data = captured(tmp_path, configs, bench)
+    problem = InstrumentProblem(model, [data], folds=1)
+    bend = next(c for c in problem.pool() if c.kind == "detector_nonlinearity")
+    full_scale = data.conditions.full_scale * bench.gain
+    value = np.array([size * full_scale / 10_000])
+    assert scatter_prefers(problem, Space((bend,)), value, {bend: value}, {}) > REFUTED
+
+
 def test_what_a_fit_leaves_of_the_optics_is_no_noise(configs, tmp_path):
     bench = Bench(rows=SIDE, columns=SIDE, electrons=6000.0)
     bench.dg += np.deg2rad(15)

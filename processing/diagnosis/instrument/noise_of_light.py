@@ -14,7 +14,7 @@ from processing.arrays import Array, BoolArray
 from processing.diagnosis.captured.capture_data import CaptureData, Correct, for_strips
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import add_response
-from processing.diagnosis.instrument.undone import undoing
+from processing.diagnosis.instrument.undone import exactly_undone, undoing
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.range_of import range_of
 from processing.diagnosis.search.rules import NOISE_LEVEL
@@ -33,11 +33,16 @@ def scatter_prefers(problem: InstrumentProblem, space: Space, values: Array, new
     """
     problem.relinearize(space, values)
     near, local = problem.near(space, values)
+    there = exactly_undone(space, values, pointwise=True)
     gain = pairs = 0.0
     for k, (data, still) in enumerate(zip(near.captures, problem.still, strict=True)):
         if still.noise_estimated or still.told_of_noise:
             continue
         rest, free = _rest(near, k, space, local)
+        if there:
+            # What is undone stretches the residual with the counts; their noise is that of counts as they were stored.
+            _, slope = undoing(still, there)(still.signal.astype(float))
+            rest /= np.broadcast_to(slope, still.signal.shape).reshape(rest.shape)
         share, good = free * near.moments[k].left, data.usable & ~data.clipped
         before, after = (
             _log_scatter(still, rest, share, near.moments[k].counts, good, undoing(still, undone))
