@@ -7,16 +7,15 @@ import numpy as np
 import pytest
 from scipy.special import betaln
 
+from processing.diagnosis.search.averages import sample, stay
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.descent import descend
 from processing.diagnosis.search.likely_set import likely_set
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import FEW_CAUSES, TAU, TAU_WEIGHT
-from processing.diagnosis.search.sampling import sample
 from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets, State
 from processing.diagnosis.search.space import Space
-from processing.diagnosis.search.stays import stay
 from processing.effect import Parameter
 from processing.instrument.effects.rotation_slip import RotationSlip
 

@@ -10,8 +10,7 @@ from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import Projected
 from processing.diagnosis.instrument.slopes import slopes_of_rows
-from processing.diagnosis.instrument.tile_features import features_of_tiles
-from processing.diagnosis.instrument.tile_rows import tile_columns
+from processing.diagnosis.instrument.tiles import features_of_tiles, tile_columns
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import FIELD_TERMS
 from processing.instrument.model import AppliedEffect, EffectParameter

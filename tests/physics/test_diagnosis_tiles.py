@@ -10,10 +10,7 @@ from steady_capture import steady_capture
 from processing.diagnosis.instrument.features import FEATURES
 from processing.diagnosis.instrument.moments import moments_of
 from processing.diagnosis.instrument.projection import add_block
-from processing.diagnosis.instrument.tile_features import features_of_tiles
-from processing.diagnosis.instrument.tile_rows import tile_columns
-from processing.diagnosis.instrument.tile_slopes import TileSlopes
-from processing.diagnosis.instrument.tile_sums import add_tiles
+from processing.diagnosis.instrument.tiles import TileSlopes, add_tiles, features_of_tiles, tile_columns
 from processing.diagnosis.search.rules import FOLDS_OF_TILES
 from processing.diagnosis.search.space import Sums
 from processing.instrument.changes import Changes, field_terms

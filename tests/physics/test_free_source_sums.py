@@ -9,8 +9,7 @@ from steady_capture import steady_capture
 from processing.diagnosis.instrument.features import FEATURES
 from processing.diagnosis.instrument.moments import moments_of
 from processing.diagnosis.instrument.projection import add_block
-from processing.diagnosis.instrument.tile_slopes import TileSlopes
-from processing.diagnosis.instrument.tile_sums import add_tiles
+from processing.diagnosis.instrument.tiles import TileSlopes, add_tiles
 from processing.diagnosis.search.space import Sums
 
 CHANNELS, STATES, VALUES = 3, 6, 4

@@ -1,14 +1,16 @@
-"""Hits (cosmic rays, bit errors) and bad pixels: what stands out of its own pixel, or of the pixels around.
+"""Outliers of a capture: bad frames, hits (cosmic rays, bit errors) and bad pixels.
 
-The model, and what the residual of the whole image has in common, are taken away first: any fault of the instrument
-that is linear in the light goes with them. A hit is one intensity that is far from what the other states of its pixel
-say; a bad pixel is noisier than its neighbours in all states. At an edge that moves, neighbours and other states are as
-far off, and nothing stands out.
+The model, and what the residual of the whole image has in common, are subtracted first. They contain any fault of the
+instrument that is linear in the light. A hit is one intensity that differs from the prediction of the other states of
+its pixel. A bad pixel is noisier than its neighbours in all states. A bad frame is a state that the others do not
+predict, or two states in each other's place.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,20 +18,188 @@ from scipy import ndimage
 
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
-from processing.diagnosis.captured.common_rest import Whitened, robust_scale
+from processing.diagnosis.search.range_of import inside_and_outside, range_of
 from processing.diagnosis.search.rules import (
+    AGAINST_NEXT,
     ALSO_BAD,
     BAD_DEVIATIONS,
     BAD_PIXEL,
+    BEYOND_NOISE,
     BRIGHTEST,
+    CUT_BACK,
     DIMMEST,
     FEWEST_FOR_HITS,
     FEWEST_FREE_FOR_HITS,
     HIT,
+    LEAST_MISFIT,
+    MOST_BAD_FRAMES,
     MOST_HITS,
     MOST_STRUCK,
+    MOSTLY,
     SIDE_AROUND,
+    SUSPECTS_OF_EXCHANGE,
+    UNPREDICTED,
 )
+
+#: [standard deviations, fixed] Median of absolute values of normal ones.
+NORMAL_MAD = 0.6745
+#: [pixels] That tell a standard deviation to half a percent.
+PIXELS_OF_SCALE = 50_000
+#: [of the largest] Least variance of a row in whose units it is: that of none is zero.
+LEAST_LEVEL = 1e-3
+
+
+@dataclass(frozen=True)
+class Whitened:
+    """Some pixels of a capture, every row in units of its noise.
+
+    Attributes
+    ----------
+    y : (L, P) intensities of the rows that count; variance : (L, P), one on average.
+    level : (L,) noise of each row in full scales; inside : (L, K), outside : (L, free) orthonormal directions that the
+        unknowns of a pixel reach, and do not reach.
+    """
+
+    y: NDArray[np.float32]
+    variance: NDArray[np.float32]
+    level: Array
+    inside: Array
+    outside: Array
+
+    @classmethod
+    def of(cls, data: CaptureData, a: Array, good: NDArray[np.bool_]) -> Whitened:
+        """Pixels `good` (rows, columns) against rows a (L, K) of the model."""
+        rows, keep = data.values_per_pixel, data.row_counts
+        y = data.signal.reshape(rows, -1)[np.ix_(keep, good.reshape(-1))]
+        variance = data.variance_of(good).reshape(rows, -1)[keep].astype(np.float32)
+        mean = np.mean(variance, axis=1, dtype=float)
+        level = np.sqrt(np.maximum(mean, LEAST_LEVEL * mean.max()))
+        y /= level[:, None].astype(np.float32)
+        variance /= (level[:, None] ** 2).astype(np.float32)
+        return cls(y, variance, level, *inside_and_outside(a[keep] / level[:, None]))
+
+    def rest(self, clean: NDArray[np.bool_]) -> Array:
+        """Projection (L, L) on what neither the model reaches nor the residual of the `clean` pixels has in common."""
+        outside = self.outside.astype(np.float32)
+        r = outside @ (outside.T @ (self.y if clean.all() else self.y[:, clean]))
+        scale = robust_scale(r).astype(np.float32)
+        inner = (outside.T @ np.clip(r, -CUT_BACK * scale, CUT_BACK * scale, out=r)).astype(float)
+        value, vector = np.linalg.eigh(inner @ inner.T / inner.shape[1])
+        # Largest eigenvalue of noise over the median one (Marchenko and Pastur).
+        edge = BEYOND_NOISE * (1 + np.sqrt(len(value) / inner.shape[1])) ** 2
+        # At least half of the directions are left to tell what noise is.
+        half = len(value) // 2
+        structure = self.outside @ vector[:, half:][:, value[half:] > edge * np.median(value)]
+        return np.asarray(self.outside @ self.outside.T - structure @ structure.T)
+
+
+def robust_scale(r: NDArray[np.floating]) -> Array:
+    """Robust standard deviation (L, 1) of every row; of many pixels some tell it."""
+    r = r[:, :: r.shape[1] // PIXELS_OF_SCALE + 1]
+    return np.asarray(np.maximum(np.median(np.abs(r), axis=1, keepdims=True) / NORMAL_MAD, 1e-12))
+
+
+@dataclass(frozen=True)
+class BadFrame:
+    """A state that belongs to nothing, and the rms of its misfit relative to the signal of all states.
+
+    `instead` is the state in whose place its frame is.
+    """
+
+    state: int
+    misfit: float
+    instead: int | None = None
+
+
+def bad_frames(data: CaptureData, a: Array) -> tuple[BadFrame, ...]:
+    """States that the others do not predict, or else two in each other's place, against rows a (L, K) of the model.
+
+    Faults of the model make many states misfit, none by itself.
+    """
+    states, channels = data.signal.shape[:2]
+    good = data.usable & ~data.clipped
+    if not good.any():
+        return ()
+    y = data.signal[:, :, good].reshape(data.values_per_pixel, -1).astype(np.float64)
+    noise = data.variance_of(good).mean(axis=2).reshape(-1)
+    bright = float(np.mean(y**2))
+    moments = _Moments(y @ y.T / y.shape[1] / bright, noise * data.noise_known / bright, a, channels)
+    left = [k for k in range(states) if data.row_counts[k * channels]]
+    found: list[BadFrame] = []
+    before = moments.suspect(left)
+    while before is not None and len(found) < MOST_BAD_FRAMES * states:
+        rest = [k for k in left if k != before.state]
+        after = moments.suspect(rest)
+        if after is None or before.misfit < LEAST_MISFIT or before.misfit**2 < AGAINST_NEXT * after.misfit**2:
+            break
+        if moments.left(rest) > (1 - MOSTLY) * moments.left(left):
+            break
+        found.append(before)
+        left, before = rest, after
+    return tuple(found) or moments.exchanged(left)
+
+
+class _Moments:
+    """Second moments (L, L) of the signal over its mean square, and how a fit to some states leaves them."""
+
+    def __init__(self, products: Array, noise: Array, a: Array, channels: int) -> None:
+        self._products, self._noise, self._a, self._channels = products, noise, a, channels
+
+    def _rows(self, states: Sequence[int]) -> NDArray[np.int64]:
+        return (np.asarray(states)[:, None] * self._channels + np.arange(self._channels)).reshape(-1)
+
+    def _outside(self, rows: NDArray[np.int64]) -> Array:
+        q = range_of(self._a[rows])
+        return np.asarray(np.eye(len(rows)) - q @ q.T)
+
+    def _fitted(self, states: Sequence[int]) -> tuple[Array, Array]:
+        """What (L', L') a fit to some states leaves of their rows, and their second moments (L', L') beyond noise."""
+        rows = self._rows(states)
+        return self._outside(rows), self._products[np.ix_(rows, rows)] - np.diag(self._noise[rows])
+
+    def left(self, states: Sequence[int]) -> float:
+        """Mean square beyond noise that a fit to some states leaves, summed over the states."""
+        p, beyond = self._fitted(states)
+        return max(float(np.sum(p * beyond)), 1e-300)
+
+    def suspect(self, states: Sequence[int]) -> BadFrame | None:
+        """The state that differs most from what the others predict; None where they do not predict any."""
+        p, signal = self._fitted(states)
+        beyond = p @ signal @ p
+        c = self._channels
+        worst = None
+        for j, state in enumerate(states):
+            mine = slice(j * c, (j + 1) * c)
+            free = p[mine, mine]
+            # A residual, over what is free of the state, is its difference from the prediction by the others.
+            if np.linalg.cond(free) > UNPREDICTED:
+                continue
+            back = np.linalg.inv(free)
+            misfit = float(np.sqrt(max(np.trace(back @ beyond[mine, mine] @ back.T), 0.0) / c))
+            if worst is None or misfit > worst.misfit:
+                worst = BadFrame(state, misfit)
+        return worst
+
+    def exchanged(self, states: Sequence[int]) -> tuple[BadFrame, ...]:
+        """The two of which each fits in the other's place, and most of what is left over goes; or none."""
+        p, beyond = self._fitted(states)
+        least, pair = (1 - MOSTLY) * self.left(states), None
+        where = np.arange(len(p)).reshape(len(states), self._channels)
+        worst = np.argsort(-np.diag(p @ beyond @ p).reshape(where.shape).sum(axis=1))[:SUSPECTS_OF_EXCHANGE]
+        for i, j in combinations(sorted(worst.tolist()), 2):
+            order = where.copy()
+            order[[i, j]] = order[[j, i]]
+            left = float(np.sum(p * beyond[np.ix_(order.reshape(-1), order.reshape(-1))]))
+            if left < least:
+                least, pair = left, (i, j)
+        if pair is None:
+            return ()
+        first, second = (where[k] for k in pair)
+        apart = beyond[first, first] + beyond[second, second] - 2 * beyond[first, second]
+        misfit = float(np.sqrt(max(apart.mean(), 0.0)))
+        i, j = (states[k] for k in pair)
+        return (BadFrame(i, misfit, j), BadFrame(j, misfit, i)) if misfit >= LEAST_MISFIT else ()
+
 
 #: [of the variance of a state] Least part that a fit leaves of it: that of none is zero.
 LEAST_FREE = 1e-6

@@ -12,11 +12,9 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.captured.averaged import averaged_for_fits
-from processing.diagnosis.captured.bad_frames import bad_frames
 from processing.diagnosis.captured.capture_data import CaptureData, LeftOut
-from processing.diagnosis.captured.checked_noise import checked_noise
-from processing.diagnosis.captured.noise_estimate import estimated_noise
-from processing.diagnosis.captured.outliers import outliers_of, without
+from processing.diagnosis.captured.noise import checked_noise, estimated_noise
+from processing.diagnosis.captured.outliers import bad_frames, outliers_of, without
 from processing.diagnosis.captured.read_capture import without_dark_pixels
 from processing.diagnosis.captured.steep_pixels import without_steep_pixels
 from processing.instrument.applied_effects import changes_of

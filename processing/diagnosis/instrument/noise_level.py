@@ -14,8 +14,7 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
-from processing.diagnosis.captured.checked_noise import noise_factors
-from processing.diagnosis.captured.detector_noise import DetectorNoise, detector_noise
+from processing.diagnosis.captured.noise import DetectorNoise, detector_noise, noise_factors
 from processing.diagnosis.instrument.undone import undoing
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.rules import GAIN_OFF, NOISE_OFF

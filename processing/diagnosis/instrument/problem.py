@@ -27,9 +27,7 @@ from processing.diagnosis.instrument.moments import (
 from processing.diagnosis.instrument.noise_level import with_noise_of_light
 from processing.diagnosis.instrument.projection import add_block, noise_information
 from processing.diagnosis.instrument.slopes import Columns, slopes_of_counts, slopes_of_rows
-from processing.diagnosis.instrument.tile_rows import tile_columns
-from processing.diagnosis.instrument.tile_slopes import slopes_of_tiles
-from processing.diagnosis.instrument.tile_sums import add_tiles
+from processing.diagnosis.instrument.tiles import add_tiles, slopes_of_tiles, tile_columns
 from processing.diagnosis.instrument.undone import distance, exactly_undone, movable, undoing
 from processing.diagnosis.search.candidate import Candidate, SourceLevel, nominal_values, pool
 from processing.diagnosis.search.range_of import range_of

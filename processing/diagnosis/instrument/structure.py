@@ -14,7 +14,7 @@ from processing.diagnosis.instrument.features import MARGIN, inside
 from processing.diagnosis.instrument.pixel_sums import Pixels
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import add_response
-from processing.diagnosis.instrument.tile_rows import tile_columns
+from processing.diagnosis.instrument.tiles import tile_columns
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.judge import beyond_chance
 from processing.diagnosis.search.linearized import deviation_of

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
+from processing.diagnosis.search.averages import Samples, sample
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.problem import Problem
 from processing.diagnosis.search.rules import NOMINAL_TAU, SAMPLES_BEFORE, SETTLED, TAKES_PART
-from processing.diagnosis.search.sampling import Samples, sample
 from processing.diagnosis.search.sets import Group, Noise, Sets, State
 from processing.diagnosis.search.space import Space, Sums
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from processing.arrays import Array
+from processing.diagnosis.search.averages import Samples
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.fit import Fit, minimize
 from processing.diagnosis.search.likely_set import retune
@@ -20,7 +21,6 @@ from processing.diagnosis.search.linearized import grouped, noise_of, quadratic
 from processing.diagnosis.search.posterior import Posterior, Say
 from processing.diagnosis.search.problem import Problem
 from processing.diagnosis.search.rules import BOUND, ENOUGH, EXPLAINS, HOPE, IMITATES, LEADERS
-from processing.diagnosis.search.sampling import Samples
 from processing.diagnosis.search.sets import Group, Sets, State
 from processing.diagnosis.search.space import Space
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from processing.arrays import Array
+from processing.diagnosis.search.averages import Samples, sample, stay
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.descent import STEPS, all_at_once, improved, mean_over_sets, minimum_of, next_values
 from processing.diagnosis.search.down_to_noise import down_to_noise
@@ -31,10 +32,8 @@ from processing.diagnosis.search.rules import (
     SHRUNK,
     TAU,
 )
-from processing.diagnosis.search.sampling import Samples, sample
 from processing.diagnosis.search.sets import Group, Noise, Sets, State
 from processing.diagnosis.search.space import Space, Sums
-from processing.diagnosis.search.stays import stay
 from processing.instrument.effects.base import PointwiseEffect
 
 #: Called with a line that says what is being done.

@@ -1,0 +1,459 @@
+"""The noise of a capture: as declared, unless its own images show another; estimated where nothing is declared.
+
+The model's rows, and what the residual of all pixels has in common, are subtracted. Differences of pixels a few apart
+then have twice the variance of the noise, whatever the instrument does. How that depends on distance, direction and
+light distinguishes the kinds of noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from processing.arrays import Array
+from processing.diagnosis.captured.capture_data import CaptureData, SharedNoise
+from processing.diagnosis.captured.outliers import NORMAL_MAD, Whitened
+from processing.diagnosis.search.range_of import inside_and_outside, range_of
+from processing.diagnosis.search.rules import (
+    AS_GOOD,
+    DARK_NOISE_OFF,
+    DIM,
+    FEW_ROWS,
+    FEWEST_DIM,
+    FEWEST_FREE_FOR_NOISE,
+    LEAST_DARK,
+    LEAST_LIT,
+    LEAST_SCATTER,
+    LINES_APART,
+    LIT,
+    MOSTLY,
+    NARROWEST,
+    NOISE_ALIKE,
+    NOISE_OFF,
+    NOISE_OFF_MIXED,
+    NOISE_SURE,
+    NOT_ALIKE_PX,
+)
+from processing.instrument.grammar import TIMES, course
+
+#: [components, fixed] Of the states that count as signal: a Mueller matrix has 16 unknowns.
+COMPONENTS = 16
+#: [pixels] That are looked at.
+PIXELS = 20_000
+#: [of the mean variance] Least variance without light.
+LEAST_FLOOR = 0.01
+#: [digits] Of the range of the signal, to which two signals are the same.
+DIGITS = 9
+#: [levels] Of the signal at which their scatter is told.
+LEVELS = 24
+
+
+def estimated_noise(data: CaptureData) -> CaptureData:
+    """The capture with variance = slope * signal + floor as its own pixels show it.
+
+    The leading components over all pixels are taken away from each pixel (16 at most, so an unknown sample and any
+    instrument error that is linear in it are gone); what is left, binned over the signal, gives the line. Structure
+    over the image that is left as well makes the estimate too large, never too small.
+    """
+    picked = np.flatnonzero((data.usable & ~data.clipped).reshape(-1))
+    if picked.size > PIXELS:
+        picked = picked[:: picked.size // PIXELS + 1]
+    y = data.signal.reshape(data.values_per_pixel, -1)[:, picked].astype(np.float64)
+    rows = y.shape[0]
+    keep = min(COMPONENTS, rows - 1, max(picked.size // 4, 1)) if data.sample is None else min(2, rows - 1)
+    u, _, _ = np.linalg.svd(y @ y.T)
+    rest = y - u[:, :keep] @ (u[:, :keep].T @ y)
+    # A row that the components follow closely has less scatter left than its noise.
+    share = 1 - np.sum(u[:, :keep] ** 2, axis=1)
+    good = share > LEAST_SCATTER if rows > FEW_ROWS else share > 0.0
+    square = rest[good] ** 2 / share[good, None]
+    signal = (y - rest)[good]
+    # Signals that rounding alone sets apart share a level, or it would hang on the processor's order of sums.
+    alike = np.round(signal / max(float(np.ptp(signal)), 1e-300), DIGITS)
+    edges = np.quantile(alike, np.linspace(0, 1, LEVELS + 1))
+    level = np.clip(np.searchsorted(edges, alike, side="right") - 1, 0, LEVELS - 1)
+    count = np.bincount(level.reshape(-1), minlength=LEVELS)
+    mean = np.bincount(level.reshape(-1), signal.reshape(-1), LEVELS) / np.maximum(count, 1)
+    variance = np.bincount(level.reshape(-1), square.reshape(-1), LEVELS) / np.maximum(count, 1)
+    weight = np.sqrt(count) / np.maximum(variance, 1e-12)
+    (slope, floor), _ = nnls(
+        np.stack([np.maximum(mean, 0), np.ones(LEVELS)], axis=1) * weight[:, None], variance * weight
+    )
+    # Counts of zero have a noise all the same: where the line leads to none, they would weigh as much as they like.
+    floor = max(floor, LEAST_FLOOR * float(np.mean(square)), 1e-12)
+    # Weighted as it will be used, the scatter must come out as one.
+    correction = float(np.mean(square / (slope * np.maximum(signal, 0) + floor)))
+    slope, floor = slope * correction, floor * correction
+    n = data.signal.shape[0]
+    return replace(
+        data,
+        slope=np.full(n, slope),
+        floor=np.full(n, floor),
+        noise_known=True,
+        noise_estimated=True,
+        noise_source="estimated from the scatter over pixels that is left after the leading components of the states",
+    )
+
+
+#: [intensities] Of the image that are looked at: enough for a part in a thousand of the noise.
+MOST_VALUES = 4_000_000
+#: [of what is declared] Least part of the variance that weights are made of.
+LEAST_PART = 0.01
+#: [unit of chi-square] Weight of the belief that both parts of the noise are as declared, where the images do not tell
+#: them apart.
+WEAK = 1e-3
+
+
+@dataclass(frozen=True)
+class DetectorNoise:
+    """What the images show.
+
+    Attributes
+    ----------
+    white, white_error : variance of a pixel over what is declared; each : mean of that over all pixels, whatever their
+        light.
+    shot, dark, covariance : the parts of the variance with and without light over what is declared, (2, 2);
+        light_share : part of the variance declared that goes with the light.
+    right, down : correlation of neighbours across and down; alike_error : its standard error.
+    bent : variance of a pixel over what is declared, by a bend of the response that the residual may show: a response
+        that flattens compresses noise too.
+    rows, columns : variance that is common to a row, or a column, of a frame, over that of a pixel; rows_error.
+    """
+
+    white: float
+    white_error: float
+    each: float
+    shot: float
+    dark: float
+    covariance: Array
+    light_share: float
+    right: float
+    down: float
+    alike_error: float
+    bent: float
+    rows: float
+    columns: float
+    rows_error: float
+
+
+def detector_noise(data: CaptureData, a: Array) -> DetectorNoise | None:
+    """Noise of a capture against rows a (L, K) of its model; None where its images do not show it."""
+    height, width = data.usable.shape
+    if min(height, width) < NARROWEST:
+        return None
+    rows = min(height, max(NARROWEST, MOST_VALUES // (width * data.values_per_pixel)))
+    part = slice((height - rows) // 2, (height - rows) // 2 + rows)
+    looked_at = np.zeros(data.usable.shape, dtype=bool)
+    looked_at[part] = (data.usable & ~data.clipped)[part]
+    if looked_at.sum() < NARROWEST**2:
+        return None
+    white = Whitened.of(data, a, looked_at)
+    if white.outside.shape[1] < FEWEST_FREE_FOR_NOISE:
+        return None
+    rest = white.rest(np.ones(white.y.shape[1], dtype=bool))
+    floor = np.repeat(data.floor, data.signal.shape[1])[data.row_counts] / white.level**2
+    r, light, dark = np.full((3, len(rest), rows, width), np.nan)
+    good = looked_at[part]
+    r[:, good] = rest @ white.y
+    dark[:, good] = (rest**2 @ floor)[:, None]
+    light[:, good] = rest**2 @ white.variance - dark[:, good]
+    return replace(_compared(r, light, dark, float(np.trace(rest)) / len(rest)), bent=_of_a_bend(white))
+
+
+def _of_a_bend(white: Whitened) -> float:
+    """Factor on the variance of the curve u + c u^2 that the residual fits best."""
+    level = white.level[:, None].astype(np.float32)
+    u = white.inside @ (white.inside.T @ white.y) * level
+    bend = white.outside.T @ (u**2 / level)
+    c = np.sum(bend * (white.outside.T @ white.y)) / max(float(np.sum(bend**2)), 1e-300)
+    return float(np.mean(np.maximum(1 + 2 * c * u, 0.0) ** 2))
+
+
+def _compared(r: Array, light: Array, dark: Array, free: float) -> DetectorNoise:
+    expected = light + dark
+    far = (NOT_ALIKE_PX, NOT_ALIKE_PX + 1)
+    across = {lag: _half_square(r, expected, lag, 2) for lag in (1, *far)}
+    down = {lag: _half_square(r, expected, lag, 1) for lag in (1, *far)}
+    count = np.isfinite(r).sum() * free
+    white = float(np.mean([across[lag] for lag in far]))
+    error = white * float(np.sqrt(3 / count))
+    rows = _common(r, expected, 2) - white * _within(r, 2, 1 - across[1] / white)
+    columns = _common(r, expected, 1) - white * _within(r, 1, 1 - down[1] / white)
+    number = free * r.shape[0] * np.array(r.shape[1:])
+    # Means of a row scatter by the noise of a pixel over the number of its pixels.
+    rows_error = float(white / r.shape[2] * np.sqrt(3 / number[0]))
+    far_down = float(np.mean([down[lag] for lag in far]))
+    shot, floor, covariance = _levels(r, light, dark, free)
+    return DetectorNoise(
+        white=white,
+        white_error=error,
+        each=float(np.mean([_of_each(r, expected, lag) for lag in far])),
+        shot=shot,
+        dark=floor,
+        covariance=covariance,
+        light_share=float(np.nansum(light) / np.nansum(expected)),
+        right=1 - across[1] / white,
+        down=1 - (down[1] - max(rows, 0.0)) / max(far_down - max(rows, 0.0), 1e-12),
+        alike_error=float(np.sqrt(2 / count)),
+        bent=1.0,
+        rows=max(rows, 0.0) / white,
+        columns=max(columns, 0.0) / white,
+        rows_error=rows_error / white,
+    )
+
+
+def _pairs(x: Array, lag: int, axis: int) -> tuple[Array, Array]:
+    before = (slice(None),) * axis
+    return x[(*before, slice(-lag))], x[(*before, slice(lag, None))]
+
+
+def _half_square(r: Array, expected: Array, lag: int, axis: int) -> float:
+    """Half the square of differences over such a distance, over the variance that is expected."""
+    first, second = _pairs(r, lag, axis)
+    one, other = _pairs(expected, lag, axis)
+    return float(np.nansum((first - second) ** 2) / np.nansum(np.where(np.isfinite(first - second), one + other, 0)))
+
+
+def _of_each(r: Array, expected: Array, lag: int) -> float:
+    """Squares of differences across so many pixels over the variance that is expected of all rows, mean over pixels."""
+    first, second = _pairs(r, lag, 2)
+    one, other = _pairs(expected, lag, 2)
+    with np.errstate(invalid="ignore"):
+        return float(np.nanmean(np.sum((first - second) ** 2, axis=0) / np.sum(one + other, axis=0)))
+
+
+def _common(r: Array, expected: Array, axis: int) -> float:
+    """The same of means over an axis, in units of the variance of a pixel."""
+    counts = np.isfinite(r).sum(axis=axis)
+    mean = np.nansum(r, axis=axis) / np.maximum(counts, 1)
+    first, second = _pairs(np.where(counts > 0, mean, np.nan), LINES_APART, 1)
+    one, other = _pairs(np.nansum(expected, axis=axis) / np.maximum(counts, 1), LINES_APART, 1)
+    used = np.isfinite(first - second)
+    return float(np.sum((first - second)[used] ** 2) / np.sum((one + other)[used]))
+
+
+def _within(r: Array, axis: int, alike: float) -> float:
+    """Variance of a mean over an axis over that of a pixel, if only neighbours are alike."""
+    counts = np.isfinite(r).sum(axis=axis)
+    return float(np.mean(1 / counts[counts > 0]) * (1 + 2 * max(alike, 0.0)))
+
+
+def _levels(r: Array, light: Array, dark: Array, free: float) -> tuple[float, float, Array]:
+    """Parts of the variance with and without light over what is declared, and their covariance."""
+    first, second = _pairs(r, NOT_ALIKE_PX, 2)
+    half = (first - second) ** 2 / 2
+    used = np.isfinite(half)
+    design = np.stack([np.mean(_pairs(x, NOT_ALIKE_PX, 2), axis=0)[used] for x in (light, dark)], axis=1)
+    found = np.ones(2)
+    for _ in range(3):
+        weight = 1 / (design @ np.maximum(found, LEAST_PART)) ** 2
+        normal = (design * weight[:, None]).T @ design + WEAK * np.eye(2)
+        found = np.linalg.solve(normal, (design * weight[:, None]).T @ half[used] + WEAK)
+    # A difference has the noise of two pixels, and each pixel is in two of them.
+    return float(found[0]), float(found[1]), np.asarray(3 * normal.shape[0] / 2 / free * np.linalg.inv(normal))
+
+
+#: [1, fixed] Variance of a median over that of a mean.
+MEDIAN = np.pi / 2
+
+
+def black_jitter(data: CaptureData, a: Array) -> tuple[Array, float] | None:
+    """Offset (L,) of every row, as far as it is not what the light of a pixel could be, and the variance of the whole.
+
+    In full scales; None where none shows. An offset changes dim pixels as much as bright ones, what happens to light
+    changes them by as much less as they are dimmer. `a` (L, K): rows of the model, which both may follow.
+    """
+    rows = data.row_counts
+    y = data.signal.reshape(data.values_per_pixel, *data.usable.shape)[rows]
+    mean = y.mean(axis=0, dtype=np.float64)
+    lit = data.usable & ~data.clipped
+    if not lit.any():
+        return None
+    lit &= mean > LIT * np.median(mean[lit])
+    dim = np.any(y != 0, axis=0) & (mean < DIM * mean[lit].mean())
+    _, outside = inside_and_outside(a[rows])
+    free = outside.shape[1]
+    if dim.sum() < FEWEST_DIM or not free:
+        return None
+    # Hits and bad pixels are among them.
+    level = np.median(y[:, dim], axis=1).astype(np.float64)
+    scatter = np.median(np.abs(y[:, dim] - level[:, None]), axis=1) / NORMAL_MAD
+    noise = MEDIAN * float(np.mean(scatter**2)) / int(dim.sum())
+    if not _alike_in_halves(y[:, dim], mean[dim], outside, noise):
+        return None
+    seen, bright = outside.T @ level, outside.T @ y[:, lit].mean(axis=1, dtype=np.float64)
+    if float(seen @ seen) < noise * (free + NOISE_SURE * np.sqrt(2 * free)):
+        return None
+    follows, light = float(bright @ seen / (seen @ seen)), float(mean[lit].mean() / max(mean[dim].mean(), 1e-300))
+    # Nearer to light than to an offset, which bright pixels follow once.
+    if follows**2 > light:
+        return None
+    if _is_a_course(data, seen, outside):
+        return None
+    offsets = np.zeros(data.values_per_pixel)
+    offsets[rows] = outside @ (seen - bright / light)
+    return offsets, float(np.sum(offsets**2)) / free
+
+
+def _is_a_course(data: CaptureData, seen: Array, outside: Array) -> bool:
+    """Whether most of it is a course over time: a fault, of which to take off a part alone would hide the rest."""
+    conditions = data.conditions
+    courses = np.concatenate([course(name, conditions) for name in TIMES]).repeat(len(conditions.channels), axis=1)
+    along = range_of(outside.T @ courses[:, data.row_counts].T)
+    return bool(np.sum((along.T @ seen) ** 2) > MOSTLY * (seen @ seen))
+
+
+def _alike_in_halves(y: NDArray[np.float32], mean: Array, outside: Array, noise: float) -> bool:
+    """Whether the brighter half of dim pixels (L, P) shows the same as the darker one, as an offset does.
+
+    What happens to light grows with it, and is another thing on another material. `noise` is the variance of a median
+    over all of them.
+    """
+    bright = mean > np.median(mean)
+    if bright.all() or not bright.any():
+        return True
+    one, other = (outside.T @ np.median(y[:, half], axis=1).astype(np.float64) for half in (bright, ~bright))
+    free, apart = outside.shape[1], one - other
+    # Each has twice the variance of the whole, their difference four times.
+    return bool(apart @ apart < 4 * noise * (free + NOISE_SURE * np.sqrt(2 * free)))
+
+
+#: [1] Largest factor on the gain that is tried, and one over the least.
+MOST_GAIN = 10.0
+#: [factors] On the gain that are tried: steps of a percent.
+GAINS = 400
+#: [1] Least factor on the variance without light that is tried.
+LEAST_DARK_FACTOR = 0.01
+#: [1] Largest factor on the variance without light that is tried.
+MOST_DARK_FACTOR = 400.0
+#: [factors] On the variance without light that are tried: steps of a percent.
+DARKS = 800
+
+
+def checked_noise(data: CaptureData, a: Array) -> CaptureData:
+    """The capture with the noise that its images show against rows a (L, K) of its model, and what is to be told.
+
+    A black level that jitters is taken off, as far as it shows.
+    """
+    told: list[str] = []
+    jitter = black_jitter(data, a) if data.noise_known else None
+    if jitter is not None:
+        offsets, variance = jitter
+        told.append(_in_counts("the black level is another one in every frame", variance, data))
+        level = offsets.reshape(*data.signal.shape[:2], 1, 1)
+        data = replace(data, signal=(data.signal - level).astype(np.float32))
+    found = detector_noise(data, a) if data.noise_known else None
+    if found is None:
+        return replace(data, noise_told=tuple(told))
+    shared = _mixed(found)
+    if shared.shown < 1:
+        told.append(
+            f"neighbours share noise (correlation {found.right:.2f} across, {found.down:.2f} down): the images were "
+            f"resampled or smoothed, and of {1 / shared.shown:.1f} pixels one is independent"
+        )
+    if max(found.rows, found.columns) > NOISE_SURE * found.rows_error:
+        shared = _with_lines(shared, found, data)
+    lines = _lines(shared, data)
+    for name, part in zip(("row", "column"), lines, strict=True):
+        if part > 0:
+            told.append(_in_counts(f"every {name} of a frame has an offset of its own", part, data))
+    shot, dark = factors = noise_factors(found, shared.shown, data.noise_estimated)
+    white = None
+    if not data.noise_estimated and factors != (1.0, 1.0):
+        white = _white_in_words(data, found.white / shared.shown, shot, dark)
+    # What is common to a line is a part of the variance of its pixels, and more of that of wide patterns.
+    slope, floor = data.slope * shot * shared.wide, (data.floor * dark + sum(lines)) * shared.wide
+    return replace(
+        data, slope=slope, floor=floor, shared=shared, noise_factors=factors, noise_told=tuple(told), white_told=white
+    )
+
+
+def _in_counts(what: str, variance: float, data: CaptureData) -> str:
+    return f"{what}, {np.sqrt(variance) * data.conditions.full_scale:.2g} counts rms"
+
+
+def _mixed(found: DetectorNoise) -> SharedNoise:
+    least = max(NOISE_ALIKE, NOISE_SURE * found.alike_error)
+    return SharedNoise(*(_part(alike) if alike > least else 0.0 for alike in (found.right, found.down)))
+
+
+def _part(alike: float) -> float:
+    """Part of the next pixel that was mixed in, from the correlation of neighbours: m (1 - m) / (1 - 2 m (1 - m))."""
+    product = min(alike / (1 + 2 * alike), 0.25)
+    return float((1 - np.sqrt(1 - 4 * product)) / 2)
+
+
+def _with_lines(shared: SharedNoise, found: DetectorNoise, data: CaptureData) -> SharedNoise:
+    rows, columns = (v if v > NOISE_SURE * found.rows_error else 0.0 for v in (found.rows, found.columns))
+    height, width = data.usable.shape
+    return replace(shared, rows=rows, columns=columns, wide=1 + rows * width + columns * height)
+
+
+def _lines(shared: SharedNoise, data: CaptureData) -> tuple[float, float]:
+    """Variance of the offsets of rows and of columns, full scales squared."""
+    if not (shared.rows or shared.columns):
+        return 0.0, 0.0
+    # They are told relative to the noise of each state, of which the dark ones show most.
+    variance = data.variance_of(data.usable).mean(axis=2)
+    usual = 1 / float(np.mean(1 / np.maximum(variance, 1e-300)))
+    return shared.rows * usual, shared.columns * usual
+
+
+def noise_factors(found: DetectorNoise, shown: float, estimated: bool) -> tuple[float, float]:
+    """Factors on the variance with and without light; one where the images agree with what is declared."""
+    both = np.array([found.shot, found.dark]) / shown
+    white = found.white / shown
+    inverse = np.asarray(np.linalg.inv(found.covariance / shown**2), dtype=float)
+    if estimated:
+        return _balanced(found, white, max(float(both[1]), LEAST_DARK))
+    usual = 1.0, 1.0
+    bent = found.bent
+    least = NOISE_OFF if shown == 1 else NOISE_OFF_MIXED
+    far = not min(bent, 1.0) - least < white < max(bent, 1.0) + least
+    if _against(both, usual, inverse) < NOISE_SURE**2 or not (far or _dark_is_off(found, shown)):
+        return usual
+    # As simple as the images allow: another gain, another read noise, both.
+    scales = np.geomspace(1 / MOST_GAIN, MOST_GAIN, GAINS)
+    gain = min(((s, s**2) for s in scales), key=lambda p: _against(both, p, inverse))
+    darks = np.geomspace(LEAST_DARK_FACTOR, MOST_DARK_FACTOR, DARKS)
+    read = min(((1.0, d) for d in darks), key=lambda p: _against(both, p, inverse))
+    simple = min(gain, read, key=lambda p: _against(both, p, inverse))
+    if _against(both, simple, inverse) < AS_GOOD**2:
+        return float(simple[0]), float(simple[1])
+    return _balanced(found, white, max(float(both[1]), LEAST_DARK))
+
+
+def _against(both: Array, told: tuple[float, float], inverse: Array) -> float:
+    off = both - np.array(told)
+    return float(off @ inverse @ off)
+
+
+def _dark_is_off(found: DetectorNoise, shown: float) -> bool:
+    return abs(found.dark / shown - 1) > max(
+        DARK_NOISE_OFF, NOISE_SURE * float(np.sqrt(found.covariance[1, 1])) / shown
+    )
+
+
+def _balanced(found: DetectorNoise, white: float, dark: float) -> tuple[float, float]:
+    """Both factors with the whole as found, which is known best."""
+    light = found.light_share
+    shot = (white - dark * (1 - light)) / light if light > LEAST_LIT else 1.0
+    return (shot, dark) if shot > 0 else (white, white)
+
+
+def _white_in_words(data: CaptureData, white: float, shot: float, dark: float) -> str:
+    out = f"the variance of a pixel is {white:.2f} times what is declared ({data.noise_source})"
+    if not data.slope.any():
+        return out
+    # Variance = light / gain + (read noise / gain)^2, of a state that is not a mean of several frames.
+    slope, floor = (float(v.max()) * data.binned**2 for v in (data.slope, data.floor))
+    gain = 1 / (slope * shot * data.conditions.full_scale)
+    read = np.sqrt(floor * dark) * data.conditions.full_scale * gain
+    same_electrons = np.isclose(dark, shot**2)
+    parts = ([] if shot == 1 else [f"a gain of {gain:.2g} e/count"]) + (
+        [] if same_electrons else [f"a read noise of {read:.2g} e"]
+    )
+    return f"{out}, as of {' and '.join(parts)}"
