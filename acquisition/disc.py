@@ -23,6 +23,7 @@ from functools import partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from multiprocessing.pool import ExceptionWithTraceback  # type: ignore[attr-defined]
+from pathlib import Path
 from typing import Any, NoReturn, ParamSpec, TypeVar
 
 import numpy as np
@@ -197,15 +198,37 @@ def _ended() -> AcquisitionError:
 _current: DiscProcess | None = None
 _starting = threading.Lock()
 _is_child = False
+#: Calls that a replacement begins with, by what they hold.
+_holding: dict[Path, tuple[int, Callable[[], None]]] = {}
 
 
 def disc() -> DiscProcess:
-    """The disc process of this program; it is started if there is none. Raises AcquisitionError."""
+    """The disc process of this program; it is started if there is none. Raises AcquisitionError, and as `hold`."""
     global _current
     with _starting:
         if _current is None or _current.has_ended or _current.owner != os.getpid():
-            _current = DiscProcess()
+            starting = DiscProcess()
+            try:
+                for folder, (owner, take) in _holding.items():
+                    if owner == starting.owner:
+                        starting.call(f"lock {folder}", take)
+            except BaseException:
+                starting.end()
+                raise
+            _current = starting
         return _current
+
+
+def hold(folder: Path, take: Callable[[Path], None]) -> None:
+    """Have the disc process lock a folder, and each replacement of it, until `let_go`. Raises what `take` raises."""
+    on_disc(f"lock {folder}", take, folder)
+    _holding[folder] = os.getpid(), partial(take, folder)
+
+
+def let_go(folder: Path, release: Callable[[Path], None]) -> None:
+    """Have the disc process unlock a folder. Raises AcquisitionError."""
+    _holding.pop(folder, None)
+    on_disc(f"let go of {folder}", release, folder)
 
 
 @contextmanager

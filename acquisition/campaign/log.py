@@ -18,7 +18,7 @@ from acquisition.campaign.identity import IDENTITY
 from acquisition.campaign.plan import Campaign, CampaignCapture
 from acquisition.capture.state_file import KILLED_S
 from acquisition.capture.synced import make_folder, sync
-from acquisition.disc import on_disc
+from acquisition.disc import hold, let_go, on_disc
 from acquisition.errors import AcquisitionError
 from processing.doors import read_json, read_text
 from processing.errors import ProcessError
@@ -45,10 +45,7 @@ class CampaignFolder:
     def __init__(self, folder: Path, campaign: Campaign) -> None:
         self.folder = folder
         make_folder(folder)
-        try:
-            on_disc(f"lock {folder}", _hold, folder)
-        except filelock.Timeout:
-            raise AcquisitionError(f"another program runs the campaign in {folder}. End that one first.") from None
+        hold(folder, _lock)
         try:
             self._require_same(campaign)
             self.index = read_index(folder)
@@ -102,20 +99,23 @@ class CampaignFolder:
     def close(self) -> None:
         """Let another program run the campaign."""
         with suppress(AcquisitionError):
-            on_disc(f"let go of {self.folder}", _let_go, self.folder)
+            let_go(self.folder, _unlock)
 
 
 #: Locks of the folders that are held, in the disc process.
 _held: dict[Path, filelock.BaseFileLock] = {}
 
 
-def _hold(folder: Path) -> None:
+def _lock(folder: Path) -> None:
     lock = filelock.FileLock(folder / ".lock")
-    lock.acquire(timeout=KILLED_S)
+    try:
+        lock.acquire(timeout=KILLED_S)
+    except filelock.Timeout:
+        raise AcquisitionError(f"another program runs the campaign in {folder}. End that one first.") from None
     _held[folder] = lock
 
 
-def _let_go(folder: Path) -> None:
+def _unlock(folder: Path) -> None:
     if (lock := _held.pop(folder, None)) is not None:
         lock.release()
 

@@ -1,11 +1,15 @@
 """Promise 28: whatever ends a run, its end has a record: in the file, the log, the index, and for whoever is called."""
 
 import json
+import os
+import signal
 
+import filelock
 import pytest
 
 from acquisition.capture import session
 from acquisition.capture.operator import Operator
+from acquisition.disc import disc
 from acquisition.errors import Unforeseen
 from processing.storage.captures.capture import Capture
 
@@ -78,6 +82,34 @@ def test_the_plans_retries_are_used(night, monkeypatch):
     assert entry["status"] == "complete"
     (failed,) = [event for event in events if event["event"] == "capture failed"]
     assert "Traceback" in failed["traceback"]
+
+
+@pytest.mark.parametrize("somebody_was_faster", [False, True])
+def test_a_campaign_whose_disc_process_was_killed_takes_its_folder_again(
+    night, monkeypatch, tmp_path, somebody_was_faster
+):
+    take, tries, others = session.take, [], filelock.FileLock(tmp_path / "night" / ".lock")
+
+    def killed_once(*arguments, **options):
+        tries.append(1)
+        if len(tries) == 1:
+            os.kill(disc()._pid, signal.SIGKILL)
+            if somebody_was_faster:
+                others.acquire(timeout=60)
+        else:
+            with pytest.raises(filelock.Timeout):
+                others.acquire(timeout=0)
+        return take(*arguments, **options)
+
+    monkeypatch.setattr(session, "take", killed_once)
+    code, said, *_ = night(retries=1)
+    others.release()
+    if somebody_was_faster:
+        assert code == 1
+        assert "another program runs the campaign" in said
+    else:
+        assert code == 0, said
+    assert len(tries) == 1 + (not somebody_was_faster)
 
 
 @pytest.mark.parametrize("where", [(session, "take"), (Operator, "prepare")])
