@@ -13,8 +13,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.maps.xi0 import dominant_model, estimate_from_stokes
+from processing.maps.xi0 import dominant_model, estimate_from_stokes, refitted
 from processing.polarization import triply_degenerate
+from processing.reduction.systematic import INPUTS, Systematic
 from processing.storage.products.images import StokesImage
 from processing.storage.products.product import Plane, Product, ProductWriter, Step
 
@@ -29,6 +30,16 @@ PLANES = {
     ),
     "valid": Plane((), "", "1 = xi0 is determined and physical", np.uint8),
 }
+#: Name of the plane that tells what is uncertain in the instrument.
+DIRECTIONS = "alpha_0_directions"
+
+
+def _systematic_planes(systematic: Systematic) -> dict[str, Plane]:
+    text = "what one standard uncertainty of each uncertain input of the instrument does to alpha_0, in standard errors"
+    return {
+        "mueller_systematic": Plane((4, 4), "count", "standard uncertainty by the instrument's; it does not average"),
+        DIRECTIONS: Plane((len(systematic.directions),), "", text),
+    }
 
 
 def extrapolate_mueller(
@@ -42,8 +53,10 @@ def extrapolate_mueller(
     with Product(source) as product:
         product.require("stokes")
         header, steps, shape = product.header, (*product.steps, step), product.shape
+        systematic = Systematic.of_product(product)
     m0 = dominant_model(header, geometry_file, material_file, shape)
-    found = estimate_from_stokes(StokesImage.load(source), m0)
+    image = StokesImage.load(source)
+    found = estimate_from_stokes(image, m0)
     with np.errstate(invalid="ignore"):
         values = triply_degenerate.mueller_matrix(m0, found.xi0, found.m00)
         errors = np.abs(m0) * found.alpha_0_stderr[..., None, None]
@@ -57,14 +70,26 @@ def extrapolate_mueller(
         "median_xi0_error": float(np.median(found.xi0_stderr[valid])) if valid.any() else None,
         "warnings": ["extrapolated: elements that the capture did not measure are the model's"],
     }
-    with ProductWriter(out, EXTRAPOLATED, header, shape, PLANES, steps, overwrite) as writer:
-        writer.write(
-            slice(0, shape[0]),
-            mueller=_planar(values),
-            mueller_errors=_planar(errors),
-            m00_correlation=found.correlation * np.sign(4 * found.xi0 - 1),
-            valid=valid.astype(np.uint8),
-        )
+    planes: dict[str, NDArray[Any]] = {
+        "mueller": _planar(values),
+        "mueller_errors": _planar(errors),
+        "m00_correlation": found.correlation * np.sign(4 * found.xi0 - 1),
+        "valid": valid.astype(np.uint8),
+    }
+    every = PLANES
+    if systematic is not None:
+        fitted = np.tensordot(image.analyzers, image.values.astype(float), axes=1)
+        # Of M/m00 alone: M = m00 e00 + alpha_0 (m0 - e00), and alpha_0/m00 = (4 xi0 - 1)/3.
+        moved = 4 / 3 * found.m00 * refitted(systematic, fitted, found.xi0, m0)
+        of_alpha_0 = np.sqrt(np.square(moved).sum(axis=0))
+        planes["mueller_systematic"] = _planar(np.abs(m0) * of_alpha_0[..., None, None])
+        planes["mueller_systematic"][0, 0] = 0.0 * of_alpha_0
+        with np.errstate(divide="ignore", invalid="ignore"):
+            planes[DIRECTIONS] = moved / found.alpha_0_stderr
+        every = PLANES | _systematic_planes(systematic)
+        facts[INPUTS] = "; ".join(systematic.labels)
+    with ProductWriter(out, EXTRAPOLATED, header, shape, every, steps, overwrite) as writer:
+        writer.write(slice(0, shape[0]), **planes)
         writer.seal(facts)
     return facts
 
@@ -79,27 +104,45 @@ class ExtrapolatedImage:
     ----------
     values, errors : (4, 4, rows, columns), counts; NaN where the object is not.
     correlation : (rows, columns), of the errors of m00 and alpha_0, with the sign of alpha_0.
+    directions : (D, rows, columns), what each uncertain input of the instrument does to alpha_0, in its standard error.
     """
 
     values: NDArray[np.float32]
     errors: NDArray[np.float32]
     correlation: NDArray[np.float32]
+    directions: NDArray[np.float32] | None = None
 
     @classmethod
     def of(cls, product: Product, rows: slice = slice(None)) -> Self:
         """From an open product of `process extrapolate`."""
         names = ("mueller", "mueller_errors", "m00_correlation")
-        return cls(*(product.get(name, rows) for name in names))
+        directions = product.get(DIRECTIONS, rows) if DIRECTIONS in product.names else None
+        values, errors, correlation = (product.get(name, rows) for name in names)
+        return cls(values, errors, correlation, directions)
 
     def at(self, pixels: NDArray[np.int64]) -> Self:
         """The image of some pixels alone (n rows of one), given by their numbers in row-major order."""
-        parts = (self.values, self.errors, self.correlation)
-        return type(self)(*(part.reshape(*part.shape[:-2], -1)[..., pixels, None] for part in parts))
+        parts = (self.values, self.errors, self.correlation, self.directions)
+        return type(self)(*(p if p is None else p.reshape(*p.shape[:-2], -1)[..., pixels, None] for p in parts))  # type: ignore[arg-type]
 
     @property
     def matrices(self) -> NDArray[np.float32]:
         """View (rows, columns, 4, 4)."""
         return np.moveaxis(self.values, (0, 1), (-2, -1))
+
+    @property
+    def moves(self) -> NDArray[np.float64] | None:
+        """What each uncertain input of the instrument does to M with m00 held, (D, 16, rows, columns); None without."""
+        if self.directions is None:
+            return None
+        moved = self.directions[:, None] * self._signed
+        moved[:, 0] = 0.0
+        return moved
+
+    @property
+    def _signed(self) -> NDArray[np.float64]:
+        """(16, rows, columns): elements but 00 move by this times one common factor, up to the sign of alpha_0."""
+        return np.asarray((np.sign(self.values) * self.errors).reshape(16, *self.correlation.shape), dtype=float)
 
     def moments_of(self, elements: Sequence[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Traces (rows, columns) of C and C^2, C being the covariance of these elements: they have one error."""
@@ -108,9 +151,8 @@ class ExtrapolatedImage:
 
     def variance_of(self, gradient: NDArray[np.floating]) -> NDArray[np.float64]:
         """First-order variance (rows, columns) of a quantity with gradient (rows, columns, 16) by the elements."""
-        signed = (np.sign(self.values) * self.errors).reshape(16, *self.correlation.shape)
         own = gradient[..., 0] * self.errors[0, 0]
-        common = np.einsum("ixy,xyi->xy", signed[1:], gradient[..., 1:])
+        common = np.einsum("ixy,xyi->xy", self._signed[1:], gradient[..., 1:])
         return np.asarray(own**2 + common**2 + 2 * self.correlation * own * common)
 
 

@@ -173,14 +173,14 @@ def _maps(product: Product, extra: Sequence[str], pairs: Pairs) -> _Maps:
         )
     product.require("mueller", EXTRAPOLATED)
     systematic = Systematic.of_product(product) if product.kind == "mueller" else None
-    told = {} if systematic is None else {INPUTS: product.facts[INPUTS]}
+    told = {INPUTS: product.facts[INPUTS]} if INPUTS in product.facts else {}
     if is_stokes_vector(product) and not extra:
         light = light_planes(product)
         own_95 = {name for name, of_matrices in OF_MATRICES.items() if has_own_95(of_matrices)}
         planes = with_errors(
             {name: plane for name, plane in light.items() if name != "stokes_covariance"},
             lambda name: name in own_95,
-            systematic=systematic is not None,
+            systematic=bool(told),
         )
         return _Maps(
             planes | {"stokes_covariance": light["stokes_covariance"]},
@@ -193,18 +193,18 @@ def _maps(product: Product, extra: Sequence[str], pairs: Pairs) -> _Maps:
     def block(rows: slice) -> dict[str, NDArray[Any]]:
         image = image_of(product, rows)
         if isinstance(image, ExtrapolatedImage):
-            return quantities_block(image, extra, pairs)
+            return quantities_block(image, extra, pairs, image.moves)
         moves = None if systematic is None else moves_of(systematic, image)
         return partial_block(image, partial, pairs, moves) if partial else quantities_block(image, extra, pairs, moves)
 
     if partial:
         return _Maps(
-            with_errors({name: maps[name] for name in [*partial, "lit"]}, systematic=systematic is not None),
+            with_errors({name: maps[name] for name in [*partial, "lit"]}, systematic=bool(told)),
             block,
             lambda writer: partial_facts(writer, partial) | told,
         )
     return _Maps(
-        with_errors(maps, systematic=systematic is not None) | _NOISE,
+        with_errors(maps, systematic=bool(told)) | _NOISE,
         block,
         lambda writer: _facts(writer, maps) | told,
     )

@@ -160,10 +160,10 @@ def _systematic_facts(systematic: Systematic, errors: NDArray[Any]) -> dict[str,
     return {INPUTS: "; ".join(systematic.labels), "median_xi0_systematic": _median(errors)}
 
 
-def _refitted(
+def refitted(
     systematic: Systematic, fitted: NDArray[np.floating], xi0: NDArray[np.float64], m0: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """What each direction does to the two-coefficient estimate of intensities (K, rows, columns): (D, ...)."""
+    """What each direction does to xi0, the two-coefficient estimate of intensities (K, rows, columns): (D, ...)."""
     flat = fitted.reshape(len(fitted), -1)
     moved = []
     for direction in systematic.directions:
@@ -256,7 +256,7 @@ def _two_coefficients(
     }
     facts["unphysical_pixels"] = int(found.unphysical.sum())
     if systematic is not None:
-        set_xi0_systematic(planes, _refitted(systematic, fitted, found.xi0, m0))
+        set_xi0_systematic(planes, refitted(systematic, fitted, found.xi0, m0))
         facts |= _systematic_facts(systematic, planes["xi0_systematic"][found.valid])
     rows, columns = found.xi0.shape
     every = STOKES_PLANES | systematic_planes(systematic)

@@ -9,11 +9,13 @@ from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
 from processing.instrument.uncertainty import value_directions
+from processing.maps.extrapolation import extrapolate_mueller
 from processing.maps.quantities import quantities_of_mueller
 from processing.maps.tables import tabulate
-from processing.maps.xi0 import xi0_of_mueller
-from processing.polarization import mueller
+from processing.maps.xi0 import dominant_model, xi0_of_mueller
+from processing.polarization import mueller, triply_degenerate
 from processing.reduction.mueller import reduce_mueller
+from processing.reduction.stokes import reduce_stokes
 from processing.storage.captures.capture import Capture
 from processing.storage.products.product import Product, Step
 from processing.yaml_file import ConfigError, parse_yaml
@@ -166,3 +168,46 @@ def test_a_table_holds_what_each_direction_does_to_its_means(stated, synthetic_c
     plain = products(synthetic_capture, tmp_path, known, known, None, "plain", **header)
     with pytest.raises(ProcessError, match="process reduce --instrument"):
         tabulate([plain[2]], geometry, "degree", table)
+
+
+def test_an_extrapolated_matrix_and_its_quantities_have_the_instruments_part(configs, synthetic_capture, tmp_path):
+    """One standard uncertainty of a micropolarizer moves M/m00 and its maps by one systematic standard error."""
+    scene = configs / "geometries/one_inch_sphere.yaml", configs / "materials/red_print.yaml"
+    model = InstrumentModel.load(configs / "instruments/linear_stokes.yaml").at(662)
+    name, u = "micropolarizer_45.azimuth_deg", 0.2
+    true = model.with_values({"micropolarizer_45": {"azimuth_deg": 45 + u}})
+    header = {"omega_deg": 35.0}
+    detector = {"gain_e_per_count": 1.0, "read_noise_e": 1.0, "black_level_counts": 0.0}
+    frames = np.ones((1, 1, 64, 76), np.float32)
+    blank = synthetic_capture(frames, {}, name="blank.h5", mosaic=model.mosaic, detector=detector, **header)
+    with Capture(blank) as capture:
+        m0 = dominant_model(capture.header, *scene, (64, 76))
+    light = np.nan_to_num(triply_degenerate.mueller_matrix(m0, np.full((64, 76), 0.5), np.full((64, 76), 4e6)))
+    intensity = np.einsum("ck,xyk->cxy", true.rows({"": np.zeros(1)})[0], light.reshape(64, 76, 16))
+    for (r, c), channel in np.ndenumerate(np.array(model.mosaic)):
+        index = [one.name for one in model.channels].index(channel)
+        frames[0, 0, r::2, c::2] = intensity[index, r::2, c::2]
+    path = synthetic_capture(frames, {}, name="s.h5", mosaic=model.mosaic, detector=detector, **header)
+    found = []
+    for used in (true, model.model_copy(update={"stderr": {name: u}})):
+        stokes, whole, maps = (tmp_path / f"{len(found)}.{kind}.h5" for kind in ("stokes", "m", "q"))
+        with Capture(path) as capture:
+            reduce_stokes(capture, used, stokes, (STEP,))
+        extrapolate_mueller(stokes, *scene, whole, STEP, False)
+        quantities_of_mueller(whole, maps, STEP)
+        with Product(whole) as product, Product(maps) as derived:
+            names = [n for n in derived.names if n.startswith("depolarization_index")]
+            found.append({n: product.get(n) for n in product.names} | {n: derived.get(n) for n in names})
+    exact, nominal = found
+    inside = (exact["valid"] > 0) & (nominal["valid"] > 0) & (np.abs(m0[..., 0, 1]) > 0.05)
+    assert inside.sum() > 300
+    m, other = (one["mueller"][..., inside] for one in found)
+    index = "depolarization_index"
+    for moved, told in (
+        (other / other[0, 0] - m / m[0, 0], nominal["mueller_systematic"][..., inside] / other[0, 0]),
+        ((nominal[index] - exact[index])[inside], nominal[f"{index}_systematic"][inside]),
+    ):
+        assert np.abs(moved).max() > 5e-4
+        # To first order: a fifth of the largest is of second.
+        assert told == pytest.approx(np.abs(moved), rel=0.1, abs=2e-4)
+        assert np.linalg.norm(told) == pytest.approx(np.linalg.norm(moved), rel=0.05)
