@@ -8,12 +8,15 @@ from typing import NamedTuple
 
 from processing.doors import read_json
 from processing.errors import ProcessError
-from processing.reduction.flat import FlatCapture
+from processing.reduction.flat import FlatCapture, flat_captures, nearest_flat
 from processing.storage.captures.capture import Capture, CaptureError, made_of_captures
 
 
 class ObjectCapture(NamedTuple):
-    """A complete capture of an object; `kind` is "mueller" or "stokes", `mode` and `sample` are the user's names."""
+    """A complete capture; `kind` is "mueller" or "stokes", `mode` and `sample` are the user's names.
+
+    `omega_deg` is NaN where it is not known; `is_reference` of air and mirrors.
+    """
 
     path: Path
     kind: str
@@ -21,12 +24,16 @@ class ObjectCapture(NamedTuple):
     omega_deg: float
     mode: str
     sample: str
+    is_reference: bool = False
 
 
-def find_captures(folder: Path, out: Path | None = None) -> tuple[list[ObjectCapture], bool, list[str]]:
+def find_captures(
+    folder: Path, out: Path | None = None, of_objects: bool = True
+) -> tuple[list[ObjectCapture], bool, list[str]]:
     """Captures under a folder, whether they are simulated, and files left out.
 
-    Flat fields are in neither list, nor is anything in `out`, the campaign's own results.
+    Flat fields are in neither list, nor is anything in `out`, the campaign's own results. `of_objects`: leave out air,
+    mirrors and captures without an arm angle.
 
     Raises
     ------
@@ -49,16 +56,19 @@ def find_captures(folder: Path, out: Path | None = None) -> tuple[list[ObjectCap
             continue
         if flat is not None:
             continue
-        if header.omega_deg is None or header.sample.kind in ("air", "mirror"):
+        is_reference = header.sample.kind in ("air", "mirror")
+        if of_objects and (header.omega_deg is None or is_reference):
             left_out.append(f"{path}: no arm angle" if header.omega_deg is None else f"{path}: {header.sample.kind}")
             continue
         kinds[path] = simulated
-        nm, omega = float(header.wavelength_nm), float(header.omega_deg)
-        found.append(ObjectCapture(path, kind, nm, omega, header.mode, header.sample.name or header.sample.kind))
+        nm, omega = float(header.wavelength_nm), float("nan" if header.omega_deg is None else header.omega_deg)
+        sample = header.sample.name or header.sample.kind
+        found.append(ObjectCapture(path, kind, nm, omega, header.mode, sample, is_reference))
     left_out += _unfinished(folder, out)
     if not found:
         raise ProcessError(
-            f"{folder} holds no complete capture of an object with an arm angle. {' '.join(left_out[:3])}"
+            f"{folder} holds no complete capture{' of an object with an arm angle' * of_objects}. "
+            f"{' '.join(left_out[:3])}"
         )
     if len(set(kinds.values())) > 1:
         simulated_one = next(p for p, s in kinds.items() if s)
@@ -92,9 +102,11 @@ def _unfinished(folder: Path, out: Path | None) -> list[str]:
 
 
 def chosen(
-    captures: Sequence[ObjectCapture], modes: Sequence[str] = (), samples: Sequence[str] = ()
+    captures: Sequence[ObjectCapture], modes: Sequence[str] = (), samples: Sequence[str] = (), twins: bool = False
 ) -> tuple[list[ObjectCapture], list[str]]:
-    """The captures of these modes and samples (empty: of all), at most one of a kind, wavelength and angle; the others.
+    """The captures of these modes and samples (empty: of all), and the others.
+
+    Without `twins`, at most one of a kind, wavelength and angle.
 
     Raises
     ------
@@ -114,8 +126,20 @@ def chosen(
             taken.append(capture)
     if not taken:
         raise ProcessError("no capture is of that mode and that sample.")
-    _refuse_twins(taken)
+    if not twins:
+        _refuse_twins(taken)
     return taken, left_out
+
+
+def flats_of(folder: Path, captures: Sequence[ObjectCapture]) -> dict[Path, Path]:
+    """The flat field of each capture that has one: of its camera and wavelength, nearest in time."""
+    known = flat_captures(folder)
+    found = {}
+    for path, *_ in captures if known else ():
+        with Capture(path) as capture:
+            if (flat := nearest_flat(known, capture)) is not None:
+                found[path] = flat
+    return found
 
 
 def _refuse_twins(captures: Sequence[ObjectCapture]) -> None:

@@ -4,13 +4,47 @@ from __future__ import annotations
 
 import importlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
-from typing import Any
+from itertools import count
+from typing import Any, TypeVar
 
 from processing.computing.threads import THREADS_VARIABLE
 from processing.errors import ProcessError
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+
+def gather(
+    pool: Executor,
+    work: Callable[[Task], Result],
+    tasks: Sequence[Task],
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Result | Exception]:
+    """Results in the order of the tasks; for one that failed its error, and the others are done all the same."""
+    done = count(1)
+
+    def tick(_: object) -> None:
+        if progress:
+            progress(next(done), len(tasks))
+
+    def outcome(future: Future[Result] | Exception) -> Result | Exception:
+        try:
+            return future if isinstance(future, Exception) else future.result()
+        except Exception as error:  # noqa: BLE001  # whatever is wrong with one task
+            return error
+
+    futures: list[Future[Result] | Exception] = []
+    for task in tasks:
+        try:
+            future = pool.submit(work, task)
+            future.add_done_callback(tick)
+            futures.append(future)
+        except Exception as error:  # noqa: BLE001  # the workers are gone
+            futures.append(error)
+    return [outcome(future) for future in futures]
 
 
 class _Here(Executor):

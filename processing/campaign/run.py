@@ -16,16 +16,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.campaign.captures import chosen, find_captures
+from processing.campaign.captures import chosen, find_captures, flats_of
+from processing.campaign.executors import gather
 from processing.campaign.tasks import CaptureMeasure, CaptureTask, locate, measure, task_view
 from processing.computing.blas import one_blas_thread
 from processing.errors import NotDetermined
 from processing.geometry.viewing import ViewingGeometry
 from processing.polarization.image_difference import rmsd
-from processing.reduction.flat import flat_captures, nearest_flat
 from processing.reduction.mueller import Progress
 from processing.reflectance.tables import ScatteringTable
-from processing.storage.captures.capture import Capture
 from processing.storage.products.provenance import Step, file_identity
 
 #: The default demosaicing reaches so far across the outline (`processing.reduction.mosaic.methods.REACH`).
@@ -78,6 +77,8 @@ class CampaignResult:
     tables: dict[tuple[str, float], Path] = field(default_factory=dict)
     #: Geometry of each kind of capture: the file's, or the one found in the images.
     views: dict[str, ViewingGeometry] = field(default_factory=dict)
+    #: Captures that failed, each with its error.
+    failed: tuple[tuple[Path, Exception], ...] = ()
 
     def average(self, wavelength_nm: float, quantity: str) -> float:
         """Mean over the arm angles of a quantity of `Row`; NaN without any."""
@@ -128,21 +129,19 @@ class Campaign:
         captures, others = chosen(found, self.modes, self.samples)
         left_out = left_out + others
         self.out.mkdir(parents=True, exist_ok=True)
-        flats = _flats(self.folder, [capture.path for capture in captures])
+        flats = flats_of(self.folder, captures)
         tasks = [self._task(capture.path, capture.kind, flats.get(capture.path)) for capture in captures]
         if self.register:
             tasks = _registered(tasks, pool)
         views = {task.kind: task_view(task) for task in tasks}
-        futures = [pool.submit(measure, task) for task in tasks]
-        measures = []
-        for done, future in enumerate(futures, 1):
-            measures.append(future.result())
-            if progress:
-                progress(done, len(futures))
+        results = gather(pool, measure, tasks, progress)
+        measures = [result for result in results if isinstance(result, CaptureMeasure)]
+        pairs = zip(captures, results, strict=True)
+        failed = tuple((capture.path, result) for capture, result in pairs if isinstance(result, Exception))
         tables = _merged_tables(measures, self.out)
         rows = tuple(_rows(measures, tables, views))
         names = {path.name: flat.name for path, flat in flats.items()}
-        return CampaignResult(rows, simulated, tuple(left_out), names, tables, views)
+        return CampaignResult(rows, simulated, tuple(left_out), names, tables, views, failed)
 
     def _task(self, capture: Path, kind: str, flat: Path | None) -> CaptureTask:
         geometry = self.geometry if kind == "mueller" else self.stokes_geometry or self.geometry
@@ -158,23 +157,12 @@ class Campaign:
         )
 
 
-def _flats(folder: Path, paths: Sequence[Path]) -> dict[Path, Path]:
-    known = flat_captures(folder)
-    found = {}
-    for path in paths if known else ():
-        with Capture(path) as capture:
-            if (flat := nearest_flat(known, capture)) is not None:
-                found[path] = flat
-    return found
-
-
 def _registered(tasks: Sequence[CaptureTask], pool: Executor) -> list[CaptureTask]:
     # Camera and sphere stand still while the arm turns: each instrument takes its best image, mostly a side view.
     best: dict[str, tuple[float, str]] = {}
-    futures = [pool.submit(locate, task) for task in tasks]
-    for task, future in zip(tasks, futures, strict=True):
-        found = future.result()
-        if found is not None and (task.kind not in best or found < best[task.kind]):
+    for task, found in zip(tasks, gather(pool, locate, tasks), strict=True):
+        # A capture that fails here fails again where it is measured, and is reported there.
+        if isinstance(found, tuple) and (task.kind not in best or found < best[task.kind]):
             best[task.kind] = found
     lacking = sorted({t.kind for t in tasks} - set(best))
     if lacking:

@@ -73,7 +73,7 @@ def run_batch(
             try:
                 made = make(path, bar.tick)
             except Exception as error:  # noqa: BLE001  # whatever is wrong with one input, the others are done
-                text, code = _reason(path, error)
+                text, code = reason_of(path, error)
                 failures.append(text)
                 worst = max(worst, code)
                 counts["failed"] += 1
@@ -262,7 +262,7 @@ def _natural(path: Path) -> list[tuple[bool, int, str]]:
     ]
 
 
-def _reason(path: Path, error: Exception) -> tuple[str, int]:
+def reason_of(path: Path, error: Exception) -> tuple[str, int]:
     """Words and exit code of a failure, as `command_line.run` has them for a command with one input."""
     text, code = " ".join(str(error).split()), 1
     if isinstance(error, ProcessError):

@@ -45,9 +45,9 @@ def calibrate_command(
     from processing.calibration.fitted_file import write_fitted
     from processing.calibration.known_sample import part_of
     from processing.calibration.train import POOR_FIT, fit_curves, fit_trains
-    from processing.commands.region import parse_region
     from processing.doors import require_distinct, require_new
     from processing.instrument.model import InstrumentModel
+    from processing.maps.region import parse_region
     from processing.reduction.instrument_of_capture import require_belongs
     from processing.storage.captures.capture import Capture
 

@@ -37,11 +37,11 @@ def mean_command(
     "u noise" gets smaller with more pixels and captures, "u instrument" does not.
     """
     from processing.commands.progress_bar import progress_bar
-    from processing.commands.region import parse_region
     from processing.doors import require_distinct, require_new
     from processing.errors import ProcessError
     from processing.export.means_file import write_means
     from processing.maps.means import mean_of
+    from processing.maps.region import parse_region
     from processing.steps.reduction import reduced
     from processing.storage.products.product import Product
 

@@ -180,9 +180,11 @@ class _Mean:
         return cls(image, moves_of_light(systematic, fitted), inputs)
 
     def numbers(self) -> dict[str, _Number]:
-        if isinstance(self.image, StokesImage):
-            return _stokes_numbers(self.image, self.moves[..., 0, 0])
-        return _mueller_numbers(self.image, self.moves)
+        # Without light a ratio is NaN.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if isinstance(self.image, StokesImage):
+                return _stokes_numbers(self.image, self.moves[..., 0, 0])
+            return _mueller_numbers(self.image, self.moves)
 
 
 def _good(mask: NDArray[np.uint8], values: NDArray[np.floating], source: Path) -> NDArray[np.bool_]:

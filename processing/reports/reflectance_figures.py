@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from processing.campaign.run import PAPER, CampaignResult
 from processing.geometry.viewing import ViewingGeometry
 from processing.reflectance.tables import ScatteringTable
 from processing.reports.colours import SIGNED
+from processing.reports.figure_style import entitle
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -21,8 +22,51 @@ STYLES = {451: ("tab:blue", "s"), 662: ("tab:red", "^")}
 _OTHERS = ("tab:green", "tab:purple", "tab:orange", "tab:brown")
 
 
-def campaign_figure(result: CampaignResult, title: str) -> Figure:
-    """RMSD of psi, |D| and xi0 against arm angle; dashed: averages of Jarecki and Kupinski, dotted: noise."""
+#: Quantities of a figure of curves where none is chosen, as far as the captures have them.
+CURVES = (
+    *("m00", "s0", "depolarization_index", "dop", "polarizance_linear", "dolp", "diattenuation_linear"),
+    *("retardance_deg", "docp", "polarizance_orientation_deg", "aolp_deg", "ellipticity_deg"),
+)
+
+
+def curves_figure(rows: Sequence[Mapping[str, Any]], quantities: Sequence[str], title: str, simulated: bool) -> Figure:
+    """Quantities against the arm angle, with bars of 95 %: a curve for each sample, wavelength and mode.
+
+    `rows` are those of `processing.campaign.curves.CurvePoint`. Without several angles the captures are in a row.
+    """
+    from matplotlib.figure import Figure
+
+    columns = min(3, len(quantities))
+    high = -(-len(quantities) // columns)
+    figure = Figure(figsize=(1 + 4.4 * columns, 0.8 + 3.4 * high), layout="constrained")
+    panels = figure.subplots(high, columns, squeeze=False).flat
+    captures = list(dict.fromkeys(row["capture"] for row in rows))
+    against_omega = len({row["omega_deg"] for row in rows if row["omega_deg"] == row["omega_deg"]}) > 1
+    for panel, name in zip(panels, quantities, strict=False):
+        curves: dict[str, list[Mapping[str, Any]]] = {}
+        for row in rows:
+            if row["quantity"] == name:
+                label = f"{row['sample']}, {row['wavelength_nm']:g} nm{', ' + row['mode'] if row['mode'] else ''}"
+                curves.setdefault(label, []).append(row)
+        for label, points in curves.items():
+            x = [row["omega_deg"] if against_omega else captures.index(row["capture"]) + 1 for row in points]
+            order = np.argsort(x)
+            y, low, top = (np.array([row[part] for row in points])[order] for part in ("value", "low", "high"))
+            bars = np.maximum([y - low, top - y], 0)
+            panel.errorbar(np.array(x)[order], y, bars, marker="o", markersize=3, linewidth=1, capsize=2, label=label)
+        unit = next((row["unit"] for row in rows if row["quantity"] == name), "")
+        panel.set_title(name.replace("_", " "), fontsize=10)
+        panel.set_ylabel(unit)
+        panel.set_xlabel("$\\Omega$ / degrees" if against_omega else "capture, in the order of the table")
+        panel.legend(fontsize=7)
+    for panel in list(panels):
+        panel.set_axis_off()
+    entitle(figure, f"{title}: means of the region, bars: 95 %", simulated)
+    return figure
+
+
+def campaign_figure(result: CampaignResult, title: str, with_paper: bool = False) -> Figure:
+    """RMSD of psi, |D| and xi0 against arm angle; dotted: noise, dashed: averages of Jarecki and Kupinski."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 4.2), layout="constrained")
@@ -39,14 +83,15 @@ def campaign_figure(result: CampaignResult, title: str) -> Figure:
         for panel, (name, label, noise) in zip(panels, quantities, strict=True):
             panel.plot(omega, [getattr(r, name) for r in rows], color=colour, marker=marker, label=f"{nm:g} nm")
             panel.plot(omega, [getattr(r, noise) for r in rows], color=colour, linestyle=":")
-            if round(nm) in PAPER:
+            if with_paper and round(nm) in PAPER:
                 panel.axhline(getattr(PAPER[round(nm)], name), color=colour, linestyle="--", linewidth=0.8)
             panel.set_xlabel("$\\Omega$ / degrees")
             panel.set_ylabel(label)
     for panel in panels:
         panel.set_ylim(bottom=0)
         panel.plot([], [], color="0.3", linestyle=":", label="noise alone")
-        panel.plot([], [], color="0.3", linestyle="--", linewidth=0.8, label="paper, average")
+        if with_paper:
+            panel.plot([], [], color="0.3", linestyle="--", linewidth=0.8, label="paper, average")
         panel.legend(fontsize=8)
     figure.suptitle(f"SIMULATED   {title}" if result.simulated else title, fontsize=11)
     return figure

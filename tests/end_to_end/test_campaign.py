@@ -1,6 +1,13 @@
 """A small campaign from simulated captures of both instruments through every command that reflectance has."""
 
+import csv
 import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
 from pathlib import Path
 
 import h5py
@@ -63,7 +70,8 @@ def test_campaign_of_a_true_model_has_small_deviations(folder, configs, process)
     code, out, err = process("campaign", folder, *options(configs))
     assert code == 0, err
     assert "SIMULATED" in out
-    assert f"{PAPER[662].psi_deg:.2f}" in out
+    # The averages are of one red sphere, not of any sample.
+    assert not [line for line in out.splitlines() if line.split()[:1] == ["paper"]]
     table = (folder / "campaign/campaign.csv").read_text().splitlines()
     rows = [dict(zip(table[0].split(","), map(float, line.split(",")), strict=True)) for line in table[1:]]
     assert [r["omega_deg"] for r in rows] == list(ANGLES)
@@ -74,6 +82,88 @@ def test_campaign_of_a_true_model_has_small_deviations(folder, configs, process)
         # So small a Mueller image fills only part of the one-degree bins that the Stokes camera sees.
         assert r["common"] > 0.1
     assert (folder / "campaign/campaign.png").stat().st_size > 10_000
+
+
+def test_the_paper_is_compared_with_on_request(folder, configs, process):
+    code, out, err = process("campaign", folder, *options(configs), "--paper")
+    assert code == 0, err
+    assert f"{PAPER[662].psi_deg:.2f}" in next(line for line in out.splitlines() if line.split()[:1] == ["paper"])
+
+
+def read(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def of_film(folder):
+    """Means of the sample "film", by quantity."""
+    rows = read(folder / "campaign/means.csv")
+    return {row["quantity"]: float(row["value"]) for row in rows if row["sample"] == "film"}
+
+
+def test_without_a_geometry_every_capture_has_its_means(folder, configs, process, tmp_path):
+    code, out, err = process("campaign", folder, "--out", tmp_path / "out")
+    assert code == 0, err
+    assert [line.split()[0] for line in out.splitlines() if ".h5" in line] == ["made"] * 4
+    rows = {(row["capture"], row["quantity"]): row for row in read(tmp_path / "out/means.csv")}
+    scene = Scene.load(configs / "scenes/red_sphere.yaml")
+    for omega in ANGLES:
+        m = scene.mueller_image(omega, 662, 90, 90)[22:68, 22:68].mean(axis=(0, 1))
+        for quantity, true in (("m01_over_m00", m[0, 1] / m[0, 0]), ("m11_over_m00", m[1, 1] / m[0, 0])):
+            row = rows[f"drr_{omega:g}.h5", quantity]
+            assert float(row["omega_deg"]) == omega
+            assert float(row["low"]) < float(row["value"]) < float(row["high"])
+            assert abs(float(row["value"]) - true) < 5 * float(row["u"]) + 1e-3
+        assert 0 < float(rows[f"stokes_{omega:g}.h5", "dolp"]["value"]) < 0.5
+    assert (tmp_path / "out/means.png").stat().st_size > 10_000
+    code, out, _ = process("campaign", folder, "--out", tmp_path / "out", "--quantity", "dolp")
+    assert [line.split()[0] for line in out.splitlines() if ".h5" in line] == ["unchanged"] * 4
+    code, _, err = process("campaign", folder, "--out", tmp_path / "out", "--quantity", "beauty")
+    assert (code, "--quantity beauty: no such quantity. There are: " in err) == (2, True)
+
+
+def test_half_of_a_geometry_is_refused(folder, configs, process):
+    code, _, err = process("campaign", folder, *options(configs)[:2])
+    assert (code, "--geometry FILE and --material FILE go together" in err) == (2, True)
+
+
+def small(folder, configs, name, omega, states=40, true=None, scene="white_diffuser", sample=None):
+    """A small capture; fewer than 16 states determine no matrix."""
+    instrument = InstrumentModel.load(configs / "instruments/rgb950.yaml")
+    bench = SimulatedBench(
+        Scene.load(configs / f"scenes/{scene}.yaml"), true or instrument, 662, 32, 32, seed=1, flux_e_per_s=5e5
+    )
+    path = folder / f"{name}.h5"
+    write_virtual_capture(path, bench, instrument, omega, states=states, darks=2, name=scene)
+    with h5py.File(path, "r+") as h5:
+        if sample:
+            header = json.loads(h5["entry"].attrs["header_json"])
+            h5["entry"].attrs["header_json"] = json.dumps(header | {"sample": sample})
+    return path
+
+
+def test_the_campaigns_own_air_corrects_its_instrument(configs, process, tmp_path):
+    instrument = InstrumentModel.load(configs / "instruments/rgb950.yaml")
+    azimuth = instrument.value_of("psg_retarder.azimuth_deg")
+    true = instrument.with_values({"psg_retarder": {"azimuth_deg": {nm: v + 1 for nm, v in azimuth.items()}}})
+    folder = tmp_path / "captures"
+    folder.mkdir()
+    small(folder, configs, "air", 180, true=true, scene="air", sample={"kind": "air", "name": "air"})
+    small(folder, configs, "again", 180, true=true, scene="air", sample={"kind": "unknown", "name": "film"})
+    code, _, err = process("campaign", folder)
+    assert code == 0, err
+    wrong = of_film(folder)
+    code, out, err = process("campaign", folder, "--correct")
+    assert code == 0, err
+    assert "instrument of 2 captures, by 1 of air" in out
+    right = of_film(folder)
+    assert abs(wrong["m12_over_m00"]) > 0.02
+    assert abs(right["m12_over_m00"]) < 0.002
+    code, out, err = process("campaign", folder, "--correct")
+    assert (code, "residual" in out, out.count("unchanged")) == (0, False, 2), err
+    (folder / "air.h5").unlink()
+    code, _, err = process("campaign", folder, "--correct")
+    assert (code, "no capture of air for --correct. Take one:" in err) == (2, True)
 
 
 def test_tables_compared_by_hand_give_the_campaigns_number(here, configs, process, tmp_path):
@@ -125,6 +215,47 @@ def test_a_cluster_gives_the_same_numbers(folder, here, configs, tmp_path):
     with distributed.LocalCluster(**settings) as cluster, executor(scheduler=cluster.scheduler_address) as pool:
         there = Campaign(folder, tmp_path, *files).run(pool)
     assert here.rows == there.rows
+
+
+@pytest.mark.long
+def test_a_cluster_survives_a_capture_that_fails_and_a_worker_that_dies(configs, tmp_path):
+    distributed = pytest.importorskip("distributed")
+
+    def process(*words):
+        # The workers write their own tracebacks to the output of this process.
+        command = [sys.executable, "-m", "processing.commands.application", *map(str, words)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert "Traceback" not in done.stderr
+        return done.returncode, done.stdout, done.stderr
+
+    for number in range(12):
+        small(tmp_path, configs, f"c{number}", 20 + number, states=8 if number == 4 else 40)
+    settings = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None, "host": "127.0.0.1"}
+    with distributed.LocalCluster(**settings, protocol="tcp") as cluster:
+        killed = []
+
+        def kill():
+            while not list((tmp_path / "campaign").glob("*.mueller.h5")):
+                time.sleep(0.02)
+            killed.append(next(iter(cluster.workers.values())).pid)
+            os.kill(killed[0], signal.SIGKILL)
+
+        killer = threading.Thread(target=kill)
+        killer.start()
+        code, out, err = process("campaign", tmp_path, "--scheduler", cluster.scheduler_address)
+        killer.join()
+        made = {path: path.stat().st_mtime_ns for path in (tmp_path / "campaign").glob("*.mueller.h5")}
+        assert (code, len(made), killed != []) == (1, 11, True), err
+        assert [line for line in err.splitlines() if line.startswith("  ") and "c4.h5" in line], err
+        assert "1 capture failed. The same command makes only what is missing." in err
+        assert len({row["capture"] for row in read(tmp_path / "campaign/means.csv")}) == 11
+        # The capture is taken again.
+        small(tmp_path, configs, "c4", 24)
+        code, out, err = process("campaign", tmp_path, "--scheduler", cluster.scheduler_address)
+    assert code == 0, err
+    again = [line.split()[1] for line in out.splitlines() if line.startswith("made")]
+    assert again == [str(tmp_path / "campaign/c4.mueller.h5")]
+    assert all(path.stat().st_mtime_ns == stamp for path, stamp in made.items())
 
 
 def test_no_scheduler_is_a_message(folder, configs, process, monkeypatch):
