@@ -130,12 +130,14 @@ class SourceMoments:
         if free <= states:
             return None
         level, fitted, spread, covariance = np.ones(states), 0.0, 0.0, np.zeros((states, states))
+        rounding = float(np.finfo(float).eps * np.trace(self.products))
         for _ in range(STEPS):
             a = level[state, None] * seen
             back = np.linalg.pinv(a)
             outside = np.eye(rows) - a @ back
             left = outside @ self.products
-            unit = float(np.trace(left)) / (free - fitted)
+            # Data without noise leave only the rounding of these sums, which may be below zero.
+            unit = max(float(np.trace(left)), rounding) / (free - fitted)
             curvature = _by_state(outside * (seen @ (back @ self.products @ back.T) @ seen.T), states)
             gradient = -np.diag(left @ back.T @ seen.T).reshape(states, -1).sum(axis=1)
             size, vector = np.linalg.eigh(curvature)

@@ -7,6 +7,7 @@ import pytest
 from processing.instrument.model import InstrumentModel
 from processing.reduction.mueller import Choice, reduce_mueller
 from processing.reduction.noise import NoiseModel
+from processing.reduction.source_level import SourceMoments
 from processing.storage.captures.capture import Capture
 from processing.storage.products.images import MuellerImage
 from processing.storage.products.product import Step
@@ -108,3 +109,15 @@ def test_a_steady_source_costs_little(sample, measured):
 def test_a_source_that_is_declared_steady_is_not_asked(measured):
     _, _, facts = measured("drr_wollaston", HALF_WAVE, free_source=False)
     assert "source" not in facts
+
+
+def test_data_without_noise_have_levels_of_one(configs):
+    """The residual of such data is rounding of either sign, which differs between processors."""
+    model = InstrumentModel.load(configs / "instruments/mosaic_polarimeter.yaml").at(662)
+    w = model.rows({"psg": 9.0 * np.arange(40)}).reshape(-1, 16)
+    y = w @ HALF_WAVE.reshape(16)
+    basis = np.linalg.svd(w)[2][: np.linalg.matrix_rank(w)].T
+    for rounding in (-1e-16, 0.0, 1e-16):
+        products = np.outer(y, y) + rounding * (y @ y) / len(y) * np.eye(len(y))
+        levels = SourceMoments(products, 1000, len(w) // 40).levels(w, basis)
+        np.testing.assert_allclose(levels.relative, 1, atol=1e-6)
