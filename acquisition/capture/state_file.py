@@ -269,7 +269,8 @@ def lock(file: int) -> None:
 def wait_until_free(path: Path) -> None:
     """Return when no other program writes a file, or after a while."""
     with contextlib.suppress(OSError):
-        file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        # A pipe would be waited for.
+        file = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
         try:
             lock(file)
         finally:

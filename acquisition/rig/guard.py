@@ -38,7 +38,7 @@ from processing.yaml_file import parse_yaml
 #: Silence of `acquire` after which the guard shuts the light, and after which it takes over and kills `acquire`.
 #: A process that was stopped says nothing for certain; one that could run may only be kept waiting.
 STOPPED_SHUT_S, STOPPED_KILL_S = 0.3, 1.0
-SILENT_SHUT_S, SILENT_KILL_S = 1.5, 10.0
+SILENT_SHUT_S, SILENT_KILL_S = 1.2, 10.0
 #: How often the guard looks.
 LOOK_S = 0.05
 #: A look that comes later than this was held up itself, as `acquire` probably was: no more of it counts as silence.

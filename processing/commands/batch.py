@@ -116,12 +116,12 @@ def make_products(
         raise ProcessError(f"--figure {figure}: one file for {len(inputs)} inputs. Leave it out: each gets its own.")
     place = place_for(inputs, out)
     first: list[Found] = []
-    sources: dict[Path, Path] = {}
+    sources: dict[str, Path] = {}
 
     def make(source: Path, tick: Progress) -> Made:
         step, start = step_of(source, tick)
         target = place(step.usual_path)
-        if (other := sources.setdefault(target.resolve(), source)) != source:
+        if (other := sources.setdefault(os.path.realpath(target), source)) != source:
             raise ProcessError(f"its product {target} is that of {other} too. Rename one of them.")
         found = step.kept_or_made(target, overwrite, tick)
         if not several:
@@ -186,7 +186,7 @@ def written_if_changed(target: Path, overwrite: bool, write: Callable[[Path], Se
         for path in targets:
             require_place(path, overwrite)
         for new, old in pairs:
-            os.replace(new, old.resolve())
+            os.replace(new, os.path.realpath(old))
     return Made(tuple(targets), False)
 
 

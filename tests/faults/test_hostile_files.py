@@ -71,13 +71,42 @@ def test_a_file_whose_parts_lie_elsewhere_is_refused(
     assert "another file" in acquire_refuses("--resume", partial, "--rig", tmp_path / "rig.yaml")
 
 
-def test_a_file_of_the_kernel_is_refused(process_refuses, acquire_refuses, quickly, configs, tmp_path):
-    """/proc/kmsg says that it is a file of no bytes, and reading it does not end."""
-    assert acquire_refuses("--rig", "/proc/kmsg", "--dry-run")
-    assert process_refuses(
-        "import", "--states", "/proc/kmsg", "--instrument", configs / "instruments" / "rgb950.yaml",
-        "--wavelength", 662, "--out", tmp_path / "out.h5",
-    )  # fmt: skip
+NO_FILES = {
+    "pipe": os.mkfifo,
+    "circle of links": lambda path: path.symlink_to(path.name),
+    "device": lambda path: path.symlink_to("/dev/zero"),
+    # It says that it is a file of no bytes, and reading it does not end.
+    "file of the kernel": lambda path: path.symlink_to("/proc/kmsg"),
+}
+
+
+@pytest.mark.parametrize("put", NO_FILES.values(), ids=NO_FILES)
+def test_no_option_waits_for_what_is_no_file(
+    put, acquire, process_refuses, quickly, synthetic_capture, configs, tmp_path
+):
+    capture = synthetic_capture(np.ones((4, 1, 8, 8), "u2"), {"psg": np.arange(4.0)})
+    instrument = configs / "instruments" / "rgb950.yaml"
+    put(tmp_path / "odd.h5")
+    odd = tmp_path / "odd.h5"
+    for option in ("--rig", "--plan", "--campaign", "--resume", "--out"):
+        code, _, err = acquire(option, odd, "--dry-run")
+        assert code in (1, 2), (option, err)
+        assert "Traceback" not in err
+        assert "not answered" not in err
+    for command in ("reduce", "mean", "camera"):
+        assert process_refuses(command, odd)
+    assert process_refuses("calibrate-mosaic", capture, "--instrument", odd)
+    given = ("--instrument", instrument, "--wavelength", 662, "--out", tmp_path / "out.h5")
+    assert process_refuses("import", "--states", odd, *given)
+
+
+def test_a_circle_of_links_is_no_place_for_a_product(process, synthetic_capture, tmp_path):
+    loop = tmp_path / "loop.h5"
+    loop.symlink_to("loop.h5")
+    capture = synthetic_capture(np.ones((4, 1, 8, 8), "u2"), {"psg": np.arange(4.0)})
+    for command in ("reduce", "mean", "export"):
+        code, _, err = process(command, capture, "--out", loop)
+        assert code == 2, (command, err)
 
 
 @pytest.mark.parametrize(
@@ -99,16 +128,6 @@ def test_what_others_put_in_the_place_of_our_files_is_not_written(put, configs, 
     with pytest.raises(OSError):
         put_layout(tmp_path / "001.h5.new", 1000, lambda h5: None, b"")
     assert (tmp_path / "victim").read_text() == "precious"
-
-
-def test_a_link_loop_is_refused(acquire, process_refuses, configs, tmp_path):
-    loop = tmp_path / "loop"
-    loop.symlink_to("loop")
-    for option in ("--rig", "--plan", "--campaign", "--out", "--resume"):
-        code, _, err = acquire(option, loop)
-        assert code in (1, 2), (option, err)
-        assert "Traceback" not in err
-    assert process_refuses("reduce", loop)
 
 
 def test_a_zip_named_npy_is_refused(tmp_path):

@@ -88,7 +88,8 @@ class OpenH5:
 
 def mark_of(path: Path, name: str) -> Any:
     """An attribute of an HDF5 file; None if the file is none, is damaged, or has no such attribute."""
-    if not os.path.isfile(path):
+    # A file of the kernel says that it is empty, and reading it may not end.
+    if not os.path.isfile(path) or os.path.getsize(path) == 0:
         return None
     try:
         if endless_heap(Path(path)) is not None:

@@ -15,6 +15,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from processing.doors import require_file
 from processing.storage.integrity.content import without_frames_sha256
 from processing.storage.integrity.h5_door import mark_of
 
@@ -65,9 +66,10 @@ def file_identity(path: Path, role: str = "") -> dict[str, Any]:
     """What an input file is, as the provenance keeps it: role, path, size, and its content.
 
     A product is known by what it was made of, a capture by the SHA-256 of its bytes with the checksums of its frames
-    in place of them, any other file by the SHA-256 of its bytes.
+    in place of them, any other file by the SHA-256 of its bytes. Raises ProcessError for what is no file.
     """
-    identity = {"role": role, "path": str(path.resolve()), "bytes": path.stat().st_size}
+    size = require_file(path)
+    identity = {"role": role, "path": str(path.resolve()), "bytes": size}
     known = made_of(path)
     if known is not None:
         return identity | {MADE_OF: known}
