@@ -18,6 +18,7 @@ import serial
 
 from drivers.clock import REAL, Clock
 from drivers.errors import DeviceError, PortBusy, PortLost, ReplyError
+from drivers.log_process import LogProcess
 from drivers.serial_ports import WRITE_S, open_port
 
 # A framer takes one whole frame off the front of the buffer, or returns None until there is one.
@@ -45,19 +46,13 @@ class Transcript:
     """Writes every byte on the wire to a text file, one line for each write and read."""
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("a", encoding="ascii")
-        self._lock = threading.Lock()
+        self._log = LogProcess(path)
+        self.close = self._log.close
 
     def note(self, mark: str, data: bytes) -> None:
         """Add a line: real time in seconds, `>>` sent or `<<` received, the bytes as text and hex."""
         text = data.decode("ascii", "backslashreplace").encode("unicode_escape").decode("ascii")
-        with self._lock:
-            self._file.write(f"{time.monotonic():.4f} {mark} {text} [{data.hex(' ')}]\n")
-            self._file.flush()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        self._log.add(f"{time.monotonic():.4f} {mark} {text} [{data.hex(' ')}]\n")
 
 
 class SerialLink:

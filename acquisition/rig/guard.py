@@ -363,7 +363,9 @@ def main() -> None:
     held = dict(zip(hello["ports"], descriptors, strict=False))
     guard = Guard(with_held_ports(own, held), hello["pid"], journal, own)
     guard.open_cutoff()
-    sys.exit(0 if guard.watch(line) else 1)
+    in_order = guard.watch(line)
+    journal.close()
+    sys.exit(0 if in_order else 1)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from acquisition.rig.config import load_rig
+from acquisition.rig.rig import Rig
 from processing.storage.captures.capture import Capture
 from simulators.rig.served_rig import serve
 
@@ -106,3 +108,25 @@ def test_a_capture_goes_on_in_a_new_run_when_the_disc_process_was_killed(begun, 
     assert child.returncode == 1
     assert "the process that writes the captures has ended" in said
     assert not simulation.light()
+
+
+@pytest.mark.timeout(120)
+def test_a_wire_log_on_a_disc_that_hangs_holds_up_no_light(small_rig, tmp_path):
+    """A pipe that nobody reads takes 64 KiB; a write to it waits for ever then, as for a disc that hangs."""
+    small_rig("rig.yaml", top={"settle_s": 0.0})
+    with serve(tmp_path / "rig.yaml", tmp_path / "served.yaml", "red_sphere") as simulation:
+        config = load_rig(tmp_path / "served.yaml").model_copy(update={"wire_log": tmp_path / "wire"})
+        with Rig(config, with_camera=False):
+            pass
+        for log in (tmp_path / "wire").iterdir():
+            log.unlink()
+            os.mkfifo(log)
+        readers = [os.open(log, os.O_RDWR) for log in (tmp_path / "wire").iterdir()]
+        with Rig(config, with_camera=False) as rig:
+            rig.source.set_light(True)
+            for _ in range(500):
+                rig.source.is_on()
+            rig.source.set_light(False)
+            assert simulation.light() == 0
+        for reader in readers:
+            os.close(reader)

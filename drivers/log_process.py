@@ -1,0 +1,69 @@
+"""A log that a process of its own appends to its file: a disc that hangs or is full holds up nobody."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import threading
+import time
+from pathlib import Path
+
+#: What is kept in memory while the disc takes nothing; the oldest goes first.
+KEPT_BYTES = 1 << 20
+#: Longest wait for the disc when the log is closed.
+CLOSE_S = 1.0
+
+#: Processes that still wait for a disc; a handle that is dropped complains.
+_waiting: list[subprocess.Popen[bytes]] = []
+
+
+class LogProcess:
+    """Appends text to a file; without one, or without a process to be had, it forgets it."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._kept = b""
+        self._lock = threading.Lock()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._pipe = -1
+        if path is not None:
+            with contextlib.suppress(OSError):
+                self._process = subprocess.Popen(
+                    ["tee", "-a", str(path)],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,
+                    start_new_session=True,
+                )
+                assert self._process.stdin is not None
+                self._pipe = self._process.stdin.fileno()
+                os.set_blocking(self._pipe, False)
+
+    def add(self, text: str) -> None:
+        """Add text."""
+        with self._lock:
+            self._kept = (self._kept + text.encode())[-KEPT_BYTES:]
+        self.flush()
+
+    def flush(self) -> None:
+        """Pass on what is kept, as far as it is taken now."""
+        with self._lock, contextlib.suppress(OSError):
+            if self._process is not None and self._kept:
+                self._kept = self._kept[os.write(self._pipe, self._kept) :]
+
+    def close(self) -> None:
+        """Pass on what is kept and end, as far as the disc takes it within CLOSE_S."""
+        process, end_s = self._process, time.monotonic() + CLOSE_S
+        if process is None:
+            return
+        while self._kept and process.poll() is None and time.monotonic() < end_s:
+            self.flush()
+            time.sleep(0.005)
+        with self._lock:
+            self._process = None
+            assert process.stdin is not None
+            process.stdin.close()
+        try:
+            process.wait(max(0.0, end_s - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            _waiting.append(process)
