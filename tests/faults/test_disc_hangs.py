@@ -4,6 +4,7 @@ The disc process is stopped, which is what a hanging disc is for the process tha
 freezes a file system.
 """
 
+import contextlib
 import json
 import os
 import signal
@@ -31,7 +32,9 @@ def _disc_process(pid):
 
 def _open_files(pid):
     for link in Path(f"/proc/{pid}/fd").iterdir():
-        yield Path(os.readlink(link))
+        # It may have been closed meanwhile.
+        with contextlib.suppress(FileNotFoundError):
+            yield Path(os.readlink(link))
 
 
 @pytest.fixture

@@ -167,6 +167,18 @@ def test_a_guard_writes_to_a_port_that_somebody_holds(open_rig):
     assert not _lit(simulation)
 
 
+def test_all_that_was_noted_is_in_the_file_when_the_journal_is_closed(tmp_path, monkeypatch):
+    """The process that writes may begin late on a busy machine; a guard that has ended has its last line written."""
+    late = tmp_path / "tee"
+    late.write_text('#!/bin/sh\nsleep 0.3\nexec /usr/bin/tee "$@"\n')
+    late.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    journal = Journal(tmp_path / "guard.jsonl")
+    journal.note("guard rests")
+    journal.close()
+    assert "guard rests" in (tmp_path / "guard.jsonl").read_text()
+
+
 def test_acknowledge_is_a_command(acquire, monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     path = alarms.give_alarm("bench", "THE LIGHT IS NOT SHUT")
