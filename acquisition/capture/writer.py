@@ -41,7 +41,7 @@ PATIENCE_S = 1.5
 DEAD_S = 30.0
 #: How long any call may take before the light is shut; one that changes no byte is tried every LOOK_S.
 DARK_S = 0.8
-LOOK_S = 0.2
+LOOK_S = 0.1
 #: Layout, notes and journals besides the frames, and the columns of a state, generously.
 LAYOUT_BYTES = 3 << 19
 COLUMN_BYTES = 512
