@@ -67,6 +67,8 @@ def _readable(data: dict[str, Any]) -> RigConfig:
     axes = data.get("axes")
     sections["axes"] = {}
     for name, entry in axes.items() if isinstance(axes, dict) else ():
+        if not isinstance(name, str):
+            continue
         try:
             sections["axes"][name] = TypeAdapter(AxisEntry).validate_python(entry)
         except ValidationError:

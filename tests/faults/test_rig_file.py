@@ -41,6 +41,7 @@ MISTAKES = {
     "no address twice": ({"axes.psa": ZABER, "axes.psg": ZABER}, ("axes.psa", "as psg")),
     "two protocols on a line": ({"axes.arm.port": "sim:rotators"}, ("axes.arm.port", "one protocol")),
     "source on an axis's line": ({"source.port": "sim:arm"}, ("source.port", "one protocol")),
+    "axis called by a number": ({"axes": {4: {**ZABER, "address": 1}}}, ("axes.4", "text")),
     "backlash misspelt": ({"backlash_deg": {"amr": 1}}, ("backlash_deg.amr", "no axis")),
     "home_order misspelt": ({"home_order": ["amr", "psg"]}, ("home_order", "no axis")),
     "home_order twice": ({"home_order": ["arm", "arm"]}, ("home_order", "twice")),
