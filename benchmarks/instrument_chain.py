@@ -5,7 +5,9 @@ capture of another sample is reduced with the nominal and with the written file.
 the emulated sample, or the ratio of the channels of measured data.
 
     python benchmarks/instrument_chain.py             prints the table of docs/studies/instrument-chain.md
-    python benchmarks/instrument_chain.py --starts    five instruments, each from two nominal files 100 degrees apart
+    python benchmarks/instrument_chain.py --starts    five instruments, each from nominal files 40 to 260 degrees apart
+    python benchmarks/instrument_chain.py --draws     measured data, the model from 36 of the 46 states of air
+    python benchmarks/instrument_chain.py --air       faults of the capture of air alone
 """
 
 from __future__ import annotations
@@ -146,8 +148,10 @@ class Row:
         return f"| {self.name} | {self.reference} | {figures} | {self.verdict.replace('_', ' ')} |"
 
 
-def emulated(name: str, folder: Path, seed: int = 1) -> Row:
-    """The chain of one instrument of configs/instruments on an emulated bench."""
+def emulated(
+    name: str, folder: Path, seed: int = 1, fault: Callable[[Bench, np.random.Generator], Wrong] | None = None
+) -> Row:
+    """The chain of one instrument of configs/instruments on an emulated bench, with a `fault` of air alone."""
     bench, file = BENCHES[name], folder / f"{name}.yaml"
     text = (INSTRUMENTS / f"{name}.yaml").read_text(encoding="utf-8")
     for value in bench.leave_out:
@@ -159,7 +163,10 @@ def emulated(name: str, folder: Path, seed: int = 1) -> Row:
         place, _, field = value.rpartition(".")
         true = true.with_values({place: {field: float(true.value_of(value) or 0.0) + by}})  # type: ignore[arg-type]
     random = np.random.default_rng(seed)
-    air, other = (_capture(true, bench, m, kind, file, random) for m, kind in ((np.eye(4), "air"), (SAMPLE, "unknown")))
+    air = _capture(
+        true, bench, np.eye(4), "air", file, random, fault(bench, np.random.default_rng(seed)) if fault else None
+    )
+    other = _capture(true, bench, SAMPLE, "unknown", file, random)
 
     def truth(product: dict[str, Array]) -> Array:
         if "stokes" not in product:
@@ -168,6 +175,39 @@ def emulated(name: str, folder: Path, seed: int = 1) -> Row:
         return np.asarray(sent / sent[0])
 
     return chain(name, air, other, file, truth, "the emulated sample")
+
+
+#: Angles of the axes as they were, and the level of the source (states,), of a capture with a fault.
+Wrong = tuple[dict[str, Array], Array]
+
+
+def _slips(bench: Bench, random: np.random.Generator) -> Wrong:
+    angles, level = _right(bench)
+    for _ in range(2):
+        first, axis = random.integers(3, len(level) - 3), list(angles)[random.integers(len(angles))]
+        angles[axis][first:] += random.uniform(0.3, 2) * random.choice([-1, 1])
+    return angles, level
+
+
+def _smooth_source(bench: Bench, random: np.random.Generator) -> Wrong:
+    angles, level = _right(bench)
+    turn = 2 * np.pi * np.arange(len(level)) / len(level)
+    wave = 0.02 * np.cos(2 * turn * random.integers(1, 4) + random.uniform(0, 6))
+    return angles, level + wave + 0.01 * np.cos(turn + random.uniform(0, 6))
+
+
+def _angles(bench: Bench, random: np.random.Generator) -> Wrong:
+    angles, level = _right(bench)
+    return {axis: a + random.normal(0, 0.2, a.size) for axis, a in angles.items()}, level
+
+
+def _right(bench: Bench) -> Wrong:
+    angles = {axis: np.array(a, dtype=float) for axis, a in bench.angles_deg.items()}
+    return angles, np.ones(len(next(iter(angles.values()))))
+
+
+#: Faults of the capture of air alone: what they change must not reach another sample.
+OF_AIR = {"slips": _slips, "source": _smooth_source, "angles": _angles}
 
 
 def chain(
@@ -194,8 +234,11 @@ def chain(
     return Row(name, nominal, alone, written, stated, found.verdict, reference)
 
 
-def half_wave_plate(nm: int, files: Mapping[str, Path], folder: Path) -> Row:
-    """The chain on measured data: air, then a half-wave plate, against the ratio of the two channels."""
+def half_wave_plate(nm: int, files: Mapping[str, Path], folder: Path, draw: int = 0) -> Row:
+    """The chain on measured data: air, then a half-wave plate, against the ratio of the two channels.
+
+    Of another `draw` than 0 the chain sees 36 of the 46 states of air.
+    """
     air, plate = (
         next(t for t in tables_of("drr-wollaston-nir", files) if t.name == f"{kind}_{nm}nm") for kind in KINDS
     )
@@ -209,6 +252,9 @@ def half_wave_plate(nm: int, files: Mapping[str, Path], folder: Path) -> Row:
         m = product["mueller"] / product["mueller"][0, 0]
         return min((reference, flip @ reference @ flip), key=lambda one: _rms(one - m))
 
+    if draw:
+        kept = sorted(np.random.default_rng(draw).choice(len(air.rows), len(air.rows) - 10, replace=False))
+        air = replace(air, rows=tuple(f"{n},{air.rows[k].partition(',')[2]}" for n, k in enumerate(kept)))
     return _measured("drr_wollaston", (air, plate), folder, truth, "the ratio of the channels")
 
 
@@ -320,7 +366,7 @@ PLATES = ("psg_retarder", "psa_retarder")
 TWO_PLATES = ("drr_wollaston", "drr_5to1", "drr_single_detector", "drr_imaging_630nm", "rgb950")
 
 
-def two_starts(name: str, folder: Path, plates: Sequence[str] = PLATES[1:]) -> Starts:
+def two_starts(name: str, folder: Path, plates: Sequence[str] = PLATES[1:], by_deg: float = 100.0) -> Starts:
     """Diagnose one capture of air from two nominal files; reduce one capture of another sample with both results."""
     bench, random = BENCHES[name], np.random.default_rng(2)
     calibrate = tuple(f"{plate}.{field}_deg" for plate in PLATES for field in ("azimuth", "retardance"))
@@ -331,7 +377,7 @@ def two_starts(name: str, folder: Path, plates: Sequence[str] = PLATES[1:]) -> S
     file.write_text(dump_yaml(nominal), encoding="utf-8")
     air, other = (_capture(true, bench, m, kind, file, random) for m, kind in ((np.eye(4), "air"), (SAMPLE, "unknown")))
     found, products = [], []
-    for by in (0.0, 100.0):
+    for by in (0.0, by_deg):
         model, new = _turned(nominal, **dict.fromkeys(plates, by)), folder / f"{name}_{by:g}.yaml"
         found.append(diagnose_captures([air], model)[0].diagnosis)
         write_instrument(new, model, found[-1])
@@ -353,13 +399,21 @@ def _turned(model: InstrumentModel, **by_deg: float) -> InstrumentModel:
 
 
 def _capture(
-    model: InstrumentModel, bench: Bench, sample: Array, kind: str, file: Path, random: np.random.Generator
+    model: InstrumentModel,
+    bench: Bench,
+    sample: Array,
+    kind: str,
+    file: Path,
+    random: np.random.Generator,
+    wrong: Wrong | None = None,
 ) -> Path:
     """An imported capture: fluxes, or frames of 48 x 48 pixels of a camera with a mosaic."""
     states = max((len(a) for a in bench.angles_deg.values()), default=4)
     angles = bench.angles_deg or {"": np.zeros(states)}
     level = 1 + bench.flicker * random.standard_normal((states, 1))
-    light = np.broadcast_to(model.rows(angles), (states, len(model.channels), 16)) @ sample.reshape(16) * level
+    as_they_were, extra = wrong or (angles, np.ones(states))
+    level = level * extra[:, None]
+    light = np.broadcast_to(model.rows(as_they_were), (states, len(model.channels), 16)) @ sample.reshape(16) * level
     table = {f"{axis}_deg": a for axis, a in bench.angles_deg.items()}
     stem = file.with_name(f"{file.stem}_{kind}")
     stack = None
@@ -425,24 +479,42 @@ def rows(folder: Path) -> Iterator[Row]:
         yield half_wave_plate(nm, files, folder)
 
 
-def main() -> None:
-    """Print the table."""
-    if "--starts" in sys.argv[1:]:
-        print("| instrument | plates off | difference / standard error | same sign | ratio of standard errors |")
-        print("|---|---|---|---|---|")
-        for name in TWO_PLATES:
+def _print_starts() -> None:
+    print("| instrument | plates off | by | difference / standard error | same sign | ratio of standard errors |")
+    print("|---|---|---|---|---|---|")
+    for name in TWO_PLATES:
+        for by in (40.0, 80.0, 100.0, 130.0, 170.0, 260.0):
             for plates in (PLATES[1:], PLATES):
                 with tempfile.TemporaryDirectory() as folder:
-                    found = two_starts(name, Path(folder), plates)
+                    found = two_starts(name, Path(folder), plates, by)
                 same = "yes" if found.same_signs else "no"
-                print(f"| {name} | {len(plates)} | {found.apart:.2f} | {same} | {found.ratio:.2f} |", flush=True)
+                figures = f"{found.apart:.2f} | {same} | {found.ratio:.2f}"
+                print(f"| {name} | {len(plates)} | {by:g} | {figures} |", flush=True)
+
+
+def _chosen(option: str, folder: Path) -> Iterator[Row]:
+    files = find_files("drr-wollaston-nir", [SHIPPED, DATA])
+    if option == "--draws" and files is not None:
+        yield from (half_wave_plate(nm, files, folder, draw) for nm in MEASURED_NM for draw in range(8))
+    elif option == "--air":
+        names = ("rgb950", "drr_5to1", "drr_wollaston", "linear_mueller")
+        for name, fault, seed in ((n, f, k) for n in names for f in OF_AIR for k in (2, 3)):
+            with tempfile.TemporaryDirectory() as own:
+                yield replace(emulated(name, Path(own), seed, OF_AIR[fault]), name=f"{name}, {fault}")
+    else:
+        yield from rows(folder)
+
+
+def main() -> None:
+    """Print the table, or that of an option."""
+    option = sys.argv[1] if len(sys.argv) > 1 else ""
+    if option == "--starts":
+        _print_starts()
         return
-    print(
-        "| instrument | reference | nominal file | fitted train alone | written file | stated error | verdict on air |"
-    )
+    print("| instrument | reference | nominal file | train alone | written file | stated error | verdict on air |")
     print("|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
-        for row in rows(Path(folder)):
+        for row in _chosen(option, Path(folder)):
             print(row.line, flush=True)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -97,21 +96,12 @@ def _print_means(found: Sequence[MeanValue]) -> None:
 
 def _print_budget(found: Sequence[MeanValue], name: str) -> None:
     from processing.errors import ProcessError
-    from processing.maps.means import Contribution
+    from processing.maps.means import BUDGET_COLUMNS
 
     one = next((value for value in found if value.name == name), None)
     if one is None:
         raise ProcessError(f"--budget {name}: no such quantity. Choose one of: {', '.join(v.name for v in found)}")
     typer.echo(f"{one.name} = {one.value:.6g} {one.unit}")
-    typer.echo(f"  {'input':50} {'u(input)':>9} {'sensitivity':>11} {'contribution':>12} {'share':>7} {'dof':>5}")
-    whole = Contribution("combined standard uncertainty", one.u, one.degrees_of_freedom)
-    for part in [*sorted(one.budget, key=lambda part: -part.u), whole]:
-        share = 100 * part.u**2 / one.u**2 if one.u else 0.0
-        given = "" if isnan(part.u_input) else f"{part.u_input:.3g}"
-        slope = "" if isnan(part.sensitivity) else f"{part.sensitivity:.3g}"
-        typer.echo(
-            f"  {part.source:50} {given:>9} {slope:>11} {part.u:12.3g} {share:5.1f} % {part.degrees_of_freedom:5.3g}"
-        )
-    typer.echo(
-        f"  k = {one.k:.2f}, U95 = {one.k * one.u:.3g}; 95 % interval {one.low:.6g} to {one.high:.6g} {one.unit}"
-    )
+    for line in (BUDGET_COLUMNS, *one.budget_lines):
+        typer.echo("  {:50} {:>9} {:>11} {:>12} {:>7} {:>5}".format(*line))
+    typer.echo(f"  {one.interval_text}")

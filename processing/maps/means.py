@@ -55,6 +55,10 @@ class Contribution:
     sensitivity: float = np.nan
 
 
+#: Columns of `MeanValue.budget_lines`.
+BUDGET_COLUMNS = ("input", "u(input)", "sensitivity", "contribution", "share", "dof")
+
+
 @dataclass(frozen=True)
 class MeanValue:
     """Mean of one quantity.
@@ -93,6 +97,28 @@ class MeanValue:
     def k(self) -> float:
         """Coverage factor for 95 %."""
         return coverage_factor(self.degrees_of_freedom)
+
+    @property
+    def interval_text(self) -> str:
+        """Coverage factor, expanded uncertainty and interval."""
+        ends = f"95 % interval {self.low:.6g} to {self.high:.6g} {self.unit}".strip()
+        return f"k = {self.k:.2f}, U95 = {self.k * self.u:.3g}; {ends}"
+
+    @property
+    def budget_lines(self) -> list[tuple[str, ...]]:
+        """A line of text for each input, the largest first, by `BUDGET_COLUMNS`; last the combined uncertainty."""
+        whole = Contribution("combined standard uncertainty", self.u, self.degrees_of_freedom)
+        return [
+            (
+                part.source,
+                "" if np.isnan(part.u_input) else f"{part.u_input:.3g}",
+                "" if np.isnan(part.sensitivity) else f"{part.sensitivity:.3g}",
+                f"{part.u:.3g}",
+                f"{100 * part.u**2 / self.u**2 if self.u else 0.0:.1f} %",
+                f"{part.degrees_of_freedom:.3g}",
+            )
+            for part in [*sorted(self.budget, key=lambda part: -part.u), whole]
+        ]
 
 
 def coverage_factor(degrees_of_freedom: float) -> float:

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from processing.doors import read_text, require_file, require_place
 from processing.errors import ProcessError
+from processing.maps.means import BUDGET_COLUMNS, mean_of
+from processing.maps.region import parse_region
 from processing.reflectance.tables import ScatteringTable, is_table
 from processing.reports.capture_facts import facts_of, papers_of
 from processing.reports.fact_words import fact_words
@@ -210,9 +212,39 @@ def _product(path: Path) -> Section:
             figures.append(Figure(png(drawn), "residual of the fit"))
         datasets = [("dataset", "unit", "what it is")]
         datasets += [(name, product.units(name), product.long_name(name)) for name in product.names]
+        tables: list[tuple[str, Sequence[Sequence[str]]]] = [("datasets", datasets), *_budgets(product)]
         warnings = list(product.facts.get("warnings", []))
         notes = [("provenance, oldest first", steps_text(product.steps))]
-        return Section(path.name, summary, figures, [("datasets", datasets)], warnings, notes)
+        return Section(path.name, summary, figures, tables, warnings, notes)
+
+
+#: Numbers whose uncertainty budget a report has, where a product determines them.
+BUDGETED = (
+    "coherency_eigenvalues_0",
+    "depolarization_index",
+    "diattenuation_linear",
+    "polarizance_linear",
+    "retardance_deg",
+    "dolp",
+    "aolp_deg",
+)
+
+
+def _budgets(product: Product) -> list[tuple[str, list[tuple[str, ...]]]]:
+    """Uncertainty budgets (GUM) of the mean over the middle half of the frame, which `process mean` prints too."""
+    if product.kind not in ("mueller", "stokes"):
+        return []
+    try:
+        found = mean_of([product.path], parse_region(None, product.shape))
+    except ProcessError:
+        # No pixel of the middle can be used.
+        return []
+    title = "uncertainty budget of {} = {:.6g} {}, mean of the middle half; {}"
+    return [
+        (title.format(one.name, one.value, one.unit, one.interval_text), [BUDGET_COLUMNS, *one.budget_lines])
+        for one in found
+        if one.name in BUDGETED
+    ]
 
 
 def _curve(path: Path) -> Section:

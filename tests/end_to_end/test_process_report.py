@@ -71,6 +71,10 @@ def test_report_is_self_contained(campaign: Path, capsys: pytest.CaptureFixture[
     for expected in ("condition number", "7.14", "residual of the fit", "reduce(capture=capture.h5", "rmsd.csv", "2.5"):
         assert expected in text, expected
     assert "nothing was subtracted" in text
+    # What `process mean --budget` prints, for the mean of the middle half.
+    assert re.search(r"uncertainty budget of depolarization_index = (1\.000|0\.999)\d*", text)
+    assert "noise of light and camera" in text
+    assert "U95 = " in text
     code, err = run(capsys, "report", campaign, "--out", out)
     assert code == 2
     assert "exists" in err

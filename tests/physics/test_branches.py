@@ -1,4 +1,4 @@
-"""Two nominal files, plates 100 degrees apart: the same M, the same signs, the same standard errors."""
+"""Two nominal files, plates 40 to 260 degrees apart: the same M, the same signs, the same standard errors."""
 
 import numpy as np
 import pytest
@@ -9,9 +9,9 @@ from benchmarks import instrument_chain as chain
 OTHER_SIGN = np.diag([1.0, 1.0, 1.0, -1.0])
 
 
-@pytest.mark.parametrize("instrument", chain.TWO_PLATES)
-def test_the_start_decides_nothing(instrument, tmp_path):
-    found = chain.two_starts(instrument, tmp_path)
+@pytest.mark.parametrize(("instrument", "by_deg"), list(zip(chain.TWO_PLATES, (100, 80, 40, 260, 130), strict=True)))
+def test_the_start_decides_nothing(instrument, by_deg, tmp_path):
+    found = chain.two_starts(instrument, tmp_path, by_deg=by_deg)
     assert found.apart < 1
     assert found.same_signs
     assert found.ratio < 1.2
