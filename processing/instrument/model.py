@@ -6,17 +6,15 @@ fixed or turned by a named axis, and one or more detector channels (docs/convent
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field, field_serializer, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from processing.arrays import Array
-from processing.instrument import direction_text
 from processing.instrument.changes import Changes
 from processing.instrument.elements import AnyElement, Part, Stated, number
 from processing.instrument.elements import Dispersive as Dispersive
@@ -24,10 +22,12 @@ from processing.instrument.elements import Element as Element
 from processing.instrument.elements import Polarizer as Polarizer
 from processing.instrument.elements import Retarder as Retarder
 from processing.instrument.elements import WavelengthError as WavelengthError
+from processing.instrument.fitted import AppliedEffect as AppliedEffect
+from processing.instrument.fitted import EffectParameter as EffectParameter
+from processing.instrument.fitted import SystematicError as SystematicError
+from processing.instrument.stated import TRAINS, Correlation, without_u
 from processing.yaml_file import load_yaml
 
-#: Where a file has elements.
-_TRAINS = ("generator", "analyzer", "channels", "elements")
 #: What fitted values belong to: mounts and mechanics, the same in all captures; the detector, the same as long as its
 #: full scale is; optics that follow a smooth curve over the wavelengths; optics with a value at each wavelength that
 #: has nothing to do with the next one; one capture alone.
@@ -47,113 +47,6 @@ class Channel(Part):
         if min(gain.values() if isinstance(gain, dict) else [gain]) <= 0:
             raise ValueError("the gain of a channel must be above 0")
         return gain
-
-
-class AppliedEffect(Part):
-    """One effect that `diagnose` found and added: what, where, how large, on which evidence."""
-
-    kind: str
-    element: str | None = None
-    parameters: dict[str, EffectParameter]
-    evidence: float | None = None
-    captures: tuple[str, ...] = ()
-    scope: Literal["instrument", "capture"] = "instrument"
-    wavelength_nm: float | None = None
-    indistinguishable_from: tuple[str, ...] = ()
-    probability: float | None = None
-
-    @field_validator("captures")
-    @classmethod
-    def _short(cls, captures: tuple[str, ...]) -> tuple[str, ...]:
-        """Files written before 24 November 2026 name a capture TITLE (FILE.h5)."""
-        return tuple(re.sub(r".* \((.+)\.h5\)", r"\1", name) for name in captures)
-
-
-#: Values by name of effects by label; values of many states in one text.
-_AsWritten = dict[str, dict[str, float | str]]
-
-
-class SystematicError(Part):
-    """What stays uncertain after a correction, as independent directions of one standard deviation each.
-
-    Together they are the covariance of all values of the posterior, as far as a Mueller matrix notices it. Each
-    direction is a set of small effects that belong together.
-
-    Attributes
-    ----------
-    directions
-        Effects of each direction, the one that a Mueller matrix notices most first; in a file by label, with their
-        values alone (`direction_text`).
-    rms_over_m00
-        Standard error of the elements of M/m00 that all of them make in the captures they were found in.
-    """
-
-    directions: tuple[tuple[AppliedEffect, ...], ...]
-    rms_over_m00: float
-    wavelength_nm: float | None = None
-
-    @field_validator(
-        "directions", mode="before", json_schema_input_type=tuple[_AsWritten | tuple[AppliedEffect, ...], ...]
-    )
-    @classmethod
-    def _read(cls, directions: Any) -> Any:
-        if not isinstance(directions, list | tuple):
-            return directions
-        return [direction_text.read(one) if isinstance(one, Mapping) else one for one in directions]
-
-    @field_serializer("directions", when_used="json")
-    def _told(self, directions: tuple[tuple[AppliedEffect, ...], ...]) -> list[_AsWritten]:
-        return [direction_text.told(effect.model_dump() for effect in one) for one in directions]
-
-
-class Correlation(Part):
-    """Correlation of standard uncertainties, as `process calibrate --write` finds it.
-
-    Attributes
-    ----------
-    between : "element.field" of each of K values.
-    coefficients : K (K - 1) / 2, below the diagonal, row by row.
-    """
-
-    between: tuple[str, ...]
-    coefficients: tuple[float, ...]
-    wavelength_nm: float | None = None
-
-    @model_validator(mode="after")
-    def _fits(self) -> Self:
-        count = len(self.between)
-        if len(self.coefficients) != count * (count - 1) // 2:
-            raise ValueError(f"{count} values have {count * (count - 1) // 2} correlation coefficients between them")
-        if np.linalg.eigvalsh(self.matrix)[0] < -1e-3:
-            raise ValueError("these correlations contradict each other: their matrix has a negative eigenvalue")
-        return self
-
-    @property
-    def matrix(self) -> Array:
-        """(K, K), symmetric, 1 on the diagonal."""
-        out = np.zeros((len(self.between),) * 2)
-        out[np.tril_indices(len(out), -1)] = self.coefficients
-        return np.asarray(out + out.T + np.eye(len(out)))
-
-
-class EffectParameter(Part):
-    """A fitted value with its standard error (None: it has none, `note` says why); or one at each wavelength."""
-
-    value: float | tuple[float, ...]
-    stderr: float | tuple[float, ...] | None = None
-    unit: str
-    note: str | None = None
-    wavelengths_nm: tuple[float, ...] | None = None
-
-    @property
-    def told(self) -> str:
-        """The value to the last of two digits of its standard error; the range of many values."""
-        if isinstance(self.value, tuple):
-            return f"{len(self.value)} values, {min(self.value):.4g} to {max(self.value):.4g}"
-        if not isinstance(self.stderr, float) or not 0 < self.stderr < np.inf:
-            return f"{self.value:.5g}"
-        digits = max(0, 1 - int(np.floor(np.log10(self.stderr))))
-        return f"{self.value:.{digits}f} ± {self.stderr:.{digits}f}"
 
 
 class InstrumentModel(Part):
@@ -198,7 +91,7 @@ class InstrumentModel(Part):
         if not isinstance(data, Mapping):
             return data
         found: dict[str, Any] = {}
-        plain = {key: _without_u(node, found) if key in _TRAINS else node for key, node in data.items()}
+        plain = {key: without_u(node, found) if key in TRAINS else node for key, node in data.items()}
         given = plain.get("stderr") or {}
         if not found or not isinstance(given, Mapping):
             return plain
@@ -379,27 +272,6 @@ def rank(w: ArrayLike) -> int:
     return int(np.linalg.matrix_rank(np.asarray(w, dtype=float).reshape(-1, 16), rtol=1e-8))
 
 
-def _without_u(node: Any, found: dict[str, Any]) -> Any:
-    """A train as a file has it, without standard uncertainties; those by "element.field" are put into `found`."""
-    if isinstance(node, list | tuple):
-        return [_without_u(part, found) for part in node]
-    if not isinstance(node, Mapping):
-        return node
-    plain = {}
-    for field, value in node.items():
-        plain[field] = _without_u(value, found) if field in _TRAINS else value
-        if field in _TRAINS or not isinstance(value, Mapping):
-            continue
-        if set(value) == {"value", "u"}:
-            plain[field], found[f"{node.get('name')}.{field}"] = value["value"], value["u"]
-            continue
-        at = {nm: one for nm, one in value.items() if isinstance(one, Mapping) and set(one) == {"value", "u"}}
-        if at:
-            plain[field] = {nm: at[nm]["value"] if nm in at else one for nm, one in value.items()}
-            found[f"{node.get('name')}.{field}"] = {nm: one["u"] for nm, one in at.items()}
-    return plain
-
-
 def _matrices(element: Element, angles_deg: Mapping[str, ArrayLike], states: int, changes: Changes | None) -> Array:
     azimuth = element.azimuth_rad(angles_deg, states)
     if changes is None:
@@ -463,6 +335,4 @@ def _resolve(node: Any, wavelength_nm: float, name: str) -> Any:
     return node
 
 
-AppliedEffect.model_rebuild()
-SystematicError.model_rebuild()
 InstrumentModel.model_rebuild()

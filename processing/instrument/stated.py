@@ -1,0 +1,66 @@
+"""Standard uncertainties that an instrument file states: `{value: ..., u: ...}`, and how they are correlated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Self
+
+import numpy as np
+from pydantic import model_validator
+
+from processing.arrays import Array
+from processing.instrument.elements import Part
+
+#: Where a file has elements.
+TRAINS = ("generator", "analyzer", "channels", "elements")
+
+
+class Correlation(Part):
+    """Correlation of standard uncertainties, as `process calibrate --write` finds it.
+
+    Attributes
+    ----------
+    between : "element.field" of each of K values.
+    coefficients : K (K - 1) / 2, below the diagonal, row by row.
+    """
+
+    between: tuple[str, ...]
+    coefficients: tuple[float, ...]
+    wavelength_nm: float | None = None
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        count = len(self.between)
+        if len(self.coefficients) != count * (count - 1) // 2:
+            raise ValueError(f"{count} values have {count * (count - 1) // 2} correlation coefficients between them")
+        if np.linalg.eigvalsh(self.matrix)[0] < -1e-3:
+            raise ValueError("these correlations contradict each other: their matrix has a negative eigenvalue")
+        return self
+
+    @property
+    def matrix(self) -> Array:
+        """(K, K), symmetric, 1 on the diagonal."""
+        out = np.zeros((len(self.between),) * 2)
+        out[np.tril_indices(len(out), -1)] = self.coefficients
+        return np.asarray(out + out.T + np.eye(len(out)))
+
+
+def without_u(node: Any, found: dict[str, Any]) -> Any:
+    """A train as a file has it, without standard uncertainties; those by "element.field" are put into `found`."""
+    if isinstance(node, list | tuple):
+        return [without_u(part, found) for part in node]
+    if not isinstance(node, Mapping):
+        return node
+    plain = {}
+    for field, value in node.items():
+        plain[field] = without_u(value, found) if field in TRAINS else value
+        if field in TRAINS or not isinstance(value, Mapping):
+            continue
+        if set(value) == {"value", "u"}:
+            plain[field], found[f"{node.get('name')}.{field}"] = value["value"], value["u"]
+            continue
+        at = {nm: one for nm, one in value.items() if isinstance(one, Mapping) and set(one) == {"value", "u"}}
+        if at:
+            plain[field] = {nm: at[nm]["value"] if nm in at else one for nm, one in value.items()}
+            found[f"{node.get('name')}.{field}"] = {nm: one["u"] for nm, one in at.items()}
+    return plain
