@@ -11,10 +11,12 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response
 
 from processing.errors import ProcessError
+from processing.polarization import gradients
+from processing.polarization.propagation import Derived
 from processing.reduction.noise import NoiseModel
 from processing.reports.colours import ALL, LIGHT, SIGNED, Scale, period_deg, scale_of, steps
 from processing.storage.captures.capture import Capture
-from processing.storage.products.images import MuellerImage, difference_errors
+from processing.storage.products.images import MuellerImage, difference_errors, element_gradient
 from processing.storage.products.product import LIT_ERRORS, Product, is_product
 from processing.storage.products.provenance import content_of
 from viewer.frames import chosen
@@ -24,6 +26,13 @@ from viewer.products import MATRICES, maps_of, named, read_map, units_words
 
 #: Errors at the ends of the scale of a difference over its error.
 ERRORS_SHOWN = 5.0
+
+#: Quantities of M that two Mueller products are compared in, with the noise that they share.
+DERIVED = {
+    "depolarization_index": gradients.depolarization_index,
+    "diattenuation_linear": gradients.diattenuation,
+    "polarizance_linear": gradients.polarizance,
+}
 
 #: Values and their standard errors, each (rows, columns).
 Measured = tuple[NDArray[np.float32], NDArray[np.float32]]
@@ -63,7 +72,22 @@ def _choices(a: Path, b: Path) -> tuple[list[dict[str, Any]], tuple[int, int]]:
         if first.kind in MATRICES and second.kind in MATRICES:
             elements = [{"label": f"m{k // 4}{k % 4} over m00", "name": "mueller", "index": k} for k in range(1, 16)]
             maps = [*elements, {"label": "m00", "name": "mueller", "index": 0}, *maps]
+        if _is_whole(first) and _is_whole(second):
+            maps += [{"label": name.replace("_", " "), "name": name, "index": 0} for name in DERIVED]
         return maps, first.shape
+
+
+def _is_whole(product: Product) -> bool:
+    return product.kind == "mueller" and int(product.facts.get("rank", 16)) == 16
+
+
+def _asked(product: Product, query: Any) -> tuple[str, int]:
+    """Dataset or derived quantity, and the number of it."""
+    return (query["name"], 0) if _is_derived(product, query) else named(product, query)
+
+
+def _is_derived(product: Product, query: Any) -> bool:
+    return _is_whole(product) and query.get("name") in DERIVED
 
 
 def _same_shape(a: tuple[int, int], b: tuple[int, int]) -> None:
@@ -80,8 +104,8 @@ def difference(request: Request) -> Response:
             window = Window.asked(query, first.shape, most=640)
             one, other = (_of_product(product, query, window) for product in (first, second))
             shared = _shared_errors(first, second, query, window)
-            name, index = named(first, query)
-            units = "" if name == "mueller" else first.units(name)
+            name, index = _asked(first, query)
+            units = "" if name == "mueller" or name in DERIVED else first.units(name)
             scale = scale_of("m00" if name == "mueller" and index == 0 else name, units, one[0])
     else:
         shared = None
@@ -114,7 +138,13 @@ def _ends(counts: NDArray[np.float32]) -> tuple[float, float]:
 
 
 def _of_product(product: Product, query: Any, window: Window) -> Measured:
-    name, index = named(product, query)
+    name, index = _asked(product, query)
+    if _is_derived(product, query):
+        image = _image(product, window)
+        values, gradient, *_ = _derived(image, name)
+        lit = image.values[0, 0] > LIT_ERRORS * np.nan_to_num(image.errors[0, 0])
+        shown = (np.where(lit, values, np.nan), np.sqrt(image.variance_of(gradient)))
+        return shown[0].reshape(window.shape).astype(np.float32), shown[1].reshape(window.shape).astype(np.float32)
     if name == "mueller":
         elements, errors = (
             window.every(product.get(dataset, window.rows)).reshape(16, *window.shape).astype(np.float32)
@@ -138,13 +168,23 @@ def _shared_errors(first: Product, second: Product, query: Any, window: Window) 
     captures = [[content_of(i) for i in every if i.get("role") == "capture"] for every in inputs]
     if captures[0] != captures[1] or not any(captures[0]):
         return None
-    name, index = named(first, query)
-    if name != "mueller" or not first.kind == second.kind == "mueller":
+    name, index = _asked(first, query)
+    if not (name == "mueller" or _is_derived(first, query)) or not first.kind == second.kind == "mueller":
         return np.full(window.shape, np.nan)
+    images = [_image(product, window) for product in (first, second)]
+    slopes = [element_gradient(i, index) if name == "mueller" else _derived(i, name).gradient for i in images]
+    return difference_errors(images, slopes).reshape(window.shape)
+
+
+def _image(product: Product, window: Window) -> MuellerImage:
+    """The pixels of a window, as rows of one."""
     rows, columns = (np.arange(part.start, part.stop, window.step) for part in (window.rows, window.columns))
-    pixels = ((rows - window.rows.start)[:, None] * first.shape[1] + columns).reshape(-1)
-    images = [MuellerImage.of(product, window.rows).at(pixels) for product in (first, second)]
-    return difference_errors(images[0], images[1], index).reshape(window.shape)
+    pixels = ((rows - window.rows.start)[:, None] * product.shape[1] + columns).reshape(-1)
+    return MuellerImage.of(product, window.rows).at(pixels)
+
+
+def _derived(image: MuellerImage, name: str) -> Derived:
+    return DERIVED[name](image.matrices.astype(float))[name]
 
 
 def _of_capture(capture: Capture, query: Any, window: Window) -> Measured:

@@ -130,6 +130,11 @@ def test_products_of_one_capture_share_its_noise(client, lab, drr_capture, confi
         alone = np.median(product.get("mueller_errors")[2, 2] / product.get("mueller")[0, 0])
     assert np.nanstd(apart) < 0.3 * alone
     assert np.nanstd(over) == pytest.approx(1, abs=0.2)
+    # So do maps of quantities.
+    (one, _, apart, over), _ = plane(client.get("/difference", params=asked | {"name": "depolarization_index"}))
+    assert np.nanmedian(one) == pytest.approx((0.5 / 3) ** 0.5, abs=0.02)
+    assert np.nanstd(apart) < 0.3 * np.nanstd(one)
+    assert np.nanstd(over) == pytest.approx(1, abs=0.25)
 
 
 @pytest.mark.parametrize("asked", [{"index": 16}, {"index": "x"}, {"name": "nothing"}, {"name": ""}])

@@ -275,24 +275,34 @@ class MuellerImage:
         return np.asarray(np.linalg.pinv(self.w, rcond=SMALLEST))
 
 
-def difference_errors(first: MuellerImage, second: MuellerImage, element: int) -> NDArray[np.float64]:
-    """Standard errors (rows, columns) of the difference of an element over m00, or of m00, of one capture's products.
+def difference_errors(images: Sequence[MuellerImage], gradients: Sequence[NDArray[np.floating]]) -> NDArray[np.float64]:
+    """Standard errors (rows, columns) of the difference of a quantity of two products of one capture.
 
     Both come from the same intensities, which they only weigh differently. NaN where that is not known: weighted
     products, or products of other states.
+
+    Parameters
+    ----------
+    gradients : of the quantity by the elements of each image, (rows, columns, 16).
     """
+    first, second = images
     if len(first.w) != len(second.w) or first.facts["weighted"] or second.facts["weighted"]:
         return np.full(first.mask.shape, np.nan)
-    weights = []
-    for image in (first, second):
-        m = image.values.reshape(16, -1).astype(float)
-        gradient = np.zeros_like(m)
-        gradient[element] = 1.0 if element == 0 else 1 / m[0]
-        if element:
-            gradient[0] = -m[element] / m[0] ** 2
-        weights.append(image._inverse.T @ gradient)
-    apart = np.einsum("np,np->p", np.square(weights[0] - weights[1]), first.told_variance)
+    one, other = (
+        image._inverse.T @ gradient.reshape(-1, 16).T for image, gradient in zip(images, gradients, strict=True)
+    )
+    apart = np.einsum("np,np->p", np.square(one - other), first.told_variance)
     return np.asarray(np.sqrt(apart).reshape(first.mask.shape))
+
+
+def element_gradient(image: MuellerImage, element: int) -> NDArray[np.float64]:
+    """Gradient (rows, columns, 16) of an element over m00, or of m00."""
+    m = image.values.reshape(16, *image.mask.shape).astype(float)
+    gradient = np.zeros((*image.mask.shape, 16))
+    gradient[..., element] = 1.0 if element == 0 else 1 / m[0]
+    if element:
+        gradient[..., 0] = -m[element] / m[0] ** 2
+    return gradient
 
 
 def neighbour_correlation(product: Product) -> NDArray[np.float64]:
