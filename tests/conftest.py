@@ -102,22 +102,10 @@ def configs() -> Path:
 @pytest.fixture
 def small_rig(configs: Path, tmp_path: Path) -> Callable[..., Path]:
     """Makes a simulated rig file with small frames and a fast clock; keywords change its `simulator` section."""
-    from ruamel.yaml import YAML
+    from tests.rig_files import write_rig
 
     def make(name: str = "rig.yaml", top: dict | None = None, **simulator: object) -> Path:
-        yaml = YAML()
-        rig = yaml.load(configs / "rigs" / "simulated.yaml")
-        quick = {"rows": 64, "columns": 80, "clock_speed": 50, "camera_wait_s": 60}
-        rig["simulator"].update(quick | simulator)
-        rig.update(top or {})
-        for mode in rig["modes"].values():
-            mode["instrument"] = str((configs / "rigs" / mode["instrument"]).resolve())
-        samples = rig["simulator"]["samples"]
-        samples.update({key: str((configs / "rigs" / path).resolve()) for key, path in samples.items()})
-        path = tmp_path / name
-        with path.open("w") as file:
-            yaml.dump(rig, file)
-        return path
+        return write_rig(configs, tmp_path / name, top, **simulator)
 
     return make
 
@@ -177,6 +165,17 @@ def chromium() -> str:
             pytest.fail("CI needs chromium")
         pytest.skip("no chromium here")
     return program
+
+
+@pytest.fixture
+def browser(chromium: str) -> Iterator[Any]:
+    """Debian's Chromium, without a window."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-dev-shm-usage"])
+        yield opened
+        opened.close()
 
 
 @pytest.fixture(autouse=True)

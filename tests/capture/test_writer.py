@@ -15,6 +15,7 @@ import h5py
 import numpy as np
 import pytest
 
+from acquisition.capture import layout
 from acquisition.capture import writer as writer_module
 from acquisition.capture.state_file import StateFile
 from acquisition.capture.writer import (
@@ -208,12 +209,19 @@ def test_room_that_is_too_small_is_refused_with_both_numbers(monkeypatch, tmp_pa
         check_space(tmp_path, needed + 1)
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES])
-def test_space_that_cannot_be_taken_leaves_nothing_behind(create, monkeypatch, tmp_path, number):
+@pytest.mark.parametrize(
+    ("place", "call", "number"),
+    [
+        *((os, "posix_fallocate", number) for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES)),
+        # HDF5 never writes to the disc: its layout is copied by calls whose errors are seen.
+        (layout, "write_whole", errno.EACCES),
+    ],
+)
+def test_space_that_cannot_be_taken_leaves_nothing_behind(create, monkeypatch, tmp_path, place, call, number):
     def refuse(*_: object) -> None:
         raise OSError(number, os.strerror(number))
 
-    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    monkeypatch.setattr(place, call, refuse)
     message = "cannot be created" if number == errno.EACCES else "cannot get them"
     with pytest.raises(AcquisitionError, match=message):
         create()

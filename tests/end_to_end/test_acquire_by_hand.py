@@ -5,9 +5,9 @@ import re
 import cv2
 import numpy as np
 import pytest
-from ruamel.yaml import YAML
 
 from simulators.rig.served_rig import serve
+from tests.rig_files import change_yaml
 
 BLACK_LEVEL = 64
 
@@ -16,14 +16,6 @@ BLACK_LEVEL = 64
 def served(small_rig, tmp_path):
     with serve(small_rig("behind.yaml"), tmp_path / "served.yaml", "red_sphere") as simulation:
         yield simulation, tmp_path / "served.yaml"
-
-
-def _change(rig, edit):
-    yaml = YAML()
-    tree = yaml.load(rig)
-    edit(tree)
-    with rig.open("w") as file:
-        yaml.dump(tree, file)
 
 
 def _positions(simulation):
@@ -55,7 +47,7 @@ def test_doctor_names_each_failure_and_goes_on(acquire, served):
         tree["axes"]["psa"]["address"] = 9
         tree["axes"]["arm"]["port"] = "/dev/ttyNOTHERE"
 
-    _change(rig, edit)
+    change_yaml(rig, edit)
     simulation.emulators["shutter"].trip(True)
     code, out, err = acquire("doctor", "--rig", rig)
     assert code == 1
@@ -80,7 +72,7 @@ def test_doctor_measures_packet_loss(acquire, served):
 
 def test_home_then_move_then_stop(acquire, served):
     simulation, rig = served
-    _change(rig, lambda tree: tree.update(home_at_start=False))
+    change_yaml(rig, lambda tree: tree.update(home_at_start=False))
     code, _, err = acquire("move", "arm", 30, "--rig", rig)
     assert code == 1
     assert "no reference" in err
@@ -133,7 +125,7 @@ def test_snap_sees_the_bench_as_it_is_not_as_it_was_declared(acquire, small_rig,
 
 def test_a_wire_log_holds_every_byte_of_every_line(acquire, served, tmp_path):
     _, rig = served
-    _change(rig, lambda tree: tree.update(wire_log="wire"))
+    change_yaml(rig, lambda tree: tree.update(wire_log="wire"))
     code, out, err = acquire("home", "psg", "--rig", rig, "--yes")
     assert code == 0, out + err
     logs = [path.read_text() for path in (tmp_path / "wire").glob("*.log")]

@@ -3,13 +3,14 @@
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from ruamel.yaml import YAML
 
 from simulators.rig.served_rig import serve
+from tests.rig_files import change_yaml
 
 PORTS = {
     "rotators": {"kind": "zaber", "axes": 2, "homed": True},
@@ -21,16 +22,7 @@ PORTS = {
 def changed(small_rig, tmp_path):
     """A served rig whose file is edited after the emulators have started."""
     with serve(small_rig("behind.yaml"), tmp_path / "served.yaml", "red_sphere"):
-
-        def change(edit):
-            yaml = YAML()
-            tree = yaml.load(tmp_path / "served.yaml")
-            edit(tree)
-            with (tmp_path / "served.yaml").open("w") as file:
-                yaml.dump(tree, file)
-            return tmp_path / "served.yaml"
-
-        yield change
+        yield partial(change_yaml, tmp_path / "served.yaml")
 
 
 def _line(out, what):

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from ruamel.yaml import YAML
 
 from processing.storage.captures.capture import Capture
 from simulators.clock import Clock
@@ -17,6 +16,7 @@ from simulators.rig.rig import SimulatedRig
 from simulators.serial.emulator import Emulator
 from simulators.serial.pty_port import PtyPort
 from simulators.serial.serve_options import ServeOptions
+from tests.rig_files import change_yaml
 
 Rig = Callable[..., Path]
 Acquire = Callable[..., tuple[int, str, str]]
@@ -91,11 +91,7 @@ def test_a_whole_capture_on_a_camera_that_nobody_here_wrote(
     monkeypatch.setattr(SimulatedRig, "_start_camera", lambda self: None)
     settings = {"pixel_format": "Mono8", "width": 128, "height": 96}
     camera = {"kind": "aravis", "packet_size": 9000, "answers_early": True, "settings": settings}
-    rig = small_rig(top={"camera": camera})
-    tree = YAML().load(rig)
-    tree["detector"]["bits"] = 8
-    with rig.open("w") as file:
-        YAML().dump(tree, file)
+    rig = change_yaml(small_rig(top={"camera": camera}), lambda tree: tree["detector"].update(bits=8))
     plan = tmp_path / "plan.yaml"
     # Its picture does not change with the light: darks would be as bright as the rest, and end the capture.
     plan.write_text("kind: plan\ndarks: 0\nexposure_s: 0.05\nstates: {kind: rotating_retarders, states: 20}\n")

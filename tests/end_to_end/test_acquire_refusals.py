@@ -8,19 +8,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from ruamel.yaml import YAML
 
 from acquisition.capture.job import Result
 from acquisition.commands.single import next_command
-
-
-def _changed(path, change):
-    yaml = YAML()
-    rig = yaml.load(path)
-    change(rig)
-    with path.open("w") as file:
-        yaml.dump(rig, file)
-    return path
+from tests.rig_files import change_yaml
 
 
 @pytest.fixture
@@ -46,19 +37,30 @@ def test_unknown_key_is_named_with_its_line(refused, small_rig):
     assert f"rig.yaml:{line}: home_at_strat: unknown key" in err
 
 
-def test_rig_file_copied_elsewhere_says_which_path_is_wrong(refused, small_rig, tmp_path):
-    rig = _changed(small_rig(), lambda r: r["modes"]["drr"].update(instrument="../instruments/rgb950.yaml"))
-    code, err = refused("--omega", 35, "--rig", rig)
-    assert code == 2
-    missing = rig.parent.parent / "instruments/rgb950.yaml"
-    assert f"modes.drr.instrument of the rig file: there is no file {missing}" in err
-
-
-def test_path_longer_than_any_file_has_is_told_in_a_line(refused, small_rig):
-    rig = _changed(small_rig(), lambda r: r["modes"]["drr"].update(instrument="x" * 5000))
-    code, err = refused("--omega", 35, "--rig", rig)
-    assert code == 2
-    assert "modes.drr.instrument of the rig file: there is no file" in err
+@pytest.mark.parametrize(
+    ("change", "code", "words"),
+    [
+        (
+            lambda r: r["modes"]["drr"].update(instrument="../instruments/rgb950.yaml"),
+            2,
+            ("modes.drr.instrument of the rig file: there is no file {folder}/instruments/rgb950.yaml",),
+        ),
+        (
+            lambda r: r["modes"]["drr"].update(instrument="x" * 5000),
+            2,
+            ("modes.drr.instrument of the rig file: there is no file",),
+        ),
+        (lambda r: r["axes"]["psa"].update(adress=2), 2, ("rig.yaml:", "adress: unknown key")),
+        (lambda r: r["axes"]["arm"].update(port="/dev/ttyNOTHERE"), 1, ("/dev/ttyNOTHERE", "no such port")),
+        (lambda r: r.update(home_at_start=False), 1, ("acquire home", "arm, psg, psa")),
+    ],
+    ids=["path of another folder", "path that is too long", "key of an axis", "port", "no reference"],
+)
+def test_what_is_wrong_in_a_rig_file_is_told_in_a_line(refused, small_rig, change, code, words):
+    rig = change_yaml(small_rig(), change)
+    found, err = refused("--omega", 35, "--rig", rig)
+    assert found == code
+    assert all(word.format(folder=rig.parent.parent) in err for word in words), err
     assert max(map(len, err.splitlines())) < 700
 
 
@@ -75,7 +77,7 @@ def test_path_longer_than_any_file_has_is_told_in_a_line(refused, small_rig):
 def test_what_is_not_on_this_machine_is_told_beside_the_rest(refused, acquire, small_rig, change, row, why):
     """A rig file of the bench on the desk of somebody else: its checks run, its runs do not."""
     parts = {key: change.pop(key) for key in ("samples", "truth") & change.keys()}
-    rig = _changed(
+    rig = change_yaml(
         small_rig(top=change), lambda r: [r["simulator"].setdefault(k, {}).update(v) for k, v in parts.items()]
     )
     code, out, err = acquire("--omega", 35, "--rig", rig, "--dry-run")
@@ -116,19 +118,10 @@ def test_wrong_key_of_an_exposure_speaks_of_that_kind_alone(refused, tmp_path):
     assert err.strip() == f"error: {plan}:2: exposure_s.taget: unknown key; is 'target' meant?"
 
 
-def test_unknown_key_of_an_axis_is_named_with_its_line(refused, small_rig):
-    rig = _changed(small_rig(), lambda r: r["axes"]["psa"].update(adress=2))
-    code, err = refused("--omega", 35, "--rig", rig)
-    assert code == 2
-    assert "adress: unknown key" in err
-    assert "rig.yaml:" in err
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (("--sample", "mirror"), ("nothing to measure", "--omega")),
-        (("--omega", 35, "--exposure", -1), ("error: exposure_s must be a positive number",)),
         (("--omega", 181), ("181", "0 to 180")),
         (("--omega", 3), ("forbidden pose", "arm")),
         (("--omega", 35, "--wavelength", 500), ("500", "662")),
@@ -136,7 +129,7 @@ def test_unknown_key_of_an_axis_is_named_with_its_line(refused, small_rig):
         (("--omega", 35, "--sample", "gold"), ("gold", "red_sphere")),
         (("--omega", 35, "--sample", "air"), ("air", "180")),
         (("--omega", 35, "--exposure", 100), ("100", "exposure")),
-        (("--omega", 35, "--exposure", -1), ("exposure_s", "positive")),
+        (("--omega", 35, "--exposure", -1), ("error: exposure_s must be a positive number",)),
         (("--omega", "nan"), ("omega_deg",)),
     ],
 )
@@ -152,14 +145,6 @@ def test_states_that_do_not_determine_a_mueller_matrix(refused, small_rig, tmp_p
     code, err = refused("--plan", plan, "--rig", small_rig())
     assert code == 2
     assert "rank 12 of 16" in err
-
-
-def test_no_such_port(refused, small_rig):
-    rig = _changed(small_rig(), lambda r: r["axes"]["arm"].update(port="/dev/ttyNOTHERE"))
-    code, err = refused("--omega", 35, "--rig", rig)
-    assert code == 1
-    assert "/dev/ttyNOTHERE" in err
-    assert "no such port" in err
 
 
 def test_camera_not_there(refused, small_rig):
@@ -179,7 +164,7 @@ def test_camera_not_there(refused, small_rig):
         for section in ("home_order", "homing", "endless", "backlash_deg", "park_deg", "forbidden", "solids"):
             del rig[section]
 
-    code, err = refused("--omega", 35, "--mode", "stokes", "--rig", _changed(small_rig(), camera_only))
+    code, err = refused("--omega", 35, "--mode", "stokes", "--rig", change_yaml(small_rig(), camera_only))
     assert code == 1
     assert "127.9.9.9" in err
 
@@ -194,7 +179,7 @@ def test_port_held_by_another_program_names_it(refused, small_rig):
     try:
         assert holder.stdout is not None
         holder.stdout.readline()
-        rig = _changed(small_rig(), lambda r: r["axes"]["arm"].update(port=path))
+        rig = change_yaml(small_rig(), lambda r: r["axes"]["arm"].update(port=path))
         code, err = refused("--omega", 35, "--rig", rig)
     finally:
         holder.kill()
@@ -204,14 +189,6 @@ def test_port_held_by_another_program_names_it(refused, small_rig):
         os.close(slave)
     assert code == 1
     assert f"pid {holder.pid}" in err
-
-
-def test_axes_without_reference_are_not_homed_unasked(refused, small_rig):
-    rig = _changed(small_rig(), lambda r: r.update(home_at_start=False))
-    code, err = refused("--omega", 35, "--rig", rig)
-    assert code == 1
-    assert "acquire home" in err
-    assert "arm, psg, psa" in err
 
 
 def test_nothing_asked_shows_help(acquire):

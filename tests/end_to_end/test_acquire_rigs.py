@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ruamel.yaml import YAML
 
 from processing.storage.captures.capture import Capture
 from simulators.camera.pixel_stamp import read_stamp
 from simulators.rig.controller_kinds import axis_configs, served_kinds
 from simulators.serial.serve_options import ServeOptions
+from tests.rig_files import write_rig
 
 #: Rotators turn freely, where the controller can be without limits; the second pair is for those that always have some.
 FREE = ((None, None), (-400.0, 2000.0))
@@ -64,24 +64,12 @@ class RigMaker:
 
     def write(self, source: dict | None) -> Path:
         """The rig file; without a source the plan must have no darks."""
-        yaml = YAML()
-        rig = yaml.load(self.configs / "rigs" / "simulated.yaml")
-        below = self.configs / "rigs"
-        for mode in rig["modes"].values():
-            mode["instrument"] = str((below / mode["instrument"]).resolve())
-        samples = {name: str((below / path).resolve()) for name, path in rig["simulator"]["samples"].items()}
         if source is not None and "port" in source:
             self.simulator["ports"]["source"] = {"kind": source["kind"]}
-        rig["simulator"] = {
-            "clock_speed": 50, "rows": 32, "columns": 40, "flux_e_per_s": 8e5, "camera_wait_s": 60, "stamp": True,
-            "samples": samples, **self.simulator,
-        }  # fmt: skip
-        rig["axes"], rig["source"] = self.axes, source
-        rig.update(settle_s=0.001, backlash_deg={}, interlocks=[], forbidden=[])
+        top = {"axes": self.axes, "source": source, "settle_s": 0.001, "backlash_deg": {}, "interlocks": []}
+        bench = {"rows": 32, "columns": 40, "flux_e_per_s": 8e5, "stamp": True}
         path = self.folder / "rig.yaml"
-        with path.open("w") as file:
-            yaml.dump(rig, file)
-        return path
+        return write_rig(self.configs, path, top | {"forbidden": []}, **bench, **self.simulator)
 
 
 SHUTTER = {"kind": "sc10", "port": "sim:source"}

@@ -8,12 +8,12 @@ import sys
 import time
 
 import pytest
-from ruamel.yaml import YAML
 
 from acquisition.rig.config import load_rig
 from acquisition.rig.rig import Rig
 from processing.storage.captures.capture import Capture
 from simulators.rig.served_rig import serve
+from tests.rig_files import change_yaml
 
 #: Far enough that nothing arrives by itself while a test runs, at the emulators' speed.
 FAR_DEG = 30_000.0
@@ -121,11 +121,7 @@ def test_emulators_of_another_command_are_out_of_reach(acquire, small_rig):
 
 def _declare_real(rig):
     """Real devices at real ports, as far as the command can tell: so it must ask."""
-    yaml = YAML()
-    tree = yaml.load(rig)
-    tree["simulated"] = False
-    with rig.open("w") as file:
-        yaml.dump(tree, file)
+    change_yaml(rig, lambda tree: tree.update(simulated=False))
 
 
 def test_homing_asks_first(acquire, served):

@@ -28,7 +28,6 @@ import serial
 import typer
 from markdown_it import MarkdownIt
 from PIL import Image
-from playwright.sync_api import sync_playwright
 from ruamel.yaml import YAML
 
 from acquisition.campaign.plan import Campaign
@@ -229,7 +228,9 @@ def serve(words: list[str]) -> None:
 
 
 @pytest.mark.long
-def test_the_documented_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture) -> None:
+def test_the_documented_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture, request: pytest.FixtureRequest
+) -> None:
     """The example of closing-the-loop.md ends applied and right, with the rig's own size and seed."""
     (block,) = (b for b in BLOCKS if b.page.stem == "closing-the-loop" and "report.html" in b.text)
     shutil.copytree(ROOT / "configs", tmp_path / "configs")
@@ -249,11 +250,9 @@ def test_the_documented_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
         assert error < 0.01
     if folder := os.environ.get("UMOV_SCREENSHOTS"):
         path = Path(folder) / "diagnose_report.png"
-        with sync_playwright() as playwright:
-            browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
-            page = browser.new_page(viewport={"width": 1000, "height": 900})
-            page.goto(f"file://{tmp_path}/report.html")
-            page.screenshot(path=path, full_page=True)
+        page = request.getfixturevalue("browser").new_page(viewport={"width": 1000, "height": 900})
+        page.goto(f"file://{tmp_path}/report.html")
+        page.screenshot(path=path, full_page=True)
         Image.open(path).convert("RGB").quantize(192).save(path, optimize=True)
 
 

@@ -15,6 +15,7 @@ from processing.storage.captures.capture import Capture
 from processing.storage.products.images import MuellerImage, StokesImage
 from processing.storage.products.product import Product
 from simulators.bench.scene import Scene
+from tests.rig_files import write_rig
 
 SHAPE = (96, 112)
 UNDECLARED = [
@@ -27,21 +28,11 @@ OMEGAS = (40, 50, 60)
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory, configs) -> Path:
     """Folder of a campaign taken by `acquire --campaign`: flats before the first and after the second capture."""
-    from ruamel.yaml import YAML
-
     from acquisition.commands.application import main
 
     folder = tmp_path_factory.mktemp("flats")
-    yaml, source = YAML(), configs / "rigs" / "simulated.yaml"
-    rig = yaml.load(source)
-    rig["simulator"] |= {"rows": SHAPE[0], "columns": SHAPE[1], "clock_speed": 200, "camera_wait_s": 60}
-    rig["simulator"] |= {"effects": UNDECLARED, "flux_e_per_s": 4e6}
-    for mode in rig["modes"].values():
-        mode["instrument"] = str((source.parent / mode["instrument"]).resolve())
-    samples = rig["simulator"]["samples"]
-    samples.update({name: str((source.parent / path).resolve()) for name, path in samples.items()})
-    with (folder / "rig.yaml").open("w") as file:
-        yaml.dump(rig, file)
+    bench = {"rows": SHAPE[0], "columns": SHAPE[1], "clock_speed": 200, "effects": UNDECLARED, "flux_e_per_s": 4e6}
+    write_rig(configs, folder / "rig.yaml", **bench)
     states = {"drr": "{kind: rotating_retarders, states: 30, step_deg: 12}", "stokes": "{kind: fixed, states: 10}"}
     for mode, table in states.items():
         (folder / f"{mode}.yaml").write_text(f"kind: plan\nmode: {mode}\ndarks: 4\nstates: {table}\n")

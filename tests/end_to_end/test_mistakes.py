@@ -2,23 +2,17 @@
 
 import h5py
 import pytest
-from ruamel.yaml import YAML
 
 from processing.campaign.captures import find_captures
 from processing.commands.application import main as process
 from processing.commands.diagnose import main as diagnose
+from tests.rig_files import change_yaml
 
 
 @pytest.fixture
 def unplugged(small_rig):
     """A rig file whose arm is at a port that is not there."""
-    path = small_rig()
-    yaml = YAML()
-    rig = yaml.load(path)
-    rig["axes"]["arm"]["port"] = "/dev/ttyUSB_none"
-    with path.open("w") as file:
-        yaml.dump(rig, file)
-    return path
+    return change_yaml(small_rig(), lambda rig: rig["axes"]["arm"].update(port="/dev/ttyUSB_none"))
 
 
 @pytest.mark.parametrize("command", [("--omega", 35), ("home",), ("move", "psg", 10)])

@@ -89,7 +89,7 @@ for instrument in (None, "hum.yaml"):
     assert with_hum > 1.2 * without
 
 
-def test_its_effect_is_searched(run, configs):
+def test_its_effect_is_searched_and_its_controller_is_served(run, configs):
     code = """
 import sys
 import numpy as np
@@ -97,40 +97,42 @@ from processing.diagnosis.search.candidate import pool
 from processing.instrument.changes import Conditions
 from processing.instrument.model import InstrumentModel
 from processing.instrument.states import rotating_retarders
+from simulators.rig.controller_kinds import served_kinds
 model = InstrumentModel.load(sys.argv[1]).at(662)
 conditions = Conditions.of(rotating_retarders(1.0).angles_deg)
-print(any(c.kind == "sample_hum" for c in pool(model, [conditions])))
+print(any(c.kind == "sample_hum" for c in pool(model, [conditions])), "sample_stage" in served_kinds())
 """
     done = run("-c", code, configs / "instruments/rgb950.yaml")
-    assert done.stdout.split() == ["True"], done.stderr
+    assert done.stdout.split() == ["True", "True"], done.stderr
 
 
-def test_simulate_serves_its_controller(run):
-    code = "from simulators.rig.controller_kinds import served_kinds; print('sample_stage' in served_kinds())"
-    assert run("-c", code).stdout.strip() == "True"
-
-
-REGISTRIES = {
-    "axes": "from drivers.registry import device_kinds as f; f('axes')",
-    "emulators": "from simulators.rig.controller_kinds import served_kinds as f; f()",
-    "effects": "from processing.instrument.applied_effects import instrument_effects as f; f()",
-    "reflectance": "from processing.reflectance.base import kinds as f; f()",
+#: Of each group an entry of another package with a name that is taken, and what reads the group.
+TAKEN = {
+    "axes": ("zaber = umov_sample.stage", "from drivers.registry import device_kinds as f; f('axes')"),
+    "emulators": (
+        "other = simulators.controllers.zaber",
+        "from simulators.rig.controller_kinds import served_kinds as f; f()",
+    ),
+    "effects": (
+        "psg_azimuth = umov_sample.hum:Hum",
+        "from processing.instrument.applied_effects import instrument_effects as f; f()",
+    ),
+    "reflectance": (
+        "first_surface = umov_sample.mirror:Model",
+        "from processing.reflectance.base import kinds as f; f()",
+    ),
 }
 
 
-@pytest.mark.parametrize(
-    ("group", "kind", "what"),
-    [
-        ("axes", "zaber", "umov_sample.stage"),
-        ("emulators", "other", "simulators.controllers.zaber"),
-        ("effects", "psg_azimuth", "umov_sample.hum:Hum"),
-        ("reflectance", "first_surface", "umov_sample.mirror:Model"),
-    ],
-)
-def test_a_plug_in_cannot_replace_what_is_here(run, tmp_path, group, kind, what):
+def test_a_plug_in_cannot_replace_what_is_here(run, tmp_path):
     folder = tmp_path / "other-1.0.dist-info"
     folder.mkdir()
     (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
-    (folder / "entry_points.txt").write_text(f"[umov.{group}]\n{kind} = {what}\n")
-    done = run("-c", f"import sys; sys.path.insert(0, {str(tmp_path)!r}); {REGISTRIES[group]}")
-    assert "which exists already" in done.stderr
+    (folder / "entry_points.txt").write_text(
+        "".join(f"[umov.{group}]\n{entry}\n" for group, (entry, _) in TAKEN.items())
+    )
+    code = f"import sys, traceback\nsys.path.insert(0, {str(tmp_path)!r})\n"
+    for group, (_, read) in TAKEN.items():
+        code += f"try:\n    {read}\nexcept Exception as error:\n    print({group!r}, error)\n"
+    done = run("-c", code)
+    assert [line.split()[0] for line in done.stdout.splitlines() if "which exists already" in line] == list(TAKEN)

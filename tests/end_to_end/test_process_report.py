@@ -2,12 +2,11 @@
 
 import os
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, sync_playwright
+from playwright.sync_api import Browser
 
 from processing.commands.application import main
 from processing.instrument.model import InstrumentModel
@@ -17,15 +16,6 @@ from processing.storage.captures.capture import Capture
 from processing.storage.products.product import Step
 
 VISIBLE = "n => n.checkVisibility({contentVisibilityAuto: true})"
-
-
-@pytest.fixture
-def browser(chromium: str) -> Iterator[Browser]:
-    """Debian's Chromium, without a window."""
-    with sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-dev-shm-usage"])
-        yield opened
-        opened.close()
 
 
 def run(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, str]:

@@ -152,9 +152,7 @@ def test_fit_of_the_truth_is_far_better_than_the_declared_instrument(bench, conf
     away = folder / "truth" / truth.name
     declared = InstrumentModel.load(configs / "instruments" / truth.instrument)
     exact = np.load(away / "validation.npy").astype(float)
-    reached = known_oracle(folder, truth, configs, "joint")
-    assert reached < Reduced.of(away / "validation.h5", declared).error(exact) / 3
-    assert known_oracle(folder, truth, configs, "joint") == reached
+    assert known_oracle(folder, truth, configs, "joint") < Reduced.of(away / "validation.h5", declared).error(exact) / 3
 
 
 @pytest.mark.timeout(600)

@@ -6,13 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-from playwright.sync_api import sync_playwright
 from ruamel.yaml import YAML
 
 ROOT = Path(__file__).parents[2]
 
 
-def test_the_search_of_the_site_works_without_a_server(tmp_path, chromium):
+def test_the_search_of_the_site_works_without_a_server(tmp_path, browser):
     yaml = YAML()
     settings = yaml.load(ROOT / "mkdocs.yml")
     # Two pages of it, without the interface: that imports and renders the program.
@@ -26,14 +25,11 @@ def test_the_search_of_the_site_works_without_a_server(tmp_path, chromium):
     (tmp_path / "docs" / "light.md").write_text("# Light\n\nThe guard shuts the light.\n")
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
     subprocess.run([sys.executable, "-m", "mkdocs", "build", "--quiet"], cwd=tmp_path, env=environment, check=True)
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        page = browser.new_page()
-        page.goto((tmp_path / "build/site/index.html").as_uri())
-        page.locator(".md-search__input").click()
-        page.keyboard.type("guard")
-        hit = page.locator(".md-search-result__link").first
-        hit.wait_for()
-        address = hit.get_attribute("href")
-        browser.close()
+    page = browser.new_page()
+    page.goto((tmp_path / "build/site/index.html").as_uri())
+    page.locator(".md-search__input").click()
+    page.keyboard.type("guard")
+    hit = page.locator(".md-search-result__link").first
+    hit.wait_for()
+    address = hit.get_attribute("href")
     assert "light.html" in str(address)

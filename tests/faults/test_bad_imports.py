@@ -34,6 +34,10 @@ def states(tmp_path):
     return write
 
 
+def _cell(row, column, text):
+    return lambda rows: rows[row].__setitem__(column, text)
+
+
 def _column(name):
     def add(rows):
         for k, row in enumerate(rows):
@@ -49,19 +53,28 @@ STATES = {
     "axis with a path": (_column("../x"), "letters"),
     "axis twice": (_column("psg"), "given twice"),
     "a row missing": (lambda rows: rows.pop(5), "state 4 is missing"),
-    "one file twice": (lambda rows: rows[7].__setitem__(3, "f2.png"), "f2.png is given already in line 4"),
-    "state of 400 digits": (lambda rows: rows[3].__setitem__(0, "9" * 400), "whole number"),
-    "state in other digits": (lambda rows: rows[3].__setitem__(0, "²"), "whole number"),
-    "a name that no file has": (lambda rows: rows[3].__setitem__(3, "9" * 5000), "no such frame"),
-    "no file": (lambda rows: rows[3].__setitem__(3, ""), "no name"),
+    "one file twice": (_cell(7, 3, "f2.png"), "f2.png is given already in line 4"),
+    "state of 400 digits": (_cell(3, 0, "9" * 400), "whole number"),
+    "state in other digits": (_cell(3, 0, "²"), "whole number"),
+    "a name that no file has": (_cell(3, 3, "9" * 5000), "no such frame"),
+    "no file": (_cell(3, 3, ""), "no name"),
+    "missing frame": (_cell(8, 3, "gone.png"), "states.csv:9: column file: no such frame: "),
+    "no number": (_cell(6, 1, "fortyfive"), "states.csv:7: column psg: 'fortyfive' is not a finite"),
+    "nan": (_cell(6, 1, "nan"), "states.csv:7: column psg: 'nan' is not a finite"),
+    "no column": (_cell(0, 2, "psa_angle"), "states.csv:1: no column psa"),
+    "state twice": (_cell(7, 0, 5), "states.csv:8: state 5 is given already in line 7"),
+    "short row": (lambda rows: rows[7].pop(1), "states.csv:8: 3 columns, the header has 4"),
+    "no rows": (lambda rows: rows.__delitem__(slice(1, None)), "needs a header line and one row per state"),
+    "no exposure": (_column("exposure_s"), "column exposure_s: 0 is not above 0"),
 }
 
 
 @pytest.mark.parametrize("name", STATES)
-def test_states_csv(states, process_refuses, name):
+def test_states_csv(states, process_refuses, tmp_path, name):
     change, word = STATES[name]
     arguments = ("--states", states(change), "--wavelength-nm", 662, "--instrument", INSTRUMENT)
     assert word in process_refuses("import", *arguments)
+    assert not list(tmp_path.glob("*.h5*"))
 
 
 def _png(path, wide, high):

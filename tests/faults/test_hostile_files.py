@@ -7,7 +7,6 @@ import zipfile
 import h5py
 import numpy as np
 import pytest
-from ruamel.yaml import YAML
 
 from acquisition.campaign.log import CampaignFolder
 from acquisition.campaign.plan import Campaign
@@ -23,6 +22,7 @@ from processing.storage.captures.capture import CaptureError
 from processing.storage.captures.schema import CaptureHeader
 from processing.storage.integrity.h5_door import read_npy
 from processing.yaml_file import ConfigError, parse_yaml
+from tests.rig_files import change_yaml
 
 SHORT = {"states": {"kind": "table", "angles": {"psg": [0.0, 10.0, 20.0]}}, "darks": 1, "mode": "stokes"}
 
@@ -210,12 +210,9 @@ def test_a_plan_that_cannot_be_meant_is_refused(text, said):
     ],
 )  # fmt: skip
 def test_a_campaign_that_cannot_be_meant_is_refused(key, value, said, configs, tmp_path):
-    yaml = YAML()
-    campaign = yaml.load(configs / "campaigns" / "red_sphere.yaml")
-    campaign[key] = value
-    yaml.dump(campaign, tmp_path / "c.yaml")
+    source, path = configs / "campaigns" / "red_sphere.yaml", tmp_path / "c.yaml"
     with pytest.raises(ConfigError, match=said):
-        Campaign.load(tmp_path / "c.yaml")
+        Campaign.load(change_yaml(source, lambda campaign: campaign.update({key: value}), to=path))
 
 
 def test_a_seed_that_no_generator_takes_is_refused(acquire):

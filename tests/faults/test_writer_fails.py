@@ -1,6 +1,5 @@
 """Promises 16 and 21: whatever ends or blocks the writer ends the run in order; a changed byte is found at reading."""
 
-import errno
 import multiprocessing
 import threading
 import time
@@ -9,15 +8,13 @@ from pathlib import Path
 import h5py
 import pytest
 
-from acquisition.capture import layout, state_file, writer
+from acquisition.capture import writer
 from acquisition.capture.runner import CaptureRunner
 from acquisition.capture.state_file import StateFile
 from acquisition.errors import AcquisitionError
 from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
-from processing.instrument.states import rotating_retarders
 from processing.storage.captures.capture import Capture, CaptureError
-from processing.storage.captures.schema import CaptureHeader
 
 SHORT = {"states": {"kind": "rotating_retarders", "states": 18, "step_deg": 20, "ratio": 4.91}, "darks": 1}
 
@@ -247,38 +244,6 @@ def test_doctor_says_that_a_light_was_left_on(small_rig):
         rig.source.close()
         with pytest.raises(AcquisitionError, match="LIGHT LEFT ON"):
             _source(rig)
-
-
-@pytest.fixture
-def new_writer(tmp_path):
-    """Makes a writer of a small capture in the test's own folder."""
-    header = CaptureHeader(title="test", simulated=True, mode="drr", wavelength_nm=662)
-    return lambda: writer.CaptureWriter.create(tmp_path / "x.h5", header, rotating_retarders(0.01), (4, 6), "now")
-
-
-def test_an_error_of_the_disc_in_the_layout_is_told_and_leaves_nothing(new_writer, monkeypatch, tmp_path):
-    """HDF5 never writes to the disc: its layout is copied by calls whose errors are seen."""
-
-    def failing(file, offset, raw):
-        raise OSError(errno.EIO, "injected")
-
-    monkeypatch.setattr(layout, "write_whole", failing)
-    with pytest.raises(AcquisitionError, match=r"cannot be created .*injected"):
-        new_writer()
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(("number", "refused"), [(errno.ENOLCK, False), (errno.EAGAIN, True), (errno.EIO, True)])
-def test_a_file_system_without_locks_is_no_obstacle(new_writer, monkeypatch, number, refused):
-    def flock(file, operation):
-        raise OSError(number, "injected")
-
-    monkeypatch.setattr(state_file.fcntl, "flock", flock)
-    if refused:
-        with pytest.raises(AcquisitionError, match="cannot be opened to resume"):
-            new_writer()
-    else:
-        new_writer().abandon()
 
 
 def test_captures_leave_no_thread_and_no_descriptor(run_with):

@@ -7,6 +7,7 @@ import pkgutil
 import subprocess
 import sys
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -112,9 +113,14 @@ def offered(configs: Path) -> set[str]:
     return kinds | set(reflectance_effects())
 
 
+@cache
+def offered_by_all(configs: Path) -> set[str]:
+    return offered(configs)
+
+
 @pytest.mark.parametrize(("folder", "name"), FILES)
 def test_without_one_file_the_others_are_offered(folder, name, hidden, configs):
-    before = offered(configs)
+    before = offered_by_all(configs)
     effect = {**instrument_effects(), **reflectance_effects()}[name]
     assert name in before or isinstance(effect, FromFileOnly)
     hidden(folder, name)

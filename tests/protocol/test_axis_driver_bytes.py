@@ -1,9 +1,5 @@
 """Byte transcripts: what each driver writes and how it reads the replies; a pair that is not used fails."""
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,40 +13,7 @@ from simulators.controllers import esp301 as esp301_emulator
 from simulators.controllers import zaber as zaber_emulator
 from simulators.serial.pty_port import PtyPort
 from simulators.serial.serve_options import ServeOptions
-
-
-class Script:
-    """A device that expects exactly these requests in this order and gives these replies."""
-
-    def __init__(self, pairs: list[tuple[bytes, bytes]]) -> None:
-        self.pairs = list(pairs)
-        self.received = b""
-        self.output = b""
-
-    def receive(self, data: bytes) -> None:
-        self.received += data
-        while self.pairs and self.received.startswith(self.pairs[0][0]):
-            request, reply = self.pairs.pop(0)
-            self.received = self.received[len(request) :]
-            self.output += reply
-
-    def take_output(self) -> bytes:
-        output, self.output = self.output, b""
-        return output
-
-    def next_output_s(self) -> float | None:
-        return None
-
-
-@contextmanager
-def scripted(*pairs: tuple[bytes, bytes]) -> Iterator[str]:
-    script = Script(list(pairs))
-    with PtyPort(script) as port:
-        yield port.path
-        give_up_s = patient_clock().now_s() + 1.0
-        while script.pairs and patient_clock().now_s() < give_up_s:
-            time.sleep(0.01)
-    assert (script.pairs, script.received) == ([], b"")
+from tests.protocol.scripted import scripted
 
 
 def summed(body: str) -> bytes:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator
-
 import pytest
 
 from drivers.errors import CommandRejected
 from drivers.serial_link import LineRegistry
 from drivers.sources import dc4100
 from simulators.clock import patient_clock
-from simulators.serial.pty_port import PtyPort
+from tests.protocol.scripted import scripted
 
 # Status 0xA80: no LED at channels 2, 3 and 4, so one LED is driven.
 OPENING = [
@@ -26,43 +23,15 @@ OPENING = [
 OFF, ON = [("O? 0", "0")] * 2, [("O? 0", "1")] * 2
 
 
-class Script:
-    """Answers each expected line, and notes what came instead."""
-
-    def __init__(self, pairs: list[tuple[bytes, bytes]]) -> None:
-        self.left = list(pairs)
-        self.unexpected: list[bytes] = []
-        self._received = b""
-        self._output = b""
-        self._lock = threading.Lock()
-
-    def receive(self, data: bytes) -> None:
-        with self._lock:
-            self._received += data
-            while b"\n" in self._received:
-                line, _, self._received = self._received.partition(b"\n")
-                if self.left and self.left[0][0] == line + b"\n":
-                    self._output += self.left.pop(0)[1]
-                else:
-                    self.unexpected.append(line)
-
-    def take_output(self) -> bytes:
-        with self._lock:
-            output, self._output = self._output, b""
-            return output
-
-    def next_output_s(self) -> float | None:
-        return 0.0 if self._output else None
+def wire(pairs: list[tuple[str, str]]) -> list[tuple[bytes, bytes]]:
+    return [
+        *OPENING,
+        *((f"{sent}\r\n".encode(), f"{answer}\r\n".encode() if answer else b"") for sent, answer in pairs),
+    ]
 
 
-@pytest.fixture
-def lines() -> Iterator[LineRegistry]:
-    with LineRegistry(clock=patient_clock()) as registry:
-        yield registry
-
-
-def opened(port: PtyPort, lines: LineRegistry) -> dc4100.LedDriver:
-    return dc4100.open(dc4100.Config(port=port.path, reply_s=0.3), lines)
+def opened(path: str, lines: LineRegistry) -> dc4100.LedDriver:
+    return dc4100.open(dc4100.Config(port=path, reply_s=0.3), lines)
 
 
 @pytest.mark.parametrize(
@@ -82,33 +51,17 @@ def opened(port: PtyPort, lines: LineRegistry) -> dc4100.LedDriver:
         ),
     ],
 )
-def test_each_call_sends_these_lines_and_no_others(action, pairs, lines: LineRegistry) -> None:  # type: ignore[no-untyped-def]
-    wire = [(f"{sent}\r\n".encode(), f"{answer}\r\n".encode() if answer else b"") for sent, answer in pairs]
-    script = Script(OPENING + wire)
-    port = PtyPort(script)
-    try:
-        action(opened(port, lines))
-    finally:
-        lines.close()
-        port.close()
-    assert not script.unexpected
-    assert not script.left
+def test_each_call_sends_these_lines_and_no_others(action, pairs) -> None:  # type: ignore[no-untyped-def]
+    with scripted(*wire(pairs)) as path, LineRegistry(clock=patient_clock()) as lines:
+        action(opened(path, lines))
 
 
-def test_a_refusal_is_explained_by_status_and_error(lines: LineRegistry) -> None:
+def test_a_refusal_is_explained_by_status_and_error() -> None:
     # Status 0xA88: too hot.
-    answers = [*OFF, ("O 0 1", ""), *OFF, ("R?", "2696"), ("E?", "ERROR 4:over temperature")]
-    wire = [(f"{sent}\r\n".encode(), f"{answer}\r\n".encode() if answer else b"") for sent, answer in answers]
-    script = Script(OPENING + wire)
-    port = PtyPort(script)
-    try:
-        source = opened(port, lines)
-        with pytest.raises(CommandRejected, match=r"LED 1 on: .*too hot.*error 4 over temperature"):
-            source.set_light(True)
-    finally:
-        lines.close()
-        port.close()
-    assert not script.left
+    pairs = [*OFF, ("O 0 1", ""), *OFF, ("R?", "2696"), ("E?", "ERROR 4:over temperature")]
+    told = pytest.raises(CommandRejected, match=r"LED 1 on: .*too hot.*error 4 over temperature")
+    with scripted(*wire(pairs)) as path, LineRegistry(clock=patient_clock()) as lines, told:
+        opened(path, lines).set_light(True)
 
 
 def test_status_bits_are_those_of_the_manual() -> None:

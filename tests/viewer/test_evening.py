@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
-from playwright.sync_api import ConsoleMessage, Page, Route, expect, sync_playwright
+from playwright.sync_api import ConsoleMessage, Page, Route, expect
 from ruamel.yaml import YAML
 
 from acquisition.rig.alarms import give_alarm
@@ -57,24 +57,22 @@ def lab(small_rig, configs, tmp_path) -> Path:
 
 
 @pytest.fixture
-def window(tmp_path, chromium):
+def window(browser):
     """A function that opens a tab; what a page complains of fails the test."""
     wrong: list[str] = []
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-dev-shm-usage"])
-        context = browser.new_context(viewport={"width": 1280, "height": 900})
-        context.set_default_timeout(PATIENCE_MS)
-        expect.set_options(timeout=PATIENCE_MS)
+    context = browser.new_context(viewport={"width": 1280, "height": 900})
+    context.set_default_timeout(PATIENCE_MS)
+    expect.set_options(timeout=PATIENCE_MS)
 
-        def tab() -> Page:
-            page = context.new_page()
-            page.on("pageerror", lambda error: wrong.append(str(error)))
-            page.on("console", lambda told: wrong.append(told.text) if complains(told) else None)
-            page.on("request", lambda asked: None if LOCAL.match(asked.url) else wrong.append(asked.url))
-            return page
+    def tab() -> Page:
+        page = context.new_page()
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on("console", lambda told: wrong.append(told.text) if complains(told) else None)
+        page.on("request", lambda asked: None if LOCAL.match(asked.url) else wrong.append(asked.url))
+        return page
 
-        yield tab
-        browser.close()
+    yield tab
+    context.close()
     assert wrong == []
 
 

@@ -1,0 +1,34 @@
+"""Rig files for tests: the simulated rig, small and fast, and files with something changed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+
+
+def change_yaml(path: Path, change: Callable[[Any], object], to: Path | None = None) -> Path:
+    """Change the tree of a YAML file in place, or into another file; return that file."""
+    yaml = YAML()
+    tree = yaml.load(path)
+    change(tree)
+    with (to or path).open("w") as file:
+        yaml.dump(tree, file)
+    return to or path
+
+
+def write_rig(configs: Path, path: Path, top: dict | None = None, **simulator: object) -> Path:
+    """Write the simulated rig with small frames and a fast clock; keywords change its `simulator` section."""
+    rigs = configs / "rigs"
+
+    def change(rig: Any) -> None:
+        rig["simulator"].update({"rows": 64, "columns": 80, "clock_speed": 50, "camera_wait_s": 60} | simulator)
+        rig.update(top or {})
+        for mode in rig["modes"].values():
+            mode["instrument"] = str((rigs / mode["instrument"]).resolve())
+        samples = rig["simulator"]["samples"]
+        samples.update({name: str((rigs / scene).resolve()) for name, scene in samples.items()})
+
+    return change_yaml(rigs / "simulated.yaml", change, to=path)
