@@ -24,3 +24,21 @@ def capture(offset, misfit):
 @pytest.mark.parametrize(("offset", "misfit", "found"), [(0.0, 0.0, False), (0.0, 0.2, False), (3e-4, 0.0, True)])
 def test_an_offset_is_the_same_in_darker_and_brighter_dim_pixels(offset, misfit, found):
     assert (black_jitter(capture(offset, misfit), np.ones((STATES, 1))) is not None) == found
+
+
+def in_counts(black, read_noise):
+    """The same surface as whole counts of twelve bits, on a `black` (N,) level in counts."""
+    counts = 4095 * capture(0.0, 0.0).signal[:, 0] + black[:, None, None]
+    return np.rint(counts + read_noise * np.random.default_rng(4).normal(size=counts.shape)) / 4095
+
+
+def test_a_drift_in_whole_counts_leaves_its_steps():
+    """The drift is a fault and stays for the fit; the steps beside it belong to no cause."""
+    drift = 8 * np.arange(STATES) / (STATES - 1)
+    data = steady_capture(in_counts(np.rint(drift), 1.0), 1.0 / 4095)
+    found = black_jitter(data, np.ones((STATES, 1)))
+    assert found is not None
+    left = np.rint(drift) - 4095 * found[0]
+    line = np.polyval(np.polyfit(drift, left, 1), drift)
+    assert np.std(left - line) < np.std(np.rint(drift) - drift) / 2
+    assert np.ptp(line) == pytest.approx(8, abs=0.5)

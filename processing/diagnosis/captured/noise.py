@@ -19,6 +19,7 @@ from processing.diagnosis.captured.outliers import NORMAL_MAD, Whitened
 from processing.diagnosis.search.range_of import inside_and_outside, range_of
 from processing.diagnosis.search.rules import (
     AS_GOOD,
+    CUT_BACK,
     DARK_NOISE_OFF,
     DIM,
     FEW_ROWS,
@@ -256,10 +257,6 @@ def _levels(r: Array, light: Array, dark: Array, free: float) -> tuple[float, fl
     return float(found[0]), float(found[1]), np.asarray(3 * normal.shape[0] / 2 / free * np.linalg.inv(normal))
 
 
-#: [1, fixed] Variance of a median over that of a mean.
-MEDIAN = np.pi / 2
-
-
 def black_jitter(data: CaptureData, a: Array) -> tuple[Array, float] | None:
     """Offset (L,) of every row, as far as it is not what the light of a pixel could be, and the variance of the whole.
 
@@ -278,47 +275,68 @@ def black_jitter(data: CaptureData, a: Array) -> tuple[Array, float] | None:
     free = outside.shape[1]
     if dim.sum() < FEWEST_DIM or not free:
         return None
-    # Hits and bad pixels are among them.
-    level = np.median(y[:, dim], axis=1).astype(np.float64)
-    scatter = np.median(np.abs(y[:, dim] - level[:, None]), axis=1) / NORMAL_MAD
-    noise = MEDIAN * float(np.mean(scatter**2)) / int(dim.sum())
-    if not _alike_in_halves(y[:, dim], mean[dim], outside, noise):
+    level, noise = _dim_levels(y[:, dim], 1 / data.conditions.full_scale)
+    if not _alike_in_halves(y[:, dim], mean[dim], outside, 1 / data.conditions.full_scale):
         return None
     seen, bright = outside.T @ level, outside.T @ y[:, lit].mean(axis=1, dtype=np.float64)
-    if float(seen @ seen) < noise * (free + NOISE_SURE * np.sqrt(2 * free)):
+    if not _is_there(seen, noise, free):
         return None
     follows, light = float(bright @ seen / (seen @ seen)), float(mean[lit].mean() / max(mean[dim].mean(), 1e-300))
     # Nearer to light than to an offset, which bright pixels follow once.
     if follows**2 > light:
         return None
-    if _is_a_course(data, seen, outside):
-        return None
+    along = _courses(data, outside)
+    if np.sum((along.T @ seen) ** 2) > MOSTLY * (seen @ seen):
+        # A fault, of which to take off a part alone would hide the rest; it may go in steps of whole counts.
+        seen, bright = (v - along @ (along.T @ v) for v in (seen, bright))
+        if not _is_there(seen, noise, free - along.shape[1]):
+            return None
     offsets = np.zeros(data.values_per_pixel)
     offsets[rows] = outside @ (seen - bright / light)
     return offsets, float(np.sum(offsets**2)) / free
 
 
-def _is_a_course(data: CaptureData, seen: Array, outside: Array) -> bool:
-    """Whether most of it is a course over time: a fault, of which to take off a part alone would hide the rest."""
+def _dim_levels(y: NDArray[np.float32], count: float) -> tuple[Array, float]:
+    """Mean (L,) of dim pixels (L, P) with hits and bad pixels cut back, and its variance.
+
+    The mean of whole counts is off by a part of a `count` where noise does not spread them (Widrow and Kollar,
+    Quantization Noise, Cambridge 2008, chapter 4).
+    """
+    # Pixels differ in all states alike: that is no noise, though it spreads the counts.
+    spread = np.maximum(y.var(axis=1, dtype=np.float64) / count**2 - 1 / 12, 0.0)
+    own = y - y.mean(axis=0, dtype=np.float64)
+    middle = np.median(own, axis=1, keepdims=True)
+    scatter = np.median(np.abs(own - middle), axis=1, keepdims=True) / NORMAL_MAD
+    reach = CUT_BACK * np.maximum(scatter, count / 2)
+    kept = np.clip(own, middle - reach, middle + reach)
+    rounding = (count / np.pi) ** 2 / 2 * np.exp(-4 * np.pi**2 * spread)
+    level = kept.mean(axis=1) + y.mean(dtype=np.float64)
+    return level, float(np.mean(kept.var(axis=1) / y.shape[1] + rounding))
+
+
+def _is_there(seen: Array, noise: float, free: int) -> bool:
+    """Whether levels in `free` directions are more than their noise."""
+    return float(seen @ seen) >= noise * (free + NOISE_SURE * np.sqrt(2 * free))
+
+
+def _courses(data: CaptureData, outside: Array) -> Array:
+    """Orthonormal courses over time (free, n), in the directions that the light leaves over."""
     conditions = data.conditions
     courses = np.concatenate([course(name, conditions) for name in TIMES]).repeat(len(conditions.channels), axis=1)
-    along = range_of(outside.T @ courses[:, data.row_counts].T)
-    return bool(np.sum((along.T @ seen) ** 2) > MOSTLY * (seen @ seen))
+    return range_of(outside.T @ courses[:, data.row_counts].T)
 
 
-def _alike_in_halves(y: NDArray[np.float32], mean: Array, outside: Array, noise: float) -> bool:
+def _alike_in_halves(y: NDArray[np.float32], mean: Array, outside: Array, count: float) -> bool:
     """Whether the brighter half of dim pixels (L, P) shows the same as the darker one, as an offset does.
 
-    What happens to light grows with it, and is another thing on another material. `noise` is the variance of a median
-    over all of them.
+    What happens to light grows with it, and is another thing on another material.
     """
     bright = mean > np.median(mean)
     if bright.all() or not bright.any():
         return True
-    one, other = (outside.T @ np.median(y[:, half], axis=1).astype(np.float64) for half in (bright, ~bright))
-    free, apart = outside.shape[1], one - other
-    # Each has twice the variance of the whole, their difference four times.
-    return bool(apart @ apart < 4 * noise * (free + NOISE_SURE * np.sqrt(2 * free)))
+    (one, its), (other, noise) = (_dim_levels(y[:, half], count) for half in (bright, ~bright))
+    free, apart = outside.shape[1], outside.T @ (one - other)
+    return bool(apart @ apart < (its + noise) * (free + NOISE_SURE * np.sqrt(2 * free)))
 
 
 #: [1] Largest factor on the gain that is tried, and one over the least.
