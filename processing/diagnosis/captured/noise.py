@@ -316,7 +316,7 @@ def _dim_levels(y: NDArray[np.float32], count: float) -> tuple[Array, float]:
 
 def _is_there(seen: Array, noise: float, free: int) -> bool:
     """Whether levels in `free` directions are more than their noise."""
-    return float(seen @ seen) >= noise * (free + NOISE_SURE * np.sqrt(2 * free))
+    return bool(seen @ seen >= noise * (free + NOISE_SURE * np.sqrt(2 * free)))
 
 
 def _courses(data: CaptureData, outside: Array) -> Array:
