@@ -73,6 +73,7 @@ PARTIAL = {
         "mueller",
     ),
     "mosaic_polarimeter": ({"psg": 22.5 * np.arange(8)}, ("psg_retarder.azimuth_deg", 0.5), "mueller"),
+    "polarization_camera_retarder": ({"psa": 20.0 * np.arange(9)}, ("psa_retarder.azimuth_deg", 0.4), "mueller"),
     "linear_stokes": ({}, ("micropolarizer_45.azimuth_deg", 0.5), "stokes"),
 }
 SAMPLE = np.array([[1, 0.2, -0.1, 0.05], [0.15, 0.6, 0.1, -0.2], [-0.3, 0.05, 0.5, 0.1], [0.2, 0.1, -0.15, 0.4]])
