@@ -19,7 +19,8 @@ from processing.instrument.model import AppliedEffect, EffectParameter, Instrume
 from processing.instrument.states import rotating_retarders
 from processing.reduction.counts_to_signal import BlockReader, Correction
 from processing.reduction.effects_of_capture import capture_changes
-from processing.reduction.mueller import BLOCK_PIXELS, field_of, measurement_matrix
+from processing.reduction.measurement_matrix import field_of, measurement_matrix
+from processing.reduction.mueller import BLOCK_PIXELS
 from processing.reduction.noise import NoiseModel
 from processing.reduction.sample_states import sample_states
 from processing.reduction.solvers.field import FieldSolver

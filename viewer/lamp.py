@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from processing.errors import ProcessError
 from processing.reduction.effects_of_capture import capture_changes
-from processing.reduction.mueller import angles_of
+from processing.reduction.measurement_matrix import angles_of
 from processing.storage.captures.capture import Capture
 
 #: Leverage beyond which the other states say too little of one: the noise of its lamp would be ten times its own.

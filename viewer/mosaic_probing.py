@@ -9,12 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.errors import ProcessError
+from processing.reduction.counts_to_signal import BlockReader, Correction
+from processing.reduction.cut_off import without_cut_off
+from processing.reduction.effects_of_capture import capture_changes, counts_correction
+from processing.reduction.instrument_of_capture import choose_model, require_one_colour
+from processing.reduction.measurement_matrix import relative_exposure
 from processing.reduction.mosaic.layout import MosaicLayout
-from processing.reduction.mueller import relative_exposure
+from processing.reduction.noise import noise_of
+from processing.reduction.sample_states import sample_states
 from processing.reduction.stokes import channel_rows
 from processing.storage.captures.capture import Capture
 from viewer.probing import MOST, Region, analyzer_names, finite
-from viewer.sample_states import SampleStates
 
 
 class SuperPixelReducer:
@@ -28,11 +33,15 @@ class SuperPixelReducer:
     def __init__(self, path: Path, instrument: Path | None = None) -> None:
         self._path = path
         with Capture(path) as capture:
-            self._sample = SampleStates(capture, instrument)
-            model, states = self._sample.model, self._sample.numbers
+            require_one_colour(capture)
+            self._model = model = choose_model(capture, instrument)
+            self._states, _ = without_cut_off(capture, sample_states(capture))
+            states, changes = self._states, capture_changes(capture, model, self._states)
+            self._counts, self._correction = counts_correction(changes, model), Correction.of(capture)
+            self._noise = noise_of(capture, states)
             mosaic = capture.header.mosaic or model.mosaic or ()
             self._layout = MosaicLayout.of(mosaic, [channel.name for channel in model.channels])
-            _, self._analyzers = channel_rows(capture, model, states, self._sample.changes)
+            _, self._analyzers = channel_rows(capture, model, states, changes)
             self._relative = relative_exposure(capture, states)
 
     def curve(self, region: Region) -> dict[str, Any]:
@@ -51,13 +60,13 @@ class SuperPixelReducer:
         s = solve @ signal
         fitted = a @ s
         variance = self._variance(fitted, len(self._layout.channels)) / pixels
-        known = self._sample.noise is not None
+        known = self._noise is not None
         if not known:
             variance = np.full(len(signal), np.sum((signal - fitted) ** 2) / max(len(signal) - len(s), 1))
         residual = (signal - fitted) / np.sqrt(variance)
         covariance = (solve * variance) @ solve.T
         return {
-            "states": np.repeat(self._sample.numbers, len(self._layout.channels)).tolist(),
+            "states": np.repeat(self._states, len(self._layout.channels)).tolist(),
             "series": analyzer_names(self._layout.channels),
             "signal": signal.tolist(),
             "fitted": fitted.tolist(),
@@ -66,7 +75,7 @@ class SuperPixelReducer:
             "chi_square": finite(np.sum(residual**2) / max(len(signal) - len(s), 1)),
             "noise_known": known,
             "stokes": _stokes(s, covariance),
-            "told": f"{self._sample.model.name}; {whole}; black: {self._sample.correction.source}",
+            "told": f"{self._model.name}; {whole}; black: {self._correction.source}",
         }
 
     def _signal(self, region: Region) -> tuple[Region, NDArray[np.float64]]:
@@ -76,21 +85,24 @@ class SuperPixelReducer:
                 for part, size in zip((region.rows, region.columns), capture.frame_shape, strict=True)
             )
             whole = Region(rows, columns)
-            if (rows.stop - rows.start) * capture.frame_shape[1] * len(self._sample.numbers) > MOST:
+            if (rows.stop - rows.start) * capture.frame_shape[1] * len(self._states) > MOST:
                 raise ProcessError(f"{region} is more than is reduced at once; draw a smaller one")
-            _, _, signal = self._sample.read(capture, rows)
+            reader = BlockReader(capture, self._states, self._correction, self._counts)
+            frames = reader.read(rows)
+            signal = np.empty(frames.shape, np.float32)
+            reader.signal(frames, slice(None), signal)
             width = capture.frame_shape[1]
-        image = signal.reshape(len(self._sample.numbers), -1, width)[:, :, columns]
+        image = signal.reshape(len(self._states), -1, width)[:, :, columns]
         means = [image[:, row::2, column::2].mean(axis=(1, 2), dtype=float) for row, column in self._layout.offsets]
         return whole, np.stack(means, axis=1).ravel()
 
     def _variance(self, signal: NDArray[np.float64], channels: int) -> NDArray[np.float64]:
         """Of one raw pixel (N channels,), counts^2."""
-        noise = self._sample.noise
+        noise = self._noise
         if noise is None:
             return np.full(len(signal), np.nan)
         with Capture(self._path) as capture:
-            repeats = np.repeat(np.maximum(capture.column("repeats")[self._sample.numbers].astype(float), 1), channels)
+            repeats = np.repeat(np.maximum(capture.column("repeats")[self._states].astype(float), 1), channels)
         return np.asarray(noise.slope * np.maximum(signal, 0) / repeats + noise.floor_of_rows(repeats, 0.0, channels))
 
 

@@ -18,12 +18,13 @@ from processing.reflectance.shared_noise import shared_variance
 from processing.reports.colours import period_deg
 from processing.storage.captures.capture import Capture
 from processing.storage.products.images import neighbour_correlation
+from processing.storage.products.pixel_mask import Mask
 from processing.storage.products.product import COMPANIONS, Product
 from viewer.frames import chosen
 from viewer.library import Library, input_of
 from viewer.mosaic_probing import SuperPixelReducer
 from viewer.pages import file_of, pages_of
-from viewer.probing import PixelReducer, Region, curve, finite, mask_words, matrix, raw_curve
+from viewer.probing import PixelReducer, Region, curve, finite, matrix, raw_curve
 
 
 def curve_of(request: Request) -> JSONResponse:
@@ -94,7 +95,7 @@ def _of_product(path: Path, query: Any, library: Library) -> dict[str, Any]:
         found: dict[str, Any] = {"where": str(region), "planes": _planes(product, region), "told": ""}
         if "pixel_flags" in product.names:
             bits = product.get("pixel_flags", region.rows)[:, region.columns]
-            found["mask"] = mask_words(int(bits.max())) if bits.any() else "valid"
+            found["mask"] = Mask.words(int(bits.max())) if bits.any() else "valid"
         if product.kind in ("mueller", EXTRAPOLATED) and region.pixels == 1:
             image = image_of(product, region.rows)
             found["matrix"] = matrix(image.at(np.array([region.columns.start])))

@@ -12,18 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.errors import ProcessError
-from processing.instrument.determined import determined_basis
 from processing.maps.extrapolation import ExtrapolatedImage
 from processing.maps.quantities import quantities_block
 from processing.reduction.counts_to_signal import saturation
-from processing.reduction.facts import determined_words
-from processing.reduction.mueller import Choice, field_of, measurement_matrix
-from processing.reduction.solvers.inversion import Inversion
-from processing.reduction.solvers.plain import MuellerSolver
+from processing.reduction.instrument_of_capture import choose_model
+from processing.reduction.mueller_reduction import MuellerReduction
 from processing.storage.captures.capture import Capture
 from processing.storage.products.images import MuellerImage
-from processing.storage.products.pixel_mask import Mask
-from viewer.sample_states import SampleStates
 
 #: Most intensities that a region may have, states x pixels.
 MOST = 1 << 26
@@ -102,11 +97,7 @@ class PixelReducer:
             #: Rows and columns of the frame to one of the image.
             self._cell = capture.stored_shape[0] // capture.frame_shape[0]
             self.channels = capture.channel_names
-            self.sample = SampleStates(capture, instrument)
-            sample = self.sample
-            self._w = measurement_matrix(capture, sample.model, sample.numbers, sample.changes)
-            self._inversion = Inversion.of(self._w.reshape(-1, 16), f"{path}: ", determined_basis(sample.model))
-            self._field = field_of(capture, sample.model, sample.numbers, sample.changes)
+            self.reduction = MuellerReduction.of(capture, choose_model(capture, instrument))
 
     def _opened(self) -> Capture:
         return Capture(self._path, by_super_pixel=True)
@@ -121,65 +112,20 @@ class PixelReducer:
         ProcessError : none of its pixels can be used, or it is too large.
         """
         region = region.reduced(self._cell)
-        if region.pixels * self._w.size // 16 > MOST:
+        if region.pixels * self.reduction.w.size // 16 > MOST:
             raise ProcessError(f"{region} is more than is reduced at once; draw a smaller one")
         with self._opened() as capture:
-            reader, frames, signal = self.sample.read(capture, region.rows)
-            noise = self.sample.noise
-            solver = Choice(noise=noise).solver(MuellerSolver(self._inversion, reader, noise), self._field)
-            found = solver.solve(frames)
-            shape = (region.rows.stop - region.rows.start, capture.frame_shape[1])
-            header, simulated, shape_of_image = capture.header, capture.simulated, capture.frame_shape
-
-        def part(values: NDArray[Any]) -> NDArray[Any]:
-            return values.reshape(*values.shape[:-1], *shape)[..., region.columns]
-
-        mask = part(found["pixel_flags"])
-        good = mask & np.uint8(Mask.NOT_FINITE | Mask.BAD | Mask.NOT_DETERMINED) == 0
-        count = int(good.sum())
-        if not count:
-            raise ProcessError(f"{region}: no pixel can be used ({mask_words(int(mask.max()))})")
-        mueller, errors = part(found["mueller"])[..., good], part(found["mueller_errors"])[..., good]
-        intensities = part(signal.reshape(len(self._w.reshape(-1, 16)), -1))[:, good].mean(axis=1, dtype=float)
-        m = mueller.reshape(16, -1).mean(axis=1, dtype=float)
-        w = self._matrix(region, shape_of_image)
-        nothing = np.full(len(w), np.nan)
-        total = np.sqrt(np.square(errors.astype(float)).sum(axis=-1)) / count
-        image = MuellerImage(
-            values=m.reshape(4, 4, 1, 1).astype(np.float32),
-            errors=total.reshape(4, 4, 1, 1).astype(np.float32),
-            mask=np.zeros((1, 1), np.uint8),
-            residual_rms=np.array([[np.sqrt(np.mean((intensities - w @ m) ** 2))]], np.float32),
-            w=w,
-            noise_slope=nothing if noise is None else noise.slope / solver.repeats / count,
-            noise_floor=nothing if noise is None else solver.intensity_floor / count,
-            header=header,
-            steps=(),
-            simulated=simulated,
-            facts={
-                "weighted": False,
-                "rank": self._inversion.rank,
-                "determined": determined_words(self._inversion),
-                "pixels": count,
-            },
-            dark=solver.dark_errors / np.sqrt(count),
-        )
-        return image, intensities
-
-    def _matrix(self, region: Region, shape: tuple[int, int]) -> NDArray[np.float64]:
-        """W (N, 16) in the middle of the region."""
-        if self._field is None:
-            return self._w.reshape(-1, 16)
-        middle = [(part.start + part.stop - 1) / 2 for part in (region.columns, region.rows)]
-        x, y = (np.array([2 * at / max(size - 1, 1) - 1]) for at, size in zip(middle, shape[::-1], strict=True))
-        return self._field.matrix(self._field.extra(x, y)[:, 0])
+            try:
+                return self.reduction.region(capture, region.rows, region.columns)
+            except ProcessError as error:
+                raise ProcessError(f"{region}: {error}") from error
 
     def told(self, region: Region) -> str:
         """How a region is reduced, in a few words."""
-        model = self.sample.model
+        model = self.reduction.model
         effects = f", {len(model.effects)} effect(s)" if model.effects else ""
         whole = f"; {region.reduced(self._cell).enlarged(self._cell)}" if self._cell > 1 else ""
-        return f"{model.name}{effects}{whole}; black: {self.sample.correction.source}"
+        return f"{model.name}{effects}{whole}; black: {self.reduction.correction.source}"
 
 
 def analyzer_names(channels: Sequence[str]) -> list[str]:
@@ -201,7 +147,7 @@ def curve(reducer: PixelReducer, region: Region) -> dict[str, Any]:
     residual = (intensities - fitted) / noise
     free = max(len(fitted) - int(image.facts["rank"]), 1)
     return {
-        "states": np.repeat(reducer.sample.numbers, channels).tolist(),
+        "states": np.repeat(reducer.reduction.states, channels).tolist(),
         "series": analyzer_names(reducer.channels) if channels > 1 else [""],
         "signal": intensities.tolist(),
         "fitted": fitted.tolist(),
@@ -241,11 +187,6 @@ def matrix(image: MuellerImage | ExtrapolatedImage) -> dict[str, Any]:
         "m00_error": finite(errors[0, 0]),
         "quantities": quantities,
     }
-
-
-def mask_words(bits: int) -> str:
-    """What the bits of a mask say."""
-    return ", ".join(bit.name.lower().replace("_", " ") for bit in Mask if bits & bit and bit.name) or "no reason given"
 
 
 def finite(values: Any) -> Any:

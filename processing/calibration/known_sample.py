@@ -17,7 +17,7 @@ from processing.instrument.model import InstrumentModel
 from processing.polarization import mueller
 from processing.reduction.counts_to_signal import Correction
 from processing.reduction.flat import FEW
-from processing.reduction.mueller import relative_exposure
+from processing.reduction.measurement_matrix import relative_exposure
 from processing.reduction.sample_states import sample_states
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import Sample

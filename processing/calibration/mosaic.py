@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from processing.errors import NotDetermined, ProcessError
 from processing.instrument.model import InstrumentModel
 from processing.reduction.counts_to_signal import BlockReader, Correction
+from processing.reduction.measurement_matrix import relative_exposure
 from processing.reduction.mosaic.layout import MosaicLayout
-from processing.reduction.mueller import relative_exposure
 from processing.reduction.sample_states import sample_states
 from processing.reduction.solvers.inversion import multiply_tiles
 from processing.storage.captures.capture import Capture

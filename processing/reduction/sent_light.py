@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from processing.arrays import BoolArray
 from processing.instrument.determined import determined_elements
+from processing.reduction.solvers.base import Solver
 from processing.reduction.solvers.inversion import Inversion
-from processing.reduction.solvers.plain import LEAST, MuellerSolver
+from processing.reduction.solvers.plain import LEAST
 from processing.storage.products.product import Plane
 
 PLANES = {
@@ -63,22 +64,21 @@ class SentLight:
         names = ", ".join(f"S{k}" for k in np.flatnonzero(self.seen))
         return f"{names} of the light that the sample sends back (dataset stokes)"
 
-    def planes(self, mueller: NDArray[np.float32], residual_rms: NDArray[np.float32], solver: Any) -> dict[str, Any]:
+    def planes(self, mueller: NDArray[np.float32], residual_rms: NDArray[np.float32], solver: Solver) -> dict[str, Any]:
         """Datasets `PLANES` (4, pixels) from the solution of least norm (16, pixels)."""
-        plain: MuellerSolver = getattr(solver, "plain", solver)
-        inversion = plain.inversion
+        inversion = solver.inversion
         stokes = (self.rows @ mueller).astype(np.float32)
         n, dof = inversion.w.shape[0], inversion.free
-        if plain.noise is None:
+        if solver.noise is None:
             variance = np.tile(residual_rms**2 * n / dof if dof else np.nan, (n, 1))
         else:
-            floor = plain.intensity_floor[:, None]
-            shot = (plain.noise.slope / plain.repeats)[:, None] * (inversion.w @ mueller)
+            floor = solver.intensity_floor[:, None]
+            shot = (solver.noise.slope / solver.repeats)[:, None] * (inversion.w @ mueller)
             variance = np.maximum(shot + floor, LEAST * floor)
         solve = self.rows @ inversion.pinv
-        channels = plain.reader.capture.channels
-        drive = np.einsum("knc,nd->kcd", solve.reshape(4, -1, channels), plain.reader.black_weights) ** 2
-        dark = (drive @ plain.black_variance).sum(axis=1)
+        channels = solver.reader.capture.channels
+        drive = np.einsum("knc,nd->kcd", solve.reshape(4, -1, channels), solver.reader.black_weights) ** 2
+        dark = (drive @ solver.black_variance).sum(axis=1)
         errors = np.sqrt(solve**2 @ variance + dark[:, None]).astype(np.float32)
         stokes[~self.seen], errors[~self.seen] = np.nan, np.nan
         return {"stokes": stokes, "stokes_errors": errors}

@@ -13,7 +13,8 @@ from processing.reduction.counts_to_signal import Correction
 from processing.reduction.flat import flat_captures, nearest_flat
 from processing.reduction.instrument_of_capture import choose_model
 from processing.reduction.left_out import LeftOut
-from processing.reduction.mueller import Choice, reduce_mueller
+from processing.reduction.mueller import reduce_mueller
+from processing.reduction.mueller_reduction import Choice
 from processing.steps.file_step import FileStep, Found, Progress
 from processing.storage.captures.capture import Capture
 from processing.storage.products.product import is_product

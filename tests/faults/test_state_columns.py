@@ -7,7 +7,8 @@ import pytest
 
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.instrument.model import InstrumentModel
-from processing.reduction.mueller import Choice, reduce_mueller
+from processing.reduction.mueller import reduce_mueller
+from processing.reduction.mueller_reduction import Choice
 from processing.storage.captures.capture import Capture
 from processing.storage.formats.foreign_arrays import ImportFailed
 from processing.storage.formats.importing import ImportRequest, import_capture

@@ -18,7 +18,8 @@ from processing.maps.tables import tabulate
 from processing.maps.xi0 import xi0_of_mueller
 from processing.polarization import mueller
 from processing.polarization.triply_degenerate import mueller_matrix
-from processing.reduction.mueller import Choice, reduce_mueller
+from processing.reduction.mueller import reduce_mueller
+from processing.reduction.mueller_reduction import Choice
 from processing.reflectance.base import normalized_mueller
 from processing.reports.figures import product_figure
 from processing.steps.maps import Xi0

@@ -11,7 +11,8 @@ from processing.reduction.black import Black
 from processing.reduction.counts_to_signal import Correction
 from processing.reduction.mosaic.layout import MosaicLayout
 from processing.reduction.mosaic.merge import merge
-from processing.reduction.mueller import Choice, reduce_mueller
+from processing.reduction.mueller import reduce_mueller
+from processing.reduction.mueller_reduction import Choice
 from processing.reduction.noise import NoiseModel
 from processing.reduction.sample_states import sample_states
 from processing.reduction.stokes import reduce_stokes

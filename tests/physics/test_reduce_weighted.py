@@ -7,10 +7,11 @@ import pytest
 import scipy.optimize
 
 from processing.errors import ProcessError
-from processing.instrument.model import InstrumentModel
+from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
 from processing.polarization import mueller
 from processing.polarization.physical import most_likely, nearest
-from processing.reduction.mueller import Choice, reduce_mueller
+from processing.reduction.mueller import reduce_mueller
+from processing.reduction.mueller_reduction import Choice, MuellerReduction
 from processing.reduction.solvers.weighted import PACKED_COLUMN, PACKED_ROW
 from processing.storage.captures.capture import Capture
 from processing.storage.products.images import MuellerImage
@@ -220,3 +221,45 @@ def test_physical_estimate_stands_beside_the_plain_one(
         made = product.get("mueller_physical")
     assert np.all(smallest_eigenvalue(made.reshape(16, -1)) > -1e-3)
     assert np.mean((made - m) ** 2) < np.mean((plain.values - m) ** 2)
+
+
+def test_weights_and_covariance_with_a_retardance_that_varies(rgb950, synthetic_capture) -> None:
+    """Each pixel against numpy with W of its place; a saturated intensity does not count."""
+    values = {"x": 9.0, "y": -6.0, "x2": 3.0, "xy": 1.0, "y2": 0.0}
+    parameters = {name: EffectParameter(value=value, unit="degree") for name, value in values.items()}
+    field = AppliedEffect(kind="field_retardance", element="psa_retarder", parameters=parameters)
+    model = rgb950.model_copy(update={"effects": (field,)})
+    rng, shape = np.random.default_rng(8), (5, 7)
+    truth = pure(rng).reshape(16)
+    matrices = np.empty((*shape, 40, 16))
+    for (r, c), y, x in ((at, 2 * at[0] / 4 - 1, 2 * at[1] / 6 - 1) for at in np.ndindex(shape)):
+        extra = 9 * x - 6 * y + 3 * (x * x - 1 / 3) + x * y
+        plate = rgb950.analyzer[0].model_copy(update={"retardance_deg": rgb950.analyzer[0].retardance_deg + extra})
+        local = rgb950.model_copy(update={"analyzer": (plate, rgb950.analyzer[1])})
+        matrices[r, c] = local.rows(ANGLES)[:, 0]
+    signal = np.moveaxis(matrices @ truth, -1, 0)[:, None] * 3000
+    counts = rng.poisson(np.maximum(signal, 0) * GAIN) / GAIN + rng.normal(0, READ / GAIN, signal.shape) + BLACK
+    counts[3, 0, 2, 2] = 65535
+    path = synthetic_capture(np.clip(np.rint(counts), 0, 65535).astype(np.uint16), ANGLES, detector=DETECTOR)
+    out = path.with_suffix(".w.h5")
+    with Capture(path) as capture:
+        choice = Choice(weighted=True, covariance=True, physical="likelihood")
+        reduce_mueller(capture, model, out, (Step("reduce", {}),), choice=choice)
+        region, _ = MuellerReduction.of(capture, model, choice=choice).region(capture, slice(2, 3), slice(5, 6))
+    image = MuellerImage.load(out)
+    np.testing.assert_allclose(region.values[..., 0, 0], image.values[..., 2, 5], atol=0.01)
+    with Product(out) as product:
+        packed = product.get("mueller_covariance")
+    y = np.rint(counts)[:, 0] - BLACK
+    for r, c in ((0, 0), (2, 2), (4, 6)):
+        w, keep = matrices[r, c], np.ones(40)
+        if (r, c) == (2, 2):
+            keep[3] = 0
+        fitted = w @ np.linalg.lstsq(w * keep[:, None], y[:, r, c] * keep, rcond=None)[0]
+        floor = (READ / GAIN) ** 2 + 1 / 12
+        weight = keep / np.maximum(fitted / GAIN + floor, floor / 2)
+        covariance = np.linalg.inv(w.T @ (weight[:, None] * w))
+        expected = covariance @ w.T @ (weight * y[:, r, c])
+        np.testing.assert_allclose(image.values[..., r, c].ravel(), expected, atol=0.2)
+        np.testing.assert_allclose(packed[:, r, c], covariance[PACKED_ROW, PACKED_COLUMN], rtol=0.01, atol=0.05)
+    assert np.isfinite(image.values).all()

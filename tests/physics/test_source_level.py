@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from processing.instrument.model import InstrumentModel
-from processing.reduction.mueller import Choice, reduce_mueller
+from processing.reduction.mueller import reduce_mueller
+from processing.reduction.mueller_reduction import Choice
 from processing.reduction.noise import NoiseModel
 from processing.reduction.source_level import SourceMoments
 from processing.storage.captures.capture import Capture

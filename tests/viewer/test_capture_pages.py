@@ -219,6 +219,26 @@ def test_a_super_pixel_behind_a_turned_generator_has_a_curve_for_each_analyzer_a
     np.testing.assert_allclose(region["fitted"], np.array(fit["fitted"]) / 2 * 7 / 3, rtol=1e-3)
 
 
+def test_a_pixel_where_the_retardance_varies_is_reduced_as_its_product_is(client, configs, synthetic_capture):
+    text = (
+        (configs / "instruments" / "rgb950.yaml").read_text()
+        + """
+effects:
+  - kind: field_retardance
+    element: psa_retarder
+    parameters: {x: &c {value: 6.0, unit: degree}, y: *c, x2: *c, xy: *c, y2: *c}
+"""
+    )
+    model = InstrumentModel.load(configs / "instruments" / "rgb950.yaml").at(662)
+    angles = {"psg": 9.0 * np.arange(40), "psa": 44.19 * np.arange(40)}
+    light = 3000 * model.rows(angles)[:, :, None, None] @ np.diag([1, 0.6, 0.5, 0.3]).ravel() * np.ones((4, 6))
+    path = synthetic_capture(light.astype(np.uint16), angles, name="lab/one.h5", instrument_yaml=text)
+    with Product(Reduction(path).make()) as product:
+        m = product.get("mueller")[:, :, 1, 5].astype(float)
+    answer = client.get("/matrix", params={"file": "one.h5", "x0": 5, "y0": 1})
+    np.testing.assert_allclose(answer.json()["matrix"]["mueller"], m / m[0, 0], atol=1e-5)
+
+
 def test_beams_have_a_curve_each(client, configs, synthetic_capture):
     file = configs / "instruments" / "drr_wollaston.yaml"
     model, angles = InstrumentModel.load(file), {"psg": 7.3 * np.arange(30)}

@@ -32,7 +32,7 @@ from processing.instrument.model import InstrumentModel
 from processing.reduction.black import Black
 from processing.reduction.counts_to_signal import Correction
 from processing.reduction.frame_evidence import evidence_of
-from processing.reduction.mueller import angles_of, measurement_matrix, relative_exposure
+from processing.reduction.measurement_matrix import angles_of, measurement_matrix, relative_exposure
 from processing.reduction.noise import NoiseModel
 from processing.reduction.sample_states import sample_states
 from processing.storage.captures.capture import Capture, CaptureError

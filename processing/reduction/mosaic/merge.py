@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from processing.arrays import Image
 from processing.reduction.counts_to_signal import Correction
 from processing.reduction.effects_of_capture import CountsCorrection
-from processing.reduction.mueller import relative_exposure
+from processing.reduction.measurement_matrix import relative_exposure
 from processing.reduction.noise import NoiseModel
 from processing.storage.captures.capture import Capture
 from processing.storage.products.pixel_mask import Mask

@@ -33,7 +33,7 @@ class Field:
 
 
 class FieldSolver:
-    """Least squares with W of each pixel's place; the same interface as MuellerSolver.
+    """Least squares with W of each pixel's place.
 
     Values and residual are those of the place. Standard errors are those of the image's centre: they change with the
     place far less than the values do. Saturated and struck intensities are not left out; their pixels are not
@@ -52,7 +52,7 @@ class FieldSolver:
     def __init__(self, plain: MuellerSolver, field: Field) -> None:
         self.plain, self.reader, self.inversion = plain, plain.reader, plain.inversion
         self.noise, self.repeats, self.intensity_floor = plain.noise, plain.repeats, plain.intensity_floor
-        self.dark_errors = plain.dark_errors
+        self.dark_errors, self.black_variance = plain.dark_errors, plain.black_variance
         self.field = field
         what = "the instrument's field_retardance changes W"
         self._pinv = FieldMatrix.of(lambda y, x: np.asarray(np.linalg.pinv(self._w_at(y, x)), dtype=float), what)
@@ -69,13 +69,27 @@ class FieldSolver:
         height, width = self.reader.capture.frame_shape
         return _centred(np.arange(first, stop), height), _centred(np.arange(width), width)
 
+    def matrix(self, start: int, stop: int) -> NDArray[np.float32]:
+        """W (N, 16, pixels) of pixels start..stop of the block that the reader just read."""
+        width = self.reader.capture.frame_shape[1]
+        first, last = start // width, -(-stop // width)
+        weights = self._w.weights(*self._places(self.reader.first_row + first, self.reader.first_row + last))
+        fixed = self._w.stack.reshape(len(weights), *self.inversion.w.shape)
+        inside = weights[:, start - first * width : stop - first * width]
+        return np.asarray(np.einsum("knj,kp->njp", fixed, inside))
+
     def solve(self, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Mueller elements, errors, residual and mask of frames (N, channels, pixels) that the reader just read."""
+        """As `Solver.solve`; pixels with saturated or struck intensities are not determined."""
+        found = self.estimate(frames)
+        partly = (found["pixel_flags"] & np.uint8(Mask.PARTLY)) != 0
+        found["pixel_flags"][partly] |= np.uint8(Mask.NOT_DETERMINED)
+        return found
+
+    def estimate(self, frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        """As `Solver.estimate`."""
         found = self.plain.estimate(frames)
         rows = frames.shape[2] // self.reader.capture.frame_shape[1]
         for_ranges(rows, lambda a, b: self._range(frames, a, b, found), align=1, smallest=16)
-        partly = (found["pixel_flags"] & np.uint8(Mask.PARTLY)) != 0
-        found["pixel_flags"][partly] |= np.uint8(Mask.NOT_DETERMINED)
         return found
 
     def _range(self, frames: NDArray[Any], start: int, stop: int, found: dict[str, NDArray[Any]]) -> None:

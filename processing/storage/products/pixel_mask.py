@@ -19,3 +19,9 @@ class Mask(IntFlag):
     def meaning(cls) -> str:
         """The bits in words, for the file."""
         return ", ".join(f"{flag.value} = {flag.name.lower().replace('_', ' ')}" for flag in cls if flag.name)
+
+    @classmethod
+    def words(cls, bits: int) -> str:
+        """What is wrong by these bits."""
+        names = [flag.name.lower().replace("_", " ") for flag in cls if bits & flag and flag.name]
+        return ", ".join(names) or "no reason given"
