@@ -27,7 +27,7 @@ from processing.reduction.mueller import Progress
 from processing.reflectance.tables import ScatteringTable
 from processing.storage.products.provenance import Step, file_identity
 
-#: The default demosaicing reaches so far across the outline (`processing.reduction.mosaic.methods.REACH`).
+#: The default demosaicing reaches so far across the outline (`REACH` of its file).
 BORDER_PX = 4
 
 

@@ -18,7 +18,7 @@ from processing.maps.intervals import moves_of, widened
 from processing.polarization.cloude import coherency_eigenvalues, xi0_and_dominant
 from processing.polarization.eigenvalue_noise import EigenvalueNoise, corrected
 from processing.polarization.xi0 import Xi0Estimate, estimate
-from processing.reduction.mosaic.methods import REACH
+from processing.reduction.mosaic.demosaic import method_of
 from processing.reduction.mueller import Progress
 from processing.reduction.systematic import INPUTS, Systematic
 from processing.reflectance.base import load_reflectance
@@ -188,7 +188,7 @@ def xi0_of_stokes(
     image = StokesImage.load(source)
     m0 = dominant_model(header, geometry_file, material_file, image.mask.shape)
     # Next to the outline, demosaicing mixes object and background.
-    reach = REACH[image.facts["method"]]
+    reach = method_of(image.facts["method"]).reach
     inside = ndimage.minimum_filter(np.isfinite(m0[..., 0, 0]), size=2 * reach + 1)
     m0[~inside] = np.nan
     found = estimate_from_stokes(image, m0)

@@ -19,9 +19,9 @@ from processing.reduction.effects_of_capture import CountsCorrection, capture_ch
 from processing.reduction.facts import in_words
 from processing.reduction.instrument_of_capture import require_one_colour
 from processing.reduction.left_out import LeftOut
+from processing.reduction.mosaic.demosaic import demosaic
 from processing.reduction.mosaic.layout import MosaicLayout
 from processing.reduction.mosaic.merge import MergedFrame, merge
-from processing.reduction.mosaic.methods import demosaic
 from processing.reduction.mosaic.noise import neighbour_correlation, stokes_covariance
 from processing.reduction.mosaic.pixel_response import corrected_frame
 from processing.reduction.mueller import Progress

@@ -8,8 +8,8 @@ import pytest
 from processing.calibration.mosaic import fit_response
 from processing.errors import NotDetermined, ProcessError
 from processing.instrument.model import InstrumentModel
+from processing.reduction.mosaic.demosaic import demosaic
 from processing.reduction.mosaic.layout import MosaicError, MosaicLayout
-from processing.reduction.mosaic.methods import demosaic
 from processing.reduction.mosaic.pixel_response import corrected_frame, read_response
 from processing.storage.captures.capture import Capture
 from processing.storage.products.product import Step

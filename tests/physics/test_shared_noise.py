@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from processing.reduction.mosaic.demosaic import demosaic
 from processing.reduction.mosaic.layout import MosaicLayout
-from processing.reduction.mosaic.methods import demosaic
 from processing.reduction.mosaic.noise import neighbour_correlation, stokes_covariance
 from processing.reflectance.shared_noise import shared_variance
 

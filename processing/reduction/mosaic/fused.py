@@ -1,6 +1,6 @@
 """Bilinear Stokes images of a mosaic in one pass over the raw frame: for live views and long series.
 
-The same numbers as `methods.bilinear` followed by the solution for S, DoLP and AoLP, without the images between.
+The same numbers as `methods/bilinear.py` followed by the solution for S, DoLP and AoLP, without the images between.
 """
 
 from __future__ import annotations

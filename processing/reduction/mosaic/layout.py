@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from processing.arrays import Image
 from processing.errors import ProcessError
 
+#: Elements of a packed covariance of (S0, S1, S2).
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
 
 class MosaicError(ProcessError):
     """A mosaic frame or its layout cannot be used."""

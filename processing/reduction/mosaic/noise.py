@@ -1,8 +1,9 @@
 """Noise of demosaiced Stokes images: how much of each channel's variance arrives in S, for each method.
 
 S at a pixel is a weighted sum of raw pixels around it. The weights depend on where in the super-pixel it lies, so
-the covariance is, for each of the four positions, a sum over the channels of (3 x 3 matrix) x (variance of that
-channel's raw pixels there). The matrices come from sending unit impulses through the method itself.
+the covariance of a linear method is, for each of the four positions, a sum over the channels of (3 x 3 matrix) x
+(variance of that channel's raw pixels there). The matrices come from sending unit impulses through the method itself.
+An adaptive method is linearized about the frame itself.
 """
 
 from __future__ import annotations
@@ -12,16 +13,14 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.reduction.mosaic import oriented
-from processing.reduction.mosaic.layout import MosaicLayout
-from processing.reduction.mosaic.methods import METHODS, REACH, demosaic
+from processing.arrays import Image
+from processing.reduction.mosaic.demosaic import demosaic, method_of
+from processing.reduction.mosaic.layout import PAIRS, MosaicLayout
 
 #: Frame on which impulses are followed, and the level under them.
 _SIZE, _LEVEL = 32, 1000.0
-#: A step small against the level: the methods that are not linear are linearized about an even scene.
+#: A step small against the level, on an even scene.
 _STEP = 1.0
-#: Rows whose covariance is worked out at a time; an even number.
-ROWS = 128
 
 
 @lru_cache(maxsize=32)
@@ -65,7 +64,7 @@ def neighbour_correlation(
     matrix = np.asarray(solve)
     flat = np.full((_SIZE, _SIZE), _LEVEL, np.float32)
     still = demosaic(flat, layout, method)
-    middle, reach = _SIZE // 2, 2 * REACH[method]
+    middle, reach = _SIZE // 2, 2 * method_of(method).reach
     total = np.zeros((2 * reach + 1, 2 * reach + 1))
     for r, c in layout.offsets:
         poked = flat.copy()
@@ -92,26 +91,49 @@ def stokes_covariance(
     Parameters
     ----------
     variance : (channels, rows, columns), counts^2, of a raw pixel of each channel at the level found there.
-    frame : the mosaic frame; the kernels of the method "oriented" depend on it. None: no edges.
+    frame : the mosaic frame, on which an adaptive method depends. None: an even scene.
     """
-    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    out = np.empty((6, *variance.shape[1:]), np.float32)
-    if method == "oriented" and frame is not None:
-        direction = oriented.directions(frame, layout)
-        every = oriented.noise_gain(layout, solve)
-        packed = np.stack([every[..., a, b] for a, b in pairs]).astype(np.float32)
-        # Few rows at a time: the weights of all pixels together would be larger than the image many times over.
-        for first in range(0, variance.shape[1], ROWS):
-            for i in range(2):
-                for j in range(2):
-                    part = np.s_[first + i : first + ROWS : 2, j::2]
-                    weights = packed[:, direction[part], i, j]
-                    out[:, *part] = np.einsum("kxyc,cxy->kxy", weights, variance[:, *part])
-        return out
+    chosen = method_of(method)
+    if frame is not None and chosen.covariance is not None:
+        return chosen.covariance(variance, layout, solve, frame)
+    if frame is not None and not chosen.linear:
+        return _local_covariance(variance, layout, method, solve, frame)
+    out = np.empty((len(PAIRS), *variance.shape[1:]), np.float32)
     gain = noise_gain(layout, method, tuple(tuple(float(v) for v in row) for row in solve))
-    step = 1 if METHODS[method] is METHODS["superpixel"] else 2
+    step = 1 if _halves(method, layout) else 2
     for i in range(step):
         for j in range(step):
-            weights = np.array([gain[i, j, :, a, b] for a, b in pairs], dtype=np.float32)
+            weights = np.array([gain[i, j, :, a, b] for a, b in PAIRS], dtype=np.float32)
             out[:, i::step, j::step] = np.tensordot(weights, variance[:, i::step, j::step], axes=1)
     return out
+
+
+def _local_covariance(
+    variance: NDArray[np.float32], layout: MosaicLayout, method: str, solve: NDArray[np.float64], frame: Image
+) -> NDArray[np.float32]:
+    """Covariance of a method whose weights depend on the frame: it is linearized about the frame, pixel by pixel.
+
+    Each raw pixel is raised by its standard deviation, many at a time, so far apart that no value feels two of them.
+    """
+    raw = np.empty(frame.shape, np.float32)
+    halves = variance.shape[1] < frame.shape[0]
+    for k, (r, c) in enumerate(layout.offsets):
+        raw[r::2, c::2] = variance[k] if halves else variance[k, r::2, c::2]
+    sigma, matrix = np.sqrt(np.maximum(raw, 0)), solve.astype(np.float32)
+    still = np.tensordot(matrix, demosaic(frame, layout, method), axes=1)
+    out = np.zeros((len(PAIRS), *still.shape[1:]), np.float32)
+    apart = 2 * method_of(method).reach + 1
+    for i in range(min(apart, frame.shape[0])):
+        for j in range(min(apart, frame.shape[1])):
+            poked = frame.copy()
+            poked[i::apart, j::apart] += sigma[i::apart, j::apart]
+            moved = np.tensordot(matrix, demosaic(poked, layout, method), axes=1) - still
+            for packed, (a, b) in zip(out, PAIRS, strict=True):
+                packed += moved[a] * moved[b]
+    return out
+
+
+@lru_cache(maxsize=32)
+def _halves(method: str, layout: MosaicLayout) -> bool:
+    """Whether the images of the channels have half the size of the frame."""
+    return len(demosaic(np.zeros((4, 4)), layout, method)[0]) == 2

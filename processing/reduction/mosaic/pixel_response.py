@@ -49,6 +49,6 @@ def corrected_frame(
     solve = np.linalg.pinv(analyzers).astype(np.float32)
     out = even
     for _ in range(ROUNDS):
-        s = np.tensordot(solve, bilinear(out, layout), axes=1)
+        s = np.tensordot(solve, bilinear.channels(out, layout), axes=1)
         out = np.asarray(even - np.einsum("sxy,sxy->xy", deviation, s), dtype=np.float32)
     return out

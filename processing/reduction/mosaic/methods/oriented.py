@@ -19,11 +19,14 @@ from scipy.ndimage import map_coordinates
 from processing.arrays import Image
 from processing.computing.compiling import njit
 from processing.computing.threads import for_ranges
-from processing.reduction.mosaic.layout import MosaicLayout
+from processing.reduction.mosaic.filling import BORDER
+from processing.reduction.mosaic.layout import PAIRS, MosaicLayout
 
 #: Kernels reach this many pixels to each side.
 REACH = 4
 DIRECTIONS = 16
+#: Rows whose covariance is worked out at a time; an even number.
+ROWS = 128
 #: How much farther the scene is alike along an edge than across.
 STRETCH = 2.5
 
@@ -37,10 +40,9 @@ _CONSTANT = 1e3
 # An edge: gradients over about 3 pixels agree in direction by this much, and are this part of the signal a pixel.
 _AGREEMENT, _CONTRAST, _SMOOTHING_PX = 0.6, 0.02, 1.5
 _SCHARR = 32.0
-_BORDER = cv2.BORDER_REFLECT_101
 
 
-def oriented(frame: Image, layout: MosaicLayout) -> NDArray[np.float32]:
+def channels(frame: Image, layout: MosaicLayout) -> NDArray[np.float32]:
     """Channels (4, rows, columns) of a mosaic frame; see the module's text."""
     out, direction, padded = _first_pass(frame, layout)
     kernels = _kernels(layout)
@@ -49,14 +51,32 @@ def oriented(frame: Image, layout: MosaicLayout) -> NDArray[np.float32]:
 
 
 def directions(frame: Image, layout: MosaicLayout) -> NDArray[np.uint8]:
-    """Kernels that `oriented` uses (rows, columns): 0 without direction, k > 0: edge along 180 (k - 1)/16 degrees."""
+    """Kernels that `channels` uses (rows, columns): 0 without direction, k > 0: edge along 180 (k - 1)/16 degrees."""
     return _first_pass(frame, layout)[1]
 
 
-def noise_gain(layout: MosaicLayout, solve: NDArray[np.float64]) -> NDArray[np.float64]:
+def covariance(
+    variance: NDArray[np.float32], layout: MosaicLayout, solve: NDArray[np.float64], frame: Image
+) -> NDArray[np.float32]:
+    """Covariance (6, rows, columns) of (S0, S1, S2) by the kernels of each pixel; see `noise.stokes_covariance`."""
+    out = np.empty((6, *variance.shape[1:]), np.float32)
+    direction = directions(frame, layout)
+    every = _noise_gain(layout, solve)
+    packed = np.stack([every[..., a, b] for a, b in PAIRS]).astype(np.float32)
+    # Few rows at a time: the weights of all pixels together would be larger than the image many times over.
+    for first in range(0, variance.shape[1], ROWS):
+        for i in range(2):
+            for j in range(2):
+                part = np.s_[first + i : first + ROWS : 2, j::2]
+                weights = packed[:, direction[part], i, j]
+                out[:, *part] = np.einsum("kxyc,cxy->kxy", weights, variance[:, *part])
+    return out
+
+
+def _noise_gain(layout: MosaicLayout, solve: NDArray[np.float64]) -> NDArray[np.float64]:
     """Covariance of S for unit variance of one channel: (1 + DIRECTIONS, 2, 2, channels, 3, 3).
 
-    As `processing.reduction.mosaic.noise.noise_gain`, for each set of kernels.
+    As `noise.noise_gain`, for each set of kernels.
     """
     kernels = _kernels(layout).astype(float)
     side = np.arange(-REACH, REACH + 1)
@@ -76,7 +96,7 @@ def _first_pass(
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.float32]]:
     """Channels without direction, the directions of edges, and the padded frame."""
     kernels = _kernels(layout)
-    padded = np.asarray(cv2.copyMakeBorder(frame, REACH, REACH, REACH, REACH, _BORDER))
+    padded = np.asarray(cv2.copyMakeBorder(frame, REACH, REACH, REACH, REACH, BORDER))
     columns = np.ascontiguousarray(np.stack([padded[:, 0::2], padded[:, 1::2]]))
     out = np.empty((len(layout.channels), *frame.shape), np.float32)
     for_ranges(frame.shape[0], lambda a, b: _everywhere(columns, kernels[0], out, a, b), 2, 64)

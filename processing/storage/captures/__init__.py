@@ -1,0 +1,1 @@
+"""Capture files: layout, reader, segments, packing, splitting by colour."""
