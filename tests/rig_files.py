@@ -19,6 +19,20 @@ def change_yaml(path: Path, change: Callable[[Any], object], to: Path | None = N
     return to or path
 
 
+def with_values(path: Path, values: dict[str, object], to: Path) -> Path:
+    """Write another file with values at dotted keys (`axes.arm.port`, `solids.parts.0.size_mm`) replaced."""
+
+    def change(tree: Any) -> None:
+        for key, value in values.items():
+            *way, last = [int(part) if part.isdigit() else part for part in key.split(".")]
+            node = tree
+            for part in way:
+                node = node[part]
+            node[last] = value
+
+    return change_yaml(path, change, to)
+
+
 def write_rig(configs: Path, path: Path, top: dict | None = None, **simulator: object) -> Path:
     """Write the simulated rig with small frames and a fast clock; keywords change its `simulator` section."""
     rigs = configs / "rigs"

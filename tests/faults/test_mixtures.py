@@ -18,6 +18,7 @@ from drivers.errors import DeviceError
 from processing.reduction.counts_to_signal import Correction
 from processing.reports.report import write_report
 from processing.storage.captures.capture import Capture
+from tests.rig_files import with_values
 
 SHORT = {"states": {"kind": "rotating_retarders", "states": 18, "step_deg": 20, "ratio": 4.91}, "darks": 1}
 
@@ -49,17 +50,8 @@ def partial(run_with, tmp_path):
 
 def _edited(rig_file, **changes):
     """A copy of a rig file with values at dotted keys (`a__b`) changed."""
-    yaml = YAML()
-    rig = yaml.load(rig_file)
-    for keys, value in changes.items():
-        *folders, last = keys.split("__")
-        node = rig
-        for key in folders:
-            node = node[key]
-        node[last] = value
-    path = rig_file.with_name("edited.yaml")
-    yaml.dump(rig, path)
-    return path
+    values = {key.replace("__", "."): value for key, value in changes.items()}
+    return with_values(rig_file, values, rig_file.with_name("edited.yaml"))
 
 
 def test_another_rig_is_refused_with_the_difference_in_words(partial, quick_rig):

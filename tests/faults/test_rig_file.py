@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from ruamel.yaml import YAML
 
 from acquisition.capture.job import prepare
 from acquisition.capture.plan import MeasurementPlan
 from acquisition.errors import AcquisitionError, PlanRefused
 from acquisition.rig.clearance import RESOLUTION_MM, find_clash, footprint, gap_mm
-from acquisition.rig.config import RigConfig, load_rig
+from acquisition.rig.config import load_rig
 from acquisition.rig.rig import Rig
 from acquisition.rig.solids import Solids
-from processing.yaml_file import ConfigError, parse_yaml
+from processing.yaml_file import ConfigError
+from tests.rig_files import with_values
 
 ZABER = {"kind": "zaber", "port": "sim:rotators"}
 
@@ -86,20 +86,7 @@ MISTAKES = {
 def changed(configs, tmp_path):
     """The simulated rig with values at dotted keys replaced."""
 
-    def write(changes):
-        tree = YAML().load(configs / "rigs" / "simulated.yaml")
-        for key, value in changes.items():
-            *way, last = [int(part) if part.isdigit() else part for part in key.split(".")]
-            node = tree
-            for part in way:
-                node = node[part]
-            node[last] = value
-        path = tmp_path / "rig.yaml"
-        with path.open("w") as file:
-            YAML().dump(tree, file)
-        return path
-
-    return write
+    return lambda changes: with_values(configs / "rigs" / "simulated.yaml", changes, tmp_path / "rig.yaml")
 
 
 @pytest.mark.parametrize("name", MISTAKES)
@@ -247,13 +234,6 @@ def test_a_plan_from_which_parking_is_not_possible_is_refused(small_rig):
     prepare(MeasurementPlan(omega_deg=35), config)
     with pytest.raises(PlanRefused, match="way to the park pose"):
         prepare(MeasurementPlan(omega_deg=150), config)
-
-
-def test_the_rig_stored_in_a_capture_is_read_again(configs):
-    from processing.yaml_file import dump_yaml
-
-    config = load_rig(configs / "rigs" / "simulated.yaml")
-    assert parse_yaml(dump_yaml(config), RigConfig) == config
 
 
 def test_every_kind_tells_the_axes_of_one_line_apart():

@@ -285,7 +285,7 @@ def test_a_job_that_was_cut_off_takes_no_page_away(lab, client):
     assert client.get("/").status_code == 200
 
 
-@pytest.mark.parametrize("name", ["", "..", "../../x", "nothing"])
+@pytest.mark.parametrize("name", ["", "..", "../../x", "nothing", "x" * 300, "x" * 5000, "a/b", "a\0b"])
 def test_a_job_or_a_diagnosis_that_is_not_there(client, name):
     for what in ("job", "diagnosis", "diagnosis-report", "residual-map"):
         assert client.get(f"/{what}", params={"name": name}).status_code == 404

@@ -123,11 +123,6 @@ def test_a_body_that_is_too_large_is_refused_before_it_is_kept(client):
     assert "at most" in answer.text
 
 
-@pytest.mark.parametrize("name", ["x" * 5000, "x" * 300, "..", "a/b", "a\0b", ""])
-def test_a_job_that_is_not_there_is_not_found(client, name):
-    assert client.get("/job", params={"name": name}).status_code == 404
-
-
 def test_the_token_is_not_on_the_command_line_of_the_browser(monkeypatch):
     from viewer import server
 
