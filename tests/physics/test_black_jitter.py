@@ -26,6 +26,16 @@ def test_an_offset_is_the_same_in_darker_and_brighter_dim_pixels(offset, misfit,
     assert (black_jitter(capture(offset, misfit), np.ones((STATES, 1))) is not None) == found
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_whole_counts_of_a_steady_camera_are_no_jitter(seed):
+    """The median of whole counts jumps by one where their mean moves by a part of one."""
+    random, light = np.random.default_rng(seed), 1 + 0.2 * np.sin(np.arange(STATES))
+    counts = np.full((SIDE, SIDE), 2000.0)
+    counts[:2] = 20.5
+    counts = counts * light[:, None, None] + 1.5 * random.normal(size=(STATES, SIDE, SIDE))
+    assert black_jitter(steady_capture(np.rint(counts) / 4095, 1.5 / 4095), light[:, None]) is None
+
+
 def in_counts(black, read_noise):
     """The same surface as whole counts of twelve bits, on a `black` (N,) level in counts."""
     counts = 4095 * capture(0.0, 0.0).signal[:, 0] + black[:, None, None]
