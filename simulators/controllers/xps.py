@@ -135,9 +135,15 @@ class XPSConversation(Emulator):
             return "XPS-C8 Firmware V2.6.x"
         if name == "ErrorStringGet":
             return f"Error {words[0]}"
+        if name == "Login":
+            return ""
+        if name == "ObjectsListGet":
+            groups = self._controller.groups
+            return f"{';'.join(groups)};;{';'.join(f'{group}.Pos' for group in groups)}"
         functions: dict[str, Callable[[Group, list[str]], str | None]] = {
             "GroupStatusGet": lambda group, _: str(group.status()),
             "GroupPositionCurrentGet": lambda group, _: f"{group.axis.position_deg():.9g}",
+            "GroupVelocityCurrentGet": lambda group, _: f"{group.axis.velocity_deg_s():.9g}",
             "PositionerUserTravelLimitsGet": lambda group, _: _limits(group.axis),
             "PositionerSGammaParametersGet": lambda group, _: (
                 f"{group.axis.speed_deg_s:.9g},{group.axis.acceleration_deg_s2:.9g},0.02,0.02"

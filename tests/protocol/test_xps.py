@@ -17,6 +17,8 @@ def test_xps_bytes() -> None:
     talk, motion = emulator.connect(), emulator.connect()
     for line, sent, came in (
         (talk, b"FirmwareVersionGet(char *)", b"0,XPS-C8 Firmware V2.6.x,EndOfAPI"),
+        (talk, b"Login(Administrator,Administrator)", b"0,,EndOfAPI"),
+        (talk, b"ObjectsListGet(char *)", b"0,Group1;Group2;;Group1.Pos;Group2.Pos,EndOfAPI"),
         (talk, b"GroupStatusGet(Group1,int *)", b"0,0,EndOfAPI"),
         (talk, b"GroupHomeSearch(Group1)", b"-22,GroupHomeSearch(Group1),EndOfAPI"),
         (talk, b"GroupInitialize(Group1)", b"0,,EndOfAPI"),
@@ -27,6 +29,7 @@ def test_xps_bytes() -> None:
         (talk, b"GroupPositionCurrentGet(Group1.Pos,double *)", b"0,-12.5,EndOfAPI"),
         (motion, b"GroupMoveRelative(Group1.Pos,2.5)", b"0,,EndOfAPI"),
         (talk, b"GroupPositionCurrentGet(Group1,double *)", b"0,-10,EndOfAPI"),
+        (talk, b"GroupVelocityCurrentGet(Group1,double *)", b"0,0,EndOfAPI"),
         (motion, b"GroupMoveRelative(Group1,-170)", b"-17,GroupMoveRelative(Group1,-170),EndOfAPI"),
         (motion, b"GroupMoveAbsolute(Group1.Pos,999)", b"-17,GroupMoveAbsolute(Group1.Pos,999),EndOfAPI"),
         (talk, b"GroupStatusGet(Group7,int *)", b"-19,GroupStatusGet(Group7,int *),EndOfAPI"),

@@ -152,6 +152,8 @@ def test_newport_library_of_the_xps() -> None:
         xps = package.XPS()
         line = xps.TCP_ConnectToServer(host, int(port), 20)
         assert line >= 0
+        assert xps.Login(line, "Administrator", "Administrator")[0] == 0
+        assert xps.ObjectsListGet(line)[1].split(";;")[0].split(";") == ["Group1", "Group2"]
         assert xps.GroupHomeSearch(line, "Group1")[0] == -22
         assert xps.GroupInitialize(line, "Group1")[0] == 0
         assert xps.GroupHomeSearch(line, "Group1")[0] == 0
@@ -159,6 +161,7 @@ def test_newport_library_of_the_xps() -> None:
         assert xps.GroupMoveAbsolute(line, "Group1", [33.25])[0] == 0
         assert xps.GroupMoveRelative(line, "Group1", [-40.0])[0] == 0
         assert xps.GroupPositionCurrentGet(line, "Group1", 1) == [0, pytest.approx(-6.75)]
+        assert xps.GroupVelocityCurrentGet(line, "Group1", 1) == [0, 0.0]
         assert emulator.true_deg(0) == pytest.approx(-6.75)
         error, low, high = xps.PositionerUserTravelLimitsGet(line, "Group1.Pos")
         assert (error, low < 0 < high) == (0, True)
