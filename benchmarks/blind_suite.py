@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def one(capture: str) -> tuple[str, dict]:
     """Diagnose one capture with the instrument model that it declares."""
-    from processing.diagnosis.instrument.run import diagnose_captures
+    from processing.diagnosis.instrument.diagnose import diagnose_captures
     from processing.instrument.model import InstrumentModel
     from processing.storage.captures.capture import Capture
     from processing.yaml_file import parse_yaml

@@ -19,10 +19,9 @@ import numpy as np
 from measured_points import FOLDS, ReflectanceProblem
 
 from processing.diagnosis.captured.read_capture import read_capture
-from processing.diagnosis.instrument.closure import closure
-from processing.diagnosis.instrument.diagnose import Judged
+from processing.diagnosis.instrument.answer import closure
+from processing.diagnosis.instrument.diagnose import Judged, diagnose_captures
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.run import diagnose_captures
 from processing.diagnosis.instrument_file import extended
 from processing.diagnosis.search.fit import held_out, minimize
 from processing.diagnosis.search.space import Space

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.surface.run import diagnose_object
+from processing.diagnosis.surface.diagnose import diagnose_object
 from processing.diagnosis.surface.write import corrected_material
 from processing.instrument.model import InstrumentModel
 from processing.maps.xi0 import estimate_from_stokes

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from processing.diagnosis.instrument.run import diagnose_captures
+from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument_file import WriteError, write_instrument
 from processing.instrument.model import InstrumentModel
 from processing.polarization import mueller

@@ -14,7 +14,7 @@ from measuring import LARGE, SMALL, Program, Spent, Task, seconds
 from acquisition.capture.writer import CaptureWriter, StateRecord
 from drivers.motion import Position
 from processing.computing.threads import for_ranges
-from processing.diagnosis.instrument.run import diagnose_captures
+from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
 from processing.instrument.states import rotating_retarders
 from processing.reduction.counts_to_signal import BlockReader, Correction

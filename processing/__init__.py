@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from processing.calibration.free_angles import free_design as free_design
-    from processing.diagnosis.instrument.run import diagnose_captures as diagnose_captures
+    from processing.diagnosis.instrument.diagnose import diagnose_captures as diagnose_captures
     from processing.diagnosis.instrument_file import write_instrument as write_instrument
     from processing.errors import ProcessError as ProcessError
     from processing.geometry.viewing import ViewingGeometry as ViewingGeometry
@@ -61,7 +61,7 @@ _PUBLIC = {
     "Extrapolation": "processing.steps.maps",
     "Tabulation": "processing.steps.table",
     "MaterialFitting": "processing.steps.material",
-    "diagnose_captures": "processing.diagnosis.instrument.run",
+    "diagnose_captures": "processing.diagnosis.instrument.diagnose",
     "write_instrument": "processing.diagnosis.instrument_file",
     "ViewingGeometry": "processing.geometry.viewing",
     "load_reflectance": "processing.reflectance.base",

@@ -15,9 +15,8 @@ from acquisition.demo.truth import DrawnFault, TrueError, draw_faults, true_erro
 from acquisition.rig.config import RigConfig
 from acquisition.screen.observer import Observer
 from acquisition.taking import take_capture
-from processing.diagnosis.instrument.diagnose import Judged
+from processing.diagnosis.instrument.diagnose import Judged, diagnose_captures
 from processing.diagnosis.instrument.report import write_report
-from processing.diagnosis.instrument.run import diagnose_captures
 from processing.diagnosis.instrument_file import write_instrument
 from processing.diagnosis.search.result import FoundEffect
 from processing.instrument.model import InstrumentModel

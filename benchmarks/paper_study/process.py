@@ -13,7 +13,7 @@ from paper_study.acquire import BENCH, CONFIGS, SHOWN_DEG
 
 from processing.campaign.captures import find_captures
 from processing.campaign.run import Campaign, CampaignResult, compare_on_sphere
-from processing.diagnosis.instrument.run import diagnose_captures
+from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument_file import write_instrument
 from processing.diagnosis.search.result import Diagnosis
 from processing.instrument.model import InstrumentModel

@@ -49,7 +49,7 @@ def diagnose_command(
         return
     from processing.commands.loaded_late.diagnose_summary import show, write_result
     from processing.commands.progress_bar import progress_line
-    from processing.diagnosis.instrument.run import diagnose_captures
+    from processing.diagnosis.instrument.diagnose import diagnose_captures
     from processing.storage.captures.capture import full_model
 
     model = full_model(captures[0], instrument)

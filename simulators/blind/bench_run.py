@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from processing.diagnosis.instrument.run import diagnose_captures
+from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument_file import write_instrument
 from processing.instrument.model import InstrumentModel
 from simulators.blind.bench_judge import GIVEN, Judgement, names_of, told_of, wiring_of

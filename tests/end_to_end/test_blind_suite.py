@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from processing.diagnosis.instrument.run import diagnose_captures
+from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
 from processing.yaml_file import parse_yaml

@@ -8,8 +8,7 @@ import pytest
 
 from processing.commands.application import main as process
 from processing.commands.diagnose import main as diagnose
-from processing.diagnosis.surface.diagnose import SurfaceDiagnosis
-from processing.diagnosis.surface.run import diagnose_object
+from processing.diagnosis.surface.diagnose import SurfaceDiagnosis, diagnose_object
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
 from processing.polarization.image_difference import linear_diattenuation, magnitude, orientation_difference, rmsd

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.run import diagnose_captures
 from processing.diagnosis.instrument_file import extended
 from processing.diagnosis.search.result import Check
 from processing.diagnosis.search.space import Space

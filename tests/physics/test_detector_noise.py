@@ -6,8 +6,8 @@ import pytest
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.captured.screening import screened
+from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.run import diagnose_captures
 from processing.diagnosis.instrument.structure import residual
 from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.space import Space

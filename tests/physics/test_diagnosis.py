@@ -9,8 +9,8 @@ import pytest
 from bench_capture import bench_capture
 
 from processing.commands import diagnose as cli
+from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument.residual_file import read_residuals
-from processing.diagnosis.instrument.run import diagnose_captures
 from processing.diagnosis.search.result import Diagnosis, FoundEffect
 from processing.instrument.model import EffectParameter, InstrumentModel
 from processing.storage.captures.capture import Capture

@@ -5,7 +5,7 @@ import pytest
 
 from processing.diagnosis.instrument.doubts import OF_THE_SAMPLE, PART_OF_LEFT
 from processing.diagnosis.instrument.guard import chances, lasts
-from processing.diagnosis.search.guard import NOTHING, predicted_change
+from processing.diagnosis.search.decision import NOTHING, predicted_change
 
 
 def test_chance_that_m_gets_worse_is_that_of_draws_from_the_posterior() -> None:

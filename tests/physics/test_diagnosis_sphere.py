@@ -8,9 +8,8 @@ import pytest
 from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.data import read_surface
-from processing.diagnosis.surface.diagnose import SurfaceDiagnosis
+from processing.diagnosis.surface.diagnose import SurfaceDiagnosis, diagnose_object
 from processing.diagnosis.surface.problem import SurfaceProblem
-from processing.diagnosis.surface.run import diagnose_object
 from processing.diagnosis.surface.standard_errors import standard_errors
 from processing.errors import ProcessError
 from processing.instrument.model import InstrumentModel

@@ -5,7 +5,7 @@ from types import SimpleNamespace as Some
 import numpy as np
 import pytest
 
-from processing.diagnosis.instrument.systematic import MuellerErrors, _leading
+from processing.diagnosis.instrument.mueller_error import MuellerErrors, _leading
 from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.search.likely_set import likely_set
 from processing.diagnosis.search.rules import MOST_STORED

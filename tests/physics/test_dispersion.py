@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.instrument.initial_values import first_values
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.starts import first_values
 from processing.diagnosis.search.dispersion import curve
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.search.stored import by_wavelength

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.fit import Fit
-from processing.diagnosis.search.judge import Judgement
+from processing.diagnosis.search.decision import Judgement
+from processing.diagnosis.search.fit import Fit, Solution
 from processing.diagnosis.search.result import Check
-from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space, Sums
 from processing.diagnosis.surface import guard
 from processing.effect import Parameter

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processing.diagnosis.instrument.run import diagnose_captures
+from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.diagnosis.instrument_file import write_instrument
 from processing.instrument.model import InstrumentModel
 from processing.storage.formats.importing import ImportRequest, import_capture, read_sample

@@ -7,7 +7,7 @@ import pytest
 
 from processing.calibration.known_sample import part_of
 from processing.calibration.train import fit_trains
-from processing.diagnosis.instrument.run import diagnose_captures
+from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.errors import NotDetermined, ProcessError
 from processing.instrument.determined import determined_basis, determined_elements
 from processing.instrument.model import InstrumentModel, Polarizer

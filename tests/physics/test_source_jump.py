@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from bench_capture import bench_capture
 
-from processing.diagnosis.instrument.run import diagnose_captures
+from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
 from simulators.blind.undeclared_captures import Bench

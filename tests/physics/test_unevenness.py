@@ -4,7 +4,7 @@ import numpy as np
 from bench_capture import bench_capture
 
 from processing.diagnosis.captured.read_capture import read_capture
-from processing.diagnosis.captured.steep_pixels import without_steep_pixels
+from processing.diagnosis.captured.screening import without_steep_pixels
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.unevenness import Evenness
 from processing.diagnosis.search.fit import minimize

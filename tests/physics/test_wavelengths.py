@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from processing.diagnosis.captured.capture_data import CaptureData
-from processing.diagnosis.instrument.mueller_slopes import mueller_slopes
+from processing.diagnosis.instrument.initial_values import along_wavelengths
+from processing.diagnosis.instrument.mueller_error import mueller_slopes
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.starts import along_wavelengths
 from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.instrument_file import extended
 from processing.diagnosis.search.fit import Fit, held_out, minimize

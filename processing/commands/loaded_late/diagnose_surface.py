@@ -27,7 +27,7 @@ def diagnose_reflectance(
         raise ProcessError("a diagnosis of the reflectance needs both --reflectance MATERIAL and --geometry GEOMETRY.")
     from processing.commands.loaded_late.diagnose_summary import show, write_result
     from processing.commands.progress_bar import progress_line
-    from processing.diagnosis.surface.run import diagnose_object
+    from processing.diagnosis.surface.diagnose import diagnose_object
     from processing.diagnosis.surface.write import targets, write_surface
     from processing.geometry.viewing import ViewingGeometry
     from processing.reflectance.base import load_reflectance

@@ -1,22 +1,23 @@
-"""From the posterior to an answer: a correction that holds, and names apart from it."""
+"""Diagnose captures against an instrument model: posterior, tests of its residual, names, correction and verdict."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
-from processing.diagnosis.instrument.empirical import empirical
-from processing.diagnosis.instrument.guard import chances, checks, lasts
-from processing.diagnosis.instrument.names import Names, names_of
-from processing.diagnosis.instrument.outcome import Outcome, outcome_of
-from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.recommend import recommended
-from processing.diagnosis.instrument.structure import Residual, descriptions
-from processing.diagnosis.instrument.systematic import MuellerErrors
-from processing.diagnosis.instrument.telling import (
+import numpy as np
+
+from processing.arrays import Array
+from processing.computing.blas import one_blas_thread
+from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.captured.read_capture import read_capture
+from processing.diagnosis.captured.screening import screened
+from processing.diagnosis.instrument.answer import (
     calibrated,
     capture_report,
     correction,
+    empirical,
     error,
     floor,
     missing,
@@ -27,16 +28,142 @@ from processing.diagnosis.instrument.telling import (
     told_switches,
     unobservable,
 )
-from processing.diagnosis.instrument.whole_bench import WholeBench
+from processing.diagnosis.instrument.doubts import (
+    doubts,
+    testable,
+)
+from processing.diagnosis.instrument.guard import chances, checks, lasts
+from processing.diagnosis.instrument.mueller_error import MuellerErrors
+from processing.diagnosis.instrument.problem import InstrumentProblem
+from processing.diagnosis.instrument.recommend import recommended
+from processing.diagnosis.instrument.structure import Residual, descriptions, residual
+from processing.diagnosis.instrument.whole_bench import WholeBench, predicts, solution
 from processing.diagnosis.instrument.wiring import Wiring, miswired, miswired_train
-from processing.diagnosis.search.evidence import wanted_for_evidence, would_be_seen
-from processing.diagnosis.search.guard import refusal
-from processing.diagnosis.search.judge import Judgement
-from processing.diagnosis.search.posterior import Say
+from processing.diagnosis.search.candidate import Candidate
+from processing.diagnosis.search.causes import Cause, causes, wanted_for_evidence, would_be_seen
+from processing.diagnosis.search.decision import Judgement, beyond_chance, refusal
+from processing.diagnosis.search.fit import Solution
+from processing.diagnosis.search.posterior import Posterior, Say
 from processing.diagnosis.search.result import Diagnosis, FoundEffect, Unexplained
-from processing.diagnosis.search.rules import MOST_TRIED
-from processing.diagnosis.search.solution import Solution
+from processing.diagnosis.search.rules import GROWTH, LIKELY, MOST_TRIED, WHITE
+from processing.instrument.effects.base import ValuePerState
 from processing.instrument.model import InstrumentModel
+from processing.storage.captures.capture import Capture, CaptureError
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A posterior, its correction, and what is left of each capture before and after it.
+
+    Attributes
+    ----------
+    structure : whether any test sees structure in what the mean of the posterior leaves; left : chi-square of it, in
+        units of each capture's own.
+    """
+
+    bench: WholeBench
+    asked: InstrumentProblem
+    found: Posterior
+    solved: Solution
+    before: tuple[Residual, ...]
+    after: tuple[Residual, ...]
+    structure: bool
+    left: float
+
+
+def outcome_of(bench: WholeBench, found: Posterior) -> Outcome:
+    """Test what is left; where single tests see structure that the sum of squares does not, weigh all anew."""
+    asked, solved = predicts(bench.problem), solution(bench, found)
+    captures = range(len(asked.captures))
+    before = tuple(residual(asked, k, solved.base, solved.before_fit) for k in captures)
+    after = residuals(asked, solved)
+    units = np.array([1 + left_of(asked, r) / directions(asked, k) for k, r in enumerate(after)])
+    if asked.noise_known and grown(units, found.samples.best.unit):
+        found = bench.weighed(found, units)
+        solved = solution(bench, found)
+        after = residuals(asked, solved)
+    else:
+        units = np.ones(len(after))
+    left = float(sum(left_of(asked, r) / u for r, u in zip(after, units, strict=True)))
+    return Outcome(bench, asked, found, solved, before, after, has_structure(asked, after), left)
+
+
+def residuals(problem: InstrumentProblem, solved: Solution) -> tuple[Residual, ...]:
+    """What a correction leaves of every capture."""
+    return tuple(residual(problem, k, solved.space, solved.fit) for k in range(len(problem.captures)))
+
+
+def grown(units: Array, unit: float) -> bool:
+    """Whether a capture leaves more, in units of chi-square, than the posterior reckoned with."""
+    return bool(units.max() > GROWTH * unit)
+
+
+def directions(problem: InstrumentProblem, k: int) -> float:
+    """Independent directions over which structure spreads in one capture."""
+    free, power = problem.powers()[k]
+    return max(free * float(power.sum() ** 2 / np.sum(power**2)), 1.0)
+
+
+def has_structure(problem: InstrumentProblem, after: Collection[Residual]) -> bool:
+    """Whether a residual has structure; where its noise is unknown, of states beside each other."""
+    if problem.noise_known:
+        return any(beyond_chance(r.tests) for r in after)
+    return any(not white(r) for r in after)
+
+
+def left_of(problem: InstrumentProblem, r: Residual) -> float:
+    """Chi-square of the structure of one capture; none where no test sees any: of many some err by two deviations."""
+    return r.left if has_structure(problem, [r]) else 0.0
+
+
+def white(r: Residual) -> bool:
+    """Whether the mean residual of a state tells nothing of that of the next one."""
+    mean = r.mean[np.isfinite(r.mean)]
+    if mean.size <= WHITE**2 or not np.any(mean):
+        return True
+    centred = mean - mean.mean()
+    lag = float(centred[1:] @ centred[:-1] / (centred @ centred))
+    return bool(abs(lag) * np.sqrt(mean.size) < WHITE)
+
+
+@dataclass(frozen=True)
+class Names:
+    """Causes that are told.
+
+    Attributes
+    ----------
+    named : likely ones; doubt : why some of them have no sure name.
+    untold : as many values as the data have, which have no name at all.
+    """
+
+    named: tuple[Cause, ...]
+    untold: tuple[Cause, ...]
+    doubt: Mapping[Cause, str]
+
+    @property
+    def sure(self) -> list[Cause]:
+        """Those that nothing speaks against."""
+        return [c for c in self.named if c.answer != "unknown" and c not in self.doubt]
+
+    @property
+    def rivals(self) -> list[tuple[Candidate, ...]]:
+        """Sets of effects of which one is there."""
+        return [(c.candidates[0], *c.others) for c in self.named if c.others]
+
+
+def names_of(outcome: Outcome) -> Names:
+    """Names of the causes of a posterior, as far as what is left over allows them."""
+    asked, found, solved = outcome.asked, outcome.found, outcome.solved
+    likely = tuple(c for c in causes(found, outcome.left) if c.probability >= LIKELY)
+    untold = tuple(
+        c
+        for c in likely
+        if isinstance(c.candidates[0].effect, ValuePerState) and not testable(asked, solved, c, likely)
+    )
+    named = tuple(c for c in likely if c not in untold)
+    # What as many values as the data have took away may be any structure.
+    left = outcome.left + sum(2 * c.log_odds * found.samples.best.unit for c in untold)
+    return Names(named, untold, doubts(asked, found, solved, named, left))
 
 
 @dataclass(frozen=True)
@@ -151,3 +278,38 @@ def _unexplained(used: Outcome, names: Names) -> Unexplained:
         tried=tried or tuple(r.candidate for r in ranking(used.found, used.solved.before)[:MOST_TRIED]),
         empirical=empirical(used.found, used.solved),
     )
+
+
+@one_blas_thread()
+def diagnose_captures(
+    captures: Sequence[Path | str], model: InstrumentModel, say: Say = lambda line: None
+) -> tuple[Judged, InstrumentProblem]:
+    """Diagnose capture files jointly.
+
+    Parameters
+    ----------
+    captures
+        Of one instrument, at one wavelength or several; what is known of each sample is in the file.
+    model
+        As loaded from its file.
+
+    Returns
+    -------
+    Verdict, names and correction; and the problem that they are the answer to.
+
+    Raises
+    ------
+    CaptureError
+        A file cannot be used, or none is given.
+    """
+    if not captures:
+        raise CaptureError("no capture to diagnose: one file or several of one instrument are wanted")
+    models: list[InstrumentModel] = []
+    data: list[CaptureData] = []
+    for path in map(Path, captures):
+        say(f"reading {path.name}")
+        with Capture(path) as capture:
+            models.append(model.nominal_at(capture.header.wavelength_nm))
+            data.append(screened(read_capture(capture, models[-1]), models[-1], say))
+    judged = diagnose(InstrumentProblem(models, data), say, model)
+    return judged, judged.problem

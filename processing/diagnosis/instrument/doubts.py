@@ -11,6 +11,7 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.unevenness import Evenness
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import Cause, shown
+from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import (
     BOUND,
@@ -23,7 +24,6 @@ from processing.diagnosis.search.rules import (
     UNEVEN_SHARE,
     UNKNOWN_NOISE,
 )
-from processing.diagnosis.search.solution import Solution
 from processing.instrument.effects.base import (
     CountsEffect,
     FieldEffect,

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 
 from processing.arrays import Array
+from processing.diagnosis.instrument.answer import stretch
 from processing.diagnosis.instrument.doubts import CHANGED
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.telling import stretch
-from processing.diagnosis.search.fit import Fit
-from processing.diagnosis.search.guard import PredictedChange, chance_checks, held_out_check, rows_checks
+from processing.diagnosis.search.decision import PredictedChange, chance_checks, held_out_check, rows_checks
+from processing.diagnosis.search.fit import Fit, Solution
 from processing.diagnosis.search.result import Check
 from processing.diagnosis.search.rules import CHANCE_WORSE
-from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 
 

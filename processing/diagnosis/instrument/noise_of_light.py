@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array, BoolArray
 from processing.diagnosis.captured.capture_data import CaptureData, Correct, for_strips
+from processing.diagnosis.instrument.photon_noise import exactly_undone, undoing
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import add_response
-from processing.diagnosis.instrument.undone import exactly_undone, undoing
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.range_of import range_of
 from processing.diagnosis.search.rules import NOISE_LEVEL

@@ -24,11 +24,10 @@ from processing.diagnosis.instrument.moments import (
     folds_of,
     moments_of,
 )
-from processing.diagnosis.instrument.noise_level import with_noise_of_light
+from processing.diagnosis.instrument.photon_noise import distance, exactly_undone, movable, undoing, with_noise_of_light
 from processing.diagnosis.instrument.projection import add_block, noise_information
 from processing.diagnosis.instrument.slopes import Columns, slopes_of_counts, slopes_of_rows
 from processing.diagnosis.instrument.tiles import add_tiles, slopes_of_tiles, tile_columns
-from processing.diagnosis.instrument.undone import distance, exactly_undone, movable, undoing
 from processing.diagnosis.search.candidate import Candidate, SourceLevel, nominal_values, pool
 from processing.diagnosis.search.range_of import range_of
 from processing.diagnosis.search.rules import ENOUGH_SOUND, EXACT

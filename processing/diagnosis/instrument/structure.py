@@ -15,8 +15,8 @@ from processing.diagnosis.instrument.pixel_sums import Pixels
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.projection import add_response
 from processing.diagnosis.instrument.tiles import tile_columns
+from processing.diagnosis.search.decision import beyond_chance
 from processing.diagnosis.search.fit import Fit
-from processing.diagnosis.search.judge import beyond_chance
 from processing.diagnosis.search.linearized import deviation_of
 from processing.diagnosis.search.range_of import range_of
 from processing.diagnosis.search.rules import FEWEST_FOR_PATTERNS, FEWEST_PAIRS, HARMONICS, PATCHES

@@ -7,16 +7,15 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.instrument.branches import nearest_branch
 from processing.diagnosis.instrument.features import MARGIN
+from processing.diagnosis.instrument.initial_values import best_of_starts, first_values, nearest_branch
 from processing.diagnosis.instrument.noise_of_light import scatter_prefers
+from processing.diagnosis.instrument.photon_noise import exactly_undone
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.starts import best_of_starts, first_values
-from processing.diagnosis.instrument.undone import exactly_undone
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.causes import causes
 from processing.diagnosis.search.descent import LEAST_WIDTH
-from processing.diagnosis.search.fit import Fit, held_out, minimize, prior, score
+from processing.diagnosis.search.fit import Fit, Solution, held_out, minimize, prior, score
 from processing.diagnosis.search.likely_set import everything
 from processing.diagnosis.search.posterior import Posterior, Say, first_look, posterior, resampled
 from processing.diagnosis.search.rules import (
@@ -31,7 +30,6 @@ from processing.diagnosis.search.rules import (
     SHARES,
     TAKES_PART,
 )
-from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import (
     FieldEffect,

@@ -15,8 +15,8 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import CaptureData
+from processing.diagnosis.instrument.initial_values import best_of_starts
 from processing.diagnosis.instrument.problem import InstrumentProblem
-from processing.diagnosis.instrument.starts import best_of_starts
 from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.rules import DECISIVE, FEW_STARTS, WIRING, WIRING_SCATTER
 from processing.diagnosis.search.space import Space

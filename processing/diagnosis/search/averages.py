@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array
-from processing.diagnosis.search.odds import probability_at
 from processing.diagnosis.search.rules import ALTERNATIVE, CERTAIN, SHARES
-from processing.diagnosis.search.sets import Conditional, Group, Quadratic, Sets, State
+from processing.diagnosis.search.sets import Conditional, Group, Quadratic, Sets, State, probability_at
 
 #: [probability] Weight of a set below which it changes no mean.
 LEAST_WEIGHT = 1e-6

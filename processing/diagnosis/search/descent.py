@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from processing.arrays import Array
 from processing.diagnosis.search.averages import Samples, sample
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.problem import Problem
 from processing.diagnosis.search.rules import NOMINAL_TAU, SAMPLES_BEFORE, SETTLED, TAKES_PART
 from processing.diagnosis.search.sets import Group, Noise, Sets, State
-from processing.diagnosis.search.space import Space, Sums
+from processing.diagnosis.search.space import Problem, Space, Sums
 
 #: [steps] Of a descent.
 STEPS = 6

@@ -17,10 +17,9 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.descent import all_at_once, next_values
 from processing.diagnosis.search.likely_set import climb, likely_set
 from processing.diagnosis.search.linearized import noise_of, quadratic
-from processing.diagnosis.search.problem import Problem
 from processing.diagnosis.search.rules import BENT, GAINING, ROUNDS, SHRUNK
 from processing.diagnosis.search.sets import Group, Noise, Sets, State
-from processing.diagnosis.search.space import Space
+from processing.diagnosis.search.space import Problem, Space
 
 
 def down_to_noise(

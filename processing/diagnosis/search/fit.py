@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array, BoolArray
-from processing.diagnosis.search.problem import Problem
+from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.rules import LEAST_FREEDOM
-from processing.diagnosis.search.space import Space, Sums
+from processing.diagnosis.search.space import Problem, Space, Sums
 from processing.instrument.effects.base import ValuePerState
 
 #: [typical sizes] Width of the prior that keeps unseen parameters still.
@@ -289,3 +289,33 @@ def _one_step(full: Fit, space: Space, folds: Sequence[int], weak: Array) -> Arr
     lower, upper = space.joined("lower"), space.joined("upper")
     step = np.where(space.fixed, 0.0, np.linalg.solve(h, g))
     return np.asarray(np.clip(full.values - step, lower, upper))
+
+
+@dataclass
+class Solution:
+    """Before and after, on data that the fit did not see.
+
+    Attributes
+    ----------
+    base : what is always fitted; space : that, and the effects of the correction (the mean of the posterior).
+    before_fit, fit : at these; before, after : predictions of what was held out.
+    weak : (K,) curvature of the prior of the values of `space`.
+    """
+
+    base: Space
+    before_fit: Fit
+    before: HeldOut
+    space: Space
+    fit: Fit
+    after: HeldOut
+    weak: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def effects(self) -> tuple[Candidate, ...]:
+        """Effects of the correction."""
+        return self.space.candidates[len(self.base.candidates) :]
+
+    @property
+    def undone(self) -> Solution:
+        """Nothing corrected."""
+        return Solution(self.base, self.before_fit, self.before, self.base, self.before_fit, self.before)

@@ -8,10 +8,9 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.problem import Problem
 from processing.diagnosis.search.rules import LEAST_NOISE, NOISE_LEVEL, NOMINAL_TAU, SLACK
 from processing.diagnosis.search.sets import Group, Noise, Quadratic
-from processing.diagnosis.search.space import Space, Sums
+from processing.diagnosis.search.space import Problem, Space, Sums
 from processing.instrument.effects.base import ResponseCurve
 
 

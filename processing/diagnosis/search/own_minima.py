@@ -19,10 +19,9 @@ from processing.diagnosis.search.fit import Fit, minimize
 from processing.diagnosis.search.likely_set import retune
 from processing.diagnosis.search.linearized import grouped, noise_of, quadratic
 from processing.diagnosis.search.posterior import Posterior, Say
-from processing.diagnosis.search.problem import Problem
 from processing.diagnosis.search.rules import BOUND, ENOUGH, EXPLAINS, HOPE, IMITATES, LEADERS
 from processing.diagnosis.search.sets import Group, Sets, State
-from processing.diagnosis.search.space import Space
+from processing.diagnosis.search.space import Problem, Space
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,6 @@ from processing.diagnosis.search.descent import STEPS, all_at_once, improved, me
 from processing.diagnosis.search.down_to_noise import down_to_noise
 from processing.diagnosis.search.likely_set import climb, likely_set
 from processing.diagnosis.search.linearized import grouped, noise_of, quadratic
-from processing.diagnosis.search.problem import Problem
 from processing.diagnosis.search.rules import (
     BENT,
     CERTAIN,
@@ -33,7 +32,7 @@ from processing.diagnosis.search.rules import (
     TAU,
 )
 from processing.diagnosis.search.sets import Group, Noise, Sets, State
-from processing.diagnosis.search.space import Space, Sums
+from processing.diagnosis.search.space import Problem, Space, Sums
 from processing.instrument.effects.base import PointwiseEffect
 
 #: Called with a line that says what is being done.

@@ -20,6 +20,15 @@ from scipy.special import betaln
 from processing.arrays import Array
 from processing.diagnosis.search.rules import FEW_CAUSES, MANY, TAU, TAU_WEIGHT, TAU_WEIGHT_OF_MANY
 
+#: [log odds] Beyond which a probability is zero or one for any number of sixteen digits.
+MOST_ODDS = 50.0
+
+
+def probability_at(log_odds: Array | float) -> Array:
+    """Probability of each of some log odds."""
+    return np.asarray(1 / (1 + np.exp(-np.clip(log_odds, -MOST_ODDS, MOST_ODDS))))
+
+
 #: [probability] Of what cannot be, for its logarithm.
 LEAST_WEIGHT = 1e-300
 #: [log odds] Of what cannot be, beyond what any data speak for.

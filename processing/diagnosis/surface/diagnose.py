@@ -1,21 +1,23 @@
-"""From the search in the reflectance to a verdict, and what the correction does to psi, |D| and xi0."""
+"""Diagnose captures of an object against a reflectance model: search, names, verdict, and what a correction does."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from processing.arrays import Array
+from processing.computing.blas import one_blas_thread
 from processing.diagnosis.search.candidate import Candidate
-from processing.diagnosis.search.causes import Cause
-from processing.diagnosis.search.evidence import wanted_for_evidence, would_be_seen
-from processing.diagnosis.search.fit import HeldOut
-from processing.diagnosis.search.judge import Judgement, beyond_chance
+from processing.diagnosis.search.causes import Cause, causes, wanted_for_evidence, would_be_seen
+from processing.diagnosis.search.decision import Judgement, beyond_chance
+from processing.diagnosis.search.fit import LEAST_GAIN, Fit, HeldOut, Solution, held_out, minimize
 from processing.diagnosis.search.own_minima import OwnMinima, Visited
 from processing.diagnosis.search.posterior import Say
-from processing.diagnosis.search.range_of import rank_of
+from processing.diagnosis.search.range_of import part_outside, rank_of
 from processing.diagnosis.search.result import (
     BeyondNoise,
     CaptureReport,
@@ -26,19 +28,137 @@ from processing.diagnosis.search.result import (
     Ranked,
     Unexplained,
 )
-from processing.diagnosis.search.rules import AS_LIKELY, LEFT_OVER, LIMIT, MOST_EFFECTS, MOST_RANKED, MOST_TRIED, SEEN
-from processing.diagnosis.search.solution import Solution
+from processing.diagnosis.search.rules import (
+    ALONG_VALLEY,
+    APART,
+    AS_LIKELY,
+    IMITATES,
+    LEFT_OVER,
+    LIKELY,
+    LIMIT,
+    MOST_EFFECTS,
+    MOST_RANKED,
+    MOST_TRIED,
+    SEEN,
+)
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.search.stored import parameters_of
+from processing.diagnosis.surface.data import SurfaceData, read_surface
 from processing.diagnosis.surface.guard import chances, checks
-from processing.diagnosis.surface.naming import named_causes, roughness, solution
-from processing.diagnosis.surface.problem import SurfaceProblem
+from processing.diagnosis.surface.problem import SurfaceProblem, structure
 from processing.diagnosis.surface.quantities import Quantities, quantities
-from processing.diagnosis.surface.recommend import recommended
-from processing.diagnosis.surface.standard_errors import standard_errors
-from processing.diagnosis.surface.structure import structure
-from processing.instrument.model import AppliedEffect
+from processing.diagnosis.surface.standard_errors import bent, standard_errors
+from processing.geometry.viewing import ViewingGeometry
+from processing.instrument.model import AppliedEffect, InstrumentModel
 from processing.polarization.image_difference import rmsd
+from processing.reflectance.effects.base import ReflectanceEffect
+from processing.storage.captures.capture import Capture, CaptureError
+
+#: [steps] Of a fit that looks for a deeper minimum in a bent valley.
+VALLEY_STEPS = 8
+
+
+def named_causes(search: OwnMinima, likeliest: Visited) -> tuple[Visited, tuple[Cause, ...]]:
+    """The set of what can be named, the most certain first: the weakest is taken away while one may be imitated."""
+    here = likeliest
+    while here.groups:
+        found = causes(search.posterior(here), search.left(here))
+        weakest = found[-1]
+        if not _doubted(search, here, weakest):
+            return here, found
+        search.say(f"{weakest.candidates[0].label} may be a part of something else")
+        (group,) = (g for g in here.groups if search.candidates_of(g)[0] == weakest.candidates[0])
+        here = search.at(here.groups - {group}, here)
+    return here, ()
+
+
+def _doubted(search: OwnMinima, here: Visited, cause: Cause) -> bool:
+    if cause.probability < LIKELY or cause.log_odds < IMITATES:
+        return True
+    others = [c for c in here.space.candidates if c not in cause.candidates]
+    rough = max((roughness(c) for c in others), default=0.0)
+    if not rough or not search.left(here):
+        return False
+    # Beside an effect whose form is rough, what its form leaves over must not get a name of its own.
+    start = search.at(frozenset()).fit.excess
+    explained = start - here.fit.excess
+    return 2 * cause.log_odds * here.state.unit < rough * explained
+
+
+def roughness(candidate: Candidate) -> float:
+    """Part of what an effect explains that its simple form may leave over."""
+    effect = candidate.effect
+    return effect.rough if isinstance(effect, ReflectanceEffect) else 0.0
+
+
+def solution(problem: SurfaceProblem, search: OwnMinima, here: Visited) -> Solution:
+    """What the named effects correct, and predictions of what was held out."""
+    nothing = search.at(frozenset())
+    fit = _deepest(problem, here.space, minimize(problem, here.space, here.fit.values))
+    before = held_out(problem, nothing.space, nothing.fit)
+    return Solution(nothing.space, nothing.fit, before, here.space, fit, held_out(problem, here.space, fit))
+
+
+def _deepest(problem: SurfaceProblem, space: Space, fit: Fit) -> Fit:
+    """A deeper minimum near by, if a valley is bent."""
+    typical, best = space.joined("typical"), fit
+    for k in np.flatnonzero(bent(space)):
+        for sign in (ALONG_VALLEY, -ALONG_VALLEY):
+            start = fit.values.copy()
+            start[k] += sign * typical[k]
+            tried = minimize(problem, space, start, steps=VALLEY_STEPS)
+            best = tried if tried.excess < best.excess - LEAST_GAIN else best
+    return best
+
+
+def recommended(
+    problem: SurfaceProblem,
+    space: Space,
+    fit: Fit,
+    rivals: Sequence[Candidate],
+    verdict: str,
+    before: Sequence[dict[str, float]],
+) -> str:
+    """One sentence."""
+    own = "smooth over the object, of the instrument"
+    if verdict == "unexplained":
+        if any(tests.get(own, 0.0) > LIMIT for tests in before):
+            return (
+                "No Mueller matrix at all explains these intensities: diagnose the instrument first, without "
+                "--reflectance and best on air, then come back with the instrument file that it writes."
+            )
+        return (
+            "The dominant process, or the assumption that the other three are equal, does not hold in a way that is "
+            "not in the list: take a full Mueller capture, look at its eigenvalues (`process xi0`) and at psi and |D|."
+        )
+    if not rivals:
+        return "None needed."
+    for candidate in rivals:
+        if isinstance(candidate.effect, ReflectanceEffect) and candidate.effect.advice:
+            return candidate.effect.advice
+    if len(rivals) > 1 and _apart(problem, space, fit, rivals) >= APART:
+        return "Their signatures differ: repeat the capture with more light or more frames."
+    if rank_of(problem.rows(0, problem.changes(0, space, fit.values)[0])) < 16:
+        return "Take a full Mueller capture of the same object: one angle of polarization at each pixel is too little."
+    return "Take captures at two more arm angles, at least 30 degrees apart, and diagnose them together."
+
+
+def _apart(problem: SurfaceProblem, space: Space, fit: Fit, rivals: Sequence[Candidate]) -> float:
+    """Smallest sine between the signatures of two rivals in these captures."""
+    signatures = []
+    for candidate in rivals:
+        alone = Space((candidate,))
+        parts = []
+        for k in range(len(problem.captures)):
+            here = problem.pixels(k, Space(()), np.zeros(0))
+            parts.append(problem.derivatives(k, alone, np.zeros(alone.size), here)[0].reshape(alone.size, -1))
+        signatures.append(np.concatenate(parts, axis=1).T)
+    smallest = 1.0
+    for i, first in enumerate(signatures):
+        for second in signatures[i + 1 :]:
+            smallest = min(smallest, part_outside(first, second), part_outside(second, first))
+    return smallest
+
 
 CONFIRM = (
     " Confirm with a full Mueller capture: linear Stokes cannot test that the three other processes are equal, and so "
@@ -296,3 +416,37 @@ def _capture(problem: SurfaceProblem, k: int, before: dict[str, float], after: d
         tests_before=before,
         tests_after=after,
     )
+
+
+@one_blas_thread()
+def diagnose_object(
+    captures: Sequence[Path],
+    model: InstrumentModel,
+    material: Any,
+    view: ViewingGeometry,
+    say: Say = lambda line: None,
+) -> tuple[SurfaceJudged, SurfaceProblem]:
+    """Diagnose captures of one object jointly.
+
+    Parameters
+    ----------
+    captures : of one instrument at one wavelength; several arm angles are best.
+    model : instrument, as loaded from its file.
+    material : reflectance model; view : geometry.
+
+    Raises
+    ------
+    ProcessError : a capture cannot be used (arm angle, noise, object out of view), a material that cannot be bent.
+    CaptureError : captures of several wavelengths.
+    """
+    data: list[SurfaceData] = []
+    for path in captures:
+        say(f"reading {path.name}")
+        with Capture(path) as capture:
+            data.append(read_surface(capture, model.at(capture.header.wavelength_nm), view, material))
+    wavelengths = {c.wavelength_nm for c in data}
+    if len(wavelengths) != 1:
+        found = ", ".join(f"{w:g}" for w in sorted(wavelengths))
+        raise CaptureError(f"the captures are at {found} nm; effects differ with wavelength. Give one wavelength.")
+    problem = SurfaceProblem(model.at(wavelengths.pop()), data)
+    return diagnose_surface(problem, material.name, say), problem

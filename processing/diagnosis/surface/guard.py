@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from processing.arrays import Array
-from processing.diagnosis.search.guard import PredictedChange, chance_checks, held_out_check, rows_checks
+from processing.diagnosis.search.decision import PredictedChange, chance_checks, held_out_check, rows_checks
+from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.result import Check
-from processing.diagnosis.search.solution import Solution
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.diagnosis.surface.quantities import xi0_of

@@ -1,27 +1,31 @@
-"""What an answer consists of: causes, correction, captures, what cannot be seen, as they are stored."""
+"""The parts of an answer as they are stored: causes, correction, captures, and what cannot be seen."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
-from processing.diagnosis.instrument.closure import closure
-from processing.diagnosis.instrument.combinations import combinations
+from processing.arrays import Array
 from processing.diagnosis.instrument.doubts import PART_OF_LEFT
+from processing.diagnosis.instrument.features import DERIVATIVES, FEATURES, features
+from processing.diagnosis.instrument.mueller_error import MuellerErrors, Uncertain
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.structure import Residual
-from processing.diagnosis.instrument.systematic import MuellerErrors, Uncertain
 from processing.diagnosis.search.candidate import Candidate, SourceLevel
-from processing.diagnosis.search.causes import Answer, Cause, shown
-from processing.diagnosis.search.evidence import information
-from processing.diagnosis.search.fit import Fit, HeldOut
-from processing.diagnosis.search.judge import Judgement
+from processing.diagnosis.search.causes import Answer, Cause, information, shown
+from processing.diagnosis.search.decision import Judgement
+from processing.diagnosis.search.fit import Fit, HeldOut, Solution
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.result import (
     BeyondNoise,
     CaptureReport,
+    Combination,
     Correction,
+    Empirical,
     Error,
     FoundEffect,
     MuellerError,
@@ -29,17 +33,153 @@ from processing.diagnosis.search.result import (
     NotMeasured,
     Ranked,
 )
-from processing.diagnosis.search.rules import DECISIVE, DOUBTED, FAR_OFF, LIKELY, MOST_RANKED, NOISE_ERROR, SEEN, SURE
-from processing.diagnosis.search.solution import Solution
+from processing.diagnosis.search.rules import (
+    ALSO,
+    ALSO_FITS,
+    DECISIVE,
+    DOUBTED,
+    EMPIRICAL_SHARE,
+    FAR_OFF,
+    LIKELY,
+    MOST_RANKED,
+    NOISE_ERROR,
+    OPEN,
+    SEEN,
+    SURE,
+    TAU,
+    TOGETHER,
+)
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.search.stored import by_wavelength, parameters_of, scope_of
 from processing.instrument.effects.base import (
     CountsEffect,
     FieldEffect,
+    GeneralEffect,
     InstrumentEffect,
     Switch,
+    ValuePerState,
 )
 from processing.instrument.model import AppliedEffect, EffectParameter
+
+
+def closure(problem: InstrumentProblem, k: int, space: Space, values: Array) -> float | None:
+    """Mean of I0 + I90 - I45 - I135 over mean S0, percent, of corrected counts over the gains of their channels."""
+    model, data = problem.models[k], problem.captures[k]
+    if model.mosaic is None or {c.name for c in model.channels} != {"0", "45", "90", "135"}:
+        return None
+    changes = problem.changes(k, space, values)
+    coefficients = problem.coefficients(k, changes).reshape(len(FEATURES), *data.signal.shape[:2])
+    good = data.usable & ~data.clipped
+    if not good.any():
+        return None
+    means = np.zeros(len(model.channels))
+    for channel, c in enumerate(model.channels):
+        sign = 1.0 if c.name in ("0", "90") else -1.0
+        for state in range(data.signal.shape[0]):
+            counts = data.signal[state, channel][good].astype(np.float64)
+            corrected = np.tensordot(coefficients[:-DERIVATIVES, state, channel], features(counts)[0], axes=1)
+            means[channel] += sign * corrected.mean() / changes.gain[state, channel]
+    return float(100 * means.sum() / (np.abs(means).sum() / 2))
+
+
+@dataclass(frozen=True)
+class Tie:
+    """Values `index` (n,) of which weights @ values is determined to `stderr`; `open_by` (n,) is one standard deviation
+    of the direction that is determined least. The largest weight is one."""
+
+    index: NDArray[np.int64]
+    weights: Array
+    value: float
+    stderr: float
+    open_by: Array
+
+
+def ties(values: Array, covariance: Array, typical: Array) -> Iterator[Tie]:
+    """Groups of values (K,) that are known together much better than each by itself, of their covariance (K, K)."""
+    error = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    alike = np.abs(covariance / np.outer(error, error)) > TOGETHER
+    count, group = connected_components(alike, directed=False)
+    for k in range(count):
+        index = np.flatnonzero(group == k)
+        if index.size < 2:
+            continue
+        size, vector = np.linalg.eigh(covariance[np.ix_(index, index)] / np.outer(typical[index], typical[index]))
+        if size[-1] < OPEN**2 * max(size[0], 0.0):
+            continue
+        weights = vector[:, 0] / typical[index]
+        weights = weights / weights[np.argmax(np.abs(weights * error[index]))]
+        variance = weights @ covariance[np.ix_(index, index)] @ weights
+        yield Tie(
+            index,
+            weights,
+            float(weights @ values[index]),
+            float(np.sqrt(max(variance, 0.0))),
+            vector[:, -1] * np.sqrt(size[-1]) * typical[index],
+        )
+
+
+def combinations(found: Posterior, solved: Solution) -> tuple[Combination, ...]:
+    """Of the values of a correction, those that are only known together."""
+    effects = set(solved.effects)
+    at: list[int] = []
+    names: list[str] = []
+    units: list[str] = []
+    for candidate, part in zip(found.space.candidates, found.space.slices, strict=True):
+        if candidate in effects and not isinstance(candidate.effect, ValuePerState):
+            at += range(part.start, part.stop)
+            single = candidate.size == 1
+            names += [candidate.label if single else f"{candidate.label} {p.name}" for p in candidate.parameters]
+            units += [p.unit for p in candidate.parameters]
+    typical = found.space.joined("typical")[at]
+    told = []
+    for tie in ties(found.values[at], found.covariance[np.ix_(at, at)], typical):
+        first = int(tie.index[np.argmin(np.abs(tie.weights - 1))])
+        told.append(
+            Combination(
+                weights={names[i]: float(w) for i, w in zip(tie.index, tie.weights, strict=True)},
+                value=tie.value,
+                stderr=tie.stderr,
+                unit=units[first],
+                open_by={names[i]: float(v) for i, v in zip(tie.index, tie.open_by, strict=True)},
+            )
+        )
+    return tuple(told)
+
+
+def empirical(found: Posterior, solved: Solution) -> Empirical | None:
+    """The best of: a gain for each state, an angle for each state, a bend of the response; last linearization."""
+    part = dict(zip(found.space.candidates, found.space.slices, strict=True))
+    plain = [c for c in solved.space.candidates if not isinstance(c.effect, GeneralEffect)]
+    beside = np.concatenate([np.zeros(0, dtype=np.int64), *(np.r_[part[c]] for c in plain)]).astype(np.int64)
+    before, _ = _excess_of(found, beside)
+    fits: list[tuple[float, Candidate, Array]] = []
+    for candidate, mine in part.items():
+        if isinstance(candidate.effect, GeneralEffect):
+            left, x = _excess_of(found, np.concatenate([beside, np.r_[mine]]))
+            fits.append((left, candidate, x[beside.size :] * candidate.typical))
+    if not fits:
+        return None
+    left, best, values = min(fits, key=lambda f: f[0])
+    if left > (1 - EMPIRICAL_SHARE) * before or not isinstance(best.effect, GeneralEffect):
+        return None
+    freedom = found.sets.noise.slack + ALSO * (before - left)
+    total = max(solved.before.excess + solved.before.freedom, 1e-300)
+    share = max(left + (solved.before.freedom if found.sets.noise.known else 0.0), 0.0) / total
+    return Empirical(
+        kind=best.effect.describes,
+        rms_percent_in_sample=100 * solved.before.rms * float(np.sqrt(share)),
+        values=tuple(values.tolist()),
+        unit=best.parameters[0].unit,
+        would_also_fit=tuple(dict.fromkeys(c.short for e, c, _ in fits if e <= left + ALSO_FITS * freedom)),
+    )
+
+
+def _excess_of(found: Posterior, index: NDArray[np.int64]) -> tuple[float, Array]:
+    """Excess that some values leave, each held by the widest prior, and the values in typical sizes."""
+    form = found.sets.form
+    g, h = form.gradient[index], form.curvature[np.ix_(index, index)]
+    x = -np.linalg.solve(h + np.eye(index.size) * found.samples.best.unit / TAU[-1] ** 2, g)
+    return float(form.excess + 2 * g @ x + x @ h @ x), x
 
 
 def error(problem: InstrumentProblem, solved: Solution, out: HeldOut, k: int | None = None) -> Error:
