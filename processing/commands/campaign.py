@@ -158,7 +158,7 @@ def _corrected(folder: Path, target: Path) -> dict[Path, Path]:
     from processing.campaign.captures import find_captures
     from processing.commands.loaded_late.diagnose_summary import show
     from processing.commands.progress_bar import progress_line
-    from processing.diagnosis.instrument.run import diagnose_captures
+    from processing.diagnosis.instrument.diagnose import diagnose_captures
     from processing.diagnosis.instrument_file import WriteError, write_instrument
     from processing.errors import ProcessError
     from processing.storage.captures.capture import Capture, full_model
