@@ -25,13 +25,18 @@ def main(argv: Sequence[str] | None = None) -> None:
     # Of this distribution alone: the metadata of all installed packages take half a second to read.
     found = distribution("umov")
     commands = {point.name: point for point in found.entry_points if point.group == GROUP}
-    usage = f"Usage: umov COMMAND [OPTIONS]\n\nCommands: {', '.join(commands)}\n\n`umov COMMAND -h` explains a command."
+    usage = (
+        f"Usage: umov COMMAND [OPTIONS]\n\nCommands: {', '.join(commands)}\n\n`umov COMMAND -h` explains a command. "
+    )
+    usage += "Commands of `process` need no `process`: umov check, umov init instrument."
     if not words or words[0] in ("-h", "--help"):
         typer.echo(usage)
         sys.exit(0 if words else 2)
     if words[0] == "--version":
         typer.echo(f"umov {found.version}")
         sys.exit(0)
+    if words[0] not in commands and _is_of_process(words[0]):
+        words.insert(0, "process")
     if words[0] not in commands:
         typer.echo(f"error: No such command {words[0]!r}; there are: {', '.join(commands)}", err=True)
         sys.exit(2)
@@ -42,6 +47,12 @@ def main(argv: Sequence[str] | None = None) -> None:
         commands[words[0]].load()()
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
+
+
+def _is_of_process(word: str) -> bool:
+    from processing.commands.application import app
+
+    return word in {entry.name for entry in app.registered_commands}
 
 
 if __name__ == "__main__":

@@ -101,6 +101,15 @@ def test_umov_has_every_command(name, capsys, monkeypatch):
         assert said in capsys.readouterr().out
 
 
+def test_umov_needs_no_process_before_a_command_of_it(capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["umov"])
+    monkeypatch.setenv("UMOV_DOOR", "")
+    with pytest.raises(SystemExit) as end:
+        umov(["check", "-h"])
+    assert not end.value.code
+    assert "umov process check" in capsys.readouterr().out
+
+
 def test_umov_lists_its_commands(capsys):
     for words, code in (([], 2), (["-h"], 0), (["fly"], 2)):
         with pytest.raises(SystemExit) as end:
