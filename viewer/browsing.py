@@ -2,21 +2,80 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
+from urllib.parse import urlencode
 
 from starlette.requests import Request
 from starlette.responses import HTMLResponse
 
 from acquisition.screen.run_file import running_in
+from processing.commands.batch import natural
 from viewer.campaigns import STATUS, CampaignView, read_campaign
 from viewer.jobs import Jobs
 from viewer.library import Entry, Library, NotHere, made_from
 from viewer.pages import file_of, pages_of
 from viewer.starting import campaign_files, resumed_with
 
-#: Files on one page of a list; more are found by searching.
-MOST = 300
+#: Files on one page of a list.
+MOST = 50
+#: What a list can be sorted by, as its columns are called; a minus turns the order round.
+SORTS: dict[str, Callable[[Entry], Any]] = {
+    "name": lambda e: natural(Path(e.name)),
+    "sample": lambda e: "" if e.header is None else e.header.sample.name or e.header.sample.kind,
+    "nm": lambda e: 0.0 if e.header is None else e.header.wavelength_nm,
+    "omega": lambda e: -1.0 if e.header is None or e.header.omega_deg is None else e.header.omega_deg,
+    "mode": lambda e: "" if e.header is None else e.header.mode,
+    "states": lambda e: e.states or (0, 0),
+    "status": lambda e: e.status,
+    "kind": lambda e: e.kind,
+    "size": lambda e: e.size,
+    "changed": lambda e: e.changed_s,
+}
+
+
+@dataclass(frozen=True)
+class Listed:
+    """One page of a list: its files, the address of any other page, and of the list in another order."""
+
+    entries: list[Entry]
+    page: int
+    pages: int
+    total: int
+    key: str
+    sort: str
+    query: dict[str, str]
+    root: str
+
+    @classmethod
+    def of(cls, entries: list[Entry], key: str, request: Request, root: str) -> Listed:
+        """The page that a request asks for with `<key>_page` and `<key>_sort`; the newest files first by default."""
+        query = dict(request.query_params)
+        sort = query.get(f"{key}_sort", "")
+        if sort.removeprefix("-") in SORTS:
+            entries = sorted(entries, key=SORTS[sort.removeprefix("-")], reverse=sort.startswith("-"))
+        pages = max(1, -(-len(entries) // MOST))
+        asked = query.get(f"{key}_page", "1")
+        page = min(max(int(asked) if asked.isdecimal() else 1, 1), pages)
+        return cls(entries[(page - 1) * MOST : page * MOST], page, pages, len(entries), key, sort, query, root)
+
+    def at(self, page: int) -> str:
+        """Address of a page of the list."""
+        return self._address({f"{self.key}_page": str(page)})
+
+    def by(self, column: str) -> str:
+        """Address of the list sorted by a column; once more turns the order round."""
+        order = f"-{column}" if self.sort == column else column
+        return self._address({f"{self.key}_sort": order, f"{self.key}_page": "1"})
+
+    def arrow(self, column: str) -> str:
+        """A sign at the column that the list is sorted by."""
+        return {column: " ▲", f"-{column}": " ▼"}.get(self.sort, "")
+
+    def _address(self, more: dict[str, str]) -> str:
+        return f"{self.root}/?{urlencode(self.query | more, errors='replace')}#{self.key}"
 
 
 def browse(request: Request) -> HTMLResponse:
@@ -29,16 +88,16 @@ def browse(request: Request) -> HTMLResponse:
     found = [e for e in entries if all(word in e.words for word in words)]
     views = [view for f in library.campaigns() if (view := read_campaign(f, library)) is not None]
     campaigns = [(v, running_in(library.root / v.name)) for v in views if all(w in v.name.lower() for w in words)]
+    products = Listed.of([e for e in found if e.kind not in ("capture", "unreadable")], "products", request, pages.root)
     return pages.draw(
         "browse.html",
         simulated=_all_simulated(found),
         query=query,
         campaigns=campaigns,
         statuses=STATUS,
-        captures=[e for e in found if e.kind in ("capture", "unreadable")][:MOST],
-        products=[(e, made_from(e, entries, library.root)) for e in found if e.kind not in ("capture", "unreadable")][
-            :MOST
-        ],
+        captures=Listed.of([e for e in found if e.kind in ("capture", "unreadable")], "captures", request, pages.root),
+        products=products,
+        sources=[made_from(e, entries, library.root) for e in products.entries],
         found=len(found),
         total=len(entries),
         shown_at=pages.shown_at,

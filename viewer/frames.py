@@ -114,7 +114,7 @@ def preview(request: Request) -> Response:
     path, query = file_of(request), request.query_params
     with Capture(path) as opened:
         state, channel = chosen(opened, query)
-        window = Window.asked({}, opened.frame_shape, most=PREVIEW)
+        window = Window.asked({key: query[key] for key in ("most",) if key in query}, opened.frame_shape, most=PREVIEW)
         counts = opened.frames(state)[channel]
         top, black = saturation(opened), opened.header.detector.black_level_counts
     mean = window.mean(counts)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,12 +18,17 @@ from processing.reflectance.tables import ScatteringTable, is_table, table_steps
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import CaptureHeader
 from processing.storage.products.product import Product, is_product
-from processing.storage.products.provenance import MADE_OF, Step, content_of, file_identity, made_of
+from processing.storage.products.provenance import MADE_OF, Step, content_of, file_identity, made_of, program
+from processing.whole_file import write_whole_text
 
 #: Part of the pixels of a state beyond which its saturation is pointed out.
 SATURATED = 0.001
 #: Where the application keeps its own files; a hidden folder is never looked into.
 OWN = ".umov-view"
+#: What is known of every file, in the folder above; written after so many files were read anew.
+INDEX, READ_ANEW = "index.json", 50
+#: Parts of a header that no list shows.
+LONG = {"instrument_yaml", "plan_yaml", "rig_yaml", "camera_settings_json", "devices_json", "versions"}
 
 
 class NotHere(ProcessError):
@@ -80,9 +86,11 @@ class Library:
     root: Path
     _known: dict[Path, tuple[tuple[int, int], Entry]] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
+    _read_anew: int = 0
 
     def __post_init__(self) -> None:
         self.root = self.root.resolve()
+        self._load_index()
 
     def path(self, name: str) -> Path:
         """The file or folder of that name. Raises NotHere for what is not there, or not inside the folder."""
@@ -107,6 +115,8 @@ class Library:
         """Every HDF5 file, newest first."""
         with self._lock:
             found = [self._entry(path) for path in self._files(".h5", f".h5{PARTIAL}")]
+            if self._read_anew >= READ_ANEW:
+                self._save_index()
         # A link has the name of the file that it leads to, which is listed once.
         by_name = {e.name: e for e in found if e is not None}
         return sorted(by_name.values(), key=lambda e: (-e.changed_s, e.name))
@@ -132,6 +142,32 @@ class Library:
                 found.append(path)
         return found
 
+    def _load_index(self) -> None:
+        """What an earlier run knew; nothing of a damaged index, or of another version of this program."""
+        try:
+            kept = json.loads((self.root / OWN / INDEX).read_text(encoding="utf-8"))
+            for name, (seen, facts) in kept["files"].items() if kept["program"] == program() else ():
+                header = facts["header"] and CaptureHeader.model_validate(facts["header"])
+                lists = {key: tuple(facts[key]) for key in ("flags", "inputs")}
+                lists["states"] = facts["states"] and tuple(facts["states"])
+                self._known[self.root / name] = (tuple(seen), Entry(**(facts | lists | {"header": header})))
+        except (OSError, ValueError, KeyError, TypeError):
+            self._known.clear()
+
+    def _save_index(self) -> None:
+        files = {}
+        for seen, entry in self._known.values():
+            header = entry.header and entry.header.model_dump(mode="json", exclude=LONG)
+            facts = {f.name: getattr(entry, f.name) for f in fields(entry)} | {"header": header}
+            files[entry.name] = (seen, facts)
+        try:
+            (self.root / OWN).mkdir(exist_ok=True)
+            write_whole_text(self.root / OWN / INDEX, json.dumps({"program": program(), "files": files}))
+        except (OSError, ValueError):
+            # A folder that nobody may write, or a name that is not UTF-8: the files are read again next time.
+            pass
+        self._read_anew = 0
+
     def _walk(self) -> Iterator[tuple[str, list[str], list[str]]]:
         for folder, folders, files in os.walk(self.root):
             folders[:] = sorted(f for f in folders if not f.startswith("."))
@@ -151,6 +187,7 @@ class Library:
         seen = (stat.st_mtime_ns, stat.st_size)
         if path in self._known and self._known[path][0] == seen:
             return self._known[path][1]
+        self._read_anew += 1
         common: dict[str, Any] = {"name": self.name(path), "changed_s": stat.st_mtime, "size": stat.st_size}
         try:
             if not _is_utf8(common["name"]):

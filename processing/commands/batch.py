@@ -213,7 +213,7 @@ def files_of(
             found.append(source)
             continue
         inside = [p for ending in endings for p in source.rglob(f"*{ending}") if p.is_file() and _shown(p, source)]
-        taken = [p for p in sorted(inside, key=_natural) if _takes(takes, p)]
+        taken = [p for p in sorted(inside, key=natural) if _takes(takes, p)]
         if not taken:
             raise ProcessError(f"{source} holds no {what}. Give files, or the folder that they are in.")
         found += taken
@@ -256,7 +256,7 @@ def _shown(path: Path, folder: Path) -> bool:
     return not any(part.startswith(".") for part in path.relative_to(folder).parts)
 
 
-def _natural(path: Path) -> list[tuple[bool, int, str]]:
+def natural(path: Path) -> list[tuple[bool, int, str]]:
     return [
         (not word.isdecimal(), int(word) if word.isdecimal() else 0, word) for word in re.split(r"(\d+)", str(path))
     ]

@@ -1,0 +1,110 @@
+"""The list of files: sorted, in pages, with thumbnails, and quick for thousands of files in a real browser."""
+
+import json
+import os
+import re
+import time
+from dataclasses import replace
+
+import pytest
+from starlette.testclient import TestClient
+
+import viewer.library
+from viewer.application import application
+from viewer.browsing import MOST
+
+
+def names(text):
+    """Names of the captures of a page, in its order."""
+    return re.findall(r'capture\?file=([\w.%]+)"', text)
+
+
+def test_a_list_is_sorted_by_any_column_and_back(client, drr_capture):
+    for number, (omega, sample) in enumerate(((35, "b"), (20, "c"), (110, "a")), 9):
+        drr_capture(f"c{number}.h5", omega_deg=omega, sample={"name": sample})
+    for column, order in (("omega", [10, 9, 11]), ("sample", [11, 9, 10]), ("name", [9, 10, 11])):
+        text = client.get("/", params={"captures_sort": column}).text
+        assert names(text) == [f"c{k}.h5" for k in order]
+        back = re.search(rf'href="[^"]*(\?[^"]*captures_sort=-{column}[^"]*)#', text)
+        assert back, "the header of the column turns the order round"
+        assert names(client.get("/", params={"captures_sort": f"-{column}"}).text) == [f"c{k}.h5" for k in order[::-1]]
+    assert client.get("/", params={"captures_sort": "beauty", "captures_page": "x"}).status_code == 200
+
+
+def copies(lab, path, count):
+    """The same capture under many names; links to the file itself take no room."""
+    for number in range(count):
+        os.link(path, lab / f"copy_{number:04}.h5")
+
+
+def test_pages_have_every_capture_once_and_a_search_stays(client, lab, drr_capture):
+    copies(lab, drr_capture("one.h5"), 2 * MOST)
+    seen = [names(client.get("/", params={"captures_page": page, "captures_sort": "name"}).text) for page in (1, 2, 3)]
+    assert [len(page) for page in seen] == [MOST, MOST, 1]
+    assert len({name for page in seen for name in page}) == 2 * MOST + 1
+    text = client.get("/", params={"q": "copy", "captures_page": 2}).text
+    assert "page 2 of 2, 100 captures" in text
+    assert "q=copy" in re.search(r'href="([^"]*)" rel="prev"', text)[1]
+
+
+def test_a_second_start_reads_no_file_again(lab, drr_capture, monkeypatch):
+    copies(lab, drr_capture("one.h5"), MOST)
+    before = [vars(e) for e in viewer.library.Library(lab).entries()]
+    assert json.loads((lab / ".umov-view/index.json").read_text())["files"]
+    read = []
+    original = viewer.library._read
+    monkeypatch.setattr(viewer.library, "_read", lambda *args: read.append(args[0].name) or original(*args))
+    again = viewer.library.Library(lab)
+    found = [vars(e) for e in again.entries()]
+    assert read == []
+    for one, other in zip(before, found, strict=True):
+        assert {k: v for k, v in one.items() if k != "header"} == {k: v for k, v in other.items() if k != "header"}
+        assert one["header"].sample == other["header"].sample
+    # A file that changed is read again, a damaged index is none.
+    os.utime(lab / "one.h5", (1, 1))
+    again.entries()
+    assert read
+    (lab / ".umov-view/index.json").write_text("{")
+    assert len(viewer.library.Library(lab).entries()) == MOST + 1
+
+
+def test_three_thousand_captures_have_their_first_page_in_a_second(lab, drr_capture, monkeypatch):
+    path = drr_capture("one.h5")
+    (known,) = viewer.library.Library(lab).entries()
+    copies(lab, path, 3000)
+    with monkeypatch.context() as quick:
+        # The first index opens every file, which takes a minute.
+        quick.setattr(viewer.library, "_read", lambda _, common: replace(known, **common))
+        viewer.library.Library(lab).entries()
+    times = []
+    for _ in range(3):
+        begin = time.process_time()
+        client = TestClient(application(lab, "t"), base_url="http://127.0.0.1:8000/t")
+        text = client.get("/").text
+        times.append(time.process_time() - begin)
+    assert len(names(text)) == MOST
+    assert "3001 captures" in text
+    # Processor time, which other work on the machine does not change.
+    assert min(times) < 1.0, times
+
+
+def test_a_browser_sorts_turns_pages_and_shows_thumbnails(lab, drr_capture, address, chromium):
+    playwright_api = pytest.importorskip("playwright.sync_api")
+    copies(lab, drr_capture("one.h5", omega_deg=35.0), MOST)
+    drr_capture("two.h5", omega_deg=20.0)
+    with playwright_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-dev-shm-usage"])
+        page = browser.new_page(viewport={"width": 1400, "height": 900})
+        # Where other work fills the machine, a page takes longer than half a minute.
+        page.set_default_timeout(180_000)
+        page.goto(address, wait_until="domcontentloaded")
+        page.get_by_role("link", name="Ω / deg").click()
+        assert page.locator("table.list tr").nth(1).get_by_role("link").first.inner_text() == "two.h5"
+        page.locator("td.thumbnail img").first.wait_for()
+        page.wait_for_function("[...document.querySelectorAll('td.thumbnail img')][0].naturalWidth > 0")
+        page.get_by_role("link", name="next").click()
+        assert "page 2 of 2" in page.content()
+        assert page.locator("table.list tr").count() == 3
+        page.set_viewport_size({"width": 380, "height": 800})
+        assert page.evaluate("document.documentElement.scrollWidth") <= 380
+        browser.close()
