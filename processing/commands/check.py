@@ -53,7 +53,7 @@ def _name_cause(capture: Path, reference: Path, instrument: Path | None) -> None
     """Diagnose the capture with the instrument as the reference saw it: the effects that it names are new."""
     from processing.commands.loaded_late.diagnose_summary import show
     from processing.commands.progress_bar import progress_line
-    from processing.diagnosis.instrument.run import diagnose_captures
+    from processing.diagnosis.instrument.diagnose import diagnose_captures
     from processing.diagnosis.instrument_file import extended
     from processing.errors import ProcessError
     from processing.storage.captures.capture import full_model
