@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from processing.reduction.black import Black
 from processing.reduction.effects_of_capture import CountsCorrection
-from processing.reduction.flat import Flat
+from processing.reduction.flat import FlatField
 from processing.reduction.frame_evidence import evidence_of
 from processing.reduction.lit_darks import leaked_light, seen_so_far
 from processing.storage.captures.capture import Capture, CaptureError
@@ -34,7 +34,7 @@ class Correction:
 
     black: Black
     source: str
-    flat: Flat | None = None
+    flat: FlatField | None = None
     bad: NDArray[np.bool_] | None = None
     saturation: float | None = None
     warnings: tuple[str, ...] = ()
@@ -87,7 +87,7 @@ class Correction:
                 "whether it did (source_jump), and `process reduce --instrument` with the file that it writes mends it"
             )
         top = saturation(capture)
-        flat = Flat.of(list(flat_from) or [capture], black, top)
+        flat = FlatField.of(list(flat_from) or [capture], black, top)
         if flat is not None and flat.lost.any():
             bad = flat.lost if bad is None else bad | flat.lost
         return cls(black, source, flat, bad, top, tuple(warnings))

@@ -22,7 +22,7 @@ SAME_NM = 0.5
 
 
 @dataclass(frozen=True)
-class Flat:
+class FlatField:
     """Relative response.
 
     Attributes
@@ -41,7 +41,9 @@ class Flat:
     source: str
 
     @classmethod
-    def of(cls, captures: list[Capture], black: Black | None = None, saturation: float | None = None) -> Flat | None:
+    def of(
+        cls, captures: list[Capture], black: Black | None = None, saturation: float | None = None
+    ) -> FlatField | None:
         """From all flat states of some captures of one camera; None without any.
 
         Parameters

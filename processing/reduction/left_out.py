@@ -28,7 +28,7 @@ class _Entry(BaseModel):
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class Exclusions:
     """What a reduction leaves out.
 
     Attributes
@@ -43,7 +43,7 @@ class LeftOut:
     bad: NDArray[np.bool_] | None = None
 
     @classmethod
-    def read(cls, path: Path, capture: Capture) -> LeftOut:
+    def read(cls, path: Path, capture: Capture) -> Exclusions:
         """From a result of `diagnose --json`; nothing where it tells of no such part of this capture.
 
         Raises

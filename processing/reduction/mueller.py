@@ -17,7 +17,7 @@ from processing.instrument.model import InstrumentModel
 from processing.reduction.counts_to_signal import Correction
 from processing.reduction.effects_of_capture import references
 from processing.reduction.facts import mueller_facts
-from processing.reduction.left_out import LeftOut
+from processing.reduction.left_out import Exclusions
 from processing.reduction.measurement_matrix import some_of
 from processing.reduction.mueller_reduction import Choice, MuellerReduction
 from processing.reduction.noise import NoiseModel
@@ -38,7 +38,7 @@ def reduce_mueller(
     steps: tuple[Step, ...],
     correction: Correction | None = None,
     choice: Choice | None = None,
-    left_out: LeftOut | None = None,
+    left_out: Exclusions | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:

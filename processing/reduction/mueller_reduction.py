@@ -18,7 +18,7 @@ from processing.reduction.counts_to_signal import BlockReader, Correction
 from processing.reduction.cut_off import without_cut_off
 from processing.reduction.effects_of_capture import CountsCorrection, capture_changes, counts_correction
 from processing.reduction.facts import determined_words
-from processing.reduction.left_out import LeftOut
+from processing.reduction.left_out import Exclusions
 from processing.reduction.measurement_matrix import field_of, measurement_matrix
 from processing.reduction.noise import NoiseModel, noise_of
 from processing.reduction.sample_states import sample_states
@@ -143,10 +143,10 @@ class MuellerReduction:
         model: InstrumentModel,
         correction: Correction | None = None,
         choice: Choice | None = None,
-        left_out: LeftOut | None = None,
+        left_out: Exclusions | None = None,
     ) -> MuellerReduction:
         """Prepare the reduction of a capture; see `reduce_mueller` for parameters and errors."""
-        left_out, choice = left_out or LeftOut(), choice or Choice()
+        left_out, choice = left_out or Exclusions(), choice or Choice()
         every = sample_states(capture)
         states, cut_off = without_cut_off(capture, left_out.rest_of(every, capture.path))
         warnings = (*left_out.warnings, *cut_off)

@@ -18,7 +18,7 @@ from processing.reduction.cut_off import without_cut_off
 from processing.reduction.effects_of_capture import CountsCorrection, capture_changes, counts_correction, references
 from processing.reduction.facts import in_words
 from processing.reduction.instrument_of_capture import require_one_colour
-from processing.reduction.left_out import LeftOut
+from processing.reduction.left_out import Exclusions
 from processing.reduction.mosaic.demosaic import demosaic
 from processing.reduction.mosaic.layout import MosaicLayout
 from processing.reduction.mosaic.merge import MergedFrame, merge
@@ -107,7 +107,7 @@ def reduce_stokes(
     correction: Correction | None = None,
     noise: NoiseModel | None = None,
     response: NDArray[np.float32] | None = None,
-    left_out: LeftOut | None = None,
+    left_out: Exclusions | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -127,7 +127,7 @@ def reduce_stokes(
         raise CaptureError(f"{capture.path} is not a mosaic capture; it reduces to a Mueller image.")
     require_one_colour(capture)
     layout = MosaicLayout.of(mosaic, [c.name for c in model.channels])
-    left_out = left_out or LeftOut()
+    left_out = left_out or Exclusions()
     states, cut_off = without_cut_off(capture, left_out.rest_of(sample_states(capture), capture.path))
     cut_off = [*left_out.warnings, *cut_off]
     changes = capture_changes(capture, model, states)

@@ -12,7 +12,7 @@ from processing.errors import ProcessError
 from processing.reduction.counts_to_signal import Correction
 from processing.reduction.flat import flat_captures, nearest_flat
 from processing.reduction.instrument_of_capture import choose_model
-from processing.reduction.left_out import LeftOut
+from processing.reduction.left_out import Exclusions
 from processing.reduction.mueller import reduce_mueller
 from processing.reduction.mueller_reduction import Choice
 from processing.steps.file_step import FileStep, Found, Progress
@@ -32,7 +32,7 @@ class Reduction(FileStep):
     instrument
         File to use instead of the model in the capture.
     weighted, covariance, physical
-        See `processing.reduction.mueller.Choice`; for a Mueller capture.
+        See `processing.reduction.mueller_reduction.Choice`; for a Mueller capture.
     camera
         Noise and bad pixels, a product of `process camera`.
     dark
@@ -107,7 +107,7 @@ class Reduction(FileStep):
             capture = opened(self.capture)
             dark = opened(self.dark) if self.dark else None
             noise, bad = read_camera(self.camera) if self.camera else (None, None)
-            left_out = LeftOut.read(self.leave_out, capture) if self.leave_out else LeftOut()
+            left_out = Exclusions.read(self.leave_out, capture) if self.leave_out else Exclusions()
             # Images of a mosaic are averaged before they are solved: what was struck once is bad in the mean.
             lost = left_out.bad if mueller else left_out.bad_or_struck(capture.frame_shape)
             if lost is not None:

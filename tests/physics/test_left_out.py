@@ -11,7 +11,7 @@ from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.captured.screening import screened
 from processing.instrument.model import AppliedEffect, EffectParameter, InstrumentModel
-from processing.reduction.left_out import LeftOut
+from processing.reduction.left_out import Exclusions
 from processing.reduction.mueller import reduce_mueller
 from processing.steps.reduction import Reduction
 from processing.storage.captures.capture import Capture
@@ -179,7 +179,7 @@ def test_a_struck_intensity_does_not_count(configs, tmp_path):
     hits = np.array([[3, 0, 4, 5]])
     with Capture(path) as capture:
         model = capture.instrument
-        reduce_mueller(capture, model, tmp_path / "a.h5", (), left_out=LeftOut(hits=hits))
+        reduce_mueller(capture, model, tmp_path / "a.h5", (), left_out=Exclusions(hits=hits))
     with Capture(path) as capture:
         frames = np.stack([capture.frames(k)[0, 4, 5] for k in range(STATES)]).astype(float) - 100
     w = model.rows(state_angles(STATES, False, False))
@@ -230,7 +230,7 @@ def test_effects_count_the_states_that_a_diagnosis_saw(configs, tmp_path):
     model = InstrumentModel.load(configs / "instruments/rgb950.yaml").at(662)
     told = model.model_copy(update={"effects": (slip, flicker)})
     errors = []
-    for left_out in (LeftOut(), LeftOut(states=(4,))):
+    for left_out in (Exclusions(), Exclusions(states=(4,))):
         with Capture(path) as capture:
             reduce_mueller(capture, told, tmp_path / "m.h5", (), left_out=left_out, overwrite=True)
         image = MuellerImage.load(tmp_path / "m.h5")

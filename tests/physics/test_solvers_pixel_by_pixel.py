@@ -12,7 +12,7 @@ import pytest
 from processing.errors import ProcessError
 from processing.reduction.black import Black
 from processing.reduction.counts_to_signal import BlockReader, Correction
-from processing.reduction.flat import Flat
+from processing.reduction.flat import FlatField
 from processing.reduction.noise import NoiseModel
 from processing.reduction.solvers import plain, weighted
 from processing.reduction.solvers.inversion import Inversion
@@ -83,7 +83,7 @@ def flat(request):
     if request.param == "even":
         return None
     response = np.random.default_rng(2).uniform(0.5, 1.5, (CHANNELS, ROWS, COLUMNS)).astype(np.float32)
-    return Flat(response, 1, np.ones(CHANNELS), np.zeros((ROWS, COLUMNS), bool), "test")
+    return FlatField(response, 1, np.ones(CHANNELS), np.zeros((ROWS, COLUMNS), bool), "test")
 
 
 @pytest.fixture(params=["whole", "partial"])
