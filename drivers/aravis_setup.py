@@ -62,7 +62,7 @@ class Config(BaseModel):
     settings: CameraSettings = Field(default=CameraSettings(), description="used where a plan leaves a setting open")
     resend: bool = Field(default=True, description="ask for lost packets again, where the camera can")
     retakes: int = Field(default=3, ge=0, description="how often a lost frame is taken again")
-    buffers: int = Field(default=4, ge=2, le=64)
+    buffers: int = Field(default=4, ge=2, le=64, description="frames that the driver has room for")
     bits: int | None = Field(default=None, ge=8, le=16, description="real bits, where the format has room for more")
     shift: int = Field(default=0, ge=0, le=8, description="empty low bits, where the camera left-aligns")
     gain_raw_per_db: float | None = Field(default=None, gt=0, description="for cameras that only have GainRaw")
@@ -74,7 +74,9 @@ class Config(BaseModel):
         description="set of the camera's own settings that is loaded before any other; null leaves those of before",
     )
     trigger_line: str = Field(default="Line0", description="input of the hardware trigger")
-    trigger_edge: Literal["RisingEdge", "FallingEdge"] = "RisingEdge"
+    trigger_edge: Literal["RisingEdge", "FallingEdge"] = Field(
+        default="RisingEdge", description="edge of the trigger's pulse that begins an exposure"
+    )
     trigger_timeout_s: float = Field(default=10.0, gt=0, description="longest wait for a hardware trigger")
     features: dict[str, bool | int | FiniteFloat | str] = Field(
         default={}, description="any GenICam features by name, set in this order after the region and read back"

@@ -25,9 +25,9 @@ ByWavelength = Annotated[dict[float, Annotated[float, Field(gt=0)]], Tag("by wav
 class AngleSteps(_Part):
     """Equal steps from `start` to `stop`, both included; at most 3600."""
 
-    start: Angle
-    stop: Angle
-    step: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    start: Angle = Field(description="first angle, degrees")
+    stop: Angle = Field(description="last angle, degrees, included")
+    step: Annotated[float, Field(gt=0, allow_inf_nan=False)] = Field(description="degrees between two angles")
 
     def angles_deg(self) -> tuple[float, ...]:
         """The angles, ascending."""
@@ -49,11 +49,11 @@ class Reference(_Part):
     A block is what is taken of one sample at one wavelength in one mode. `role` flat marks it as a flat field.
     """
 
-    sample: Sample
-    omega_deg: Angle
-    modes: tuple[str, ...]
-    every: int | None = Field(default=None, gt=0)
-    role: Literal["flat", "air", "sample"] | None = None
+    sample: Sample = Field(description="what it is of")
+    omega_deg: Angle = Field(description="angle between source and camera, degrees")
+    modes: tuple[str, ...] = Field(description="modes in which it is taken")
+    every: int | None = Field(default=None, gt=0, description="again after so many captures; without it once a block")
+    role: Literal["flat", "air", "sample"] | None = Field(default=None, description="flat marks a flat field")
 
 
 class Campaign(_Part):
@@ -66,23 +66,40 @@ class Campaign(_Part):
     """
 
     kind: Literal["campaign"] = "campaign"
-    name: str = Field(pattern=NAME_PATTERN)
-    rig: Path | None = None
-    plans: dict[Mode, Path] = Field(min_length=1)
-    samples: tuple[Sample, ...] = Field(min_length=1)
-    wavelengths_nm: tuple[Annotated[float, Field(gt=0)], ...] = Field(min_length=1)
-    omega_deg: AngleSteps | Annotated[tuple[Angle, ...], Field(min_length=1)]
+    name: str = Field(pattern=NAME_PATTERN, description="name of the folder that the captures go into")
+    rig: Path | None = Field(default=None, description="rig file, relative to this file; --rig replaces it")
+    plans: dict[Mode, Path] = Field(
+        min_length=1,
+        description="plan file of each mode; the campaign replaces sample, wavelength, angle and exposure in it",
+    )
+    samples: tuple[Sample, ...] = Field(
+        min_length=1, description="what is measured, one after another; each change is asked for"
+    )
+    wavelengths_nm: tuple[Annotated[float, Field(gt=0)], ...] = Field(
+        min_length=1, description="wavelengths, nm, as the rig has them"
+    )
+    omega_deg: AngleSteps | Annotated[tuple[Angle, ...], Field(min_length=1)] = Field(
+        description="angles between source and camera: a list, or equal steps; taken upwards"
+    )
     exposure_s: (
         Annotated[
             Seconds | ByWavelength | Auto,
             Discriminator(exposure_kind),
         ]
         | None
-    ) = None
-    references: tuple[Reference, ...] = ()
-    retries: int = Field(default=0, ge=0, le=100)
-    retry_wait_s: float = Field(default=5.0, ge=0)
-    continue_after_interlock: bool = False
+    ) = Field(
+        default=None, description="seconds, or seconds for each wavelength, or {kind: auto}; without it the plan's"
+    )
+    references: tuple[Reference, ...] = Field(
+        default=(), description="captures of something known, first in each block and again after every so many"
+    )
+    retries: int = Field(
+        default=0, ge=0, le=100, description="how often a capture that a device ended is gone on with unattended"
+    )
+    retry_wait_s: float = Field(default=5.0, ge=0, description="pause before such a retry, s")
+    continue_after_interlock: bool = Field(
+        default=False, description="go on by itself when an interlock closes again, if its reason is one that passes"
+    )
 
     @model_validator(mode="after")
     def _references_have_a_plan(self) -> Self:

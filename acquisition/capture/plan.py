@@ -40,10 +40,16 @@ class RotatingRetarders(_Part):
     """
 
     kind: Literal["rotating_retarders"] = "rotating_retarders"
-    states: int = Field(default=RGB950_STATES, gt=0, le=10_000)
-    step_deg: float = Field(default=RGB950_STEP_DEG, ge=-360, le=360)
-    ratio: float = Field(default=RGB950_RATIO, ge=-1000, le=1000)
-    axes: tuple[str, str] = ("psg", "psa")
+    states: int = Field(default=RGB950_STATES, gt=0, le=10_000, description="number of poses")
+    step_deg: float = Field(
+        default=RGB950_STEP_DEG, ge=-360, le=360, description="step of the generator's plate, degrees"
+    )
+    ratio: float = Field(
+        default=RGB950_RATIO, ge=-1000, le=1000, description="how many times as far the analyzer's plate turns"
+    )
+    axes: tuple[str, str] = Field(
+        default=("psg", "psa"), description="names of the generator's and the analyzer's axis"
+    )
 
     def angles_deg(self) -> dict[str, NDArray[np.float64]]:
         """Target angles of each axis (states,), degrees."""
@@ -54,7 +60,7 @@ class FixedPose(_Part):
     """Every frame in the same pose, the one that the rig file gives for the mode."""
 
     kind: Literal["fixed"] = "fixed"
-    states: int = Field(default=8, gt=0, le=10_000)
+    states: int = Field(default=8, gt=0, le=10_000, description="number of frames in the one pose")
 
     def angles_deg(self) -> dict[str, NDArray[np.float64]]:
         """No axis of its own."""
@@ -65,7 +71,9 @@ class ListedStates(_Part):
     """Any table: a list of angles for each axis, all of one length."""
 
     kind: Literal["table"]
-    angles: dict[str, tuple[Annotated[float, Field(allow_inf_nan=False)], ...]]
+    angles: dict[str, tuple[Annotated[float, Field(allow_inf_nan=False)], ...]] = Field(
+        description="for each axis its angle in each pose, degrees; all lists of one length"
+    )
 
     @model_validator(mode="after")
     def _one_length(self) -> Self:
@@ -94,10 +102,10 @@ class AutoExposure(_Part):
     """
 
     kind: Literal["auto"] = "auto"
-    percentile: float = Field(default=99.9, gt=0, le=100)
-    target: float = Field(default=0.7, gt=0, lt=1)
-    start_s: float = Field(default=0.005, gt=0)
-    longest_s: float = Field(default=10.0, gt=0)
+    percentile: float = Field(default=99.9, gt=0, le=100, description="of the pixels of the brightest state")
+    target: float = Field(default=0.7, gt=0, lt=1, description="part of full scale that this percentile comes to")
+    start_s: float = Field(default=0.005, gt=0, description="exposure that the search begins with, s")
+    longest_s: float = Field(default=10.0, gt=0, description="longest exposure that the search may choose, s")
 
 
 def exposure_kind(value: Any) -> str:
@@ -120,22 +128,32 @@ class MeasurementPlan(_Part):
     """
 
     kind: Literal["plan"] = "plan"
-    title: str = ""
-    mode: Mode = "drr"
-    wavelength_nm: float = Field(default=662, gt=0)
-    omega_deg: float = Field(default=35, allow_inf_nan=False)
-    sample: Sample = Sample(name="red_sphere")
-    illumination: Literal["horizontal", "vertical"] = "horizontal"
-    states: States = RotatingRetarders()
-    exposure_s: Annotated[Seconds | Auto, Discriminator(exposure_kind)] = 0.02
-    repeats: int = Field(default=1, ge=1, le=1000)
-    darks: int = Field(default=4, ge=0, le=1000)
+    title: str = Field(
+        default="", description="title of the capture; made of sample, mode, wavelength and angle without it"
+    )
+    mode: Mode = Field(default="drr", description="mode of the rig file: which instrument and which pose")
+    wavelength_nm: float = Field(default=662, gt=0, description="nm, one of the rig's")
+    omega_deg: float = Field(default=35, allow_inf_nan=False, description="angle between source and camera, degrees")
+    sample: Sample = Field(default=Sample(name="red_sphere"), description="what stands at the centre")
+    illumination: Literal["horizontal", "vertical"] = Field(
+        default="horizontal", description="word for the light, kept with the capture"
+    )
+    states: States = Field(default=RotatingRetarders(), description="the poses of the polarimeter")
+    exposure_s: Annotated[Seconds | Auto, Discriminator(exposure_kind)] = Field(
+        default=0.02, description="seconds of one frame, or {kind: auto}"
+    )
+    repeats: int = Field(default=1, ge=1, le=1000, description="frames averaged into each state")
+    darks: int = Field(default=4, ge=0, le=1000, description="states with the shutter closed, first, at each exposure")
     repeat_first: bool = Field(default=False, description="take the first light state again at the end: a drift check")
-    bracket: tuple[Annotated[float, Field(gt=0)], ...] = Field(default=(1.0,), min_length=1)
+    bracket: tuple[Annotated[float, Field(gt=0)], ...] = Field(
+        default=(1.0,), min_length=1, description="factors of the exposure at which every pose is taken, such as [1, 8]"
+    )
     role: Literal["flat", "air", "sample"] | None = Field(
         default=None, description="of the light states; default air for the sample air, else sample"
     )
-    continue_after_interlock: bool = False
+    continue_after_interlock: bool = Field(
+        default=False, description="go on by itself when an interlock closes again, if its reason is one that passes"
+    )
 
     @model_validator(mode="after")
     def _exposure_is_positive(self) -> Self:

@@ -16,7 +16,6 @@ from pydantic import TypeAdapter
 from acquisition.campaign.plan import Campaign
 from acquisition.capture.plan import MeasurementPlan
 from acquisition.commands.defaults import CONFIGS
-from acquisition.commands.key_texts import OF_KEY, OF_SECTION
 from acquisition.rig.config import RigConfig
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
@@ -36,17 +35,12 @@ MODELS: dict[str, Any] = {
 
 
 def text_of(name: str) -> str:
-    """The schema as it is committed, with a description of every key."""
+    """The schema as it is committed; models describe their keys, and `kind` means the same in all of them."""
     schema = {"$schema": "https://json-schema.org/draft/2020-12/schema"} | TypeAdapter(MODELS[name]).json_schema()
     for section in (schema, *schema.get("$defs", {}).values()):
-        for key, entry in section.get("properties", {}).items():
-            entry.setdefault("description", _told(section, key))
+        if "kind" in section.get("properties", {}):
+            section["properties"]["kind"].setdefault("description", "which of the kinds this is")
     return json.dumps(schema, indent=1, sort_keys=True) + "\n"
-
-
-def _told(section: dict[str, Any], key: str) -> str:
-    """What a key means in its section, or wherever it stands; nothing if nobody has said it."""
-    return OF_SECTION.get(f"{section.get('title')}.{key}") or OF_KEY.get(key, "")
 
 
 def path_of(name: str) -> Path:

@@ -30,15 +30,19 @@ class ModeConfig(Part):
     `pose_deg`: where axes stand that do not turn in this mode, one angle or one for each wavelength.
     """
 
-    instrument: Path
-    pose_deg: dict[str, float | dict[float, float]] = {}
+    instrument: Path = Field(description="instrument file, relative to the rig file")
+    pose_deg: dict[str, float | dict[float, float]] = Field(
+        default={}, description="where axes stand that the states do not turn, degrees"
+    )
 
 
 class ForbiddenPose(Part):
     """A box of axis angles that the rig must neither stand in nor pass: all ranges hold at once."""
 
-    why: str
-    ranges_deg: Annotated[dict[str, Range], Field(min_length=1)]
+    why: str = Field(description="what would happen, for the message")
+    ranges_deg: Annotated[dict[str, Range], Field(min_length=1)] = Field(
+        description="range of each axis, degrees; the pose is forbidden where all are met"
+    )
     homing_may_pass: bool = Field(
         default=False, description="nothing is hit there; it is only no pose to measure in, so homing may pass it"
     )
@@ -47,8 +51,8 @@ class ForbiddenPose(Part):
 class HomingPath(Part):
     """What an axis may pass while it homes, from wherever it was left, and where it stands afterwards."""
 
-    passes_deg: Range
-    ends_deg: float
+    passes_deg: Range = Field(description="range that homing passes, degrees")
+    ends_deg: float = Field(description="where homing ends, degrees")
 
     @model_validator(mode="after")
     def _ends_inside(self) -> Self:
@@ -67,5 +71,7 @@ class InterlockConfig(Part):
     pose and exposure has the same light, to the fraction `limit`.
     """
 
-    kind: Literal["door", "temperature", "saturation", "lamp", "drift"]
-    limit: float = Field(default=0.0, ge=0)
+    kind: Literal["door", "temperature", "saturation", "lamp", "drift"] = Field(
+        description="door, temperature, saturation, lamp or drift"
+    )
+    limit: float = Field(default=0.0, ge=0, description="degC for temperature, else a fraction")

@@ -38,20 +38,26 @@ class RigSections(Part):
     """A rig. Relative paths are relative to the rig file."""
 
     kind: Literal["rig"] = "rig"
-    name: str = Field(min_length=1)
-    axes: dict[str, AxisEntry]
-    camera: CameraEntry
-    source: SourceEntry | None = None
+    name: str = Field(min_length=1, description="name that messages and other files use")
+    axes: dict[str, AxisEntry] = Field(description="axes by name: controller, address, zero, direction")
+    camera: CameraEntry = Field(description="camera and how it is set")
+    source: SourceEntry | None = Field(
+        default=None, description="light source or shutter; without one, darks are asked for"
+    )
     cutoff: SourceEntry | None = Field(
         default=None,
         description="second shutter or relay in the light, best one that shuts by itself without a heartbeat; the "
         "guard of `acquire` holds it, and light passes it only while the guard watches",
     )
-    detector: Detector
-    modes: dict[str, ModeConfig] = Field(min_length=1)
-    wavelengths_nm: tuple[Annotated[float, Field(gt=0)], ...] = Field(min_length=1)
+    detector: Detector = Field(description="constants of the detector's noise, for error bars")
+    modes: dict[str, ModeConfig] = Field(
+        min_length=1, description="measuring modes: instrument model and pose of what does not turn"
+    )
+    wavelengths_nm: tuple[Annotated[float, Field(gt=0)], ...] = Field(
+        min_length=1, description="wavelengths that the rig can give, nm"
+    )
     home_at_start: bool = Field(default=False, description="home axes without a reference before the first move")
-    home_order: tuple[str, ...] = ()
+    home_order: tuple[str, ...] = Field(default=(), description="order of homing; the arm first and alone")
     homing: dict[str, HomingPath] = Field(default={}, description="what an axis may pass while it homes; default all")
     park_deg: dict[str, float] = Field(default={}, description="where a run that is stopped leaves axes")
     endless: tuple[str, ...] = Field(
@@ -74,8 +80,10 @@ class RigSections(Part):
     alert_every_s: float = Field(default=60.0, ge=1, description="time between two alerts of an alarm")
     notify: NotifyConfig | None = Field(default=None, description="who hears of an end, a failure, an interlock")
     wire_log: Path | None = Field(default=None, description="folder for a transcript of every byte on serial lines")
-    forbidden: tuple[ForbiddenPose, ...] = ()
+    forbidden: tuple[ForbiddenPose, ...] = Field(default=(), description="poses that no move may pass")
     solids: Solids | None = Field(default=None, description="arm, sample holder, ... that must keep apart")
-    interlocks: tuple[InterlockConfig, ...] = ()
+    interlocks: tuple[InterlockConfig, ...] = Field(default=(), description="what ends or holds a run")
     simulated: bool = Field(default=False, description="the devices at these ports are emulators (simulate rig)")
-    simulator: SimulatorConfig | None = None
+    simulator: SimulatorConfig | None = Field(
+        default=None, description="emulators that stand in for the devices at ports sim:NAME"
+    )

@@ -18,32 +18,32 @@ Coordinate = Annotated[float, Field(ge=-10_000, le=10_000)]
 
 
 class _Solid(Part):
-    name: str
-    centre_mm: tuple[Coordinate, Coordinate, Coordinate]
+    name: str = Field(description="name that messages and other files use")
+    centre_mm: tuple[Coordinate, Coordinate, Coordinate] = Field(description="centre from the centre of rotation, mm")
     turns_with: str | None = Field(default=None, description="axis that carries it; without one it stands still")
 
 
 class Box(_Solid):
     """A box with its edges along x, y and z."""
 
-    shape: Literal["box"]
-    size_mm: tuple[Length, Length, Length]
+    shape: Literal["box"] = Field(description="box, cylinder or disc")
+    size_mm: tuple[Length, Length, Length] = Field(description="edges, mm")
 
 
 class Cylinder(_Solid):
     """An upright cylinder."""
 
-    shape: Literal["cylinder"]
-    radius_mm: Length
-    height_mm: Length
+    shape: Literal["cylinder"] = Field(description="box, cylinder or disc")
+    radius_mm: Length = Field(description="radius, mm")
+    height_mm: Length = Field(description="height, mm")
 
 
 class Disc(_Solid):
     """A disc on edge that faces along z, for instance a mount in the beam."""
 
-    shape: Literal["disc"]
-    radius_mm: Length
-    thickness_mm: Length
+    shape: Literal["disc"] = Field(description="box, cylinder or disc")
+    radius_mm: Length = Field(description="radius, mm")
+    thickness_mm: Length = Field(description="thickness, mm")
 
 
 Solid = Annotated[Box | Cylinder | Disc, Field(discriminator="shape")]
@@ -53,4 +53,4 @@ class Solids(Part):
     """Solids that must keep their distance from each other at every instant of every move."""
 
     margin_mm: float = Field(ge=0, le=1000, description="smallest distance allowed")
-    parts: tuple[Solid, ...]
+    parts: tuple[Solid, ...] = Field(description="boxes, cylinders and discs that must keep apart")

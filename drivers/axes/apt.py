@@ -58,7 +58,7 @@ class Config(AxisConfig):
     """An APT axis in a rig file. Every unit has its own USB port; `serial_number` makes sure it is the right one."""
 
     kind: Literal["apt"] = "apt"
-    serial_number: int | None = None
+    serial_number: int | None = Field(default=None, description="serial number; another device at this port is refused")
     stage: Literal["K10CR1", "PRM1-Z8", "DDR25", "DDR100"] | None = Field(
         default=None, description="scale of the stage, where the controller does not tell it (KBD101) or is not known"
     )

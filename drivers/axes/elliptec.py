@@ -51,9 +51,9 @@ class Config(SessionReferenceConfig):
     """An Elliptec module in a rig file. Without `address` the line is searched for `serial_number`."""
 
     kind: Literal["elliptec"] = "elliptec"
-    address: str | None = Field(default=None, pattern="^[0-9A-F]$")
-    serial_number: str | None = None
-    home_clockwise: bool = True
+    address: str | None = Field(default=None, pattern="^[0-9A-F]$", description="address on the line")
+    serial_number: str | None = Field(default=None, description="serial number; another device at this port is refused")
+    home_clockwise: bool = Field(default=True, description="whether homing turns clockwise")
     pause_before_move_s: float = Field(
         default=0.1, ge=0, description="pylablib notes that a move sent too soon after another command can end at zero"
     )

@@ -48,11 +48,11 @@ class Config(SessionReferenceConfig):
     identified_by: ClassVar[str] = "stage_id"
 
     kind: Literal["esp301"] = "esp301"
-    axis: int = Field(default=1, ge=1, le=3)
-    stage_id: str | None = None
+    axis: int = Field(default=1, ge=1, le=3, description="number of the axis at its controller")
+    stage_id: str | None = Field(default=None, description="name of the stage that the controller reports")
     home_mode: int = Field(default=1, ge=0, le=6, description="mode of OR")
-    baudrate: int = 19_200
-    rtscts: bool = True
+    baudrate: int = Field(default=19_200, description="bits a second, as the controller is set")
+    rtscts: bool = Field(default=True, description="whether the wires RTS and CTS hold back who sends too fast")
 
     def place(self) -> str:
         return f"axis {self.axis}"

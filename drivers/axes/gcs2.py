@@ -42,8 +42,8 @@ class Config(AxisConfig):
 
     kind: Literal["gcs2"] = "gcs2"
     axis: int = Field(default=1, ge=1, le=16, description="axis identifier, as SAI? lists it")
-    serial_number: str | None = None
-    baudrate: int = 115_200
+    serial_number: str | None = Field(default=None, description="serial number; another device at this port is refused")
+    baudrate: int = Field(default=115_200, description="bits a second, as the controller is set")
 
     def place(self) -> str:
         return f"axis {self.axis}"

@@ -26,14 +26,14 @@ class Config(SessionReferenceConfig):
     identified_by: ClassVar[str] = "device"
 
     kind: Literal["mmcore"] = "mmcore"
-    port: str = "micromanager"
+    port: str = Field(default="micromanager", description="serial port, or sim:NAME for an emulator")
     device: str = Field(description="label of the stage in the core")
     configuration: Path | None = Field(
         default=None, description="configuration file that is loaded if the core does not hold the device yet"
     )
     units_per_deg: float = Field(default=1.0, gt=0, description="what the core calls micrometres, per degree")
     speed_deg_s: float = Field(gt=0, description="of moves and homing, for deadlines: the core does not tell it")
-    acceleration_deg_s2: float = Field(default=100.0, gt=0)
+    acceleration_deg_s2: float = Field(default=100.0, gt=0, description="acceleration, degrees a second squared")
 
     def place(self) -> str:
         return f"device {self.device}"

@@ -78,8 +78,8 @@ class Config(AxisConfig):
     identified_by: ClassVar[str] = "stage_id"
 
     kind: Literal["smc100"] = "smc100"
-    address: int = Field(default=1, ge=1, le=31)
-    stage_id: str | None = None
+    address: int = Field(default=1, ge=1, le=31, description="address on the line")
+    stage_id: str | None = Field(default=None, description="name of the stage that the controller reports")
     baudrate: int = Field(default=57_600, description="57600 for SMC100, 921600 for CONEX")
 
     def place(self) -> str:

@@ -56,7 +56,7 @@ class Config(SessionReferenceConfig):
     """A Standa axis in a rig file; every controller has its own port."""
 
     kind: Literal["standa"] = "standa"
-    serial_number: int | None = None
+    serial_number: int | None = Field(default=None, description="serial number; another device at this port is refused")
     steps_per_deg: float = Field(
         gt=0,
         description="full motor steps per degree of the stage, which the controller does not know: 8MR190-2-28: 100",

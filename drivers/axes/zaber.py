@@ -63,13 +63,13 @@ class Config(AxisConfig):
     """A Zaber axis in a rig file. Give `serial_number`: addresses are the order of the wiring."""
 
     kind: Literal["zaber"] = "zaber"
-    address: int | None = Field(default=None, ge=1, le=99)
-    serial_number: int | None = None
+    address: int | None = Field(default=None, ge=1, le=99, description="address on the line")
+    serial_number: int | None = Field(default=None, description="serial number; another device at this port is refused")
     axis: int = Field(default=1, ge=1, le=9, description="axis of a controller with several")
     counts_per_turn: float | None = Field(
         default=None, gt=0, description="microsteps per turn, for a stage that does not report limit.cycle.dist"
     )
-    baudrate: int = 115_200
+    baudrate: int = Field(default=115_200, description="bits a second, as the controller is set")
 
     def place(self) -> str:
         who = f"serial number {self.serial_number}" if self.address is None else f"address {self.address}"

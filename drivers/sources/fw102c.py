@@ -38,7 +38,7 @@ class Config(BaseModel):
     held_by: str | None = Field(default=None, description="program that may hold the port too: its simulator")
     positions: dict[float, Position] = Field(min_length=1, description="wavelength in nm to position on the wheel")
     dark_position: Position | None = Field(default=None, description="position of an opaque filter")
-    shutter: sc10.Config | None = None
+    shutter: sc10.Config | None = Field(default=None, description="SC10 shutter beside the wheel")
     reply_s: float = Field(default=1.0, gt=0, description="longest wait for a reply")
     turn_s: float = Field(default=8.0, gt=0, description="longest time for the wheel to turn")
 

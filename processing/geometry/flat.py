@@ -21,9 +21,9 @@ class Flat(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["flat"] = "flat"
-    width_mm: float = Field(gt=0)
-    height_mm: float = Field(gt=0)
-    normal_deg: float | None = None
+    width_mm: float = Field(gt=0, description="width, mm")
+    height_mm: float = Field(gt=0, description="height, mm")
+    normal_deg: float | None = Field(default=None, description="direction of the normal, degrees")
 
     def intersect(self, origin_mm: Array, rays: Array, omega_deg: float) -> tuple[NDArray[np.bool_], Array, Array]:
         """Hits of rays (..., 3): mask (...), points (N, 3) in mm and normals (N, 3)."""

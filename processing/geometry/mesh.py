@@ -32,12 +32,14 @@ class Mesh(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["mesh"] = "mesh"
-    file: str
-    scale_mm: float = Field(default=1.0, gt=0)
-    rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    translation_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    smooth_normals: bool = True
-    allow_holes: bool = False
+    file: str = Field(description="file, relative to this one")
+    scale_mm: float = Field(default=1.0, gt=0, description="mm for one unit of the mesh file")
+    rotation_deg: tuple[float, float, float] = Field(
+        default=(0.0, 0.0, 0.0), description="turns about x, y and z, degrees"
+    )
+    translation_mm: tuple[float, float, float] = Field(default=(0.0, 0.0, 0.0), description="shift after the turns, mm")
+    smooth_normals: bool = Field(default=True, description="interpolate normals between the corners of a triangle")
+    allow_holes: bool = Field(default=False, description="take a mesh that is not closed")
 
     def relative_to(self, folder: Path) -> Mesh:
         """The same mesh with its file looked up from `folder`."""

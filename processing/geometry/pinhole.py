@@ -17,15 +17,15 @@ class PinholeCamera(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    rows: int = Field(gt=0)
-    columns: int = Field(gt=0)
-    pixel_mm: float = Field(gt=0)
-    focal_length_mm: float = Field(gt=0)
-    distance_mm: float = Field(gt=0)
-    centre_px: tuple[float, float] | None = None
-    distortion: tuple[float, ...] = Field(default=(), max_length=5)
+    rows: int = Field(gt=0, description="pixels from top to bottom")
+    columns: int = Field(gt=0, description="pixels from left to right")
+    pixel_mm: float = Field(gt=0, description="side of a pixel, mm")
+    focal_length_mm: float = Field(gt=0, description="focal length, mm")
+    distance_mm: float = Field(gt=0, description="camera to centre of rotation, mm")
+    centre_px: tuple[float, float] | None = Field(default=None, description="pixel on the optical axis, (column, row)")
+    distortion: tuple[float, ...] = Field(default=(), max_length=5, description="radial and tangential coefficients")
     #: Standard errors of a calibration, by key; empty when stated and not measured.
-    stderr: dict[str, float] = {}
+    stderr: dict[str, float] = Field(default={}, description="standard errors of what was fitted")
 
     @property
     def focal_px(self) -> float:

@@ -17,8 +17,10 @@ class Sphere(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["sphere"] = "sphere"
-    radius_mm: float = Field(gt=0)
-    centre_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    radius_mm: float = Field(gt=0, description="radius, mm")
+    centre_mm: tuple[float, float, float] = Field(
+        default=(0.0, 0.0, 0.0), description="centre from the centre of rotation, mm"
+    )
 
     def intersect(self, origin_mm: Array, rays: Array, omega_deg: float) -> tuple[NDArray[np.bool_], Array, Array]:
         """Nearest hits of rays (..., 3): mask (...), points (N, 3) in mm and outward normals (N, 3)."""

@@ -27,10 +27,10 @@ class ViewingGeometry(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    camera: PinholeCamera
-    source_distance_mm: float = Field(gt=0)
-    shape: Shape
-    arm_zero_deg: float = 0.0
+    camera: PinholeCamera = Field(description="pinhole camera")
+    source_distance_mm: float = Field(gt=0, description="source to centre of rotation, mm")
+    shape: Shape = Field(description="shape of the object")
+    arm_zero_deg: float = Field(default=0.0, description="what is added to the arm's reading, degrees")
 
     @classmethod
     def load(cls, path: Path | str) -> ViewingGeometry:

@@ -31,8 +31,8 @@ class Part(BaseModel):
 class Uncertain(Part):
     """A number with its standard uncertainty, as a file may state it."""
 
-    value: float
-    u: float
+    value: float = Field(description="the number")
+    u: float = Field(description="its standard uncertainty, in its unit")
 
 
 #: A number, or one for each wavelength, each with its u or without; `InstrumentModel.stderr` then holds the u.
@@ -45,10 +45,12 @@ Stated = Annotated[
 class Element(Part):
     """One optical element, fixed or turned: azimuth = azimuth_deg + ratio * angle of `axis`."""
 
-    name: str
-    azimuth_deg: Stated = 0.0
-    axis: str | None = None
-    ratio: Annotated[float, BeforeValidator(lambda value: value, json_schema_input_type=float | Uncertain)] = 1.0
+    name: str = Field(description="name that messages and other files use")
+    azimuth_deg: Stated = Field(default=0.0, description="azimuth at zero of the axis, degrees from +x towards +y")
+    axis: str | None = Field(default=None, description="name of the axis")
+    ratio: Annotated[float, BeforeValidator(lambda value: value, json_schema_input_type=float | Uncertain)] = Field(
+        default=1.0, description="degrees of the element for one degree of its axis"
+    )
 
     @model_validator(mode="after")
     def _ratio_needs_axis(self) -> Self:
@@ -75,7 +77,7 @@ class Polarizer(Element):
     """Linear polarizer; `extinction` is the intensity leak T_min/T_max."""
 
     kind: Literal["polarizer"]
-    extinction: Stated = 0.0
+    extinction: Stated = Field(default=0.0, description="intensity leak T_min / T_max")
 
     def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
         extinction = number(self.extinction) + (changes.extinction[self.name] if changes else 0.0)
@@ -90,9 +92,12 @@ class Retarder(Element):
     """
 
     kind: Literal["retarder"]
-    retardance_deg: Stated
-    diattenuation: Stated = 0.0
-    depolarization: Stated = 0.0
+    retardance_deg: Stated = Field(description="retardance, degrees; one number, or one for each wavelength in nm")
+    diattenuation: Stated = Field(default=0.0, description="(T_fast - T_slow) / (T_fast + T_slow)")
+    depolarization: Stated = Field(
+        default=0.0,
+        description="share of what the retardance acts on that is lost to the mean over several retardances",
+    )
 
     def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
         retardance = np.deg2rad(number(self.retardance_deg)) + (changes.retardance_rad[self.name] if changes else 0.0)
@@ -108,8 +113,8 @@ class Diattenuator(Element):
     """Linear diattenuator with intensity transmissions `t_max` along the azimuth and `t_min` across it."""
 
     kind: Literal["diattenuator"]
-    t_max: Stated = 1.0
-    t_min: Stated
+    t_max: Stated = Field(default=1.0, description="intensity transmission along the azimuth")
+    t_min: Stated = Field(description="intensity transmission across it")
 
     def mueller(self, azimuth_rad: Array, changes: Changes | None = None) -> Array:
         return mueller.diattenuator(azimuth_rad, number(self.t_max), number(self.t_min))

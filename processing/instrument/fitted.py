@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import field_serializer, field_validator
+from pydantic import Field, field_serializer, field_validator
 
 from processing.instrument.elements import Part
 
@@ -19,11 +19,13 @@ from processing.instrument.elements import Part
 class EffectParameter(Part):
     """A fitted value with its standard error (None: it has none, `note` says why); or one at each wavelength."""
 
-    value: float | tuple[float, ...]
-    stderr: float | tuple[float, ...] | None = None
-    unit: str
-    note: str | None = None
-    wavelengths_nm: tuple[float, ...] | None = None
+    value: float | tuple[float, ...] = Field(description="fitted value")
+    stderr: float | tuple[float, ...] | None = Field(default=None, description="its standard error")
+    unit: str = Field(description="its unit")
+    note: str | None = Field(default=None, description="why it has no standard error")
+    wavelengths_nm: tuple[float, ...] | None = Field(
+        default=None, description="wavelengths of the values, nm, where there are several"
+    )
 
     @property
     def told(self) -> str:
@@ -40,14 +42,20 @@ class AppliedEffect(Part):
     """One effect that `diagnose` found and added: what, where, how large, on which evidence."""
 
     kind: str
-    element: str | None = None
-    parameters: dict[str, EffectParameter]
-    evidence: float | None = None
-    captures: tuple[str, ...] = ()
-    scope: Literal["instrument", "capture"] = "instrument"
-    wavelength_nm: float | None = None
-    indistinguishable_from: tuple[str, ...] = ()
-    probability: float | None = None
+    element: str | None = Field(default=None, description="name of the element in the instrument file")
+    parameters: dict[str, EffectParameter] = Field(description="values with their standard errors")
+    evidence: float | None = Field(
+        default=None, description="drop of the residual that speaks for it, as `diagnose` counts it"
+    )
+    captures: tuple[str, ...] = Field(
+        default=(), description="captures that it holds in, where it is not the instrument's"
+    )
+    scope: Literal["instrument", "capture"] = Field(default="instrument", description="instrument, or single captures")
+    wavelength_nm: float | None = Field(default=None, description="wavelength that it holds at, nm")
+    indistinguishable_from: tuple[str, ...] = Field(default=(), description="effects that would look the same")
+    probability: float | None = Field(
+        default=None, description="how likely it is, given everything that was looked for"
+    )
 
     @field_validator("captures")
     @classmethod
@@ -75,9 +83,11 @@ class SystematicError(Part):
         Standard error of the elements of M/m00 that all of them make in the captures they were found in.
     """
 
-    directions: tuple[tuple[AppliedEffect, ...], ...]
-    rms_over_m00: float
-    wavelength_nm: float | None = None
+    directions: tuple[tuple[AppliedEffect, ...], ...] = Field(
+        description="sets of small effects that belong together, one standard deviation each"
+    )
+    rms_over_m00: float = Field(description="standard error of an element of M / m00 that all of them make")
+    wavelength_nm: float | None = Field(default=None, description="wavelength that it holds at, nm")
 
     @field_validator(
         "directions", mode="before", json_schema_input_type=tuple[_AsWritten | tuple[AppliedEffect, ...], ...]

@@ -37,9 +37,11 @@ Belongs = Literal["mechanics", "detector", "dispersion", "wavelength", "capture"
 class Channel(Part):
     """One detector channel: the elements that only its light passes, after the common analyzer train."""
 
-    name: str
-    elements: tuple[AnyElement, ...] = ()
-    gain: Stated = 1.0
+    name: str = Field(description="name that messages and other files use")
+    elements: tuple[AnyElement, ...] = Field(
+        default=(), description="elements that only this channel's light passes, after the analyzer"
+    )
+    gain: Stated = Field(default=1.0, description="response relative to the other channels")
 
     @field_validator("gain")
     @classmethod
@@ -69,21 +71,46 @@ class InstrumentModel(Part):
     """
 
     kind: Literal["instrument"] = "instrument"
-    name: str
-    source: str | None = None
-    wavelengths_nm: tuple[float, ...] | None = None
-    generator: tuple[AnyElement, ...]
-    analyzer: tuple[AnyElement, ...]
-    channels: tuple[Channel, ...] = (Channel(name="camera"),)
-    mosaic: tuple[tuple[str, ...], ...] | None = None
-    beams: tuple[str, ...] | None = None
-    calibrate: tuple[str, ...] = ()
-    belongs_to: dict[str, Belongs] = Field(default={})
-    free_source: bool | None = None
-    stderr: dict[str, Dispersive] = Field(default={})
-    effects: tuple[AppliedEffect, ...] = ()
-    systematic: tuple[SystematicError, ...] = ()
-    correlations: tuple[Correlation, ...] = ()
+    name: str = Field(description="name that messages and other files use")
+    source: str | None = Field(
+        default=None, description="Stokes vector of the source, S0 first; unpolarized without it"
+    )
+    wavelengths_nm: tuple[float, ...] | None = Field(
+        default=None, description="wavelengths that the numbers are given for, nm"
+    )
+    generator: tuple[AnyElement, ...] = Field(
+        description="elements between source and sample, in the order of the light"
+    )
+    analyzer: tuple[AnyElement, ...] = Field(
+        description="elements between sample and detector, in the order of the light"
+    )
+    channels: tuple[Channel, ...] = Field(
+        default=(Channel(name="camera"),),
+        description="detector channels, each with the elements that its light alone passes",
+    )
+    mosaic: tuple[tuple[str, ...], ...] | None = Field(
+        default=None, description="names of the channels over the super-pixel of a polarization camera"
+    )
+    beams: tuple[str, ...] | None = Field(
+        default=None, description="where the channels lie on a sensor that sees several beams"
+    )
+    calibrate: tuple[str, ...] = Field(
+        default=(), description="values that are only nominal: `diagnose` fits them to captures of known samples"
+    )
+    belongs_to: dict[str, Belongs] = Field(
+        default={}, description="which captures share a value of `calibrate` or the values of a kind of effect"
+    )
+    free_source: bool | None = Field(default=None, description="false: the source has one level in all states")
+    stderr: dict[str, Dispersive] = Field(
+        default={}, description="standard uncertainties of values; or write a value as {value: ..., u: ...}"
+    )
+    effects: tuple[AppliedEffect, ...] = Field(
+        default=(), description="faults that were found and are corrected for, as `diagnose --write` adds them"
+    )
+    systematic: tuple[SystematicError, ...] = Field(default=(), description="what stays uncertain after the correction")
+    correlations: tuple[Correlation, ...] = Field(
+        default=(), description="between standard uncertainties, as `process calibrate --write` adds them"
+    )
 
     @model_validator(mode="before")
     @classmethod

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Self
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from processing.arrays import Array
 from processing.instrument.elements import Part
@@ -24,9 +24,9 @@ class Correlation(Part):
     coefficients : K (K - 1) / 2, below the diagonal, row by row.
     """
 
-    between: tuple[str, ...]
-    coefficients: tuple[float, ...]
-    wavelength_nm: float | None = None
+    between: tuple[str, ...] = Field(description="values, element.field")
+    coefficients: tuple[float, ...] = Field(description="below the diagonal of their matrix, row by row")
+    wavelength_nm: float | None = Field(default=None, description="wavelength that it holds at, nm")
 
     @model_validator(mode="after")
     def _fits(self) -> Self:

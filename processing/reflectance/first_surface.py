@@ -20,8 +20,8 @@ class Constants(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    n: float = Field(gt=0)
-    k: float = Field(default=0.0, ge=0)
+    n: float = Field(gt=0, description="refractive index")
+    k: float = Field(default=0.0, ge=0, description="extinction coefficient")
 
 
 class Model(BaseModel):
@@ -30,9 +30,9 @@ class Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["first_surface"] = "first_surface"
-    name: str
-    source: str | None = None
-    constants: dict[float, Constants]
+    name: str = Field(description="name that messages and other files use")
+    source: str | None = Field(default=None, description="where the constants come from")
+    constants: dict[float, Constants] = Field(description="optical constants for each wavelength in nm")
 
     @property
     def wavelengths_nm(self) -> tuple[float, ...]:

@@ -18,10 +18,10 @@ class Constants(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    n: float = Field(gt=0)
-    k: float = Field(default=0.0, ge=0)
-    a: float
-    b: float = Field(gt=0)
+    n: float = Field(gt=0, description="refractive index")
+    k: float = Field(default=0.0, ge=0, description="extinction coefficient")
+    a: float = Field(description="strength of the first surface's reflection")
+    b: float = Field(gt=0, description="strength of the diffuse part")
 
 
 def diffuse_jones(geometry: ScatteringGeometry) -> ComplexArray:
@@ -40,9 +40,9 @@ class Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["polarized_diffuse"] = "polarized_diffuse"
-    name: str
-    source: str | None = None
-    constants: dict[float, Constants]
+    name: str = Field(description="name that messages and other files use")
+    source: str | None = Field(default=None, description="where the constants come from")
+    constants: dict[float, Constants] = Field(description="optical constants for each wavelength in nm")
 
     @property
     def wavelengths_nm(self) -> tuple[float, ...]:

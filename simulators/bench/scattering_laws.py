@@ -21,10 +21,10 @@ class Xi0Law(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    base: float = Field(ge=0.25, le=1)
-    lobe: float = Field(default=0.0, ge=0)
-    width_deg: float = Field(default=25.0, gt=0)
-    rise: float = Field(default=0.0, ge=0)
+    base: float = Field(ge=0.25, le=1, description="value without the lobe")
+    lobe: float = Field(default=0.0, ge=0, description="height of the specular lobe")
+    width_deg: float = Field(default=25.0, gt=0, description="width of the lobe, degrees")
+    rise: float = Field(default=0.0, ge=0, description="change towards grazing angles")
 
     @model_validator(mode="after")
     def _physical(self) -> Self:
@@ -44,9 +44,9 @@ class M00Law(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    albedo: float = Field(ge=0, le=1)
-    lobe: float = Field(default=0.0, ge=0)
-    width_deg: float = Field(default=12.0, gt=0)
+    albedo: float = Field(ge=0, le=1, description="throughput without the lobe")
+    lobe: float = Field(default=0.0, ge=0, description="height of the specular lobe")
+    width_deg: float = Field(default=12.0, gt=0, description="width of the lobe, degrees")
 
     def __call__(self, geometry: ScatteringGeometry) -> Array:
         """M00 (...) at the points."""

@@ -41,9 +41,11 @@ class Surface(_Part):
     as sin(theta_h): a surface that no TD model describes. 0 keeps it triply degenerate.
     """
 
-    xi0: Xi0Law
-    m00: M00Law
-    eigenvalue_deviation: float = Field(default=0.0, ge=0, lt=0.25)
+    xi0: Xi0Law = Field(description="law of the largest coherency eigenvalue")
+    m00: M00Law = Field(description="law of the throughput")
+    eigenvalue_deviation: float = Field(
+        default=0.0, ge=0, lt=0.25, description="what the three small eigenvalues differ by"
+    )
 
 
 class ObjectScene(_Part):
@@ -53,35 +55,35 @@ class ObjectScene(_Part):
     """
 
     kind: Literal["object"]
-    name: str
-    geometry: ViewingGeometry
-    material: str
-    surface: dict[float, Surface]
-    background_m00: float = Field(default=0.0, ge=0)
+    name: str = Field(description="name that messages and other files use")
+    geometry: ViewingGeometry = Field(description="camera, source and shape")
+    material: str = Field(description="material file, relative to this file")
+    surface: dict[float, Surface] = Field(description="laws of depolarization and brightness")
+    background_m00: float = Field(default=0.0, ge=0, description="throughput beside the object")
 
 
 class AirScene(_Part):
     """Nothing: M is the identity, seen where the source stands opposite to the camera (180 degrees)."""
 
     kind: Literal["air"]
-    name: str = "air"
-    throughput: float = Field(default=1.0, gt=0, le=1)
+    name: str = Field(default="air", description="name that messages and other files use")
+    throughput: float = Field(default=1.0, gt=0, le=1, description="factor on the light")
 
 
 class MirrorScene(_Part):
     """An ideal flat mirror that fills the frame and turns with the arm: M = diag(1, 1, -1, -1)."""
 
     kind: Literal["mirror"]
-    name: str = "mirror"
-    throughput: float = Field(default=1.0, gt=0, le=1)
+    name: str = Field(default="mirror", description="name that messages and other files use")
+    throughput: float = Field(default=1.0, gt=0, le=1, description="factor on the light")
 
 
 class FlatScene(_Part):
     """An even white diffuser that fills the frame, for flat fields: it depolarizes perfectly, M = diag(1, 0, 0, 0)."""
 
     kind: Literal["flat"] = "flat"
-    name: str = "white_diffuser"
-    throughput: float = Field(default=0.5, gt=0, le=1)
+    name: str = Field(default="white_diffuser", description="name that messages and other files use")
+    throughput: float = Field(default=0.5, gt=0, le=1, description="factor on the light")
 
 
 AnyScene = Annotated[ObjectScene | AirScene | MirrorScene | FlatScene, Field(discriminator="kind")]

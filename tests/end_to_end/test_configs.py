@@ -31,7 +31,7 @@ def test_every_key_of_a_schema_is_described(name):
     schema = json.loads(schemas.text_of(name))
     for section in (schema, *schema.get("$defs", {}).values()):
         for key, entry in section.get("properties", {}).items():
-            assert entry["description"], f"{section['title']}.{key}: say what it is, with its unit, in key_texts.py"
+            assert entry["description"], f"{section['title']}.{key}: say what it is, with its unit, at its field"
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*/*.yaml")), ids=lambda p: p.stem)

@@ -108,9 +108,11 @@ class Sample(_Part):
     Air and mirror are known up to one throughput for each pixel.
     """
 
-    kind: SampleKind = "unknown"
-    name: Line = ""
-    mueller: Annotated[tuple[float, ...], Field(min_length=16, max_length=16)] | None = None
+    kind: SampleKind = Field(default="unknown", description="unknown, or known: air, mirror, or a given Mueller matrix")
+    name: Line = Field(default="", description="name that messages and other files use")
+    mueller: Annotated[tuple[float, ...], Field(min_length=16, max_length=16)] | None = Field(
+        default=None, description="16 numbers, row by row, for kind mueller"
+    )
 
     @model_validator(mode="after")
     def _matrix_goes_with_its_kind(self) -> Self:
@@ -126,11 +128,13 @@ class Detector(_Part):
     None means not known: error bars then come from the residual, and say so.
     """
 
-    black_level_counts: float = 0.0
-    gain_e_per_count: float | None = Field(default=None, gt=0)
-    read_noise_e: float | None = Field(default=None, ge=0)
-    full_well_e: float | None = Field(default=None, gt=0)
-    bits: int | None = Field(default=None, ge=1, le=32)
+    black_level_counts: float = Field(default=0.0, description="counts without light")
+    gain_e_per_count: float | None = Field(
+        default=None, gt=0, description="electrons for one count; without it error bars come from the residual"
+    )
+    read_noise_e: float | None = Field(default=None, ge=0, description="read noise, electrons")
+    full_well_e: float | None = Field(default=None, gt=0, description="electrons that a pixel holds")
+    bits: int | None = Field(default=None, ge=1, le=32, description="bits of a count; full scale is 2**bits - 1")
 
 
 class CaptureHeader(_Part):

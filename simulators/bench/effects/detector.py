@@ -6,6 +6,7 @@ import zlib
 from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from processing.arrays import Image
 from simulators.bench.effects.base import BenchEffect, Shot
@@ -15,8 +16,8 @@ class Nonlinearity(BenchEffect):
     """The response bends: electrons lose the fraction `at_full_scale` at `full_scale_e`, in proportion below."""
 
     kind: Literal["nonlinearity"] = "nonlinearity"
-    at_full_scale: float = 0.0
-    full_scale_e: float = 10_000.0
+    at_full_scale: float = Field(default=0.0, description="part of the electrons that is lost at full scale")
+    full_scale_e: float = Field(default=10_000.0, description="electrons at full scale")
 
     def detector(self, electrons: Image, shot: Shot) -> Image:
         return np.asarray(electrons * (1 - self.at_full_scale * electrons / self.full_scale_e), dtype=np.float32)
@@ -26,7 +27,7 @@ class PixelResponse(BenchEffect):
     """Fixed pattern: each pixel's response differs, relative standard deviation `sigma`, the same in every frame."""
 
     kind: Literal["pixel_response"] = "pixel_response"
-    sigma: float = 0.0
+    sigma: float = Field(default=0.0, description="standard deviation, relative")
 
     def detector(self, electrons: Image, shot: Shot) -> Image:
         pattern = np.random.default_rng([shot.seed, zlib.crc32(b"pixel response")])
@@ -37,7 +38,7 @@ class BlackDrift(BenchEffect):
     """The black level moves by electrons an hour."""
 
     kind: Literal["black_drift"] = "black_drift"
-    e_per_hour: float = 0.0
+    e_per_hour: float = Field(default=0.0, description="electrons an hour")
 
     def detector(self, electrons: Image, shot: Shot) -> Image:
         return np.asarray(electrons + np.float32(self.e_per_hour * shot.time_s / 3600))
@@ -47,7 +48,7 @@ class BlackOffset(BenchEffect):
     """The black level is `electrons` above what the header says."""
 
     kind: Literal["black_offset"] = "black_offset"
-    electrons: float = 0.0
+    electrons: float = Field(default=0.0, description="black level above what the header says, electrons")
 
     def detector(self, electrons: Image, shot: Shot) -> Image:
         return np.asarray(electrons + np.float32(self.electrons))
@@ -57,8 +58,8 @@ class ToneCurve(BenchEffect):
     """The camera stores a power of the light: its contrast setting is not 1."""
 
     kind: Literal["tone_curve"] = "tone_curve"
-    gamma: float = 1.0
-    full_scale_e: float = 10_000.0
+    gamma: float = Field(default=1.0, description="the camera stores light to the power 1 / gamma")
+    full_scale_e: float = Field(default=10_000.0, description="electrons at full scale")
 
     def detector(self, electrons: Image, shot: Shot) -> Image:
         share = np.maximum(electrons, 0) / self.full_scale_e

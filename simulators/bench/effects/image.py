@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from processing.arrays import Image
 from simulators.bench.effects.base import BenchEffect, Shot
@@ -14,10 +15,12 @@ class ImageDrift(BenchEffect):
     """The image moves: steadily with time, and in a circle with an axis whose element is a wedge (pixels)."""
 
     kind: Literal["image_drift"] = "image_drift"
-    rows_per_hour: float = 0.0
-    columns_per_hour: float = 0.0
-    axis: str | None = None
-    wedge_pixels: float = 0.0
+    rows_per_hour: float = Field(default=0.0, description="drift downwards, pixels an hour")
+    columns_per_hour: float = Field(default=0.0, description="drift to the right, pixels an hour")
+    axis: str | None = Field(default=None, description="axis whose element is a wedge")
+    wedge_pixels: float = Field(
+        default=0.0, description="radius of the circle in which the wedge moves the image, pixels"
+    )
 
     def optics(self, electrons: Image, shot: Shot) -> Image:
         from scipy.ndimage import shift
@@ -36,8 +39,8 @@ class StrayLight(BenchEffect):
     """Light that never saw the polarization optics: electrons a second on every pixel, falling over the columns."""
 
     kind: Literal["stray_light"] = "stray_light"
-    e_per_s: float = 0.0
-    gradient: float = 0.0
+    e_per_s: float = Field(default=0.0, description="electrons a second")
+    gradient: float = Field(default=0.0, description="relative change from the first column to the last")
 
     def optics(self, electrons: Image, shot: Shot) -> Image:
         ramp = 1 + self.gradient * np.linspace(-0.5, 0.5, electrons.shape[-1], dtype=np.float32)
@@ -48,7 +51,7 @@ class VeilingGlare(BenchEffect):
     """A fraction of the light of the whole image spreads evenly over it."""
 
     kind: Literal["veiling_glare"] = "veiling_glare"
-    fraction: float = 0.0
+    fraction: float = Field(default=0.0, description="part of the light")
 
     def optics(self, electrons: Image, shot: Shot) -> Image:
         mean = float(electrons.mean(dtype=np.float64))
@@ -59,7 +62,7 @@ class MosaicCrosstalk(BenchEffect):
     """A fraction of each pixel's light is collected by its four neighbours, which on a mosaic look elsewhere."""
 
     kind: Literal["mosaic_crosstalk"] = "mosaic_crosstalk"
-    fraction: float = 0.0
+    fraction: float = Field(default=0.0, description="part of the light")
 
     def optics(self, electrons: Image, shot: Shot) -> Image:
         padded = np.pad(electrons, 1, mode="edge")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from pydantic import PrivateAttr
+from pydantic import Field, PrivateAttr
 
 from simulators.bench.effects.base import BenchEffect, Shot
 
@@ -14,8 +14,8 @@ class AngleOffset(BenchEffect):
     """The axis stands `offset_deg` from where it says."""
 
     kind: Literal["angle_offset"] = "angle_offset"
-    axis: str
-    offset_deg: float = 0.0
+    axis: str = Field(description="name of the axis")
+    offset_deg: float = Field(default=0.0, description="how far the axis stands from where it says, degrees")
 
     def angles(self, angles_deg: dict[str, float], shot: Shot) -> dict[str, float]:
         return angles_deg | {self.axis: angles_deg[self.axis] + self.offset_deg}
@@ -25,8 +25,8 @@ class AngleScale(BenchEffect):
     """The axis turns 1 + `scale_error` times as far as it says."""
 
     kind: Literal["angle_scale"] = "angle_scale"
-    axis: str
-    scale_error: float = 0.0
+    axis: str = Field(description="name of the axis")
+    scale_error: float = Field(default=0.0, description="how much farther the axis turns than it says, relative")
 
     def angles(self, angles_deg: dict[str, float], shot: Shot) -> dict[str, float]:
         return angles_deg | {self.axis: angles_deg[self.axis] * (1 + self.scale_error)}
@@ -36,10 +36,10 @@ class AngleWobble(BenchEffect):
     """Eccentric encoder or gear: a periodic error of `amplitude_deg`, `harmonic` periods a turn."""
 
     kind: Literal["angle_wobble"] = "angle_wobble"
-    axis: str
-    amplitude_deg: float = 0.0
-    harmonic: int = 1
-    phase_deg: float = 0.0
+    axis: str = Field(description="name of the axis")
+    amplitude_deg: float = Field(default=0.0, description="amplitude, degrees")
+    harmonic: int = Field(default=1, description="periods in one turn")
+    phase_deg: float = Field(default=0.0, description="phase, degrees")
 
     def angles(self, angles_deg: dict[str, float], shot: Shot) -> dict[str, float]:
         angle = angles_deg[self.axis]
@@ -51,8 +51,8 @@ class AngleJitter(BenchEffect):
     """Random positioning error of `sigma_deg` in each state."""
 
     kind: Literal["angle_jitter"] = "angle_jitter"
-    axis: str
-    sigma_deg: float = 0.0
+    axis: str = Field(description="name of the axis")
+    sigma_deg: float = Field(default=0.0, description="standard deviation, degrees")
 
     def angles(self, angles_deg: dict[str, float], shot: Shot) -> dict[str, float]:
         error = self.sigma_deg * shot.random(f"jitter {self.axis}").standard_normal()
@@ -63,9 +63,9 @@ class AngleSlip(BenchEffect):
     """The axis slips by `slip_deg` on its shaft before exposure `at_index` and stays there."""
 
     kind: Literal["angle_slip"] = "angle_slip"
-    axis: str
-    at_index: int = 0
-    slip_deg: float = 0.0
+    axis: str = Field(description="name of the axis")
+    at_index: int = Field(default=0, description="number of the exposure, from 0, from which on it holds")
+    slip_deg: float = Field(default=0.0, description="how far the axis slips on its shaft, degrees")
 
     def angles(self, angles_deg: dict[str, float], shot: Shot) -> dict[str, float]:
         if shot.index < self.at_index:
@@ -77,8 +77,10 @@ class AnglePlay(BenchEffect):
     """Play in the gear: the shaft stays until the drive has turned by `play_deg` either way from its middle."""
 
     kind: Literal["angle_play"] = "angle_play"
-    axis: str
-    play_deg: float = 0.0
+    axis: str = Field(description="name of the axis")
+    play_deg: float = Field(
+        default=0.0, description="turn of the drive either way from its middle that does not move the shaft, degrees"
+    )
     _shaft: float | None = PrivateAttr(default=None)
 
     def angles(self, angles_deg: dict[str, float], shot: Shot) -> dict[str, float]:

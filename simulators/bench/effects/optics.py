@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from processing.arrays import Image
 from processing.instrument.elements import number
@@ -21,10 +22,12 @@ class ElementError(BenchEffect):
     """An element's value (retardance_deg, azimuth_deg, extinction, ...) is off, and drifts."""
 
     kind: Literal["element_error"] = "element_error"
-    element: str
-    parameter: str = "retardance_deg"
-    offset: float = 0.0
-    per_hour: float = 0.0
+    element: str = Field(description="name of the element in the instrument file")
+    parameter: str = Field(
+        default="retardance_deg", description="value that is off: retardance_deg, azimuth_deg, extinction, ..."
+    )
+    offset: float = Field(default=0.0, description="what is added to it, in its own unit")
+    per_hour: float = Field(default=0.0, description="what is added to it in an hour, in its own unit")
 
     def train(self, model: InstrumentModel, shot: Shot) -> InstrumentModel:
         value = _value(model, self.element, self.parameter) + self.offset + self.per_hour * shot.time_s / 3600
@@ -38,9 +41,9 @@ class Window(BenchEffect):
     """
 
     kind: Literal["window"] = "window"
-    behind: str
-    azimuth_deg: float = 45.0
-    retardance_deg: float = 0.0
+    behind: str = Field(description="element of the generator that it stands behind")
+    azimuth_deg: float = Field(default=45.0, description="azimuth of its fast axis, degrees from +x towards +y")
+    retardance_deg: float = Field(default=0.0, description="retardance, degrees")
 
     def train(self, model: InstrumentModel, shot: Shot) -> InstrumentModel:
         names = [e.name for e in model.generator]
@@ -57,10 +60,10 @@ class PlateTransmission(BenchEffect):
     """What an axis turns passes more light at some angles: a wedge or a stain (once a turn), s against p (twice)."""
 
     kind: Literal["plate_transmission"] = "plate_transmission"
-    axis: str
-    amplitude: float = 0.0
-    harmonic: int = 1
-    phase_deg: float = 0.0
+    axis: str = Field(description="name of the axis")
+    amplitude: float = Field(default=0.0, description="relative amplitude")
+    harmonic: int = Field(default=1, description="periods in one turn")
+    phase_deg: float = Field(default=0.0, description="phase, degrees")
 
     def source(self, level: float, shot: Shot) -> float:
         angle = np.deg2rad(self.harmonic * shot.angles_deg[self.axis] - self.phase_deg)
@@ -71,9 +74,9 @@ class PlateRetardance(BenchEffect):
     """A plate with a wedge, met beside its axis: its retardance goes up and down once a turn."""
 
     kind: Literal["plate_retardance"] = "plate_retardance"
-    element: str
-    amplitude_deg: float = 0.0
-    phase_deg: float = 0.0
+    element: str = Field(description="name of the element in the instrument file")
+    amplitude_deg: float = Field(default=0.0, description="amplitude, degrees")
+    phase_deg: float = Field(default=0.0, description="phase, degrees")
 
     def train(self, model: InstrumentModel, shot: Shot) -> InstrumentModel:
         declared = _value(model, self.element, "retardance_deg")
@@ -91,10 +94,12 @@ class FieldRetardance(BenchEffect):
     """
 
     kind: Literal["field_retardance"] = "field_retardance"
-    element: str
-    edge_deg: float = 0.0
-    x: float = 0.0
-    y: float = 0.0
+    element: str = Field(description="name of the element in the instrument file")
+    edge_deg: float = Field(
+        default=0.0, description="retardance added at half the image width from the centre, degrees"
+    )
+    x: float = Field(default=0.0, description="centre across the image, -1 (left) to 1")
+    y: float = Field(default=0.0, description="centre down the image, -1 (top) to 1")
 
     def field(self, image: Image, model: InstrumentModel, seen: Callable[[InstrumentModel], Image]) -> Image:
         if self.edge_deg == 0:
@@ -118,8 +123,8 @@ class ChannelError(BenchEffect):
     """One channel passes `gain` times what it should."""
 
     kind: Literal["channel_error"] = "channel_error"
-    channel: str
-    gain: float = 1.0
+    channel: str = Field(description="name of the channel")
+    gain: float = Field(default=1.0, description="factor on the channel")
 
     def train(self, model: InstrumentModel, shot: Shot) -> InstrumentModel:
         if self.channel not in {c.name for c in model.channels}:
