@@ -29,8 +29,7 @@ from processing.reduction.solvers.plain import MuellerSolver
 from processing.reduction.solvers.weighted import WeightedSolver
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import CaptureHeader, Detector, Sample
-from simulators.blind.suite import state_angles
-from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
+from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, state_angles, write_capture
 
 ROOT = Path(__file__).resolve().parents[1]
 INSTRUMENT = ROOT / "configs/instruments/rgb950.yaml"

@@ -21,12 +21,22 @@ from numpy.typing import NDArray
 from processing.arrays import Array
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.schema import Sample
-from simulators.blind.detectable import expected, expected_electrons
 from simulators.blind.detector_cases import DETECTOR
 from simulators.blind.lab_priors import PRIORS, draw_kinds
+from simulators.blind.mosaic_faults import MOSAIC as MOSAIC_FAULTS
 from simulators.blind.outside_list import EVENTS, OUTSIDE
-from simulators.blind.suite import declared_bench, state_angles
-from simulators.blind.undeclared_captures import Bench, Scene, counted, digitize, expose, write_capture
+from simulators.blind.undeclared_captures import (
+    Bench,
+    Scene,
+    counted,
+    declared_bench,
+    digitize,
+    expected,
+    expected_electrons,
+    expose,
+    state_angles,
+    write_capture,
+)
 from simulators.blind.undeclared_faults import LISTED, UNLISTED, Fault, Truth
 from simulators.blind.wiring import MOSAIC_WIRING, WIRING
 
@@ -47,6 +57,8 @@ OF_THE_CAPTURE = frozenset(
 GROUPS: dict[str, dict[str, Fault]] = {
     "real": {},
     "none": {},
+    "single": {**LISTED},
+    "mosaic": {**MOSAIC_FAULTS},
     "outside": {**UNLISTED, **OUTSIDE},
     "detector": DETECTOR,
     "wiring": WIRING,
@@ -165,10 +177,10 @@ def make_bench(
     ----------
     group : one of `GROUPS`.
     pixels : side of the images.
-    polarimeter : for all groups but "mosaic_wiring".
+    polarimeter : for all groups but "mosaic" and "mosaic_wiring".
     """
     random = np.random.default_rng([seed, 8128])
-    name, mosaic = f"{group}_{seed:04d}", group == "mosaic_wiring"
+    name, mosaic = f"{group}_{seed:04d}", group.startswith("mosaic")
     own, away = folder / name, folder / "truth" / name
     own.mkdir(parents=True, exist_ok=True)
     away.mkdir(parents=True, exist_ok=True)
@@ -208,7 +220,7 @@ def make_bench(
         np.save(away / f"{capture}.npy", true_mueller(scene, pixels))
         for i, fault in faults.items():
             known = found.setdefault((i, fault.capture), fault)
-            if group in ("real", "outside"):
+            if group in ("real", "single", "outside"):
                 w = model.at(nm).rows(angles).reshape(-1, 16)
                 known.matters[capture] = taken.matters(w, i, expected(bench, exposed))
     truth = RealBench(name, group, seed, file.name, nm, tuple(found[k] for k in sorted(found, key=str)))

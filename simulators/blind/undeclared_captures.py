@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.arrays import Array, ComplexArray
+from processing.instrument.model import InstrumentModel, Polarizer, Retarder
 from processing.storage.captures.schema import CaptureHeader, Detector, Sample, create_layout, write_closing
 
 #: Pauli matrices in the order of docs/conventions.md.
@@ -307,3 +308,51 @@ def write_capture(
         states["repeats"][...] = 1
         states["done"][...] = 1
         write_closing(h5, "complete", {})
+
+
+def expected_electrons(bench: Bench, electrons: Array) -> Array:
+    """Electrons (N, rows, columns) that the detector collects on average."""
+    found = np.minimum(electrons, bench.full_well)
+    for curve in bench.transfer:
+        found = curve(found)
+    return found
+
+
+def expected(bench: Bench, electrons: Array) -> Array:
+    """Counts (N, rows, columns) above black that the detector reports on average."""
+    return np.asarray(expected_electrons(bench, electrons) / bench.gain)
+
+
+def declared_bench(model: InstrumentModel, nm: float, size: int, mosaic: bool, electrons: float) -> Bench:
+    """A bench that is what its model (resolved at the wavelength) declares."""
+    bench = Bench(rows=size, columns=size, mosaic=mosaic, electrons=electrons, wavelength_nm=nm)
+    for element in model.elements():
+        azimuth = _radians(element.azimuth_deg)
+        if isinstance(element, Retarder):
+            retardance = _radians(element.retardance_deg)
+            if element.axis == "psg":
+                bench.og, bench.dg = azimuth, retardance
+            else:
+                bench.oa, bench.da = azimuth, retardance
+        elif isinstance(element, Polarizer) and element.name == "analyzer":
+            bench.lp = azimuth
+    return bench
+
+
+def _radians(value_deg: float | dict[float, float]) -> float:
+    if isinstance(value_deg, dict):
+        raise ValueError("the model is not resolved at a wavelength")
+    return float(np.deg2rad(value_deg))
+
+
+def state_angles(
+    states: int, mosaic: bool, zigzag: bool, step_deg: float | None = None, ratio: float = 4.91
+) -> dict[str, Array]:
+    """Angles of both axes in degrees; `zigzag` reaches states from both sides. Steps divide a turn, or half of it."""
+    step = step_deg or (180.0 if mosaic else 360.0) / states
+    psg = np.asarray(step * np.arange(states), dtype=np.float64)
+    order = np.arange(states)
+    if zigzag:
+        # Every third step goes back: states are reached from both sides.
+        order = np.concatenate([g[::-1] for g in np.array_split(order, max(states // 3, 1))])
+    return {"psg": np.asarray(psg[order]), "psa": np.asarray(ratio * psg[order])}

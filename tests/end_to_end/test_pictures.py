@@ -1,11 +1,5 @@
 """What a reader sees in figures: scales that the object decides, and panels that say something."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
-import cv2
 import numpy as np
 import pytest
 
@@ -84,17 +78,3 @@ def test_squares_of_pixels_show_what_the_noise_of_single_pixels_hides():
     # A point detector: one pixel.
     assert _cells(np.ones((4, 1, 1))).shape == (4, 1, 1)
     assert _noise_of_cells(np.ones((4, 1, 1))) is None
-
-
-@pytest.mark.skipif(not os.environ.get("UMOV_SLOW"), reason="takes minutes each; UMOV_SLOW=1 runs them")
-@pytest.mark.timeout(0)
-@pytest.mark.parametrize("name", ["closing_loop_measured", "closing_loop_reflectance"])
-def test_a_study_makes_its_picture(name, tmp_path):
-    root = Path(__file__).resolve().parents[2]
-    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(root)}
-    command = [sys.executable, root / f"benchmarks/{name}.py", "--figure", tmp_path / "made.png"]
-    subprocess.run(command, check=True, env=environment)
-    made, shown = (
-        cv2.imread(str(path)).astype(int) for path in (tmp_path / "made.png", root / f"docs/images/{name}.png")
-    )
-    assert np.abs(made - shown).mean() < 3

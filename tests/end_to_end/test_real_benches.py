@@ -14,7 +14,7 @@ from processing.storage.captures.capture import Capture
 from simulators.blind.bench_judge import WIRING_WORDS, Judgement, names_of, told_of, wiring_of
 from simulators.blind.bench_oracle import known_oracle
 from simulators.blind.bench_run import judge_bench
-from simulators.blind.bench_table import is_worse, reliability, sure_and_wrong, table
+from simulators.blind.bench_table import MATTERS, is_worse, reliability, sure_and_wrong, table
 from simulators.blind.mueller_error import Reduced, coverage_of, error_of
 from simulators.blind.real_bench import (
     GROUPS,
@@ -27,8 +27,7 @@ from simulators.blind.real_bench import (
     read_truth,
 )
 from simulators.blind.reliability_diagram import draw
-from simulators.blind.suite import declared_bench, state_angles
-from simulators.blind.undeclared_captures import Scene, digitize, expose
+from simulators.blind.undeclared_captures import Scene, declared_bench, digitize, expose, state_angles
 
 SMALL = 24
 #: Of a bench whose sources drift and flicker.
@@ -126,7 +125,7 @@ def test_true_values_mend_the_validation_sample(bench, configs):
     ("group", "kind"), [(group, kind) for group, kinds in GROUPS.items() for kind in kinds], ids=lambda name: name
 )
 def test_every_fault_changes_what_a_capture_file_says(group, kind, configs):
-    mosaic = group == "mosaic_wiring"
+    mosaic = group.startswith("mosaic")
     polarimeter = MOSAIC if mosaic else RGB950
     model = InstrumentModel.load(configs / "instruments" / polarimeter.instrument).at(662)
     angles = state_angles(polarimeter.states, mosaic, False)
@@ -166,6 +165,27 @@ def test_answer_to_a_small_bench_harms_nothing(group, seed, given, configs, tmp_
     assert max(grows, default=0.0) > 0.3 or not any(is_worse(*pair) for pair in judgement.own.values())
     if group == "none":
         assert result["verdict"] == "consistent"
+
+
+#: Groups with one fault or none, and their seeds: the seed goes through the faults of a group in turn.
+BLIND = {"single": range(0, 28, 4), "mosaic": range(4), "outside": range(0, 9, 4), "none": range(1000, 1002)}
+
+
+@pytest.mark.long
+@pytest.mark.timeout(900)
+def test_one_undeclared_fault_is_named_or_nothing_is(configs, tmp_path):
+    """A fault may stay unnamed, and half of those in the list that matter do not; no answer does harm."""
+    judged = []
+    for group, seeds in BLIND.items():
+        for seed in seeds:
+            truth = make_bench(tmp_path, seed, configs, group, pixels=SMALL)
+            judged.append(judge_bench(tmp_path, truth, configs, "sphere")[0])
+    print(table(judged))
+    assert not [j.name for j in judged if sure_and_wrong(j)]
+    assert not [j.name for j in judged if is_worse(j.declared, j.corrected)]
+    assert all(j.verdict == "consistent" for j in judged if j.group == "none")
+    answers = [m.told for j in judged if j.group == "single" for m in j.matters if m.size > MATTERS]
+    assert answers.count("missed") <= len(answers) / 2
 
 
 @pytest.mark.long

@@ -1,6 +1,6 @@
 """Promises 14 and 15: killed before any call that changes the disc, or without power there, next to nothing is lost.
 
-A sample of what `python benchmarks/kill_points.py` runs in full.
+A sample of what `python tests/faults/kill_points.py` runs in full.
 """
 
 import os
@@ -14,7 +14,7 @@ import pytest
 from simulators.disc.power_cut import Disc, read_record
 from simulators.disc.watched import compiler
 
-PROGRAM = Path(__file__).resolve().parents[2] / "benchmarks" / "kill_points.py"
+PROGRAM = Path(__file__).with_name("kill_points.py")
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler: calls cannot be watched")
 

@@ -9,8 +9,7 @@ from processing.diagnosis.captured.read_capture import read_capture
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import Sample
-from simulators.blind.suite import state_angles
-from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
+from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, state_angles, write_capture
 
 
 def bench_capture(folder: Path, file: Path, bench: Bench, air: bool = False, states: int = 40, seed: int = 7) -> Path:

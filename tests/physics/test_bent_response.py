@@ -9,8 +9,7 @@ from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.schema import Sample
 from simulators.blind.real_bench import Disc
-from simulators.blind.suite import declared_bench, state_angles
-from simulators.blind.undeclared_captures import digitize, expose, write_capture
+from simulators.blind.undeclared_captures import declared_bench, digitize, expose, state_angles, write_capture
 
 STATES, PIXELS, NM = 40, 64, 662.0
 BEND = 0.03

@@ -15,8 +15,7 @@ from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import Sample
 from simulators.blind.detector_cases import DETECTOR
-from simulators.blind.suite import state_angles
-from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
+from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, state_angles, write_capture
 
 STATES = 40
 OPTICS = "instruments/rgb950.yaml"

@@ -15,8 +15,15 @@ from processing.diagnosis.search.result import Diagnosis, FoundEffect
 from processing.instrument.model import EffectParameter, InstrumentModel
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import Sample
-from simulators.blind.suite import declared_bench, state_angles
-from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
+from simulators.blind.undeclared_captures import (
+    Bench,
+    Scene,
+    declared_bench,
+    digitize,
+    expose,
+    state_angles,
+    write_capture,
+)
 
 STATES = 40
 

@@ -6,7 +6,7 @@ import pytest
 from processing.diagnosis.instrument.diagnose import diagnose_captures
 from processing.instrument.model import InstrumentModel
 from processing.storage.formats.importing import ImportRequest, import_capture, read_sample
-from simulators.blind.suite import state_angles
+from simulators.blind.undeclared_captures import state_angles
 
 STATES = 24
 

@@ -14,8 +14,7 @@ from processing.instrument.model import InstrumentModel
 from processing.storage.captures.schema import Sample
 from simulators.blind.outside_list import ghost, image_lag, lamp_jump
 from simulators.blind.real_bench import Disc
-from simulators.blind.suite import declared_bench, state_angles
-from simulators.blind.undeclared_captures import Bench, digitize, expose, write_capture
+from simulators.blind.undeclared_captures import Bench, declared_bench, digitize, expose, state_angles, write_capture
 from simulators.blind.undeclared_faults import busy_machine
 
 STATES, PIXELS, NM = 40, 32, 662.0

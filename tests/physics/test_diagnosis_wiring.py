@@ -10,8 +10,7 @@ from processing.diagnosis.instrument.wiring import miswired, miswired_train
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import Sample
-from simulators.blind.suite import state_angles
-from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
+from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, state_angles, write_capture
 
 
 def problem(folder, configs, bench, told, air):

@@ -21,8 +21,7 @@ from processing.storage.products.pixel_mask import Mask
 from processing.storage.products.product import Product
 from processing.yaml_file import dump_yaml
 from simulators.blind.detector_cases import DETECTOR
-from simulators.blind.suite import state_angles
-from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
+from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, state_angles, write_capture
 
 STATES, SIDE = 46, 40
 

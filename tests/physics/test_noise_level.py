@@ -16,8 +16,7 @@ from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.instrument.effects.field_retardance import FieldRetardance
 from processing.storage.captures.schema import Sample
 from simulators.blind.real_bench import Disc
-from simulators.blind.suite import state_angles
-from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
+from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, state_angles, write_capture
 
 SIDE, STATES = 64, 40
 

@@ -13,8 +13,7 @@ from processing.diagnosis.search.space import Sums
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import Sample
-from simulators.blind.suite import state_angles
-from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, write_capture
+from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, state_angles, write_capture
 
 STATES, ROWS, COLUMNS, NOISE = 12, 90, 70, 1e-3
 

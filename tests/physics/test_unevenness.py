@@ -13,8 +13,7 @@ from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import Sample
 from simulators.blind.real_bench import Disc
-from simulators.blind.suite import state_angles
-from simulators.blind.undeclared_captures import Bench, digitize, expose, write_capture
+from simulators.blind.undeclared_captures import Bench, digitize, expose, state_angles, write_capture
 
 STATES = 40
 

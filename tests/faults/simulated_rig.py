@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ruamel.yaml import YAML
 
-DEFAULT = Path(__file__).resolve().parents[1] / "configs" / "rigs" / "simulated.yaml"
+DEFAULT = Path(__file__).resolve().parents[2] / "configs" / "rigs" / "simulated.yaml"
 
 
 def write_rig(path: Path, simulator: Mapping[str, object], **top: object) -> Path:

@@ -1,6 +1,6 @@
 """Hostile and damaged files at every door: how many were refused in words, and what was not.
 
-Run: .venv/bin/python benchmarks/fuzz_doors.py [--door capture] [--seconds 3600 | --inputs 120] [--seed 1] [--jobs 2]
+Run: .venv/bin/python tests/faults/fuzz_doors.py [--door capture] [--seconds 3600 | --inputs 120] [--seed 1] [--jobs 2]
      [--keep DIR]
 
 Each input is read in a process of its own kind, with 1 GiB of memory beside what the program itself has and 5 s of

@@ -12,7 +12,7 @@ from simulators.camera.gige_features import description
 from simulators.camera.node_map import node_map
 from simulators.camera.played.played_camera import PlayedCamera
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 STYLE = ROOT / "tests" / "conformance" / "descriptions" / "in_the_style_of_makers.xml"
 SIZE = (64, 48)
 

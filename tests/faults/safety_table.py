@@ -1,6 +1,6 @@
 """Whether the light goes off: promise x fault x survived, with real faults of disc, `acquire` and guard.
 
-    python benchmarks/safety_table.py [RUNS [SEED [FAULT ...]]]
+    python tests/faults/safety_table.py [RUNS [SEED [FAULT ...]]]
 
 The rig is emulated by this process behind real ports, so that it outlasts the programs that are killed. A run begins
 `acquire`, waits for light, injects one or two faults within two seconds of each other, and measures how long the light

@@ -1,10 +1,10 @@
 """Kills `acquire` before each of its calls that change the disc, and cuts the power at each of them.
 
-    python benchmarks/kill_points.py kill [EVERY [FIRST]]     each (or every n-th) call of a small campaign
-    python benchmarks/kill_points.py error [EVERY [FIRST]]    each call fails with an input/output error instead
-    python benchmarks/kill_points.py power [CUTS]             states of the disc after a power cut, replayed
-    python benchmarks/kill_points.py image [CUTS]             the same on copies of a block device (root, ext4)
-    python benchmarks/kill_points.py night [CAPTURES [CALLS]] a night, killed at random again and again
+    python tests/faults/kill_points.py kill [EVERY [FIRST]]     each (or every n-th) call of a small campaign
+    python tests/faults/kill_points.py error [EVERY [FIRST]]    each call fails with an input/output error instead
+    python tests/faults/kill_points.py power [CUTS]             states of the disc after a power cut, replayed
+    python tests/faults/kill_points.py image [CUTS]             the same on copies of a block device (root, ext4)
+    python tests/faults/kill_points.py night [CAPTURES [CALLS]] a night, killed at random again and again
 
 After each kill the same command goes on. At its end every capture must be complete and equal to that of an undisturbed
 run in all but times and segments, and `acquire verify` must find nothing. Exit code 1 if anything is lost.
@@ -40,7 +40,7 @@ from processing.storage.captures.capture import Capture, CaptureError
 from simulators.disc.power_cut import Disc, read_record
 from simulators.disc.watched import RECORD, DiscCalls, build, restart_watched
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 WORK = Path(tempfile.gettempdir()) / f"umov_kill_points_{os.getuid()}"
 #: Longest time for the points of one run, seconds.
 LIMIT_S = float(os.environ.get("UMOV_LIMIT_S", "inf"))

@@ -1,6 +1,6 @@
 """Cameras and axes that report something false, in whole captures: what is reported where.
 
-Run: .venv/bin/python benchmarks/false_statements.py [EACH] [KIND ...]
+Run: .venv/bin/python tests/faults/false_statements.py [EACH] [KIND ...]
 
 EACH captures (default 25) of each of the 20 kinds, each from a random state on. Counted are captures that ended with
 an error, that took a state again, that have a message in the file, and of which `process reduce` warns. The exit code
