@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from acquisition.errors import AcquisitionError as AcquisitionError
     from acquisition.rig.config import RigConfig as RigConfig
     from acquisition.rig.config import load_rig as load_rig
+    from acquisition.rig.open_rig import open_rig as open_rig
     from acquisition.rig.rig import Rig as Rig
     from acquisition.taking import take_capture as take_capture
     from simulators.bench.bench import SimulatedBench as SimulatedBench
@@ -32,6 +33,7 @@ _PUBLIC = {
     "Campaign": "acquisition.campaign.plan",
     "RigConfig": "acquisition.rig.config",
     "Rig": "acquisition.rig.rig",
+    "open_rig": "acquisition.rig.open_rig",
     "load_rig": "acquisition.rig.config",
     "take_capture": "acquisition.taking",
     "CONFIGS": "acquisition.commands.defaults",

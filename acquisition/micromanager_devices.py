@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from pymmcore_plus.experimental.unicore import ShutterDevice, SimpleCameraDevice, StageDevice
 
 from acquisition.rig.config import load_rig
+from acquisition.rig.open_rig import open_rig
 from acquisition.rig.rig import Rig
 from drivers.errors import DeviceError
 from drivers.source import LightSource
@@ -146,7 +147,7 @@ def rig_in_core(core: Any, rig_file: Path | str, sample: str = "red_sphere", hom
         loaded.append(label)
         core.initializeDevice(label)
 
-    with Rig(config) as rig:
+    with open_rig(config) as rig:
         if (home or config.home_at_start) and (missing := rig.unhomed()):
             rig.home(missing)
         rig.show(sample)

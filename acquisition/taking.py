@@ -13,7 +13,7 @@ from acquisition.capture.job import check_with_devices, prepare
 from acquisition.capture.plan import MeasurementPlan
 from acquisition.errors import AcquisitionError
 from acquisition.rig.config import RigConfig
-from acquisition.rig.rig import Rig
+from acquisition.rig.open_rig import open_rig
 from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
 
@@ -41,7 +41,7 @@ def take_capture(
         It was refused, failed or was stopped; the message names what is left to go on with.
     """
     job = prepare(plan, rig)
-    with StopRequest() as stop, Rig(rig) as devices:
+    with StopRequest() as stop, open_rig(rig) as devices:
         refuse_failed(check_with_devices(job, devices, Path(folder)))
         with free_name(Path(folder) / default_name(plan)) as path:
             result = session.take(job, devices, path, stop, observers, home=home)

@@ -24,6 +24,7 @@ from acquisition.bluesky_devices.capture_device import CaptureDevice
 from acquisition.bluesky_devices.settings import InterlockDevice, SettingDevice
 from acquisition.capture.plan import ARM, MeasurementPlan
 from acquisition.rig.config import load_rig
+from acquisition.rig.open_rig import open_rig
 from acquisition.rig.rig import Rig
 
 
@@ -59,7 +60,7 @@ def open_bench(rig_file: Path | str, home: bool = False) -> Iterator[Bench]:
     home : home axes without a reference now; nothing homes unless asked here or by the rig file.
     """
     config = load_rig(rig_file)
-    with Rig(config) as rig:
+    with open_rig(config) as rig:
         if (home or config.home_at_start) and (missing := rig.unhomed()):
             rig.home(missing)
         bench = Bench(rig, home)

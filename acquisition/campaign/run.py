@@ -28,6 +28,7 @@ from acquisition.rig.continuous_rotation import states_deg, unwound
 from acquisition.rig.folded_angles import folded
 from acquisition.rig.guarded import GUARD_LOG
 from acquisition.rig.interlocks import LOOK_S
+from acquisition.rig.open_rig import open_rig
 from acquisition.rig.rig import Rig
 from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
@@ -246,7 +247,7 @@ class CampaignRun:
 
     def _open_rig(self) -> Rig:
         if self._rig is None:
-            rig = Rig(self.config, ask=self.operator.confirm)
+            rig = open_rig(self.config, ask=self.operator.confirm)
             rig.__enter__()
             self._rig = rig
             # A device may have been changed between two tries.

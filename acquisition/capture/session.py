@@ -30,7 +30,6 @@ from acquisition.screen.observer import Mosaic, Observer
 from acquisition.stop_request import StopRequest
 from processing.arrays import Array
 from processing.instrument.applied_effects import changes_at
-from processing.instrument.model import InstrumentModel
 from processing.reduction.lit_darks import LitDarks, seen_so_far
 from processing.storage.captures.capture import Capture
 from processing.storage.captures.schema import Status
@@ -127,25 +126,15 @@ def _earlier(
 
 
 def place_sample(job: Job, rig: Rig) -> None:
-    """On a simulated rig, do what the operator does: sample, optics and filter."""
-    simulation, config = rig.simulation, job.rig.simulator
-    if simulation is None or config is None:
-        return
-    truth = config.truth.get(job.plan.mode)
-    instrument = InstrumentModel.load(truth) if truth else job.instrument
+    """Have the sample, the optics and the filter of the plan in place."""
     plan = job.plan
-    omega_deg = plan.omega_deg if ARM in job.rig.axes else None
-    simulation.prepare(plan.sample.name or plan.sample.kind, instrument, plan.wavelength_nm, omega_deg)
-
-
-class Announcer(Observer):
-    """Tells the simulated bench to which state the next exposure belongs."""
-
-    def __init__(self, announce: Callable[[int, int], None]) -> None:
-        self._announce = announce
-
-    def exposing(self, state: int, retake: int) -> None:
-        self._announce(state, retake)
+    rig.show(
+        plan.sample.name or plan.sample.kind,
+        plan.wavelength_nm,
+        mode=plan.mode,
+        instrument=job.instrument,
+        omega_deg=plan.omega_deg if ARM in job.rig.axes else None,
+    )
 
 
 def _run(
@@ -157,9 +146,7 @@ def _run(
     observers: Sequence[Observer],
     earlier: Earlier | None,
 ) -> Result:
-    watchers = list(observers)
-    if rig.simulation is not None:
-        watchers.append(Announcer(rig.simulation.announce))
+    watchers = [*observers, *rig.observers()]
     auto = job.plan.exposure_s
     first = pending[0] if pending else 0
     runner = CaptureRunner(

@@ -65,12 +65,12 @@ def home(
     """Home axes, one after another. They turn to their reference switches: look that the way is free."""
     from rich.console import Console
 
-    from acquisition.rig.rig import Rig
+    from acquisition.rig.open_rig import open_rig
     from acquisition.stop_request import StopRequest
 
     config = _load(rig)
     _known(config, axes or [])
-    with StopRequest(patience=1), Rig(config, with_camera=False) as live:
+    with StopRequest(patience=1), open_rig(config, with_camera=False) as live:
         unhomed = live.unhomed()
         names = [name for name in live.homing_order() if name in (axes or unhomed)]
         if not names:
@@ -106,12 +106,16 @@ def move(
     """Move one axis to an absolute angle."""
     from rich.console import Console
 
-    from acquisition.rig.rig import Rig
+    from acquisition.rig.open_rig import open_rig
     from acquisition.stop_request import StopRequest
 
     config = _load(rig)
     _known(config, [axis])
-    with StopRequest(patience=1), Rig(config, with_camera=False) as live, Console(stderr=True).status("") as status:
+    with (
+        StopRequest(patience=1),
+        open_rig(config, with_camera=False) as live,
+        Console(stderr=True).status("") as status,
+    ):
         live.axes[axis].check(degrees)
         if (home_first or config.home_at_start) and axis in live.unhomed():
             status.update(f"homing {axis}; Ctrl-C stops it")

@@ -25,8 +25,8 @@ from acquisition.commands.defaults import DEFAULT_RIG, INTERRUPTED
 from acquisition.commands.single import Options, given_rig, live_page, say_simulated, seeded, show_checks
 from acquisition.disc import disc_process, on_disc
 from acquisition.errors import AcquisitionError
+from acquisition.rig.open_rig import open_rig
 from acquisition.rig.own_rigs import is_own_rig, note_campaign
-from acquisition.rig.rig import Rig
 from acquisition.screen.notify import notifying
 from acquisition.screen.observer import Observer
 from acquisition.screen.progress import ConsoleProgress
@@ -54,7 +54,7 @@ def _run(options: Options, file: Path, stop: StopRequest, observers: Sequence[Ob
     identity = campaign_identity(campaign, jobs, rig_config, rig_file.resolve())
     folder = folder_for(options.out / campaign.name, identity, options.as_new)
     say_simulated(console, rig_config)
-    with Rig(rig_config) as rig, console.status(f"checking {len(jobs)} captures"):
+    with open_rig(rig_config) as rig, console.status(f"checking {len(jobs)} captures"):
         identity = with_devices(identity, rig)
         require_same_campaign(folder, identity)
         planned, checks = campaign_run.check_all(jobs, rig, folder)

@@ -15,6 +15,7 @@ from acquisition.capture.machine_checks import check_machine
 from acquisition.cleanup import run_all
 from acquisition.errors import AcquisitionError
 from acquisition.rig.config import RigConfig
+from acquisition.rig.open_rig import open_rig
 from acquisition.rig.rig import Rig
 from drivers.camera import Camera, CameraIdentity, CameraSettings
 from drivers.errors import DeviceError, FrameLost
@@ -57,9 +58,9 @@ def examine(config: RigConfig, folder: Path, frames: int = FRAMES) -> Iterator[F
         yield _guarded(f"mode {name}", lambda mode=mode: _instrument(mode.instrument))  # type: ignore[misc]
     for check in check_machine(config, config.simulator.samples if config.simulator else ()):
         yield Finding(check.what, check.passed, check.found)
-    rig = Rig(config)
+    rig = open_rig(config)
     try:
-        yield _guarded("emulators", rig.start_simulation) if config.simulator else Finding("rig", None, config.name)
+        yield _guarded("emulators", rig.start) if config.simulator else Finding("rig", None, config.name)
         for name in config.axes:
             yield _guarded(f"axis {name}", lambda name=name: _axis(rig.open_axis(name)))  # type: ignore[misc]
         if config.source is not None:

@@ -32,8 +32,8 @@ from acquisition.disc import disc_process, on_disc
 from acquisition.errors import AcquisitionError
 from acquisition.rig.config import RigConfig, load_rig
 from acquisition.rig.guarded import GUARD_LOG
+from acquisition.rig.open_rig import open_rig
 from acquisition.rig.own_rigs import note_rig, own_rigs
-from acquisition.rig.rig import Rig
 from acquisition.screen.notify import notifying
 from acquisition.screen.observer import Observer
 from acquisition.screen.progress import ConsoleProgress
@@ -90,7 +90,7 @@ def _run(options: Options, stop: StopRequest) -> int:
     sample = job.plan.sample.name or job.plan.sample.kind
     say_simulated(console, job.rig)
     operator = Operator(partial(say, console), stop, options.yes, job.rig.simulated)
-    with Rig(job.rig, ask=operator.confirm) as rig:
+    with open_rig(job.rig, ask=operator.confirm) as rig:
         checks = [*check_machine(job.rig, [sample]), *check_with_devices(job, rig, path.parent)]
         if options.dry_run:
             show_checks(Console(), (*job.checks, *checks))

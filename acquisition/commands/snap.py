@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from acquisition.errors import AcquisitionError
 from acquisition.rig.config import RigConfig
-from acquisition.rig.rig import Rig
+from acquisition.rig.open_rig import open_rig
 from drivers.camera import CameraSettings
 from processing.doors import require_folder
 from processing.yaml_file import ConfigError
@@ -46,7 +46,7 @@ def take_frame(
     require_folder(out)
     if config.simulated:
         out = out.with_name(f"{out.stem}.simulated{out.suffix}")
-    with Rig(config, ask=typer.confirm) as rig:
+    with open_rig(config, ask=typer.confirm) as rig:
         rig.show(sample, wavelength_nm)
         before = rig.source.is_on() if rig.source is not None else None
         camera = rig.require_camera()

@@ -7,7 +7,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -16,10 +16,11 @@ from typing import Any, Self
 from acquisition.cleanup import Step, run_all
 from acquisition.errors import AcquisitionError
 from acquisition.rig.alarms import ACKNOWLEDGE
-from acquisition.rig.config import RigConfig, clock_of, has_own_emulators
+from acquisition.rig.config import RigConfig, clock_of
 from acquisition.rig.guard import TRY_S
 from acquisition.rig.guarded import BEAT_S, Guarding, WatchedSource
 from acquisition.rig.joint_axes import JointAxes
+from acquisition.screen.observer import Observer
 from drivers.camera import Camera, CameraSettings
 from drivers.errors import DeviceError
 from drivers.motion import MotionAxis
@@ -27,8 +28,6 @@ from drivers.registry import open_axis, open_camera, open_source
 from drivers.serial_link import LineRegistry
 from drivers.sources.manual import Ask, ManualSource
 from processing.instrument.model import InstrumentModel
-from simulators.rig.model import SCHEME
-from simulators.rig.rig import SimulatedRig
 
 log = logging.getLogger(__name__)
 
@@ -52,9 +51,8 @@ class Rig(JointAxes):
     axes : dict of name to MotionAxis
     camera : Camera or None where it was not asked for
     source : LightSource or None where the rig has none
-    simulation : SimulatedRig or None
     clock : Clock
-        What every wait and deadline is counted by: real time, or with emulators the patient clock that they keep.
+        What every wait and deadline is counted by.
 
     Parameters
     ----------
@@ -72,7 +70,7 @@ class Rig(JointAxes):
         super().__init__(config, clock_of(config))
         self.camera: Camera | None = None
         self.source: WatchedSource | None = None
-        self.simulation: SimulatedRig | None = None
+        self._camera_entry = config.camera
         self._asked: CameraSettings | None = None
         self._read_back = CameraSettings()
         self._with_camera = with_camera
@@ -101,8 +99,7 @@ class Rig(JointAxes):
             error.add_note(f"closing the rig failed too: {failure}")
 
     def _open(self) -> None:
-        if self.config.simulator is not None:
-            self.start_simulation()
+        self.start()
         for name in self.config.axes:
             with _said_of(f"axis {name}"):
                 self.open_axis(name)
@@ -112,33 +109,36 @@ class Rig(JointAxes):
         if self._with_camera:
             self.open_camera()
 
-    def start_simulation(self) -> str:
-        """Start the emulators of a simulated rig; returns what was started."""
-        if self.config.simulator is None:
-            raise AcquisitionError(f"rig {self.config.name!r} has no `simulator` section")
-        self.simulation = SimulatedRig(self.config.simulator, with_camera=self._with_camera)
-        self.simulation.start()
-        return ", ".join(self.config.simulator.ports)
+    def start(self) -> str:
+        """Start what the devices need before they are opened; says what was started."""
+        return self.config.name
 
-    def show(self, sample: str, wavelength_nm: float | None = None) -> None:
-        """On a simulated rig, put a sample before the optics of the first mode, as they truly are.
+    def show(
+        self,
+        sample: str,
+        wavelength_nm: float | None = None,
+        *,
+        mode: str | None = None,
+        instrument: InstrumentModel | None = None,
+        omega_deg: float | None = None,
+    ) -> None:
+        """Place a sample before the optics and set the filter. On a real rig the operator does this.
 
         Parameters
         ----------
         wavelength_nm : of the light; None: the first of the rig.
+        mode : mode of the rig file; None: the first.
+        instrument : as declared; None: that of the mode.
+        omega_deg : angle of the arm that comes next, if it is known.
         """
-        if self.simulation is None or self.config.simulator is None:
-            return
-        mode, declared = next(iter(self.config.modes.items()))
-        model = InstrumentModel.load(self.config.simulator.truth.get(mode, declared.instrument))
-        self.simulation.prepare(sample, model, wavelength_nm or self.config.wavelengths_nm[0])
+
+    def observers(self) -> Sequence[Observer]:
+        """Observers that a run on this rig needs in addition to its own."""
+        return ()
 
     def open_axis(self, name: str) -> MotionAxis:
         """Open one axis of the rig file; moves nothing."""
-        entry = self._at_port(self.config.axes[name])
-        if self.simulation is not None:
-            self.simulation.connect(name, entry.direction, entry.zero_deg)
-        self.axes[name] = open_axis(name, entry, self._lines)
+        self.axes[name] = open_axis(name, self._at_port(self.config.axes[name]), self._lines)
         return self.axes[name]
 
     def open_source(self) -> WatchedSource:
@@ -149,47 +149,31 @@ class Rig(JointAxes):
         source = open_source(entry, self._lines)
         if isinstance(source, ManualSource):
             source.ask = self._ask
-            if self.simulation is not None:
-                self.simulation.uncovered = source.is_on
         self.source = WatchedSource(source, self._require_guard)
         return self.source
 
     def open_camera(self) -> Camera:
         """Open the camera; exposes nothing."""
-        entry = self.config.camera
-        if self.simulation is not None:
-            entry = entry.model_copy(update={"device": self.simulation.camera_device()})
-        camera = open_camera("camera", entry, self.clock)
+        camera = open_camera("camera", self._camera_entry, self.clock)
         self.camera = camera
         return camera
 
     def _at_port(self, entry: Any) -> Any:
-        # What is switched by hand has no port.
-        if not getattr(entry, "port", "").startswith(SCHEME):
-            return entry
-        if self.simulation is None:
-            raise AcquisitionError(
-                f"port {entry.port!r} is an emulator, but the rig file has no `simulator` section. "
-                "Give the device path."
-            )
-        changes = {"port": self.simulation.port(entry.port.removeprefix(SCHEME))}
-        # A filter wheel's shutter has a port of its own.
-        if getattr(entry, "shutter", None) is not None:
-            changes["shutter"] = self._at_port(entry.shutter)
-        return entry.model_copy(update=changes)
+        """The entry of a device, with the port that it has now."""
+        return entry
 
     # --- the guard ---------------------------------------------------------------------------------------
 
     def start_guard(self, journal: Path | None = None) -> None:
         """Have the rig watched from outside, if that is not done yet.
 
-        Emulators that end with this process need no guard. Without this call the guard begins with the first light.
+        Without this call the guard begins with the first light.
 
         Parameters
         ----------
         journal : the file that the guard appends to, or None.
         """
-        if self._guarding is None and not has_own_emulators(self.config):
+        if self._guarding is None:
             self._guarding = Guarding(
                 self.config, journal, self._lines.descriptors(), self._shut_at_once, self._guard_says
             )
@@ -287,8 +271,8 @@ class Rig(JointAxes):
 
     @property
     def time_scale(self) -> float:
-        """Seconds of the devices for one second here: the emulators' clock may run fast."""
-        return 1.0 if self.simulation is None else self.simulation.clock.speed
+        """Seconds of the devices for one second here."""
+        return 1.0
 
     # --- the rest ----------------------------------------------------------------------------------------
 
@@ -334,13 +318,13 @@ class Rig(JointAxes):
         ----------
         will_retry : this program opens the rig again and tries itself what did not obey.
         """
+        return run_all(self._steps_of_closing(will_retry=will_retry))
+
+    def _steps_of_closing(self, *, will_retry: bool) -> list[Step]:
         steps: list[Step] = [("end the guard", partial(self._end_guard, will_retry))]
         if self.camera is not None:
             steps.append(("close the camera", self.camera.close))
         if self.source is not None:
             steps.append(("close the source", self.source.close))
         steps += [(f"close axis {name}", axis.close) for name, axis in self.axes.items()]
-        steps.append(("close the ports", self._lines.close))
-        if self.simulation is not None:
-            steps.append(("end the emulators", self.simulation.stop))
-        return run_all(steps)
+        return [*steps, ("close the ports", self._lines.close)]

@@ -5,7 +5,7 @@ import pytest
 from acquisition.commands import init
 from acquisition.commands.init import FoundPort, rig_text
 from acquisition.rig.config import load_rig
-from acquisition.rig.rig import Rig
+from acquisition.rig.open_rig import open_rig
 from processing.errors import ProcessError
 
 CAMERA = {"id": "x", "vendor": "Allied", "model": "Manta", "serial_number": "50-01", "address": "10.0.0.5"}
@@ -32,7 +32,7 @@ def test_what_was_found_is_in_the_file_and_the_file_loads(tmp_path):
 
 def test_a_camera_of_the_network_is_found_and_nothing_is_replaced(small_rig, acquire, tmp_path):
     out = tmp_path / "new.yaml"
-    with Rig(load_rig(small_rig())):
+    with open_rig(load_rig(small_rig())):
         code, told, err = acquire("init", "--out", out)
     assert code == 0, err
     assert "1 camera(s)" in told

@@ -10,7 +10,7 @@ import time
 import pytest
 
 from acquisition.rig.config import load_rig
-from acquisition.rig.rig import Rig
+from acquisition.rig.open_rig import open_rig
 from processing.storage.captures.capture import Capture
 from simulators.rig.served_rig import serve
 from tests.rig_files import change_yaml
@@ -100,7 +100,7 @@ def test_a_move_that_nobody_waits_for_is_stopped_where_it_can_be(acquire, small_
         clock_speed=1, ports=ports, axes={"psg": {"port": "rotators"}, "psa": {"port": "mount"}},
     )  # fmt: skip
     with serve(behind, tmp_path / "served.yaml", "red_sphere") as simulation:
-        with Rig(load_rig(tmp_path / "served.yaml"), with_camera=False) as rig:
+        with open_rig(load_rig(tmp_path / "served.yaml"), with_camera=False) as rig:
             rig.start_moves({"psg": FAR_DEG, "psa": 300.0})
         assert _moving(simulation)
         code, out, err = acquire("stop", "--rig", tmp_path / "served.yaml")

@@ -5,6 +5,7 @@ import subprocess
 import pytest
 
 from acquisition.rig.config import load_rig
+from acquisition.rig.open_rig import open_rig
 from acquisition.rig.rig import Rig
 from drivers.errors import CameraError
 from simulators.camera.loopback_address import loopback_addresses
@@ -31,7 +32,7 @@ def _frame(rig: Rig, exposure_s: float):
 
 def test_two_simulated_rigs_measure_at_once(small_rig, second_address):
     configs = [load_rig(small_rig(f"{k}.yaml", seed=k, rows=24 + 8 * k, columns=32)) for k in (0, 1)]
-    with Rig(configs[0]) as one, Rig(configs[1]) as other:
+    with open_rig(configs[0]) as one, open_rig(configs[1]) as other:
         shapes = [_frame(rig, 0.002).shape for rig in (one, other, one)]
     assert shapes == [(24, 32), (32, 32), (24, 32)]
 
@@ -40,5 +41,5 @@ def test_without_a_free_address_it_says_how_to_get_one(small_rig):
     config = load_rig(small_rig(camera_wait_s=0.2))
     if len(loopback_addresses()) > 1:
         pytest.skip("this machine has more than one")
-    with Rig(config), pytest.raises(CameraError, match=r"ip addr add 127\.0\.0\.2/8 dev lo"), Rig(config):
+    with open_rig(config), pytest.raises(CameraError, match=r"ip addr add 127\.0\.0\.2/8 dev lo"), open_rig(config):
         pass

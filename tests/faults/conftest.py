@@ -147,7 +147,7 @@ def run_with(quick_rig: Callable[..., Path], tmp_path: Path) -> Callable[..., tu
     from acquisition.disc import disc_process
     from acquisition.errors import AcquisitionError
     from acquisition.rig.config import load_rig
-    from acquisition.rig.rig import Rig
+    from acquisition.rig.open_rig import open_rig
     from acquisition.screen.observer import Observer
     from acquisition.stop_request import StopRequest
     from drivers.errors import DeviceError
@@ -166,7 +166,7 @@ def run_with(quick_rig: Callable[..., Path], tmp_path: Path) -> Callable[..., tu
         job = prepare(MeasurementPlan().with_changes(**(plan or {})), config)
         folder = tmp_path / f"capture{next(numbers)}" if resume is None else resume.parent
         error: BaseException | None = None
-        with disc_process(), Rig(config) as rig:
+        with disc_process(), open_rig(config) as rig:
 
             class Act(Observer):
                 def exposing(self, state: int, retake: int) -> None:

@@ -26,6 +26,7 @@ from acquisition.capture.job import check_with_devices, prepare
 from acquisition.capture.plan import MeasurementPlan
 from acquisition.errors import AcquisitionError
 from acquisition.rig.config import load_rig
+from acquisition.rig.open_rig import open_rig
 from acquisition.rig.rig import Rig
 from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
@@ -169,7 +170,7 @@ def take(kind: str, seed: int, folder: Path) -> tuple[bool, bool, bool, bool]:
     plan = MeasurementPlan().with_changes(sample={"name": sample}, darks=DARKS, exposure_s=draw.choice([0.01, 0.02]))
     job, path = prepare(plan, config), folder / "run.h5"
     error = None
-    with Rig(config) as rig:
+    with open_rig(config) as rig:
         false = _False(rig, kind, draw.randint(DARKS + 2, DARKS + STATES - 3))
         try:
             check_with_devices(job, rig, folder)

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from acquisition.rig.config import load_rig
-from acquisition.rig.rig import Rig
+from acquisition.rig.open_rig import open_rig
 from processing.storage.captures.capture import Capture
 from simulators.rig.served_rig import serve
 
@@ -119,13 +119,13 @@ def test_a_wire_log_on_a_disc_that_hangs_holds_up_no_light(small_rig, tmp_path):
     small_rig("rig.yaml", top={"settle_s": 0.0})
     with serve(tmp_path / "rig.yaml", tmp_path / "served.yaml", "red_sphere") as simulation:
         config = load_rig(tmp_path / "served.yaml").model_copy(update={"wire_log": tmp_path / "wire"})
-        with Rig(config, with_camera=False):
+        with open_rig(config, with_camera=False):
             pass
         for log in (tmp_path / "wire").iterdir():
             log.unlink()
             os.mkfifo(log)
         readers = [os.open(log, os.O_RDWR) for log in (tmp_path / "wire").iterdir()]
-        with Rig(config, with_camera=False) as rig:
+        with open_rig(config, with_camera=False) as rig:
             rig.source.set_light(True)
             for _ in range(500):
                 rig.source.is_on()

@@ -15,8 +15,8 @@ from acquisition.capture.writer import mark_not_taken
 from acquisition.errors import AcquisitionError, PlanRefused
 from acquisition.rig.config import load_rig
 from acquisition.rig.forbidden_poses import find_forbidden
+from acquisition.rig.open_rig import open_rig
 from acquisition.rig.parts import ForbiddenPose
-from acquisition.rig.rig import Rig
 from acquisition.screen.observer import Observer
 from acquisition.stop_request import StopRequest
 from drivers.axis_types import Limits
@@ -65,7 +65,7 @@ def test_random_moves_over_several_turns_enter_no_forbidden_place(rig_with, runs
     for seed in range(max(2, runs)):
         draw = random.Random(seed)
         boxes = [random_pose(draw) for _ in range(draw.randint(1, 3))]
-        with Rig(rig_with(*boxes, endless=draw.choice([[], ["psg", "psa"]])), with_camera=False) as rig:
+        with open_rig(rig_with(*boxes, endless=draw.choice([[], ["psg", "psa"]])), with_camera=False) as rig:
             rig.home(rig.unhomed())
             steps = watch(rig)
             for _ in range(MOVES):
@@ -119,7 +119,7 @@ def test_out_of_a_box_of_two_axes_one_of_them_moves():
 
 
 def test_a_move_by_hand_is_refused_in_every_turn(rig_with):
-    with Rig(rig_with(pose(psg=[80, 100])), with_camera=False) as rig:
+    with open_rig(rig_with(pose(psg=[80, 100])), with_camera=False) as rig:
         rig.home(rig.unhomed())
         for target in (90, -265, 450, -630, 5000 * 360 - 270):
             with pytest.raises((AcquisitionError, DeviceError), match=r"forbidden|limits"):
@@ -151,7 +151,7 @@ def test_an_endless_axis_unwinds_where_the_way_ahead_is_forbidden(rig_with, tmp_
     """What passes the dry run of a campaign passes its second capture too."""
     config = rig_with(pose(psg=[340, 350]), endless=["psg", "psa"])
     turn = [float(angle) for angle in range(0, 331, 22)]
-    with Rig(config) as rig:
+    with open_rig(config) as rig:
         for number in range(3):
             job = prepare(plan_of({"psg": turn, "psa": turn}), config)
             refuse_failed(check_with_devices(job, rig, tmp_path))
@@ -169,7 +169,7 @@ def test_the_dry_run_looks_at_the_way_between_captures(rig_with, tmp_path, endle
     for number, psg in enumerate((0.0, second)):
         plan = plan_of({"psg": [psg, psg + 5.0]})
         jobs.append((CampaignCapture(number=number, name=f"{number}.h5", plan=plan), prepare(plan, config)))
-    with Rig(config) as rig:
+    with open_rig(config) as rig:
         _, checks = check_all(jobs, rig, tmp_path)
         assert [check.what for check in checks if not check.passed] == ([] if passes else ["first move"])
         if passes:
@@ -197,7 +197,7 @@ def test_resume_goes_to_the_first_missing_state_by_an_allowed_way(rig_with, tmp_
             if report.state == stopped_at:
                 stop.request()
 
-    with Rig(config) as rig:
+    with open_rig(config) as rig:
         refuse_failed(check_with_devices(job, rig, tmp_path))
         session.take(job, rig, tmp_path / "run.h5", stop, [StopThere()])
         steps = watch(rig)
@@ -213,7 +213,7 @@ def test_states_missing_here_and_there_are_reached_round_the_box(rig_with, tmp_p
     """After `acquire repair` the states to take are not neighbours."""
     config = rig_with(BLOCK, endless=[])
     job = prepare(plan_of(AROUND), config)
-    with Rig(config) as rig:
+    with open_rig(config) as rig:
         refuse_failed(check_with_devices(job, rig, tmp_path))
         session.take(job, rig, tmp_path / "run.h5", StopRequest())
         partial = mark_not_taken(tmp_path / "run.h5", [1, 8])

@@ -12,7 +12,7 @@ from acquisition.rig import alarms
 from acquisition.rig.config import load_rig
 from acquisition.rig.guard import Guard, with_held_ports
 from acquisition.rig.journal import Journal
-from acquisition.rig.rig import Rig
+from acquisition.rig.open_rig import open_rig
 from processing.storage.captures.capture import Capture
 from processing.yaml_file import dump_yaml
 from simulators.rig.served_rig import serve
@@ -80,10 +80,10 @@ def test_killed_or_frozen_the_light_is_shut_and_the_axes_stop(kind, spawn, parti
 
 
 @pytest.fixture
-def open_rig(served):
+def watched_rig(served):
     """The served rig, open in this process, with a guard that watches it."""
     simulation, rig, told = served
-    with Rig(load_rig(rig), with_camera=False) as live:
+    with open_rig(load_rig(rig), with_camera=False) as live:
         live.start_guard(rig.parent / "guard.jsonl")
         yield live, simulation, told
 
@@ -92,8 +92,8 @@ def _guard_of(rig):
     return rig._guarding._guard.pid
 
 
-def test_no_light_before_a_guard_watches_and_the_light_goes_off_with_the_guard(open_rig):
-    rig, simulation, _ = open_rig
+def test_no_light_before_a_guard_watches_and_the_light_goes_off_with_the_guard(watched_rig):
+    rig, simulation, _ = watched_rig
     rig.source.set_light(True)
     assert "guard watches" in (served_journal := Path(rig._guarding._journal)).read_text(), served_journal
     assert _lit(simulation)
@@ -158,9 +158,9 @@ def test_a_light_that_acquire_cannot_shut_is_shut_by_the_guard(spawn, partial_of
     _until(lambda: "alarm acknowledged" in (tmp_path / "out" / "guard.jsonl").read_text())
 
 
-def test_a_guard_writes_to_a_port_that_somebody_holds(open_rig):
+def test_a_guard_writes_to_a_port_that_somebody_holds(watched_rig):
     """What dies slowly, or waits in the kernel, holds its ports: the guard has them already."""
-    rig, simulation, _ = open_rig
+    rig, simulation, _ = watched_rig
     rig.source.set_light(True)
     held = with_held_ports(rig.config, rig._lines.descriptors())
     assert Guard(held, os.getpid(), Journal(None))._try_light() is None

@@ -12,15 +12,15 @@ from acquisition.capture.plan import MeasurementPlan
 from acquisition.errors import PlanRefused
 from acquisition.rig.config import load_rig
 from acquisition.rig.forbidden_poses import find_forbidden
+from acquisition.rig.open_rig import open_rig
 from acquisition.rig.parts import ForbiddenPose
-from acquisition.rig.rig import Rig
 from drivers.errors import LimitError
 
 LOW, HIGH = -90.0, 400.0
 
 
 @pytest.fixture
-def open_rig(small_rig):
+def limited_rig(small_rig):
     """A homed rig whose generator axis has limits, with one forbidden box of two axes."""
     path = small_rig(
         top={
@@ -32,7 +32,7 @@ def open_rig(small_rig):
         }
     )
     path.write_text(path.read_text().replace("address: 1}", f"address: 1, limits_deg: [{LOW}, {HIGH}]}}", 1))
-    with Rig(load_rig(path), with_camera=False) as rig:
+    with open_rig(load_rig(path), with_camera=False) as rig:
         rig.home(rig.unhomed())
         rig.move({"arm": 90.0})
         yield rig
@@ -46,8 +46,8 @@ angle = st.one_of(
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(omega=angle, psg=st.lists(angle, min_size=1, max_size=6))
-def test_random_plans_are_refused_as_a_whole_or_wholly_allowed(open_rig, omega, psg):
-    rig = open_rig
+def test_random_plans_are_refused_as_a_whole_or_wholly_allowed(limited_rig, omega, psg):
+    rig = limited_rig
     before = rig.simulation.true_angles_deg()
     # The state table's rank is another matter: a Stokes plan has none.
     plan = MeasurementPlan().with_changes(
@@ -76,7 +76,7 @@ def test_random_plans_are_refused_as_a_whole_or_wholly_allowed(open_rig, omega, 
     assert rig.simulation.true_angles_deg() == before
 
 
-def test_a_target_just_outside_is_refused_not_clipped(open_rig):
+def test_a_target_just_outside_is_refused_not_clipped(limited_rig):
     for axis, target in (
         ("psg", HIGH + 0.01),
         ("psg", LOW - 0.01),
@@ -84,10 +84,10 @@ def test_a_target_just_outside_is_refused_not_clipped(open_rig):
         ("psg", math.nan),
         ("arm", math.inf),
     ):
-        before = open_rig.simulation.true_angles_deg()
+        before = limited_rig.simulation.true_angles_deg()
         with pytest.raises(LimitError):
-            open_rig.move({axis: target})
-        assert open_rig.simulation.true_angles_deg() == before
+            limited_rig.move({axis: target})
+        assert limited_rig.simulation.true_angles_deg() == before
 
 
 def test_a_box_between_two_poses_is_in_the_way():

@@ -13,7 +13,7 @@ from acquisition.capture.plan import MeasurementPlan
 from acquisition.errors import AcquisitionError, PlanRefused
 from acquisition.rig.clearance import RESOLUTION_MM, find_clash, footprint, gap_mm
 from acquisition.rig.config import load_rig
-from acquisition.rig.rig import Rig
+from acquisition.rig.open_rig import open_rig
 from acquisition.rig.solids import Solids
 from processing.yaml_file import ConfigError
 from tests.rig_files import with_values
@@ -130,7 +130,7 @@ def test_homing_by_hand_looks_where_the_others_stand(small_rig):
     """Allowed in the order of the rig file, where the arm is out of the way by then; refused alone."""
     post = {"why": "cable", "ranges_deg": {"arm": [100, 120], "psg": [200, 250]}}
     path = small_rig(top={"forbidden": [post], "homing": {"arm": {"passes_deg": [-1, 90], "ends_deg": 0}}})
-    with Rig(load_rig(path), with_camera=False) as rig:
+    with open_rig(load_rig(path), with_camera=False) as rig:
         rig.home(rig.homing_order())
         rig.move({"psg": 180.0})
         rig.move({"arm": 110.0})
@@ -214,7 +214,7 @@ def test_no_move_brings_solids_together(small_rig, monkeypatch):
     path = small_rig(top={"solids": {"margin_mm": 10, "parts": [ARM, POST]}, "park_deg": {}, "homing": {
         "arm": {"passes_deg": [-1, 60], "ends_deg": 0}}})  # fmt: skip
     config = load_rig(path)
-    with Rig(config, with_camera=False) as rig:
+    with open_rig(config, with_camera=False) as rig:
         rig.home(rig.unhomed())
         rig.move({"arm": 45.0})
         before = rig.simulation.true_angles_deg()

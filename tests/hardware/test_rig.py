@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from acquisition.rig.config import load_rig
+from acquisition.rig.open_rig import open_rig
 from acquisition.rig.rig import Rig
 from drivers.camera import CameraSettings
 
@@ -23,7 +24,7 @@ def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
     path = request.config.getoption("--rig")
     if path is None:
         pytest.skip("no rig was named with --rig")
-    with Rig(load_rig(Path(path))) as live:
+    with open_rig(load_rig(Path(path))) as live:
         yield live
 
 
