@@ -28,8 +28,9 @@ class LogProcess:
         self._pipe = -1
         if path is not None:
             with contextlib.suppress(OSError):
+                # A link may lead to a file of somebody else.
                 self._process = subprocess.Popen(
-                    ["tee", "-a", str(path)],
+                    ["dd", f"of={path}", "oflag=append,nofollow", "conv=notrunc", "bs=64k", "status=none"],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.DEVNULL,

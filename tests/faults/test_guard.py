@@ -169,14 +169,24 @@ def test_a_guard_writes_to_a_port_that_somebody_holds(watched_rig):
 
 def test_all_that_was_noted_is_in_the_file_when_the_journal_is_closed(tmp_path, monkeypatch):
     """The process that writes may begin late on a busy machine; a guard that has ended has its last line written."""
-    late = tmp_path / "tee"
-    late.write_text('#!/bin/sh\nsleep 0.3\nexec /usr/bin/tee "$@"\n')
+    late = tmp_path / "dd"
+    late.write_text('#!/bin/sh\nsleep 0.3\nexec /usr/bin/dd "$@"\n')
     late.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
     journal = Journal(tmp_path / "guard.jsonl")
     journal.note("guard rests")
     journal.close()
     assert "guard rests" in (tmp_path / "guard.jsonl").read_text()
+
+
+def test_a_link_in_the_place_of_the_journal_is_not_followed(tmp_path):
+    """The folder of the captures may be somebody else's."""
+    (tmp_path / "victim").write_text("precious")
+    (tmp_path / "guard.jsonl").symlink_to("victim")
+    journal = Journal(tmp_path / "guard.jsonl")
+    journal.note("guard watches")
+    journal.close()
+    assert (tmp_path / "victim").read_text() == "precious"
 
 
 def test_acknowledge_is_a_command(acquire, monkeypatch, tmp_path):
