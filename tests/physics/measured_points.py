@@ -76,7 +76,7 @@ class ReflectanceProblem:
     def dominant(self, space: Space, values: Array) -> Array:
         """Dominant process (N, 4, 4) of the model with the effects."""
         changes = ReflectanceChanges()
-        for candidate, part in zip(space.candidates, space.slices, strict=True):
+        for candidate, part in space.pairs:
             if isinstance(candidate.effect, ReflectanceEffect):
                 candidate.effect.bend(changes, "", values[part])
         return changes.dominant(self.geometry, self.index)

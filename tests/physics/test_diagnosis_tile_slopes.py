@@ -34,7 +34,7 @@ def test_sums_over_tiles_are_those_of_every_tile_by_itself(problem, varying):
     space = Space(tuple(sorted(pool, key=lambda c: c.kind != "field_retardance")))
     assert {c.kind for c in space.candidates} == {*KINDS, *KINDS_OF_COUNTS}
     values = 0.3 * space.joined("typical") * np.random.default_rng(5).normal(size=space.size)
-    for candidate, part in list(zip(space.candidates, space.slices, strict=True))[varying:]:
+    for candidate, part in list(space.pairs)[varying:]:
         if candidate.kind == "field_retardance":
             values[part] = 0.0
     sums = problem.sums(space, values)

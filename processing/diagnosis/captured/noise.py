@@ -18,16 +18,10 @@ from processing.diagnosis.captured.capture_data import CaptureData, SharedNoise
 from processing.diagnosis.captured.outliers import NORMAL_MAD, Whitened
 from processing.diagnosis.search.range_of import inside_and_outside, range_of
 from processing.diagnosis.search.rules import (
-    AS_GOOD,
-    CUT_BACK,
     DARK_NOISE_OFF,
-    DIM,
     FEW_ROWS,
-    FEWEST_DIM,
     FEWEST_FREE_FOR_NOISE,
-    LEAST_DARK,
-    LEAST_LIT,
-    LEAST_SCATTER,
+    FEWEST_PIXELS,
     LINES_APART,
     LIT,
     MOSTLY,
@@ -37,6 +31,9 @@ from processing.diagnosis.search.rules import (
     NOISE_OFF_MIXED,
     NOISE_SURE,
     NOT_ALIKE_PX,
+    OUTSTANDING,
+    SHOWN,
+    SMALL,
 )
 from processing.instrument.grammar import TIMES, course
 
@@ -69,7 +66,7 @@ def estimated_noise(data: CaptureData) -> CaptureData:
     rest = y - u[:, :keep] @ (u[:, :keep].T @ y)
     # A row that the components follow closely has less scatter left than its noise.
     share = 1 - np.sum(u[:, :keep] ** 2, axis=1)
-    good = share > LEAST_SCATTER if rows > FEW_ROWS else share > 0.0
+    good = share > SMALL if rows > FEW_ROWS else share > 0.0
     square = rest[good] ** 2 / share[good, None]
     signal = (y - rest)[good]
     # Signals that rounding alone sets apart share a level, or it would hang on the processor's order of sums.
@@ -270,10 +267,10 @@ def black_jitter(data: CaptureData, a: Array) -> tuple[Array, float] | None:
     if not lit.any():
         return None
     lit &= mean > LIT * np.median(mean[lit])
-    dim = np.any(y != 0, axis=0) & (mean < DIM * mean[lit].mean())
+    dim = np.any(y != 0, axis=0) & (mean < SMALL * mean[lit].mean())
     _, outside = inside_and_outside(a[rows])
     free = outside.shape[1]
-    if dim.sum() < FEWEST_DIM or not free:
+    if dim.sum() < FEWEST_PIXELS or not free:
         return None
     level, noise = _dim_levels(y[:, dim], 1 / data.conditions.full_scale)
     if not _alike_in_halves(y[:, dim], mean[dim], outside, 1 / data.conditions.full_scale):
@@ -307,7 +304,7 @@ def _dim_levels(y: NDArray[np.float32], count: float) -> tuple[Array, float]:
     own = y - y.mean(axis=0, dtype=np.float64)
     middle = np.median(own, axis=1, keepdims=True)
     scatter = np.median(np.abs(own - middle), axis=1, keepdims=True) / NORMAL_MAD
-    reach = CUT_BACK * np.maximum(scatter, count / 2)
+    reach = OUTSTANDING * np.maximum(scatter, count / 2)
     kept = np.clip(own, middle - reach, middle + reach)
     rounding = (count / np.pi) ** 2 / 2 * np.exp(-4 * np.pi**2 * spread)
     level = kept.mean(axis=1) + y.mean(dtype=np.float64)
@@ -426,7 +423,7 @@ def noise_factors(found: DetectorNoise, shown: float, estimated: bool) -> tuple[
     white = found.white / shown
     inverse = np.asarray(np.linalg.inv(found.covariance / shown**2), dtype=float)
     if estimated:
-        return _balanced(found, white, max(float(both[1]), LEAST_DARK))
+        return _balanced(found, white, max(float(both[1]), SMALL))
     usual = 1.0, 1.0
     bent = found.bent
     least = NOISE_OFF if shown == 1 else NOISE_OFF_MIXED
@@ -439,9 +436,9 @@ def noise_factors(found: DetectorNoise, shown: float, estimated: bool) -> tuple[
     darks = np.geomspace(LEAST_DARK_FACTOR, MOST_DARK_FACTOR, DARKS)
     read = min(((1.0, d) for d in darks), key=lambda p: _against(both, p, inverse))
     simple = min(gain, read, key=lambda p: _against(both, p, inverse))
-    if _against(both, simple, inverse) < AS_GOOD**2:
+    if _against(both, simple, inverse) < SHOWN**2:
         return float(simple[0]), float(simple[1])
-    return _balanced(found, white, max(float(both[1]), LEAST_DARK))
+    return _balanced(found, white, max(float(both[1]), SMALL))
 
 
 def _against(both: Array, told: tuple[float, float], inverse: Array) -> float:
@@ -458,7 +455,7 @@ def _dark_is_off(found: DetectorNoise, shown: float) -> bool:
 def _balanced(found: DetectorNoise, white: float, dark: float) -> tuple[float, float]:
     """Both factors with the whole as found, which is known best."""
     light = found.light_share
-    shot = (white - dark * (1 - light)) / light if light > LEAST_LIT else 1.0
+    shot = (white - dark * (1 - light)) / light if light > SMALL else 1.0
     return (shot, dark) if shot > 0 else (white, white)
 
 

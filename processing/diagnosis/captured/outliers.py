@@ -25,17 +25,16 @@ from processing.diagnosis.search.rules import (
     BAD_DEVIATIONS,
     BAD_PIXEL,
     BEYOND_NOISE,
-    BRIGHTEST,
-    CUT_BACK,
     DIMMEST,
-    FEWEST_FOR_HITS,
     FEWEST_FREE_FOR_HITS,
+    FEWEST_OF_MANY,
     HIT,
     LEAST_MISFIT,
     MOST_BAD_FRAMES,
     MOST_HITS,
     MOST_STRUCK,
     MOSTLY,
+    OUTSTANDING,
     SIDE_AROUND,
     SUSPECTS_OF_EXCHANGE,
     UNPREDICTED,
@@ -83,7 +82,7 @@ class Whitened:
         outside = self.outside.astype(np.float32)
         r = outside @ (outside.T @ (self.y if clean.all() else self.y[:, clean]))
         scale = robust_scale(r).astype(np.float32)
-        inner = (outside.T @ np.clip(r, -CUT_BACK * scale, CUT_BACK * scale, out=r)).astype(float)
+        inner = (outside.T @ np.clip(r, -OUTSTANDING * scale, OUTSTANDING * scale, out=r)).astype(float)
         value, vector = np.linalg.eigh(inner @ inner.T / inner.shape[1])
         # Largest eigenvalue of noise over the median one (Marchenko and Pastur).
         edge = BEYOND_NOISE * (1 + np.sqrt(len(value) / inner.shape[1])) ** 2
@@ -219,14 +218,14 @@ def outliers_of(data: CaptureData, a: Array) -> Outliers:
     good, keep = data.usable & ~data.clipped, data.row_counts
     hits, bad = np.zeros((rows, good.size), dtype=bool), np.zeros(good.shape, dtype=bool)
     found = Outliers(hits.reshape(data.signal.shape), bad)
-    if good.sum() < FEWEST_FOR_HITS:
+    if good.sum() < FEWEST_OF_MANY:
         return found
     white = Whitened.of(data, a, good)
     if white.outside.shape[1] < FEWEST_FREE_FOR_HITS:
         return found
     # What is struck tells a noise of its own: no state is believed to be far brighter than the usual one of its pixel.
     usual = np.maximum(np.median(white.variance, axis=0), np.float32(DIMMEST))
-    share = np.sqrt(np.clip(white.variance / usual, np.float32(DIMMEST), np.float32(BRIGHTEST)))
+    share = np.sqrt(np.clip(white.variance / usual, np.float32(DIMMEST), np.float32(BAD_PIXEL)))
     clean = np.ones(white.y.shape[1], dtype=bool)
     # Twice: what was struck is no structure of the image.
     for _ in range(2):
@@ -241,7 +240,7 @@ def outliers_of(data: CaptureData, a: Array) -> Outliers:
         t /= size.astype(np.float32) * scale
         struck, noisy = _hits(r, t, noise, rest)
         clean = (np.max(np.abs(t), axis=0) < HIT) & ~struck.any(axis=0)
-        if clean.all() or clean.sum() < FEWEST_FOR_HITS:
+        if clean.all() or clean.sum() < FEWEST_OF_MANY:
             break
     hits[np.ix_(keep, good.reshape(-1))] = struck
     map_of = np.full(good.shape, float(np.median(noisy)))

@@ -17,15 +17,15 @@ from processing.diagnosis.captured.averaged import means, side_for, squares
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.noise import estimated_noise
 from processing.diagnosis.search.rules import (
-    BELOW_WELL,
-    CUT_OFF,
     DARK_RIM,
-    FAINTEST,
     FEW_PIXELS,
-    FEWEST_FOR_SCATTER,
+    FEWEST_PIXELS,
+    LIMIT,
     MANY_VALUES,
     MOST_CUT_OFF,
     MOST_READ,
+    NOISE_SURE,
+    OUTSTANDING,
 )
 from processing.instrument.changes import Conditions, elapsed, elapsed_error
 from processing.instrument.model import InstrumentModel
@@ -132,14 +132,14 @@ def _cuts_off(capture: Capture) -> bool:
     detector = capture.header.detector
     if not capture.integer_counts or detector.gain_e_per_count is None:
         return False
-    return detector.black_level_counts > CUT_OFF * (detector.read_noise_e or 0.0) / detector.gain_e_per_count
+    return detector.black_level_counts > NOISE_SURE * (detector.read_noise_e or 0.0) / detector.gain_e_per_count
 
 
 def _clip_level(capture: Capture, correction: Correction) -> float | None:
     detector, level = capture.header.detector, correction.saturation
     if detector.full_well_e is not None and detector.gain_e_per_count is not None:
         well = detector.black_level_counts + detector.full_well_e / detector.gain_e_per_count
-        spread = BELOW_WELL * (detector.read_noise_e or 0.0) / detector.gain_e_per_count
+        spread = OUTSTANDING * (detector.read_noise_e or 0.0) / detector.gain_e_per_count
         level = well - spread if level is None else min(level, well - spread)
     return level
 
@@ -207,7 +207,7 @@ def read_capture(capture: Capture, model: InstrumentModel) -> CaptureData:
         data = replace(
             data, slope=np.zeros(len(states)), floor=floor, noise_known=True, noise_source="stated per state"
         )
-    if not data.noise_known and data.usable.sum() >= FEWEST_FOR_SCATTER:
+    if not data.noise_known and data.usable.sum() >= FEWEST_PIXELS:
         data = estimated_noise(data)
     return without_dark_pixels(data) if data.noise_known else data
 
@@ -247,10 +247,10 @@ def without_dark_pixels(data: CaptureData) -> CaptureData:
     CaptureError : nothing else is there.
     """
     mean = data.signal.mean(axis=(0, 1), dtype=np.float64)
-    dark = mean < FAINTEST * np.sqrt(np.maximum(data.slope.mean() * mean + data.floor.mean(), 0))
+    dark = mean < LIMIT * np.sqrt(np.maximum(data.slope.mean() * mean + data.floor.mean(), 0))
     if dark.all():
         raise CaptureError(
-            f"{data.name}: no pixel has a mean signal above {FAINTEST:g} standard deviations of its noise. "
+            f"{data.name}: no pixel has a mean signal above {LIMIT:g} standard deviations of its noise. "
             "Expose longer, or look whether the light was on."
         )
     wide = ndimage.binary_dilation(dark, structure=np.ones((3, 3), dtype=bool), iterations=DARK_RIM)

@@ -42,9 +42,9 @@ from processing.diagnosis.search.rules import (
     FAR_OFF,
     LIKELY,
     MOST_RANKED,
-    NOISE_ERROR,
     OPEN,
     SEEN,
+    SMALL,
     SURE,
     TAU,
     TOGETHER,
@@ -124,7 +124,7 @@ def combinations(found: Posterior, solved: Solution) -> tuple[Combination, ...]:
     at: list[int] = []
     names: list[str] = []
     units: list[str] = []
-    for candidate, part in zip(found.space.candidates, found.space.slices, strict=True):
+    for candidate, part in found.space.pairs:
         if candidate in effects and not isinstance(candidate.effect, ValuePerState):
             at += range(part.start, part.stop)
             single = candidate.size == 1
@@ -148,7 +148,7 @@ def combinations(found: Posterior, solved: Solution) -> tuple[Combination, ...]:
 
 def empirical(found: Posterior, solved: Solution) -> Empirical | None:
     """The best of: a gain for each state, an angle for each state, a bend of the response; last linearization."""
-    part = dict(zip(found.space.candidates, found.space.slices, strict=True))
+    part = dict(found.space.pairs)
     plain = [c for c in solved.space.candidates if not isinstance(c.effect, GeneralEffect)]
     beside = np.concatenate([np.zeros(0, dtype=np.int64), *(np.r_[part[c]] for c in plain)]).astype(np.int64)
     before, _ = _excess_of(found, beside)
@@ -217,7 +217,7 @@ def _noise(problem: InstrumentProblem, space: Space, fit: Fit, k: int | None) ->
 def left_without(problem: InstrumentProblem, solved: Solution, effects: Collection[Candidate]) -> HeldOut:
     """What the correction would leave without some of its effects; for each degree of freedom, as after it."""
     values = solved.fit.values.copy()
-    for candidate, part in zip(solved.space.candidates, solved.space.slices, strict=True):
+    for candidate, part in solved.space.pairs:
         if candidate in effects:
             values[part] = 0.0
     sums = problem.sums(solved.space, values, derivatives=False)
@@ -280,7 +280,7 @@ def told_answer(cause: Cause, doubt: str | None) -> tuple[Answer, float]:
 def told_switches(problem: InstrumentProblem, solved: Solution) -> list[FoundEffect]:
     """Pixels that are left out because what they say is another thing than the others say."""
     told = []
-    for candidate, part in zip(solved.space.candidates, solved.space.slices, strict=True):
+    for candidate, part in solved.space.pairs:
         if not isinstance(candidate.effect, Switch):
             continue
         without = left_without(problem, solved, (candidate,))
@@ -318,10 +318,10 @@ def correction(
 ) -> Correction:
     """What an instrument file would hold: means, with the spread over the sets; for these captures alone unless it
     `lasts`. Of it `used` is applied."""
-    part = dict(zip(found.space.candidates, found.space.slices, strict=True))
+    part = dict(found.space.pairs)
     chance = {found.space.candidates[m]: p for g, p in enumerate(found.samples.probability) for m in found.members[g]}
     effects = []
-    for candidate, where in zip(solved.space.candidates, solved.space.slices, strict=True):
+    for candidate, where in solved.space.pairs:
         if candidate in solved.base.candidates or not any_cause:
             continue
         covariance = found.covariance[part[candidate], part[candidate]]
@@ -370,9 +370,9 @@ def _wavelength(problem: InstrumentProblem, candidate: Candidate) -> float | Non
 
 def calibrated(problem: InstrumentProblem, found: Posterior, solved: Solution) -> dict[str, EffectParameter]:
     """Nominal values as fitted: one number, or one for each wavelength where they differ."""
-    part = dict(zip(found.space.candidates, found.space.slices, strict=True))
+    part = dict(found.space.pairs)
     values: dict[str, dict[float, tuple[float, float]]] = {}
-    nominal = {c: p for c, p in zip(solved.base.candidates, solved.base.slices, strict=True) if c.place}
+    nominal = {c: p for c, p in solved.base.pairs if c.place}
     for candidate, where in nominal.items():
         covariance = found.covariance[part[candidate], part[candidate]]
         for one, (fitted,), ((variance,),) in by_wavelength(candidate, solved.fit.values[where], covariance):
@@ -415,7 +415,7 @@ def unobservable(problem: InstrumentProblem, found: Posterior) -> list[Candidate
     """Candidates about which the captures say nothing, the nominal values being free."""
     told, always = information(found)
     out = []
-    for candidate, part in zip(found.space.candidates, found.space.slices, strict=True):
+    for candidate, part in found.space.pairs:
         if candidate.state_chosen or isinstance(candidate.effect, Switch) or np.isin(part.start, always):
             continue
         least = np.full(candidate.size, SEEN)
@@ -423,7 +423,7 @@ def unobservable(problem: InstrumentProblem, found: Posterior) -> list[Candidate
             # Noise alone has slopes too, from one pixel to the next, which a shift would change.
             one = Space((candidate,))
             noise = np.diag(problem.noise_information(one, np.zeros(one.size))) * candidate.typical**2
-            least = np.maximum(least, NOISE_ERROR * noise)
+            least = np.maximum(least, SMALL * noise)
         if np.all(told[part] < least):
             out.append(candidate)
     return out
@@ -465,7 +465,7 @@ def _source_percent(problem: InstrumentProblem, k: int, solved: Solution) -> flo
     """Standard deviation of the level of the source over the states, where channels tell it."""
     if not problem.has_free_level(k):
         return None
-    found = dict(zip(solved.space.candidates, solved.space.slices, strict=True))
+    found = dict(solved.space.pairs)
     own = [p for c, p in found.items() if isinstance(c.effect, SourceLevel) and c.capture == k]
     level = 1 + solved.fit.values[own[0]] if own else None
     if level is None:

@@ -45,7 +45,7 @@ from processing.diagnosis.search.decision import Judgement, beyond_chance, refus
 from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.posterior import Posterior, Say
 from processing.diagnosis.search.result import Diagnosis, FoundEffect, Unexplained
-from processing.diagnosis.search.rules import GROWTH, LIKELY, MOST_TRIED, WHITE
+from processing.diagnosis.search.rules import GROWTH, LIKELY, MOST_TRIED, OUTSTANDING
 from processing.instrument.effects.base import ValuePerState
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture, CaptureError
@@ -119,11 +119,11 @@ def left_of(problem: InstrumentProblem, r: Residual) -> float:
 def white(r: Residual) -> bool:
     """Whether the mean residual of a state tells nothing of that of the next one."""
     mean = r.mean[np.isfinite(r.mean)]
-    if mean.size <= WHITE**2 or not np.any(mean):
+    if mean.size <= OUTSTANDING**2 or not np.any(mean):
         return True
     centred = mean - mean.mean()
     lag = float(centred[1:] @ centred[:-1] / (centred @ centred))
-    return bool(abs(lag) * np.sqrt(mean.size) < WHITE)
+    return bool(abs(lag) * np.sqrt(mean.size) < OUTSTANDING)
 
 
 @dataclass(frozen=True)

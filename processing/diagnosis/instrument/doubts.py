@@ -15,14 +15,14 @@ from processing.diagnosis.search.fit import Solution
 from processing.diagnosis.search.posterior import Posterior
 from processing.diagnosis.search.rules import (
     BOUND,
+    CERTAIN,
     EDGES,
     LIMIT,
+    NOISE_SURE,
     SURE,
     TESTABLE,
     TIMES,
-    UNEVEN,
     UNEVEN_SHARE,
-    UNKNOWN_NOISE,
 )
 from processing.instrument.effects.base import (
     CountsEffect,
@@ -71,7 +71,7 @@ def doubts(
         else:
             general = isinstance(cause.candidates[0].effect, GeneralEffect | PointwiseEffect)
             rest = found.sets.noise.directions if general else 0.0
-            weak = cause.log_odds < max(UNKNOWN_NOISE, TIMES * rest / 2)
+            weak = cause.log_odds < max(CERTAIN, TIMES * rest / 2)
         if cause not in out and weak:
             out[cause] = PART_OF_LEFT
         # What is uneven is another cause, and smaller effects beside it may be parts of it.
@@ -156,14 +156,9 @@ def _at_bound(cause: Cause) -> bool:
     return False
 
 
-def acts_on_unknown(problem: InstrumentProblem, candidate: Candidate) -> bool:
-    """Whether the candidate acts on a capture of an unknown sample."""
-    return any(c.sample is None and candidate.acts(k, c.wavelength_nm) for k, c in enumerate(problem.captures))
-
-
 def _uneven(even: Evenness, solved: Solution, candidate: Candidate, cause: Cause) -> bool:
     """A source, or a train, that changes does so alike in the whole image; what differs from part to part is none."""
     if candidate not in solved.space.candidates or any(isinstance(c.effect, FieldEffect) for c in solved.effects):
         return False
     excess, terms = even.varies(candidate)
-    return bool(excess > max(UNEVEN * np.sqrt(2 * terms), UNEVEN_SHARE * 2 * cause.log_odds))
+    return bool(excess > max(NOISE_SURE * np.sqrt(2 * terms), UNEVEN_SHARE * 2 * cause.log_odds))

@@ -105,7 +105,7 @@ def _of_capture(
 def _without(space: Space, values: Array, candidates: Sequence[Candidate]) -> Array:
     """The values with those of some candidates at zero."""
     out = values.copy()
-    for candidate, part in zip(space.candidates, space.slices, strict=True):
+    for candidate, part in space.pairs:
         if candidate in candidates:
             out[part] = 0.0
     return out

@@ -19,7 +19,7 @@ from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.candidate import Candidate, NominalValue
 from processing.diagnosis.search.fit import Fit, minimize
 from processing.diagnosis.search.posterior import Say
-from processing.diagnosis.search.rules import FAR_DEG, FAR_OFF, LESS_FROM_AFAR, NEAR_DEG, NEAR_ENOUGH, STARTS
+from processing.diagnosis.search.rules import FAR_DEG, FAR_OFF, MOSTLY, NEAR_DEG, NEAR_ENOUGH, STARTS
 from processing.diagnosis.search.space import Space
 from processing.instrument.effects.base import ChannelLevels, SourceEffect, ValuePerState
 from processing.instrument.elements import number
@@ -146,7 +146,7 @@ def _distance(values: Values, places: Collection[str]) -> float:
 
 def _excess(problem: InstrumentProblem, values: Values) -> float:
     space = Space(tuple(values))
-    sums = problem.sums(space, np.concatenate([np.zeros(0), *values.values()]), derivatives=False)
+    sums = problem.sums(space, space.vector(values), derivatives=False)
     return float(sums.excess.sum() + sums.freedom.sum())
 
 
@@ -160,16 +160,16 @@ def first_values(problem: InstrumentProblem, base: Space, pool: Sequence[Candida
     several = base.size and len(set(problem.wavelengths_nm)) > 1
     # Curves over the wavelengths have more valleys than the values at one of them.
     if fit.rms < (NEAR_ENOUGH if several else FAR_OFF):
-        return _by_candidate(base, fit.values)
+        return base.split(fit.values)
     say("far off: searching from many starts")
     if not any(isinstance(c.effect, NominalValue) for c in base.candidates):
         return _far(problem, pool, base, fit)
     if not several:
         return _searched(problem, base, pool, fit)
     found = along_wavelengths(problem, base, say)
-    space, values = Space(tuple(found)), np.concatenate([np.zeros(0), *found.values()])
-    other = problem.sums(space, values, derivatives=False)
-    return found if other.excess.sum() < fit.excess else _by_candidate(base, fit.values)
+    space = Space(tuple(found))
+    other = problem.sums(space, space.vector(found), derivatives=False)
+    return found if other.excess.sum() < fit.excess else base.split(fit.values)
 
 
 def _searched(problem: InstrumentProblem, base: Space, pool: Sequence[Candidate], fit: Fit) -> Values:
@@ -182,7 +182,7 @@ def _searched(problem: InstrumentProblem, base: Space, pool: Sequence[Candidate]
     ]
     wide = Space((*base.candidates, *free))
     values = np.concatenate([fit.values, np.zeros(wide.size - base.size)])
-    return _by_candidate(wide, _best_start(problem, wide, values, fit.excess, STARTS))
+    return wide.split(_best_start(problem, wide, values, fit.excess, STARTS))
 
 
 def best_of_starts(problem: InstrumentProblem, space: Space, starts: int, begin: Array | None = None) -> Fit:
@@ -235,13 +235,13 @@ def _anywhere(candidate: Candidate) -> bool:
 
 
 def _far(problem: InstrumentProblem, pool: Sequence[Candidate], base: Space, fit: Fit) -> Values:
-    best, out = LESS_FROM_AFAR * fit.excess, _by_candidate(base, fit.values)
+    best, out = MOSTLY * fit.excess, base.split(fit.values)
     for candidate in pool:
         space = Space((*base.candidates, candidate))
         for start in candidate.starts:
             tried = minimize(problem, space, np.concatenate([fit.values, start]))
             if tried.excess < best:
-                best, out = tried.excess, _by_candidate(space, tried.values)
+                best, out = tried.excess, space.split(tried.values)
     return out
 
 
@@ -265,7 +265,7 @@ def along_wavelengths(problem: InstrumentProblem, base: Space, say: Say) -> Valu
             break
     else:
         say("no mounts fit all wavelengths: were they homed anew in between? Then give each run by itself")
-    return {} if best is None else _by_candidate(space, best.values)
+    return {} if best is None else space.split(best.values)
 
 
 class _AtOne:
@@ -285,14 +285,14 @@ class _AtOne:
         values = fit.values
         if fit.rms > NEAR_ENOUGH:
             values = _best_start(self.problem, self.space, values, fit.excess, STARTS, NEAR_ENOUGH, self._large)
-        return _by_candidate(self.space, values)
+        return self.space.split(values)
 
     def beside(self, start: Mapping[str, Array]) -> Values:
         """From values of the same places; what the wavelengths share is held."""
         own = np.array([c.wavelength_nm is not None for c in self.space.candidates for _ in c.parameters])
         values = np.concatenate([start[c.short] for c in self.space.candidates])
         fit = minimize(self.problem, self.space, values, free=own & self._large)
-        return _by_candidate(self.space, fit.values)
+        return self.space.split(fit.values)
 
 
 def _pointed_to(
@@ -319,7 +319,3 @@ def _joined(space: Space, found: Sequence[Values]) -> Array:
             own = [v for each in found for c, v in each.items() if c == candidate]
             parts.append(own[0])
     return np.concatenate(parts)
-
-
-def _by_candidate(space: Space, values: Array) -> Values:
-    return {c: values[p] for c, p in zip(space.candidates, space.slices, strict=True)}

@@ -22,12 +22,12 @@ from processing.diagnosis.instrument.features import FEATURES
 from processing.diagnosis.instrument.pixel_sums import Pixels, Precision, features_of_pixels, products_of_pixels
 from processing.diagnosis.search.rules import (
     FEWEST_PIXELS_FOR_TILES,
-    FEWEST_TILES,
     FOLDS_OF_STATES,
     FOLDS_OF_TILES,
     MOST_ROWS_FOR_TILES,
     MOST_TILES,
     TILE_PX,
+    TILES,
 )
 
 #: [of the largest] Eigenvalues of second moments below this are none.
@@ -180,7 +180,7 @@ class _Grid:
     @classmethod
     def of(cls, height: int, width: int) -> _Grid:
         small = min(height, width)
-        side = min(MOST_TILES, max(small // TILE_PX, FEWEST_TILES), small)
+        side = min(MOST_TILES, max(small // TILE_PX, TILES), small)
         r, rows, y = _divided(height, side)
         c, columns, x = _divided(width, side)
         boxes = tuple((here, there) for here in rows for there in columns)

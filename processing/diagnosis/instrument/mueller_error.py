@@ -136,8 +136,7 @@ class MuellerErrors:
         """Of a posterior, with slopes where its mean is; `solved` says to what the intensities are known."""
         chosen = [k for k, c in enumerate(found.space.candidates) if _moves_mueller(found, k, c in solved.effects)]
         space = Space(tuple(found.space.candidates[k] for k in chosen))
-        index = np.concatenate([np.zeros(0, dtype=np.int64), *(np.r_[found.space.slices[k]] for k in chosen)])
-        index = index.astype(np.int64)
+        index = found.space.positions(chosen)
         values, captures = found.values[index], len(problem.captures)
         products, each = np.zeros((16, index.size, index.size)), []
         for own, part in mueller_slopes(problem, space, values, _left(problem, solved)):
@@ -147,11 +146,7 @@ class MuellerErrors:
 
     def given(self, used: Solution) -> Array:
         """Values (K,) that a correction applies."""
-        part, out = dict(zip(used.space.candidates, used.space.slices, strict=True)), np.zeros(self.space.size)
-        for candidate, own in zip(self.space.candidates, self.space.slices, strict=True):
-            if candidate in part:
-                out[own] = used.fit.values[part[candidate]]
-        return out
+        return self.space.vector(used.space.split(used.fit.values))
 
     def changes(self, used: Solution) -> tuple[PredictedChange, PredictedChange, tuple[PredictedChange, ...]]:
         """What a correction does to M of these captures, of later ones, and of each of these."""
@@ -237,7 +232,7 @@ def _moves_mueller(found: Posterior, k: int, applied: bool) -> bool:
 
 def _as_effects(space: Space, direction: Array, size: Array, names: tuple[str, ...]) -> tuple[AppliedEffect, ...]:
     effects = []
-    for candidate, part in zip(space.candidates, space.slices, strict=True):
+    for candidate, part in space.pairs:
         if size[part].max() <= SMALL_PART * size.max():
             continue
         own = direction[part]

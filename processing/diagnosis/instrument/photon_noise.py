@@ -28,7 +28,7 @@ def movable(shift_px: Array) -> bool:
 def distance(undone: Mapping[Candidate, Array], space: Space, values: Array, *, pointwise: bool = False) -> float:
     """Largest distance of a correction from where it was undone, in typical sizes; of the `pointwise` ones alone."""
     away = [0.0]
-    for candidate, part in zip(space.candidates, space.slices, strict=True):
+    for candidate, part in space.pairs:
         if _exactly_undone(candidate, pointwise):
             away.append(float(np.max(np.abs(values[part] - undone.get(candidate, 0.0)) / candidate.typical)))
     return max(away)
@@ -41,7 +41,7 @@ def _exactly_undone(candidate: Candidate, pointwise: bool) -> bool:
 
 def exactly_undone(space: Space, values: Array, *, pointwise: bool = False) -> dict[Candidate, Array]:
     """Values of what can be undone exactly; of the `pointwise` corrections alone."""
-    active = zip(space.candidates, space.slices, strict=True)
+    active = space.pairs
     return {c: values[p] for c, p in active if _exactly_undone(c, pointwise) and values[p].any()}
 
 

@@ -140,7 +140,7 @@ class InstrumentProblem:
             if set(other.undone) <= set(space.candidates) and away < least:
                 best, least = other, away
         local = values.copy()
-        for candidate, part in zip(space.candidates, space.slices, strict=True):
+        for candidate, part in space.pairs:
             if candidate in best.undone:
                 local[part] -= best.undone[candidate]
         return best, local
@@ -250,7 +250,7 @@ class InstrumentProblem:
         changes.shift_px = changes.shift_px - self.own_px[capture] * data.pitch
         # At zero an effect does nothing: there is no need to ask it.
         other_than_zero = [0, *np.cumsum(values != 0).tolist()]
-        for candidate, part in zip(space.candidates, space.slices, strict=True):
+        for candidate, part in space.pairs:
             there = other_than_zero[part.stop] > other_than_zero[part.start]
             if there and candidate.acts(capture, data.wavelength_nm):
                 candidate.apply(changes, model, values[part])
@@ -346,7 +346,7 @@ class InstrumentProblem:
     def time_noise(self, space: Space, values: Array) -> Array:
         """Variance (K,) that errors of the frames' times make of a source's level in each state, where it drifts."""
         out = np.zeros(space.size)
-        parts = dict(zip(space.candidates, space.slices, strict=True))
+        parts = dict(space.pairs)
         for k, (data, nm) in enumerate(zip(self.captures, self.wavelengths_nm, strict=True)):
             conditions = data.conditions
             acting = [c for c in parts if isinstance(c.effect, SourceEffect) and c.acts(k, nm)]

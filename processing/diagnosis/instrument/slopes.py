@@ -87,7 +87,7 @@ def slopes_of_counts(
 
 def fitted(space: Space) -> list[tuple[Candidate, slice]]:
     """Candidates that have values to fit."""
-    pairs = zip(space.candidates, space.slices, strict=True)
+    pairs = space.pairs
     return [(c, part) for c, part in pairs if not isinstance(c.effect, Switch)]
 
 

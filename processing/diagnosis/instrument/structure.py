@@ -19,7 +19,7 @@ from processing.diagnosis.search.decision import beyond_chance
 from processing.diagnosis.search.fit import Fit
 from processing.diagnosis.search.linearized import deviation_of
 from processing.diagnosis.search.range_of import range_of
-from processing.diagnosis.search.rules import FEWEST_FOR_PATTERNS, FEWEST_PAIRS, HARMONICS, PATCHES
+from processing.diagnosis.search.rules import FEWEST_OF_MANY, FEWEST_PIXELS, HARMONICS, TILES
 from processing.diagnosis.search.space import Space
 from processing.instrument.changes import FIELD_TERMS, Changes, field_terms
 from processing.reduction.move_image import neighbour_noise
@@ -200,7 +200,7 @@ def _tests(
     freedom = shown @ wanted.sum(axis=1, dtype=float)
     # Name to chi-square beyond noise, and its standard deviation with nothing but noise.
     found = {"sum of squares": (_square(flat) - freedom, deviation_of(max(freedom, 1e-300), spread))}
-    if count < FEWEST_FOR_PATTERNS:
+    if count < FEWEST_PIXELS:
         # What goes with the signal, or with the place, needs an image.
         return _in_deviations(found)
     # Linear in the signal: every pixel's residual against the leading components of the fitted signal near by.
@@ -229,7 +229,7 @@ def _tests(
             both = good[first[1:]] & good[second[1:]]
             product = r[first] * r[second]
             product[:, ~both] = 0.0
-            if both.sum() * len(r) > FEWEST_PAIRS:
+            if both.sum() * len(r) > FEWEST_OF_MANY:
                 null = alike[:, k] @ np.sum(expected[first], axis=(1, 2), where=both, dtype=float)
                 # The residuals of the rows of one pixel go together: a pair of pixels counts as one.
                 pairs = product.sum(axis=0, dtype=float)
@@ -250,7 +250,7 @@ def _in_deviations(found: dict[str, tuple[float, float]]) -> tuple[dict[str, flo
 
 
 def _patches(r: NDArray[np.float32], expected: NDArray[np.float32], spread: float) -> tuple[float, float]:
-    side = max(r.shape[1] // PATCHES, 1)
+    side = max(r.shape[1] // TILES, 1)
     h, w = r.shape[1] // side * side, r.shape[2] // side * side
     shape = (r.shape[0], h // side, side, w // side, side)
     total = np.nansum(r[:, :h, :w].reshape(shape), axis=(2, 4), dtype=np.float64)
@@ -261,7 +261,7 @@ def _patches(r: NDArray[np.float32], expected: NDArray[np.float32], spread: floa
 
 
 def _correlates(r: NDArray[np.float32], signal: NDArray[np.float32], good: NDArray[np.bool_]) -> dict[str, float]:
-    if good.sum() < FEWEST_FOR_PATTERNS or min(r.shape[1:]) < 3:
+    if good.sum() < FEWEST_PIXELS or min(r.shape[1:]) < 3:
         return {}
     loud = np.sqrt(np.mean(np.nan_to_num(r) ** 2, axis=0))
     mean = signal.mean(axis=0)

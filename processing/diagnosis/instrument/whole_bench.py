@@ -24,9 +24,9 @@ from processing.diagnosis.search.rules import (
     FAR_OFF,
     GROWTH,
     LIKELY,
-    MISSED,
-    REFUTED,
+    NEEDED,
     ROUNDS,
+    SEEN,
     SHARES,
     TAKES_PART,
 )
@@ -80,7 +80,7 @@ class WholeBench:
         """Take the azimuths found for those of the model: a prior about far ones would widen with their distance."""
         azimuths = [c for c in self._start if c in self.base.candidates and c.place.endswith("azimuth_deg")]
         space = Space(tuple(azimuths))
-        values = np.concatenate([np.zeros(0), *(self._start[c] for c in azimuths)])
+        values = space.vector(self._start)
 
         def there(k: int, model: InstrumentModel) -> InstrumentModel:
             acting = space.acting(k, self.whole.wavelengths_nm[k])
@@ -105,7 +105,8 @@ class WholeBench:
         # With one channel a value for each state takes up any mistake.
         beside = len(self.whole.model.channels) > 1
         start = {c: v for c, v in self._start.items() if beside or c in self.base.candidates}
-        space, values = Space(tuple(start)), np.concatenate([np.zeros(0), *start.values()])
+        space = Space(tuple(start))
+        values = space.vector(start)
         if not beside:
             values = best_of_starts(self.whole, space, 0, values).values
         return Fit(values, self.whole.sums(space, values, derivatives=False), 0.0).rms > FAR_OFF
@@ -205,7 +206,7 @@ class WholeBench:
         undone = exactly_undone(space, values, pointwise=True)
         far = {c: v for c, v in undone.items() if np.any(np.abs(v) > EXACT * c.typical)}
         gains = {c: scatter_prefers(self.whole, space, values, {c: v}, {}) for c, v in far.items()}
-        return {c: gain for c, gain in gains.items() if gain < -REFUTED}
+        return {c: gain for c, gain in gains.items() if gain < -NEEDED}
 
     def _unknowns(self, k: int) -> int:
         return int(np.linalg.matrix_rank(self.whole.columns(k, self.whole.changes(k, Space(()), np.zeros(0)))))
@@ -284,8 +285,8 @@ class WholeBench:
     def _values_at_start(self, space: Space, old: Posterior | None = None) -> Array:
         start = dict(self._start)
         if old is not None:
-            start |= {c: old.values[p] for c, p in zip(old.space.candidates, old.space.slices, strict=True)}
-        return np.concatenate([np.zeros(0), *(start.get(c, np.zeros(c.size)) for c in space.candidates)])
+            start |= old.space.split(old.values)
+        return space.vector(start)
 
     def _clipped(self) -> list[Candidate]:
         """The switch that leaves clipped pixels out, if they say something else than the others."""
@@ -309,7 +310,7 @@ class WholeBench:
         unit = self._least_unit(found)
         both = Space((*space.candidates, *fields))
         sums = self.whole.sums(both, np.append(values, np.zeros(both.size - space.size)))
-        parts = dict(zip(both.candidates, both.slices, strict=True))
+        parts = dict(both.pairs)
         gains = {c: score(sums, space.size, parts[c], prior(both))[0] / unit for c in fields}
         best = max(gains, key=lambda c: gains[c])
         if gains[best] < DECISIVE:
@@ -332,9 +333,8 @@ def applied(found: Posterior, base: Space, unfit: Collection[Candidate] = ()) ->
         keep |= {found.space.candidates[m] for m in found.members[g]}
     keep -= set(unfit)
     order = [*base.candidates, *(c for c in found.space.candidates if c in keep and c not in base.candidates)]
-    part = dict(zip(found.space.candidates, found.space.slices, strict=True))
-    values = [found.values[part[c]] for c in order]
-    return Space(tuple(order)), np.concatenate([np.zeros(0), *values])
+    space = Space(tuple(order))
+    return space, space.vector(found.space.split(found.values))
 
 
 def _least_needed(found: Posterior, keep: Collection[Candidate]) -> list[int]:
@@ -351,7 +351,7 @@ def _least_needed(found: Posterior, keep: Collection[Candidate]) -> list[int]:
     out: list[int] = []
     for g in order:
         left = form.at(np.where(kept, mean, 0.0)) - told
-        if found.samples.probability[g] <= TAKES_PART and left <= MISSED * found.samples.best.unit:
+        if found.samples.probability[g] <= TAKES_PART and left <= SEEN * found.samples.best.unit:
             break
         out.append(int(g))
         for m in found.members[g]:
@@ -362,18 +362,13 @@ def _least_needed(found: Posterior, keep: Collection[Candidate]) -> list[int]:
 def solution(bench: WholeBench, found: Posterior) -> Solution:
     """The correction of a posterior, and how well it predicts what it did not see."""
     asked = predicts(bench.problem)
-    base_fit = minimize(asked, bench.base, _values_of(bench, bench.base))
+    base_fit = minimize(asked, bench.base, bench.base.vector(bench._start))
     before = held_out(asked, bench.base, base_fit)
     space, values = applied(found, bench.base, bench.as_many_as_intensities(found, SHARES))
     asked.relinearize(space, values)
     sums = asked.sums(space, values)
     fit = Fit(values, sums, float(sums.excess.sum()))
     typical = space.joined("typical")
-    part = dict(zip(found.space.candidates, found.space.slices, strict=True))
-    spread = np.concatenate([np.zeros(0), *(np.diag(found.covariance)[part[c]] for c in space.candidates)])
+    spread = space.vector(found.space.split(np.diag(found.covariance)))
     weak = found.samples.best.unit / np.maximum(np.sqrt(spread + values**2), LEAST_WIDTH * typical) ** 2
     return Solution(bench.base, base_fit, before, space, fit, held_out(asked, space, fit, weak), weak)
-
-
-def _values_of(bench: WholeBench, space: Space) -> Array:
-    return np.concatenate([np.zeros(0), *(bench._start.get(c, np.zeros(c.size)) for c in space.candidates)])

@@ -18,7 +18,7 @@ from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.initial_values import best_of_starts
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.search.fit import minimize
-from processing.diagnosis.search.rules import DECISIVE, FEW_STARTS, WIRING, WIRING_SCATTER
+from processing.diagnosis.search.rules import DECISIVE, FEW_STARTS, OUTSTANDING, WIRING
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
 
@@ -85,7 +85,7 @@ def _left(problem: InstrumentProblem, space: Space, values: Array) -> float:
     excess, freedom = float(sums.excess.sum()), float(sums.freedom.sum())
     if not problem.noise_known:
         return excess + freedom
-    return max(excess, 0.0) + WIRING_SCATTER * float(np.sqrt(2 * max(freedom, 1.0) * problem.spread))
+    return max(excess, 0.0) + OUTSTANDING * float(np.sqrt(2 * max(freedom, 1.0) * problem.spread))
 
 
 def _mistakes(problem: InstrumentProblem) -> Iterator[Wiring]:

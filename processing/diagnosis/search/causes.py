@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.posterior import Posterior
-from processing.diagnosis.search.rules import ALIKE, LIKELY, NOMINAL_TAU, SHOWN, SURE, VISIBLE_FAULT
+from processing.diagnosis.search.rules import ALIKE, LIKELY, NOMINAL_TAU, OUTSTANDING, SHOWN, SURE
 from processing.diagnosis.search.sets import probability_at
 from processing.diagnosis.search.space import Problem
 from processing.instrument.effects.base import CountsEffect, FieldEffect, Switch, ValuePerState
@@ -127,11 +127,11 @@ def would_be_seen(found: Posterior) -> tuple[Candidate, ...]:
     told /= found.samples.best.unit
     return tuple(
         candidate
-        for candidate, part in zip(found.space.candidates, found.space.slices, strict=True)
+        for candidate, part in found.space.pairs
         if not candidate.state_chosen
         and not isinstance(candidate.effect, CountsEffect | FieldEffect | Switch | ValuePerState)
         and not np.isin(part.start, always)
-        and told[part].max() > VISIBLE_FAULT**2
+        and told[part].max() > OUTSTANDING**2
     )
 
 

@@ -38,7 +38,7 @@ def all_at_once(
     """Values (K,) with every group there and `tau` typical sizes wide, but those that are one of many alternatives."""
     chosen = [k for k, c in enumerate(space.candidates) if not c.state_chosen and not c.price]
     part = Space(tuple(space.candidates[k] for k in chosen))
-    positions = np.concatenate([np.r_[space.slices[k]] for k in chosen]).astype(int)
+    positions = space.positions(chosen)
     always = np.concatenate([np.full(c.size, c in fixed) for c in part.candidates])
     width = part.joined("typical") * np.where(always, NOMINAL_TAU, tau)
     values = x[positions]
@@ -112,8 +112,7 @@ def _part_of(space: Space, groups: Sequence[Group]) -> tuple[Space, NDArray[np.i
     """The candidates of some groups, and their positions (J,) in the common vector."""
     index = {int(i) for g in groups for i in g.index}
     chosen = [k for k, part in enumerate(space.slices) if part.start in index]
-    positions = np.concatenate([np.zeros(0, dtype=np.int64), *(np.r_[space.slices[k]] for k in chosen)])
-    return Space(tuple(space.candidates[k] for k in chosen)), positions.astype(np.int64)
+    return Space(tuple(space.candidates[k] for k in chosen)), space.positions(chosen)
 
 
 def _penalized(sums: Sums, weak: Array, values: Array, reference: float | None = None) -> float:

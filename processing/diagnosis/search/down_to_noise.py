@@ -17,7 +17,7 @@ from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.descent import all_at_once, next_values
 from processing.diagnosis.search.likely_set import climb, likely_set
 from processing.diagnosis.search.linearized import noise_of, quadratic
-from processing.diagnosis.search.rules import BENT, GAINING, ROUNDS, SHRUNK
+from processing.diagnosis.search.rules import BENT, EXACT, MOSTLY, ROUNDS
 from processing.diagnosis.search.sets import Group, Noise, Sets, State
 from processing.diagnosis.search.space import Problem, Space
 
@@ -36,9 +36,9 @@ def down_to_noise(
     Parameters
     ----------
     start : (K,) values to begin with.
-    noise, unit : of chi-square where structure was left; every round has to leave less than `GAINING` of it, or `BENT`.
+    noise, unit : of chi-square where structure was left; every round has to leave less than `MOSTLY` of it, or `BENT`.
     """
-    x, settled = all_at_once(problem, space, fixed, start, noise, SHRUNK), False
+    x, settled = all_at_once(problem, space, fixed, start, noise, EXACT), False
     for left in reversed(range(ROUNDS)):
         problem.relinearize(space, x)
         sums = problem.sums(space, x)
@@ -46,7 +46,7 @@ def down_to_noise(
         if not (np.isfinite(form.excess) and np.all(np.isfinite(form.curvature))):
             return None
         last, unit = unit, noise_of(problem, sums).unit(float(sums.excess.sum()))
-        if unit > max(GAINING * last, BENT):
+        if unit > max(MOSTLY * last, BENT):
             return None
         full = Noise(True, max(float(sums.freedom.sum()), 1.0))
         sets = Sets(form, groups, full)

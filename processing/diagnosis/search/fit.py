@@ -210,7 +210,7 @@ def held_out(problem: Problem, space: Space, full: Fit, weak: Array | None = Non
         return _in_sample(space, full, weak)
     by_state = problem.holds_out_states
     local = np.zeros(space.size, dtype=bool)
-    for candidate, part in zip(space.candidates, space.slices, strict=True):
+    for candidate, part in space.pairs:
         local[part] = isinstance(candidate.effect, ValuePerState) and by_state
     total, shares = np.zeros(4), np.zeros((full.sums.shares.shape[0], 4))
     spent = np.zeros(space.size)
@@ -254,7 +254,7 @@ def _determined(curvature: Array, weak: Array, local: BoolArray) -> Array:
 
 def _count_values(space: Space, spent: Array, shares: Array, noise_known: bool) -> None:
     """Values of single states take degrees of freedom of their capture away; what several share, of all alike."""
-    for candidate, part in zip(space.candidates, space.slices, strict=True):
+    for candidate, part in space.pairs:
         if isinstance(candidate.effect, ValuePerState):
             mine = slice(None) if candidate.capture is None else candidate.capture
             each = spent[part].sum() / np.size(shares[mine, 1])

@@ -95,9 +95,8 @@ class OwnMinima:
         """A set at its own minimum; the fit begins at the values of a set that is near."""
         if groups not in self.visited:
             space = Space(tuple(c for g in sorted(groups) for c in self.candidates_of(g)))
-            start, unit = ({}, 1.0) if near is None else (values_of(near), near.state.unit)
-            begin = np.concatenate([np.zeros(0), *(start.get(c, np.zeros(c.size)) for c in space.candidates)])
-            self.visited[groups] = self._visit(groups, space, self._deepest(space, begin, unit))
+            start, unit = ({}, 1.0) if near is None else (near.space.split(near.fit.values), near.state.unit)
+            self.visited[groups] = self._visit(groups, space, self._deepest(space, space.vector(start), unit))
         return self.visited[groups]
 
     def left(self, here: Visited) -> float:
@@ -105,7 +104,7 @@ class OwnMinima:
         return max(here.fit.excess - self.noise.slack, 0.0)
 
     def _visit(self, groups: frozenset[int], space: Space, fit: Fit) -> Visited:
-        part = dict(zip(space.candidates, space.slices, strict=True))
+        part = dict(space.pairs)
         here = [
             Group(np.concatenate([np.r_[part[c]] for c in self.candidates_of(g)]), self.groups[g].share)
             for g in sorted(groups)
@@ -128,7 +127,7 @@ class OwnMinima:
             # What is left is less than there was, and counts for more.
             least = ENOUGH * self._unit(fit)
             fit = minimize(self.problem, space, fit.values, least_gain=least)
-        for candidate, part in zip(space.candidates, space.slices, strict=True):
+        for candidate, part in space.pairs:
             for far in candidate.starts:
                 start = fit.values.copy()
                 start[part] = far
@@ -167,8 +166,7 @@ class OwnMinima:
     def beside(self, here: Visited) -> tuple[Sets, State]:
         """All groups linearized about the minimum of a set, and that set among them."""
         if here.groups not in self._beside:
-            known = values_of(here)
-            values = np.concatenate([known.get(c, np.zeros(c.size)) for c in self.whole.candidates])
+            values = self.whole.vector(here.space.split(here.fit.values))
             form = quadratic(self.problem, self.whole, values, self.problem.sums(self.whole, values))
             state = State(np.zeros(len(self.groups)), here.state.unit)
             state.tau[sorted(here.groups)] = here.state.tau
@@ -190,7 +188,7 @@ class OwnMinima:
         weight = np.exp([min(v.score_at(unit) - here.score_at(unit), 0.0) for v in visited])
         weight /= weight.sum()
         there = np.array([[g in v.groups for g in range(len(self.groups))] for v in visited])
-        part = dict(zip(self.whole.candidates, self.whole.slices, strict=True))
+        part = dict(self.whole.pairs)
         index = np.concatenate([np.zeros(0, dtype=int), *(np.r_[part[c]] for c in here.space.candidates)])
         values, covariance = np.zeros(typical.size), np.zeros((typical.size, typical.size))
         values[index] = here.fit.values
@@ -244,8 +242,3 @@ def likelier(best: Visited, others: Iterable[Visited]) -> Visited:
     for other in others:
         best = other if log_odds(other, best) > 0 else best
     return best
-
-
-def values_of(here: Visited) -> dict[Candidate, Array]:
-    """Values at the minimum by candidate."""
-    return {c: here.fit.values[p] for c, p in zip(here.space.candidates, here.space.slices, strict=True)}

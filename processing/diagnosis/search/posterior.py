@@ -22,13 +22,13 @@ from processing.diagnosis.search.rules import (
     BENT,
     CERTAIN,
     CHANGES,
+    EXACT,
     FEWER_ROUNDS,
     GROWTH,
     HOPE,
     ROUNDS,
     SAMPLES,
     SAMPLES_BEFORE,
-    SHRUNK,
     TAU,
 )
 from processing.diagnosis.search.sets import Group, Noise, Sets, State
@@ -181,7 +181,7 @@ def _found(
         # large as they may be; or with the least values, where a straight line holds, if they leave nothing but noise.
         begun = [look(all_at_once(problem, space, fixed, start, first.sets.noise, TAU[-1]))]
         if problem.noise_known:
-            least = look(all_at_once(problem, space, fixed, start, first.sets.noise, SHRUNK))
+            least = look(all_at_once(problem, space, fixed, start, first.sets.noise, EXACT))
             begun += [least] if least is not None and least.state.unit <= BENT else []
         first = max((one for one in begun if one is not None), key=lambda one: one.score, default=first)
         problem.relinearize(space, first.about)

@@ -47,29 +47,15 @@ SLACK = 2.0
 NOISE_LEVEL = 0.005
 #: [of the signal] Least residual that is taken as noise where the noise is not known: no bench repeats better.
 LEAST_NOISE = 1e-4
-#: [log odds] Of the scatter of the counts against the noise that a correction of them tells, from which on it is
-#: dropped: 1 to 160 000.
-REFUTED = 12.0
 
-#: [pixels] Below which their scatter says nothing about the noise.
-FEWEST_FOR_SCATTER = 30
-#: [of its noise] That a row has to have beside the components of a capture, if its scatter is to tell noise.
-LEAST_SCATTER = 0.05
 #: [intensities of a pixel] Up to which every row tells noise that has any: there are no others.
 FEW_ROWS = 4
 
 # ---- what is left out of a capture ---------------------------------------------------------------------------------
-#: [standard deviations of one intensity] Mean signal below which a pixel is dark: logarithms and powers of such counts
-#: do not scatter in proportion to the noise, and they say nothing about polarization.
-FAINTEST = 5.0
 #: [pixels] Around dark ones that are left out too: image derivatives over 7 pixels do not tell there what a shift does.
 DARK_RIM = 4
-#: [standard deviations of the read-out] Below black, from which on counts of zero are cut off, not noise.
-CUT_OFF = 6.0
 #: [of its pixels] That are cut off, from which on a state is left out.
 MOST_CUT_OFF = 0.01
-#: [standard deviations of the read-out] Below the full well, from which on a pixel is clipped: noise takes it there.
-BELOW_WELL = 4.0
 #: [pixels of the sensor] By which frames are moved, and back again, to see what is lost: half of one loses most.
 TRIED_PX = 0.5
 #: [standard deviations of one intensity] By which a pixel is another one after the image was moved by half a pixel and
@@ -79,19 +65,17 @@ LOST_BY_MOVING = 0.5
 MOST_STEEP = 0.75
 #: [robust standard deviations] From which on an intensity is a hit: the largest of 10^9 normal ones is 6.1.
 HIT = 8.0
-#: [of the variance of the usual state of a pixel] Up to which the noise of a state is believed: a hit tells its own.
-BRIGHTEST = 4.0
 #: [of the mean variance] The same of a dim pixel, at least.
 DIMMEST = 0.1
-#: [pixels] Below which nothing can stand out.
-FEWEST_FOR_HITS = 100
+#: [pixels, pairs] Below which nothing can stand out, neighbours are not compared, and an object tells nothing.
+FEWEST_OF_MANY = 100
 #: [directions] Over the states that the model leaves over, below which nothing can stand out.
 FEWEST_FREE_FOR_HITS = 8
 #: [states] Of one pixel that are hits; with more of them it is a bad pixel.
 MOST_STRUCK = 4
 #: [of the pixels of a state] Beyond which what stands out is no hit: the frame itself moved, or belongs to nothing.
 MOST_HITS = 0.02
-#: [of the variance of the pixels around] From which on a pixel is bad.
+#: [of the usual variance] From which on a pixel is bad, and up to which the noise of a bright state is believed.
 BAD_PIXEL = 4.0
 #: [standard deviations] By which its variance has to stand out as well, where there are few states.
 BAD_DEVIATIONS = 10.0
@@ -104,7 +88,7 @@ ALSO_BAD = 0.2
 LEAST_MISFIT = 0.015
 #: [1] Times by which its misfit is larger, squared, than the next one that is left without it.
 AGAINST_NEXT = 8.0
-#: [of what is left over] That goes with a bad frame.
+#: [of the residual] That a bad frame, a far start or a round of a search has to take away.
 MOSTLY = 0.5
 #: [of the states] That may be bad.
 MOST_BAD_FRAMES = 0.1
@@ -118,8 +102,6 @@ ENOUGH_SOUND = 1.5
 # ---- the detector's noise, as its images show it ------------------------------------------------------------------
 #: [of the largest eigenvalue of noise] From which on a direction over the states is structure, which all pixels share.
 BEYOND_NOISE = 1.15
-#: [robust standard deviations] At which a residual is cut back before structure is looked for: a hit is none.
-CUT_BACK = 4.0
 #: [pixels] Along a side of an image, below which it tells nothing about noise.
 NARROWEST = 12
 #: [directions] Over the states that the model leaves over, below which they tell nothing about noise.
@@ -128,7 +110,8 @@ FEWEST_FREE_FOR_NOISE = 4
 NOT_ALIKE_PX = 3
 #: [rows, or columns] Distance of those whose means are compared: next to each other they may share noise.
 LINES_APART = 2
-#: [standard deviations] From which on a deviation from what is declared of the noise is there.
+#: [standard deviations] From which on the noise, or an effect over the image, differs from what is declared; and below
+#: black, from which on counts of zero are cut off.
 NOISE_SURE = 6.0
 #: [1] Deviation of the variance of a pixel from what is declared that is told: photon transfer curves of a lab are as
 #: good.
@@ -137,47 +120,33 @@ NOISE_OFF = 0.06
 NOISE_OFF_MIXED = 0.15
 #: [1] The same of the part of the variance without light: darks of a lab are as good.
 DARK_NOISE_OFF = 0.5
-#: [of what is estimated] Least part of the noise without light where the noise was estimated: no camera has none.
-LEAST_DARK = 0.05
-#: [of the variance] That goes with the light, from which on images tell the gain.
-LEAST_LIT = 0.05
+#: [of the whole] Below which a part tells nothing: of the variance with or without light, of the scatter of a row, of
+#: the light in dim pixels, of the noise in image derivatives.
+SMALL = 0.05
 #: [1] Deviation of the variance from what is declared where a bend of the response is undone, beyond which that bend
 #: does not go with how the counts scatter: two standard deviations of what labs know of a gain.
 GAIN_OFF = 0.03
 #: [correlation] Of neighbours, from which on they share noise.
 NOISE_ALIKE = 0.05
-#: [standard deviations] Up to which another gain alone, or another read noise alone, is as good as both.
-AS_GOOD = 3.0
 #: [of the median] Brightness from which on a pixel is lit.
 LIT = 0.5
-#: [of the mean of lit pixels] Brightness below which a pixel is dim: what happens to the light is twenty times weaker
-#: there, an offset is not.
-DIM = 0.05
-#: [pixels] Dim ones that tell the black level of a frame: five times better than one of them.
-FEWEST_DIM = 30
 
 # ---- search --------------------------------------------------------------------------------------------------------
 #: [of the signal] Residual above which nominal values, and what else has far starts, are searched for from many starts.
 FAR_OFF = 0.05
 #: [of the signal] Residual below which no better start is looked for.
 NEAR_ENOUGH = 0.01
-#: [of what is left over] Less than which a far start has to leave to be taken.
-LESS_FROM_AFAR = 0.5
 #: [degree] Half width of the starts of retardances of plates of a known order; and size from which on values have any.
 NEAR_DEG = 20.0
 #: [degree] The same of elements of which no more than "some retardance" is known.
 FAR_DEG = 120.0
 #: [unit of chi-square] After the first choice of groups, from which on the first linearization is not believed.
 BENT = 2.0
-#: [typical sizes] Standard deviation of every group where all begin at once and each intensity counts in full: among
-#: causes that can do the same the least values are the likeliest, and a straight line is believed only near them.
-SHRUNK = 0.3
-#: [of the unit of chi-square] That a round of such a search may leave of the one before, or it ends.
-GAINING = 0.5
 #: [log odds] Loss of a change of the set, or of a new linearization, that is still tried: the unit of chi-square may
 #: fall with it.
 HOPE = -6.0
-#: [log odds] From which on a group is not taken away any more on the way down from all groups.
+#: [log odds] At which evidence decides by itself, 1 to 160 000: a group is not taken away any more, a correction is
+#: dropped that the scatter of the counts contradicts.
 NEEDED = 12.0
 #: [chi-square] Gain from which on something that needs a search of its own (a retardance that varies over the image,
 #: clipped pixels, a mistake of wiring) is looked into.
@@ -185,9 +154,11 @@ DECISIVE = 25.0
 #: [1] Growth of the unit of chi-square, by what the tests of the residual find, from which on the sets are visited
 #: again; and at values beyond what a straight line to them promised, from which on it is not believed.
 GROWTH = 1.05
-#: [typical sizes] From where a correction of counts was made exactly, up to which it is exact enough.
+#: [typical sizes] Up to which a straight line is exact enough: from where counts were corrected exactly, and as the
+#: standard deviation of every group where all begin at once.
 EXACT = 0.3
-#: [log odds] Against its absence, and over any other group in its place, from which on a group is not asked any more.
+#: [log odds] At which a group is certain and is not tested any more. A name needs as much where the residual alone
+#: measures the noise, since part of the residual may be structure.
 CERTAIN = 25.0
 #: [unit of chi-square] A fit of a set ends when a step gains less, and a far start is taken that gains more.
 ENOUGH = 0.05
@@ -195,8 +166,6 @@ ENOUGH = 0.05
 # ---- wiring --------------------------------------------------------------------------------------------------------
 #: [1] Factor by which less must be left over without a mistake of wiring: no small change of a value does that.
 WIRING = 5.0
-#: [standard deviations] Of what is left over by chance, that count as left over too: less is no reason for a mistake.
-WIRING_SCATTER = 4.0
 
 # ---- correction ----------------------------------------------------------------------------------------------------
 #: [probability] From which on a group takes part in the correction that is written. What is less likely moves the mean
@@ -204,9 +173,6 @@ WIRING_SCATTER = 4.0
 TAKES_PART = 0.25
 #: [probability] From which on a member of a class that is likely as a whole takes its share in the correction.
 SHARES = 0.01
-#: [unit of chi-square] That the fit may lose by what takes no part: several causes that are unlikely one by one can be
-#: one that is certain, and what is left over without them is no structure.
-MISSED = 4.0
 #: [1] Growth of the residual on held-out data that is still put down to chance.
 WORSE = 1.002
 #: [probability] That the error of what the user reads grows by a correction, up to which it is written: below it the
@@ -236,18 +202,12 @@ MOST_STORED = 20
 SMALL_PART = 0.03
 
 # ---- structure -----------------------------------------------------------------------------------------------------
-#: [standard deviations] Beyond which a test of the residual says "structure".
+#: [standard deviations] Beyond which a test of the residual says "structure", and a pixel is not dark.
 LIMIT = 5.0
 #: [standard deviations] The same of two of the six tests of one capture: as likely by chance as one beyond `LIMIT`.
 LIMIT_OF_TWO = 3.5
-#: [standard deviations] Autocorrelation over the states from which on the residual of few pixels is not white.
-WHITE = 4.0
-#: [pixels] From which on structure is looked for that goes with the signal, or with the place.
-FEWEST_FOR_PATTERNS = 30
-#: [pairs of intensities] Beyond which neighbours are compared.
-FEWEST_PAIRS = 100
-#: [patches] Along the height of an image, whose means are tested.
-PATCHES = 8
+#: [pixels] Below which means over them tell no noise, no black level and no pattern.
+FEWEST_PIXELS = 30
 #: [harmonics] Of a turn that are shown of a residual: an element that turns makes four.
 HARMONICS = 4
 
@@ -262,8 +222,8 @@ FOLDS_OF_TILES = 2
 FOLDS_OF_STATES = 5
 #: [tiles] Along each side of an image, for effects and structure that vary over it.
 MOST_TILES = 16
-#: [tiles] The same of a small image, at least.
-FEWEST_TILES = 8
+#: [tiles] Along a side of a small image, of an object, and of the patches whose means are tested.
+TILES = 8
 #: [pixels] Along a side of a tile, between these two.
 TILE_PX = 4
 
@@ -288,25 +248,12 @@ MOST_TRIED = 5
 # ---- why a name is doubted -----------------------------------------------------------------------------------------
 #: [of the range] How close to the end of a parameter's range a value stands at its bound.
 BOUND = 1e-3
-#: [log odds] By which a source that follows one wave has to fit better in a cause's place, for each capture: its
-#: frequency is free, which costs 7; what turns has two harmonics, two values more, and is the commoner fault.
-ONE_WAVE = 4.5
-#: [of their scatter] What a single wave, or one jump, beside a drift may hold of values that belong to one state each,
-#: if they are to be random; of a known sample, where they are what they are.
-ONE_PATTERN = 0.85
-#: [chance] That one of these holds as much of random values: below it they are not random, where an unknown sample may
-#: take up a part of them.
-CHANCE_OF_PATTERN = 0.01
 #: [of a shift, and of what is left at the edges] What sharp edges, which no fit saw, must show of an image that is said
 #: to move. Where it does they show 0.5 to 1.1 of it, and it explains 0.5 to 0.7 of what they do; of light that is
 #: added, or a spot that fades, one of the two is 0 to 0.4.
 EDGES = 0.43
 #: [pixels] At edges, from which on they are asked.
 FEWEST_AT_EDGES = 10
-#: [degree] Turn of a plate from which on a wave of its turns is asked in a cause's place: over less it is a slope.
-LEAST_TURN_DEG = 180.0
-#: [standard deviations] By which the size of an effect of source, optics or mechanics may differ over the image.
-UNEVEN = 6.0
 #: [of what it explains] The same, for a large effect.
 UNEVEN_SHARE = 0.01
 #: [of the directions of the data] What values for each state, with all others, may have.
@@ -314,9 +261,6 @@ TESTABLE = 0.75
 #: [1] With structure left something is there that is not in the list, and causes that are may be parts of it: one alone
 #: has to explain this many times what is left, the second strongest four times as much, the third nine times, ...
 TIMES = 100.0
-#: [log odds] That a name needs where nothing but what is left tells the noise: part of it may be structure. What can
-#: describe any pattern (a bend of the response, a value for each state) has to explain `TIMES` what is left.
-UNKNOWN_NOISE = 25.0
 
 # ---- values that are told together ---------------------------------------------------------------------------------
 #: [correlation] From which on two values are told together.
@@ -325,12 +269,12 @@ TOGETHER = 0.9
 OPEN = 5.0
 
 # ---- what captures can show ----------------------------------------------------------------------------------------
-#: [chi-square] Information about a typical size below which an effect cannot be seen.
+#: [chi-square] Two standard deviations: information about a typical size below which an effect cannot be seen, and what
+#: the fit may lose by groups that take no part.
 SEEN = 4.0
-#: [standard deviations] By which an effect of typical size has to stand out for its absence to mean anything.
-VISIBLE_FAULT = 4.0
-#: [of the noise] Information from slopes of noise, not of light, that counts as none: noise is known to some percent.
-NOISE_ERROR = 0.05
+#: [standard deviations] By which something stands out that is tested once: an effect of typical size, a mistake of
+#: wiring, an autocorrelation over the states; and at which residuals and counts near the full well are cut back.
+OUTSTANDING = 4.0
 #: [sine] Of the angle between two signatures, from which on a capture tells them apart.
 APART = 0.3
 #: [sine] By which another sample has to do better than a simpler one to be asked for.
@@ -355,24 +299,18 @@ AS_LIKELY = 0.015
 DARK = 0.1
 #: [of the noise of a pixel] Modulated light of a tile from which on its pixels have a say in the dominant process.
 LEAST_MODULATION = 1.0
-#: [pixels] Below which an object tells nothing.
-FEWEST_OF_OBJECT = 100
 #: [pixels] Of an object that are used at most, evenly spread.
 MOST_OF_OBJECT = 4000
 #: [of its radius] Rim of an object that is left out: one off its place would mix object and background there.
 RIM_OF_OBJECT = 0.06
 #: [pixels of the camera] The same, at least: the interpolation of a mosaic mixes as many.
 RIM_PX = 6
-#: [tiles] Along each side of an object, half of which are held out in turn.
-TILES_OF_OBJECT = 8
 #: [degree] Half angle in which the middle of an object sees its support.
 SUPPORT_DEG = 35.0
 #: [half widths of the object] From its middle down to the support.
 SUPPORT_DEPTH = 2.0
 #: [typical sizes] Along a bent valley, from where a deeper minimum is looked for.
 ALONG_VALLEY = 1.0
-#: [standard errors] From a minimum, where the excess is looked at if the valley is bent.
-ERRORS_AWAY = 3.0
 #: [doublings] By which an error may grow at most as a bent valley asks.
 MOST_DOUBLINGS = 5
 #: [of its noise] Polarized light of a pixel from which on its xi0 is shown.

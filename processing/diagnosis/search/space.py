@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -122,6 +123,23 @@ class Space:
         if any(self.candidates[k].curve is not None for k in chosen):
             mix = block_diag(*(self.candidates[k].matrix(wavelength_nm) for k in chosen))
         return Acting(mine, np.concatenate(index).astype(np.int64), mix)
+
+    @property
+    def pairs(self) -> list[tuple[Candidate, slice]]:
+        """Candidates, each with where its values stand in the common vector."""
+        return list(zip(self.candidates, self.slices, strict=True))
+
+    def split(self, values: Array) -> dict[Candidate, Array]:
+        """Values by candidate, of the common vector (K,)."""
+        return {c: values[p] for c, p in self.pairs}
+
+    def vector(self, values: Mapping[Candidate, Array]) -> Array:
+        """Common vector (K,) of values by candidate, zero where none are given."""
+        return np.concatenate([np.zeros(0), *(values.get(c, np.zeros(c.size)) for c in self.candidates)])
+
+    def positions(self, numbers: Iterable[int]) -> NDArray[np.int64]:
+        """Positions (J,) of the values of some candidates, by their numbers, in the common vector."""
+        return np.concatenate([np.zeros(0, dtype=np.int64), *(np.r_[self.slices[k]] for k in numbers)]).astype(np.int64)
 
     def joined(self, name: str) -> Array:
         """A property of all candidates, end to end."""

@@ -13,12 +13,12 @@ from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.search.rules import (
     DARK,
-    FEWEST_OF_OBJECT,
+    FEWEST_OF_MANY,
     LEAST_MODULATION,
     MOST_OF_OBJECT,
     RIM_OF_OBJECT,
     RIM_PX,
-    TILES_OF_OBJECT,
+    TILES,
 )
 from processing.diagnosis.surface.view import SurfaceView
 from processing.errors import ProcessError
@@ -117,10 +117,10 @@ def read_surface(
     camera = _grid(view.camera.resized(rows, columns), cell * data.binned, height, width)
     picked = _pick(data, signal, view.model_copy(update={"camera": camera}), omega, cell)
     where = np.argwhere(picked)
-    if len(where) < FEWEST_OF_OBJECT:
+    if len(where) < FEWEST_OF_MANY:
         raise ProcessError(
             f"{capture.path}: {len(where)} pixels see the lit object well within its outline; "
-            f"{FEWEST_OF_OBJECT} are needed. Check the geometry file and the arm angle ({omega:g} degrees)."
+            f"{FEWEST_OF_MANY} are needed. Check the geometry file and the arm angle ({omega:g} degrees)."
         )
     states = signal[:, :, picked].astype(np.float64)
     exposure, conditions, state_slope, state_floor = data.exposure, data.conditions, data.slope, data.floor
@@ -163,8 +163,8 @@ def read_surface(
 def _tiles(where: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Tile of each pixel (P, 2), and the part of a chessboard in which it is, each (P,)."""
     low = where.min(axis=0)
-    tiles = (where - low) * TILES_OF_OBJECT // (where.max(axis=0) - low + 1)
-    return tiles[:, 0] * TILES_OF_OBJECT + tiles[:, 1], tiles.sum(axis=1) % FOLDS
+    tiles = (where - low) * TILES // (where.max(axis=0) - low + 1)
+    return tiles[:, 0] * TILES + tiles[:, 1], tiles.sum(axis=1) % FOLDS
 
 
 def _black_variance(capture: Capture) -> float:

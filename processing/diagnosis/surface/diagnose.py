@@ -345,7 +345,7 @@ def _error(problem: SurfaceProblem, out: HeldOut) -> Error:
 def _effects(problem: SurfaceProblem, found: _Found, in_doubt: bool) -> tuple[FoundEffect, ...]:
     solved = found.solved
     error = standard_errors(problem, solved.space, solved.fit, found.here.state.unit)
-    part = dict(zip(solved.space.candidates, solved.space.slices, strict=True))
+    part = dict(solved.space.pairs)
     doubt = (DEGENERACY,) if in_doubt else ()
     return tuple(
         FoundEffect(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from processing.arrays import Array
 from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.range_of import range_of, rank_of
-from processing.diagnosis.search.rules import FEWEST_OF_OBJECT
+from processing.diagnosis.search.rules import FEWEST_OF_MANY
 from processing.diagnosis.search.space import Space, Sums
 from processing.diagnosis.surface.data import FOLDS, SurfaceData
 from processing.effect import Parameter
@@ -100,7 +100,7 @@ class SurfaceProblem:
         for k, data in enumerate(self.captures):
             w = self.rows(k, self.changes(k, Space(()), np.zeros(0))[0])
             here = data.kept(data.polarized(w[:, 0]))
-            if len(here.y) >= FEWEST_OF_OBJECT:
+            if len(here.y) >= FEWEST_OF_MANY:
                 out.append(here)
         if not out:
             raise ProcessError(
@@ -143,7 +143,7 @@ class SurfaceProblem:
         for applied in self.model.effects:
             if applied.scope == "instrument" or data.name in applied.captures:
                 apply_to(optics, self.model, applied)
-        for candidate, part in zip(space.candidates, space.slices, strict=True):
+        for candidate, part in space.pairs:
             effect = candidate.effect
             if isinstance(effect, ReflectanceEffect):
                 effect.bend(surface, candidate.place, values[part])

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.search.fit import Fit, minimize, prior
-from processing.diagnosis.search.rules import ERRORS_AWAY, MOST_DOUBLINGS
+from processing.diagnosis.search.rules import MOST_DOUBLINGS, SHOWN
 from processing.diagnosis.search.space import Space
 from processing.diagnosis.surface.problem import SurfaceProblem
 from processing.reflectance.effects.base import BentValley
@@ -31,7 +31,7 @@ def standard_errors(problem: SurfaceProblem, space: Space, fit: Fit, spread: flo
     error = np.sqrt(np.maximum(np.diag(both), 0.0))
     wide = np.ones(space.size)
     for j in np.flatnonzero(bent(space)):
-        step = ERRORS_AWAY * error[j]
+        step = SHOWN * error[j]
         wide[j] = _wide(problem, space, fit, int(j), step, step**2 / max(bread[j, j], 1e-300))
     return np.asarray(error * wide * np.sqrt(spread))
 
