@@ -51,7 +51,7 @@ class Device(Protocol):
 def _broadcast_sockets(address: str) -> list[socket.socket]:
     """Sockets that hear what is sent to all, and to all of the subnet; fewer where another program has them alone."""
     found = []
-    for everybody in ("255.255.255.255", address.split(".", maxsplit=1)[0] + ".255.255.255"):
+    for everybody in ("255.255.255.255", address.split(".")[0] + ".255.255.255"):
         heard = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         heard.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
