@@ -7,9 +7,12 @@ import pytest
 
 from processing.diagnosis.instrument.mueller_error import MuellerErrors, _leading
 from processing.diagnosis.instrument.whole_bench import WholeBench
+from processing.diagnosis.search.candidate import Candidate
 from processing.diagnosis.search.likely_set import likely_set
 from processing.diagnosis.search.rules import MOST_STORED
 from processing.diagnosis.search.sets import Group, Noise, Quadratic, Sets
+from processing.diagnosis.search.space import Space
+from processing.effect import Parameter
 
 
 def test_directions_hold_what_another_capture_will_have_too():
@@ -45,10 +48,13 @@ def test_what_varies_over_the_image_is_asked_for_beside_all_groups():
 
 def test_what_is_found_and_not_used_is_uncertain_as_a_whole():
     """A path that was found and is not applied: the correction of the drift changes M by less than the path does."""
-    space = Some(candidates=("drift", "path"), slices=(slice(0, 1), slice(1, 2)), size=2)
+    drift, path = (
+        Candidate(type("E", (), {"kind": k})(), "", (Parameter("p", "1", -9.0, 9.0, 1.0),)) for k in ("drift", "path")
+    )
+    space = Space((drift, path))
     own = (np.array([0, 1]), np.eye(2))
     errors = MuellerErrors(space, np.array([1.0, 4.0]), np.diag([0.01, 0.09]), np.zeros((16, 2, 2)), (own,))
-    used = Some(space=Some(candidates=("drift",), slices=(slice(0, 1),)), fit=Some(values=np.array([1.0])))
+    used = Some(space=Space((drift,)), fit=Some(values=np.array([1.0])))
     assert errors.given(used).tolist() == [1.0, 0.0]
     change = errors._change(*own[:1], errors.given(used), own[1])
     assert change.before == pytest.approx(np.sqrt(17.1))
