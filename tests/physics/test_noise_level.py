@@ -114,7 +114,7 @@ def test_beside_a_map_over_the_image_all_take_part_with_the_noise_of_their_light
     space = SimpleNamespace(candidates=(), size=0, slices=())
     bench.base, bench.say = None, lambda line: None
     bench.whole = SimpleNamespace(sums=lambda space, values: None)
-    both = SimpleNamespace(candidates=(field,), size=5, slices=(slice(0, 5),))
+    both = SimpleNamespace(candidates=(field,), size=5, pairs=[(field, slice(0, 5))])
     monkeypatch.setattr(whole_bench, "applied", lambda found, base: (space, np.zeros(0)))
     monkeypatch.setattr(whole_bench, "Space", lambda candidates: both)
     monkeypatch.setattr(whole_bench, "score", lambda *of: (1000.0,))
