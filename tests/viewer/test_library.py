@@ -103,7 +103,8 @@ def test_a_browser_sorts_turns_pages_and_shows_thumbnails(lab, drr_capture, addr
         page.wait_for_url("**captures_sort=omega**", wait_until="domcontentloaded")
         assert page.locator("table.list tr").nth(1).get_by_role("link").first.inner_text() == "two.h5"
         page.locator("td.thumbnail img").first.wait_for()
-        page.wait_for_function("[...document.querySelectorAll('td.thumbnail img')][0].naturalWidth > 0")
+        picture = page.locator("td.thumbnail img").first
+        assert picture.evaluate("image => image.decode().then(() => image.naturalWidth)") > 0
         page.get_by_role("link", name="next").click()
         page.wait_for_url("**captures_page=2**", wait_until="domcontentloaded")
         assert "page 2 of 2" in page.content()
