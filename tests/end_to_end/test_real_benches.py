@@ -167,25 +167,29 @@ def test_answer_to_a_small_bench_harms_nothing(group, seed, given, configs, tmp_
         assert result["verdict"] == "consistent"
 
 
-#: Groups with one fault or none, and their seeds: the seed goes through the faults of a group in turn.
-BLIND = {"single": range(0, 28, 4), "mosaic": range(4), "outside": range(0, 9, 4), "none": range(1000, 1002)}
+#: Groups with one fault or none: capture that is given, and seeds. The seed goes through the faults of a group in turn.
+BLIND = {
+    "single": ("air", range(0, 20, 4)),
+    "mosaic": ("sphere", range(4)),
+    "outside": ("sphere", range(0, 9, 4)),
+    "none": ("sphere", range(1000, 1002)),
+}
 
 
 @pytest.mark.long
-@pytest.mark.timeout(900)
-def test_one_undeclared_fault_is_named_or_nothing_is(configs, tmp_path):
-    """A fault may stay unnamed, and half of those in the list that matter do not; no answer does harm."""
-    judged = []
-    for group, seeds in BLIND.items():
-        for seed in seeds:
-            truth = make_bench(tmp_path, seed, configs, group, pixels=SMALL)
-            judged.append(judge_bench(tmp_path, truth, configs, "sphere")[0])
-    print(table(judged))
-    assert not [j.name for j in judged if sure_and_wrong(j)]
-    assert not [j.name for j in judged if is_worse(j.declared, j.corrected)]
-    assert all(j.verdict == "consistent" for j in judged if j.group == "none")
-    answers = [m.told for j in judged if j.group == "single" for m in j.matters if m.size > MATTERS]
-    assert answers.count("missed") <= len(answers) / 2
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize(
+    ("group", "given", "seed"), [(group, given, seed) for group, (given, seeds) in BLIND.items() for seed in seeds]
+)
+def test_one_undeclared_fault_gets_its_name_or_none(group, given, seed, configs, tmp_path):
+    judgement, _ = judge_bench(tmp_path, make_bench(tmp_path, seed, configs, group, pixels=SMALL), configs, given)
+    assert not sure_and_wrong(judgement)
+    assert not is_worse(judgement.declared, judgement.corrected)
+    if group == "single":
+        # In air, where the sample is known, each fault of the instrument can be seen.
+        assert [m.told for m in judgement.matters if m.size > MATTERS / 3] == ["named"]
+    if group == "none":
+        assert judgement.verdict == "consistent"
 
 
 @pytest.mark.long
