@@ -141,7 +141,9 @@ def parsed(text: str) -> Sentence:
 
 
 def _course_names(name: str) -> tuple[str, ...]:
-    return ("cos", "sin") if name.startswith(("by ", "beating")) else ("",)
+    if name.startswith("beating"):
+        return ("cos", "sin", "cos_trend", "sin_trend")
+    return ("cos", "sin") if name.startswith("by ") else ("",)
 
 
 def course(name: str, conditions: Conditions) -> Array:
@@ -161,8 +163,9 @@ def course(name: str, conditions: Conditions) -> Array:
     if name == "warming":
         return (1 - np.exp(-k / (n / 2.7)))[None]
     if name.startswith("beating "):
-        turn = 2 * np.pi * float(name.split()[1]) * k / n
-        return np.stack([np.cos(turn), np.sin(turn)])
+        # A wave of a frequency between two of the grid grows against its neighbour along the capture.
+        turn, trend = 2 * np.pi * float(name.split()[1]) * k / n, 2 * k / n - 1
+        return np.stack([np.cos(turn), np.sin(turn), trend * np.cos(turn), trend * np.sin(turn)])
     if name.startswith("from state "):
         return (k >= int(name[11:]))[None].astype(float)
     raise KeyError(name)

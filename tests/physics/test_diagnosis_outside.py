@@ -15,7 +15,7 @@ from processing.storage.captures.schema import Sample
 from simulators.blind.outside_list import ghost, image_lag, lamp_jump
 from simulators.blind.real_bench import Disc
 from simulators.blind.undeclared_captures import Bench, declared_bench, digitize, expose, state_angles, write_capture
-from simulators.blind.undeclared_faults import busy_machine
+from simulators.blind.undeclared_faults import busy_machine, etalon, lamp_beat
 
 STATES, PIXELS, NM = 40, 32, 662.0
 
@@ -139,3 +139,10 @@ def test_a_lamp_that_jumps_is_no_source_that_drifts(configs, tmp_path, bench):
     bench.level.clear()
     bench.level.append(lambda k, a: 1 + 0.01 * k / (STATES - 1))
     assert sure(diagnosed(tmp_path, configs, bench)) == ["source_drift"]
+
+
+@pytest.mark.parametrize(("fault", "seed"), [(etalon, 9002), (etalon, 9005), (lamp_beat, 9003), (lamp_beat, 9004)])
+def test_a_wave_of_any_frequency_is_no_fault_of_the_plate(fault, seed, configs, tmp_path, bench):
+    """Two waves of the grid, or the plate's own, explain a part of a wave between them."""
+    fault(bench, np.random.default_rng(seed), STATES)
+    assert set(sure(diagnosed(tmp_path, configs, bench))) <= {"source_flicker"}
