@@ -111,6 +111,17 @@ def small_rig(configs: Path, tmp_path: Path) -> Callable[..., Path]:
 
 
 @pytest.fixture
+def default_rig(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], None]:
+    """Makes a rig file the default one for this test alone; a module that is first imported then would keep it."""
+
+    def use(path: Path) -> None:
+        for module in ("by_hand", "campaign", "demo", "single", "defaults"):
+            monkeypatch.setattr(f"acquisition.commands.{module}.DEFAULT_RIG", path)
+
+    return use
+
+
+@pytest.fixture
 def dim_instrument(configs: Path, tmp_path: Path) -> Path:
     """The default rig's Mueller polarimeter with a tenth of the light: a truth that is not what is declared."""
     from processing.instrument.model import InstrumentModel

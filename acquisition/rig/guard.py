@@ -364,6 +364,10 @@ def main() -> None:
     guard = Guard(with_held_ports(own, held), hello["pid"], journal, own)
     guard.open_cutoff()
     in_order = guard.watch(line)
+    # The next program may want the ports while a slow disc still takes the last words.
+    for descriptor in descriptors:
+        with contextlib.suppress(OSError):
+            os.close(descriptor)
     journal.close()
     sys.exit(0 if in_order else 1)
 

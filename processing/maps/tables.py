@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.doors import require_distinct
 from processing.errors import ProcessError
 from processing.geometry.frames import GeometryImage
 from processing.geometry.viewing import ViewingGeometry
@@ -87,7 +86,6 @@ def tabulate(
     ------
     ProcessError : products of another kind or wavelength, without an arm angle, or simulated and measured mixed.
     """
-    require_distinct(sources)
     view = ViewingGeometry.load(geometry_file)
     for done, source in enumerate(sources, 1):
         with Product(source) as product:

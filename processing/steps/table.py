@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from processing.doors import require_distinct
 from processing.errors import ProcessError
 from processing.maps.tables import tabulate
 from processing.reflectance.table_axes import Layout
@@ -43,6 +44,7 @@ class Tabulation(FileStep):
 
     def record(self) -> Step:
         """Layout, sources and geometry."""
+        require_distinct(self.sources)
         inputs = [file_identity(source, "source") for source in self.sources]
         return Step("table", {"layout": self.layout}, (*inputs, *geometry_identities(self.geometry)))
 

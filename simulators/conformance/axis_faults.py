@@ -67,7 +67,7 @@ class AxisFaults(AxisTests):
 
     def test_a_silent_device_fails_with_the_reason(self, kind: str) -> None:
         with self.served(kind, speed=2.0) as served:
-            axis = served.open(reply_s=0.15)
+            axis = served.open()
             motion = axis.start_move(90.0)
             served.emulator.faults.add(Fault("silent"))
             with pytest.raises(MotionFailed, match="nothing within") as caught:
@@ -85,7 +85,7 @@ class AxisFaults(AxisTests):
         """One spoiled reply, at every place of the exchange: the move ends right, or with an error."""
         right = 0
         with self.served(kind) as served:
-            axis = served.open(reply_s=0.1)
+            axis = served.open()
             for place in range(1, 13) if fault == "garbled" else (1, 4, 7, 10):
                 served.emulator.faults.add(Fault(fault, from_command=place, commands=1, amount=0.13))  # type: ignore[arg-type]
                 target_deg = 7.0 * place

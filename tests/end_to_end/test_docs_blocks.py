@@ -162,14 +162,14 @@ def first_capture(checkout: Path) -> Path:
 
 
 @pytest.fixture
-def desk(checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def desk(checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, default_rig: Callable[[Path], None]) -> Path:
     """Where a page's commands run: links to the files of the checkout, nothing else."""
     for name in SHOWN_FOLDERS:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).symlink_to(checkout / name)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")
-    monkeypatch.setattr("acquisition.commands.defaults.DEFAULT_RIG", checkout / "configs/rigs/simulated.yaml")
+    default_rig(checkout / "configs/rigs/simulated.yaml")
     return tmp_path
 
 

@@ -26,11 +26,11 @@ SAID = {
 
 
 @pytest.mark.parametrize("name", SAID)
-def test_script(name, tmp_path, monkeypatch, capsys, small_rig):
+def test_script(name, tmp_path, monkeypatch, capsys, small_rig, default_rig):
     monkeypatch.setattr("sys.argv", [name, str(tmp_path)])
     monkeypatch.chdir(tmp_path)
     # The rig of the examples has 360 000 pixels at a tenth of real time.
-    monkeypatch.setattr("acquisition.commands.defaults.DEFAULT_RIG", small_rig())
+    default_rig(small_rig())
     runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
     said = capsys.readouterr().out
     assert SAID[name] in said

@@ -106,9 +106,9 @@ def test_a_campaign_is_one_array_over_angle_and_wavelength(capture, tmp_path):
         umov.open_campaign(folder, "stokes")
 
 
-def test_the_docstrings_run_as_they_stand(small_rig, tmp_path, monkeypatch, capsys):
+def test_the_docstrings_run_as_they_stand(small_rig, default_rig, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("acquisition.commands.defaults.DEFAULT_RIG", small_rig())
+    default_rig(small_rig())
     blocks = {}
     for package in (acquisition, processing):
         lines = (package.__doc__ or "").splitlines()

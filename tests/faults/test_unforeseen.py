@@ -96,10 +96,10 @@ def test_a_campaign_whose_disc_process_was_killed_takes_its_folder_again(
             os.kill(disc()._pid, signal.SIGKILL)
             if somebody_was_faster:
                 others.acquire(timeout=60)
-        else:
-            with pytest.raises(filelock.Timeout):
-                others.acquire(timeout=0)
-        return take(*arguments, **options)
+        taken = take(*arguments, **options)
+        with pytest.raises(filelock.Timeout):
+            others.acquire(timeout=0)
+        return taken
 
     monkeypatch.setattr(session, "take", killed_once)
     code, said, *_ = night(retries=1)
@@ -108,8 +108,9 @@ def test_a_campaign_whose_disc_process_was_killed_takes_its_folder_again(
         assert code == 1
         assert "another program runs the campaign" in said
     else:
+        # The end of the process is seen before the capture begins, or by the capture, which is then tried again.
         assert code == 0, said
-    assert len(tries) == 1 + (not somebody_was_faster)
+        assert len(tries) in (1, 2)
 
 
 @pytest.mark.parametrize("where", [(session, "take"), (Operator, "prepare")])
