@@ -1,7 +1,8 @@
 """Repeat tests of numbers under each kernel of OpenBLAS that this processor can run, and with numba's generic code.
 
-`./lab kernels` runs `tests/physics` and `tests/measured` in one child process after another. Sums come out in another
-order on another processor: a verdict, a name or a sign that changes with it is a fault of the engine.
+`./lab kernels` runs `tests/physics`, `tests/measured` and the chain of instruments in one child process after another.
+Sums come out in another order on another processor: a verdict, a name or a sign that changes with it is a fault of the
+engine.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-TESTS = ("tests/physics", "tests/measured")
+TESTS = ("tests/physics", "tests/measured", "tests/end_to_end/test_instrument_chain.py")
 #: What the processor must have for each kernel, by the names in /proc/cpuinfo.
 NEEDS = {
     "Nehalem": {"sse4_2"},
