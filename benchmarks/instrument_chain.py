@@ -163,10 +163,10 @@ def emulated(
         place, _, field = value.rpartition(".")
         true = true.with_values({place: {field: float(true.value_of(value) or 0.0) + by}})  # type: ignore[arg-type]
     random = np.random.default_rng(seed)
-    air = _capture(
+    air = emulated_capture(
         true, bench, np.eye(4), "air", file, random, fault(bench, np.random.default_rng(seed)) if fault else None
     )
-    other = _capture(true, bench, SAMPLE, "unknown", file, random)
+    other = emulated_capture(true, bench, SAMPLE, "unknown", file, random)
 
     def truth(product: dict[str, Array]) -> Array:
         if "stokes" not in product:
@@ -375,7 +375,9 @@ def two_starts(name: str, folder: Path, plates: Sequence[str] = PLATES[1:], by_d
     true = _turned(nominal, psg_retarder=3.0, psa_retarder=-2.0)
     file = folder / f"{name}.yaml"
     file.write_text(dump_yaml(nominal), encoding="utf-8")
-    air, other = (_capture(true, bench, m, kind, file, random) for m, kind in ((np.eye(4), "air"), (SAMPLE, "unknown")))
+    air, other = (
+        emulated_capture(true, bench, m, kind, file, random) for m, kind in ((np.eye(4), "air"), (SAMPLE, "unknown"))
+    )
     found, products = [], []
     for by in (0.0, by_deg):
         model, new = _turned(nominal, **dict.fromkeys(plates, by)), folder / f"{name}_{by:g}.yaml"
@@ -398,7 +400,7 @@ def _turned(model: InstrumentModel, **by_deg: float) -> InstrumentModel:
     return model.with_values(azimuths)  # type: ignore[arg-type]
 
 
-def _capture(
+def emulated_capture(
     model: InstrumentModel,
     bench: Bench,
     sample: Array,

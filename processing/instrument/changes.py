@@ -14,6 +14,9 @@ from processing.arrays import Array
 
 #: Standard deviation of a normal distribution over its median absolute deviation.
 MAD_TO_SIGMA = 1.4826
+#: [of full scale] Below this, a power of the counts is taken as straight: curved within the noise of a dark pixel, it
+#: would narrow that noise, which looks like evidence for it. Cameras with a tone curve are straight up to about 0.003.
+STRAIGHT_BELOW = 1e-3
 #: Names of the smooth terms of what varies over the image.
 FIELD_TERMS = ("x", "y", "x2", "xy", "y2")
 

@@ -10,14 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.instrument.applied_effects import changes_of, instrument_effects
-from processing.instrument.changes import Changes, Conditions, elapsed, field_terms
+from processing.instrument.changes import STRAIGHT_BELOW, Changes, Conditions, elapsed, field_terms
 from processing.instrument.model import InstrumentModel
 from processing.instrument.nominal import KIND
 from processing.reduction.sample_states import states_of_sample
 from processing.storage.captures.capture import Capture
-
-#: Signals below this part of full scale have the logarithm of this.
-_TINY = np.float32(1e-6)
 
 
 @dataclass(frozen=True)
@@ -125,5 +122,5 @@ def _feature(name: str, u: NDArray[np.float32]) -> NDArray[np.float32] | np.floa
     powers = {"square": 2, "cube": 3, "fourth": 4}
     if name in powers:
         return np.asarray(u ** powers[name])
-    log = np.log(np.maximum(u, _TINY))
+    log = np.log(np.maximum(u, np.float32(STRAIGHT_BELOW)))
     return np.asarray(u * log ** {"log": 1, "log_square": 2, "log_cube": 3}[name])

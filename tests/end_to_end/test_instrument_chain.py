@@ -1,8 +1,12 @@
 """Diagnose a capture of air, write the file, reduce another sample: its M is better than before, or unchanged."""
 
+import numpy as np
 import pytest
 
 from benchmarks import instrument_chain as chain
+from processing.diagnosis.instrument.diagnose import diagnose_captures
+from processing.instrument.model import InstrumentModel
+from processing.yaml_file import dump_yaml
 
 
 def test_every_instrument_has_its_line(configs):
@@ -45,3 +49,19 @@ def test_a_plate_of_fewer_states_of_air_is_nearer_too(public_files, tmp_path):
 def test_a_fault_of_the_air_capture_alone_stays_there(fault, tmp_path):
     row = chain.emulated("rgb950", tmp_path, 2, chain.OF_AIR[fault])
     assert row.written < 0.5 * row.nominal
+
+
+@pytest.mark.parametrize("is_nominal", [False, True])
+@pytest.mark.parametrize("gains", [(1.03, 1.0), (1.05, 1.02)])
+def test_the_noise_of_a_dark_channel_is_no_tone_curve(gains, is_nominal, configs, tmp_path):
+    """A polarization camera sees horizontal light: one channel is dark, and the gains of two others are off."""
+    names = ("45", "135")
+    stated = InstrumentModel.load(configs / "instruments/linear_stokes.yaml").at(662)
+    stated = stated.model_copy(update={"calibrate": tuple(f"{n}.gain" for n in names) if is_nominal else ()})
+    true = stated.with_values({name: {"gain": gain} for name, gain in zip(names, gains, strict=True)})
+    file = tmp_path / "stokes.yaml"
+    file.write_text(dump_yaml(stated))
+    random = np.random.default_rng(4)
+    air = chain.emulated_capture(true, chain.Bench({}, {}), np.eye(4), "air", file, random)
+    found = diagnose_captures([air], stated)[0].diagnosis
+    assert "tone_curve" not in [effect.kind for effect in found.effects]

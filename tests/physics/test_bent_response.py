@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from processing.diagnosis.instrument.diagnose import diagnose_captures
+from processing.diagnosis.instrument.features import features
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.schema import Sample
 from simulators.blind.real_bench import Disc
@@ -39,3 +40,12 @@ def test_a_bend_beside_other_faults_is_not_taken_for_several(configs: Path, tmp_
     assert set(bend.indistinguishable_from) <= {"tone_curve"}
     lost = bend.parameters["lost_at_full_scale"]
     assert lost.value == pytest.approx(BEND, abs=4 * lost.stderr)
+
+
+def test_the_slope_of_a_feature_is_its_derivative_at_dark_signals_too() -> None:
+    """What noise adds to a feature is subtracted by these slopes; half of the counts of a dark pixel are negative."""
+    u = np.array([-1.3e-2, -2e-4, 0.0, 3e-4, 9.5e-4, 1.2e-3, 0.04, 0.7])
+    step = 1e-8
+    _, slope = features(u)
+    exact = (features(u + step)[0] - features(u - step)[0]) / (2 * step)
+    np.testing.assert_allclose(slope, exact, rtol=1e-5, atol=1e-5)

@@ -44,7 +44,8 @@ def show(d: Diagnosis, details: bool = False, written: bool = False) -> None:
     _say(short, f"{head}{d.instrument}: {VERDICTS[d.verdict]}{', not corrected' if refused else ''}")
     noise = "" if d.noise_floor_percent is None else f"; noise {d.noise_floor_percent:.3g} %"
     kind = "residual" if d.noise_floor_percent is None else "residual beyond noise"
-    _say(short, f"{kind} {d.error_before.told} -> {d.error_after.told} of the mean signal{noise}")
+    after = f" -> {d.error_after.told}" if d.error_after != d.error_before else ""
+    _say(short, f"{kind} {d.error_before.told}{after} of the mean signal{noise}")
     for c in d.captures:
         _name_capture(short, c)
     for head, text in (("first of all", d.wiring), ("not determined", d.branch)):

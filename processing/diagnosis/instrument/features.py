@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from processing.arrays import Array
 from processing.diagnosis.captured.capture_data import SharedNoise
+from processing.instrument.changes import STRAIGHT_BELOW
 from processing.reduction.move_image import noise_taps
 
 #: Features of a signal u (counts over full scale); corrected counts = u + sum of coefficient times feature.
@@ -23,8 +24,6 @@ FEATURES = (
 )
 #: [features, fixed] The last of them are derivatives of the image by position.
 DERIVATIVES = 5
-#: [of full scale] Signals below this have the logarithm of this.
-TINY = 1e-6
 NOTHING_SHARED = SharedNoise()
 #: [1, fixed] Savitzky-Golay filters of seven points: value (third order), first and second derivative (fourth and fifth
 #: order).
@@ -48,16 +47,18 @@ def features(u: NDArray[np.floating[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Features of signals that need no neighbours, (F - 5, ...), and their derivatives by the signal, as exact as u."""
     z, slope = np.empty((2, len(FEATURES) - DERIVATIVES, *u.shape), dtype=u.dtype)
     # Products: numpy's powers beyond the second take ten times as long.
-    log, square = np.log(np.maximum(u, TINY)), u * u
+    log, square = np.log(np.maximum(u, STRAIGHT_BELOW)), u * u
     cube, log_square = square * u, log * log
+    # Straight below: there the logarithm is constant.
+    curved = (u > STRAIGHT_BELOW).astype(u.dtype)
     z[0], slope[0] = u, 1.0
     z[1], slope[1] = 1.0, 0.0
     z[2], slope[2] = square, 2 * u
     z[3], slope[3] = cube, 3 * square
     z[4], slope[4] = square * square, 4 * cube
-    z[5], slope[5] = u * log, log + 1
-    z[6], slope[6] = u * log_square, log_square + 2 * log
-    z[7], slope[7] = u * log_square * log, log_square * log + 3 * log_square
+    z[5], slope[5] = u * log, log + curved
+    z[6], slope[6] = u * log_square, log_square + 2 * log * curved
+    z[7], slope[7] = u * log_square * log, log_square * log + 3 * log_square * curved
     return z, slope
 
 

@@ -12,12 +12,9 @@ import numpy as np
 
 from processing.arrays import Array
 from processing.effect import Parameter
-from processing.instrument.changes import Changes, Conditions
+from processing.instrument.changes import STRAIGHT_BELOW, Changes, Conditions
 from processing.instrument.effects.base import ResponseCurve
 from processing.instrument.model import InstrumentModel
-
-#: Signal over full scale below which the curve is taken as straight.
-TINY = 1e-6
 
 
 class ToneCurve(ResponseCurve):
@@ -36,6 +33,5 @@ class ToneCurve(ResponseCurve):
             changes.response[name] = changes.response[name] + factor
 
     def undo(self, signal: Array, conditions: Conditions, values: Array) -> tuple[Array, Array]:
-        # Noise takes dark pixels below zero, where a power is not defined: straight there.
-        power = np.maximum(signal, TINY) ** values[0]
-        return signal * power, (1 + values[0]) * power
+        power = np.maximum(signal, STRAIGHT_BELOW) ** values[0]
+        return signal * power, (1 + values[0] * (signal > STRAIGHT_BELOW)) * power
