@@ -110,4 +110,4 @@ def test_lab_asks_whether_a_command_near_by_was_meant(typed: str, meant: str | N
     done = subprocess.run([ROOT / "lab", typed], capture_output=True, text=True, check=False)
     assert done.returncode == 1
     hint = f" Did you mean '{meant}'?" if meant else ""
-    assert done.stderr.splitlines()[-1] == f"lab: there is no command '{typed}'.{hint}"
+    assert done.stderr == f"lab: there is no command '{typed}'.{hint} ./lab help lists them.\n"

@@ -256,10 +256,10 @@ class ZaberAxis(MotionAxis):
             if config.address in (None, address) and str(config.serial_number or serial) == serial
         ]
         if len(wanted) != 1:
-            rule = f"address {config.address}, serial_number {config.serial_number}"
-            raise WrongDevice(
-                asked, f"{len(wanted)} devices match {rule}; found {listed}", "Correct the rig file or the wiring"
-            )
+            named = {"address": config.address, "serial_number": config.serial_number}
+            rule = ", ".join(f"{key} {value}" for key, value in named.items() if value is not None)
+            what = f"no device has {rule}" if rule else f"{len(wanted)} devices answer and the rig file names none"
+            raise WrongDevice(asked, f"{what}; found {listed}", "Correct the rig file or the wiring")
         return wanted[0]
 
     def describe(self) -> AxisIdentity:
