@@ -497,7 +497,9 @@ def _print_starts() -> None:
 def _chosen(option: str, folder: Path) -> Iterator[Row]:
     files = find_files("drr-wollaston-nir", [SHIPPED, DATA])
     if option == "--draws" and files is not None:
-        yield from (half_wave_plate(nm, files, folder, draw) for nm in MEASURED_NM for draw in range(8))
+        for nm, draw in ((nm, draw) for nm in MEASURED_NM for draw in range(8)):
+            with tempfile.TemporaryDirectory() as own:
+                yield half_wave_plate(nm, files, Path(own), draw)
     elif option == "--air":
         names = ("rgb950", "drr_5to1", "drr_wollaston", "linear_mueller")
         for name, fault, seed in ((n, f, k) for n in names for f in OF_AIR for k in (2, 3)):
