@@ -55,3 +55,15 @@ def test_an_undeclared_fault_is_found(diagnosed):
     assert effect["kind"] == "psg_azimuth"
     found = effect["parameters"]["azimuth"]
     assert found["value"] == pytest.approx(0.5, abs=3 * found["stderr"])
+
+
+def test_a_residual_below_the_noise_says_what_is_explained(diagnosed, capfd):
+    """A slip that is seen beyond doubt leaves the rms of single pixels under its bound, before and after."""
+    (effect,) = diagnosed([{"kind": "angle_slip", "axis": "psa", "at_index": 13, "slip_deg": 0.8}])["effects"]
+    said = capfd.readouterr().out
+    slip = effect["parameters"]["slip"]
+    value, error = map(
+        float, re.search(r"beyond noise under [\d.]+ % \(([\d.]+) ± ([\d.]+) % explained\)", said).groups()
+    )
+    # The explained part is as many of its errors from zero as the slip.
+    assert value / error == pytest.approx(abs(slip["value"]) / slip["stderr"], rel=0.2)

@@ -44,8 +44,7 @@ def show(d: Diagnosis, details: bool = False, written: bool = False) -> None:
     _say(short, f"{head}{d.instrument}: {VERDICTS[d.verdict]}{', not corrected' if refused else ''}")
     noise = "" if d.noise_floor_percent is None else f"; noise {d.noise_floor_percent:.3g} %"
     kind = "residual" if d.noise_floor_percent is None else "residual beyond noise"
-    after = f" -> {d.error_after.told}" if d.error_after != d.error_before else ""
-    _say(short, f"{kind} {d.error_before.told}{after} of the mean signal{noise}")
+    _say(short, f"{kind} {d.error_before.told_beside(d.error_after)} of the mean signal{noise}")
     for c in d.captures:
         _name_capture(short, c)
     for head, text in (("first of all", d.wiring), ("not determined", d.branch)):
@@ -94,7 +93,7 @@ def _show_effect(short: Mapping[str, str], number: int, effect: FoundEffect, noi
     )
     _say(short, f"{number}. {effect.kind}{where} ({_answer(effect)}): {values}")
     if effect.residual_without is not None and effect.residual_with is not None:
-        _say(short, f"   residual {effect.residual_without.told} -> {effect.residual_with.told}{noise}")
+        _say(short, f"   residual {effect.residual_without.told_beside(effect.residual_with)}{noise}")
     _say(short, f"   not applied, because {effect.not_applied}" if effect.not_applied else "   applied")
 
 
@@ -117,7 +116,7 @@ def _name_capture(short: Mapping[str, str], c: CaptureReport) -> None:
     one = short.get(c.name, "capture")
     line = f"  {one}  {c.name}" + (f", {c.wavelength_nm:g} nm" if c.wavelength_nm else "")
     if short and c.error_before is not None and c.error_after is not None:
-        line += f": {c.error_before.told} -> {c.error_after.told}"
+        line += f": {c.error_before.told_beside(c.error_after)}"
     if c.source_percent is not None:
         line += f"; level of the source projected out, it varies by {c.source_percent:.2g} %"
     typer.echo(line)

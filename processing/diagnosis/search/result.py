@@ -26,11 +26,16 @@ class BeyondNoise(_Part):
     ----------
     percent : zero where the residual is not larger than noise.
     stderr : standard error; most : two standard errors of the mean square above it.
+    mean_square : in percent squared, below zero where noise makes it so.
+    stderr_of_known : standard error of the rms of a pattern whose shape is known. It is far smaller than `stderr` of
+        a small residual.
     """
 
     percent: float
     stderr: float
     most: float
+    mean_square: float
+    stderr_of_known: float
 
     @classmethod
     def of(cls, excess: float, freedom: float, noise_percent: float) -> BeyondNoise:
@@ -45,6 +50,8 @@ class BeyondNoise(_Part):
         """
         share, error = max(excess / freedom, 0.0), (2 / freedom) ** 0.5
         return cls(
+            mean_square=noise_percent**2 * excess / freedom,
+            stderr_of_known=noise_percent / freedom**0.5,
             percent=noise_percent * share**0.5,
             stderr=noise_percent * error / 2 / max(share, error) ** 0.5,
             most=noise_percent * (share + 2 * error) ** 0.5,
@@ -53,11 +60,30 @@ class BeyondNoise(_Part):
     @property
     def told(self) -> str:
         """With its error, or below which it is where noise alone could be as large."""
-        if 2 * self.percent**2 < self.most**2:
-            return f"under {self.most:.1g} %"
-        digits = max(0, 2 - math.floor(math.log10(self.percent)))
-        error = f"{self.stderr:.{digits}f}"
-        return f"{self.percent:.{digits}f}" + (f" ± {error} %" if float(error) > 0 else " %")
+        return _percent(self.percent, self.stderr) if self.resolved else f"under {self.most:.1g} %"
+
+    @property
+    def resolved(self) -> bool:
+        """The residual is larger than noise alone could make it."""
+        return 2 * self.percent**2 >= self.most**2
+
+    def explained(self, after: BeyondNoise) -> str | None:
+        """How much a correction explains that leaves `after`; None where that is nothing.
+
+        Examples
+        --------
+        >>> before, after = (BeyondNoise.of(x, freedom=1_000_000, noise_percent=2.5) for x in (2000, -100))
+        >>> before.told, before.explained(after)
+        ('under 0.2 %', '0.115 ± 0.003 %')
+        """
+        square = self.mean_square - after.mean_square
+        return _percent(square**0.5, self.stderr_of_known) if square > self.stderr_of_known**2 else None
+
+
+def _percent(value: float, stderr: float) -> str:
+    digits = max(0, 2 - math.floor(math.log10(value)))
+    error = f"{stderr:.{digits}f}"
+    return f"{value:.{digits}f}" + (f" ± {error} %" if float(error) > 0 else " %")
 
 
 class Error(_Part):
@@ -75,6 +101,19 @@ class Error(_Part):
     def told(self) -> str:
         """The residual beyond noise, or all of it where the noise is not known."""
         return f"{self.rms_percent:.3g} %" if self.beyond_noise is None else self.beyond_noise.told
+
+    def explained(self, after: Error) -> str | None:
+        """What a correction explains that leaves `after`, where this residual is lost in noise; otherwise None."""
+        if after == self or self.beyond_noise is None or after.beyond_noise is None or self.beyond_noise.resolved:
+            return None
+        return self.beyond_noise.explained(after.beyond_noise)
+
+    def told_beside(self, after: Error) -> str:
+        """This residual and the one `after` a correction, or how much of this one is explained."""
+        if after == self:
+            return self.told
+        explained = self.explained(after)
+        return f"{self.told} -> {after.told}" if explained is None else f"{self.told} ({explained} explained)"
 
 
 class FoundEffect(_Part):
