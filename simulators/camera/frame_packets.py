@@ -1,6 +1,6 @@
 """A frame in packets as GigE Vision has it: a leader, its bytes, a trailer; with or without chunks behind the image.
 
-Aravis' fake camera sends images alone. Each chunk ends with its number and its length.
+Each chunk ends with its number and its length.
 """
 
 from __future__ import annotations
@@ -42,20 +42,21 @@ class FramePackets:
     payload: bytes
     chunked: bool = False
 
-    def packets(self, packet_bytes: int) -> Iterator[bytes]:
-        """The packets, without their IP and UDP headers."""
+    def packets(self, packet_bytes: int) -> Iterator[tuple[bytes, memoryview | bytes]]:
+        """Header and content of the packets, without their IP and UDP headers."""
         left, top, width, height = self.region
         kind = IMAGE_WITH_CHUNKS if self.chunked else IMAGE
         numbers = (self.time_ns, self.code, width, height, left, top, 0, 0)
         yield self._packet(LEADER, 0, struct.pack(">HHQIIIIIHH", 0, kind, *numbers))
         size = packet_bytes - TRANSPORT_BYTES - STREAM_BYTES
         count = -(-len(self.payload) // size)
+        payload = memoryview(self.payload)
         for k in range(count):
-            yield self._packet(DATA, k + 1, self.payload[k * size : (k + 1) * size])
+            yield self._packet(DATA, k + 1, payload[k * size : (k + 1) * size])
         yield self._packet(TRAILER, count + 1, struct.pack(">II", kind, height))
 
-    def _packet(self, kind: int, number: int, content: bytes) -> bytes:
-        return struct.pack(">HHI", 0, self.frame_id, kind << 24 | number) + content
+    def _packet(self, kind: int, number: int, content: memoryview | bytes) -> tuple[bytes, memoryview | bytes]:
+        return struct.pack(">HHI", 0, self.frame_id, kind << 24 | number), content
 
 
 def send(
@@ -73,6 +74,7 @@ def send(
     host = socket.inet_ntoa(struct.pack(">I", register(HOST_ADDRESS)))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as channel:
         channel.bind((address, 0))
+        receiver = (host, register(HOST_PORT) & 0xFFFF)
         for number, packet in enumerate(frame.packets(max(register(PACKET_SIZE) & 0xFFFF, _LEAST_PACKET_BYTES))):
             if (numbers is None or number in numbers) and random.random() >= lost_ratio:
-                channel.sendto(packet, (host, register(HOST_PORT) & 0xFFFF))
+                channel.sendmsg(packet, (), 0, receiver)

@@ -1,7 +1,8 @@
-"""A real GigE Vision camera on loopback that shows our own pixels.
+"""A simulated GigE Vision camera on loopback: it serves a GenICam description and does what its features say.
 
-It is Aravis' fake camera: it speaks the control and the stream protocol over UDP, so a driver cannot tell that it
-is simulated. Its pixels come from a Python function that is called at each exposure, in the camera's own thread.
+Registers are memory; a few features act, by their standard (SFNC) names: region, pixel format, exposure, gain,
+triggers, acquisition, status, events, time stamps behind the image. A program can set and read back all others.
+Its pixels come from a Python function that is called at each exposure, in a thread of the camera.
 
 One camera occupies one address. A second one at the same time needs a second loopback address, which root adds
 with `ip addr add 127.0.0.2/8 dev lo`.
@@ -9,40 +10,50 @@ with `ip addr add 127.0.0.2/8 dev lo`.
 
 from __future__ import annotations
 
-import ctypes
+import socket
 import struct
-import tempfile
 import threading
 import time
-from dataclasses import replace
+from collections import deque
 from pathlib import Path
-from typing import Any
+from typing import Self
 
-from drivers.aravis_library import load_aravis
 from drivers.errors import CameraError
-from drivers.pixel_formats import PixelFormat, pixel_format, pixel_format_of
-from simulators.camera import gige_features as features
-from simulators.camera.camera_memory import CameraMemory
-from simulators.camera.event_messages import (
-    CAPABILITY,
-    EVENTS,
-    EVENTS_SUPPORTED,
-    NUMBER_OF_CHANNELS,
-    EventMessages,
-    Moment,
+from drivers.pixel_formats import pixel_format_of
+from simulators.camera.bootstrap import boot
+from simulators.camera.control_channel import ControlChannel
+from simulators.camera.event_messages import EventMessages, Moment
+from simulators.camera.exposure import PixelSource, counts_of
+from simulators.camera.frame_packets import (
+    HOST_ADDRESS,
+    HOST_PORT,
+    PACKET_SIZE,
+    TRANSPORT_BYTES,
+    FramePackets,
+    send,
+    with_chunks,
 )
-from simulators.camera.exposure import ExposureInfo, PixelSource, counts_of
-from simulators.camera.frame_packets import FramePackets, send, with_chunks
-from simulators.camera.node_map import node_map
-from simulators.camera.simulated_camera import SimulatedCamera
+from simulators.camera.genicam.features import LOADS, START, STOP, TRIGGER, Features
+from simulators.camera.genicam.formula import Number
+from simulators.camera.genicam.node_tree import REGISTERS, NodeError, NodeTree
+from simulators.camera.genicam.power_up import power_up
+from simulators.camera.genicam.register import RegisterMemory
+from simulators.camera.gige_features import describe
+from simulators.camera.image_settings import delay_s, exposed, processed
+from simulators.camera.loopback_address import LoopbackAddress
 
-_FillPattern = ctypes.CFUNCTYPE(
-    None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32
-)
+# Set by a program that wants one packet of the size to see whether it gets through.
+_TEST_PACKET = 1 << 31
+_MOST_XML_BYTES = 1 << 24
+_KEPT_FRAMES = 4
+# Between two frames of a camera that runs without triggers.
+_FREE_RUN_S = 0.05
+# Registers of the link, which a user set does not hold: who controls, heartbeat, streams, and where the XML stands.
+_LINK = ((0x000, 0x100), (0x200, 0x240), (0x600, 0x604), (0x900, 0xA04), (0xB00, 0xB20), (0xD00, 0xD20))
 
 
-class GigeCamera(SimulatedCamera):
-    """A simulated camera; a context manager that runs it.
+class GigeCamera:
+    """A simulated camera; a context manager that runs it and raises at its end what went wrong in an exposure.
 
     Parameters
     ----------
@@ -53,20 +64,27 @@ class GigeCamera(SimulatedCamera):
     pixel_source : callable
         Gets an `ExposureInfo` at the start of each exposure and returns counts, uint16 of shape (height, width) of
         that info. If it raises, no frame is sent and the error is raised when the context ends, or by `check()`.
+    description : str or Path
+        Name of a table in `node_maps/`, or a file: a table (.yaml), or a GenICam description (.xml, .zip).
     bits : int
         Real bits of the counts in the 16-bit format; more is an error of the pixel source.
     lost_ratio : float
         Part of the packets that are lost, 0 to 1; may be changed at any time.
     address : str
         Loopback address to occupy.
-    description : str
-        Name of a table in `node_maps/`, or "aravis" for Aravis' own description with older names (ExposureTimeAbs).
     wait_s : float
         How long to wait for the address if another simulated camera has it.
-    elsewhere : bool
-        Take another loopback address of this machine at once, if there is one that no camera has.
     arming_s : float
         Time after an exposure in which a trigger is ignored; None for that of the table.
+    elsewhere : bool
+        Take another loopback address of this machine at once, if there is one that no camera has.
+    complete : bool
+        False plays a camera whose features do not suffice for a capture, so that a driver can refuse it.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be used; NodeError where a feature that a capture needs cannot be played.
     """
 
     def __init__(
@@ -75,214 +93,331 @@ class GigeCamera(SimulatedCamera):
         width: int,
         height: int,
         pixel_source: PixelSource,
+        *,
+        description: str | Path = "loopback",
         bits: int = 12,
         lost_ratio: float = 0.0,
         address: str = "127.0.0.1",
-        description: str = "loopback",
         wait_s: float = 60.0,
         arming_s: float | None = None,
         elsewhere: bool = False,
+        complete: bool = True,
     ) -> None:
-        super().__init__(address, elsewhere)
+        self.address = address
         self.serial = serial
-        self._size = (width, height)
-        self._source = pixel_source
         self.bits = bits
-        self._lost_ratio = lost_ratio
-        self._table = None if description == "aravis" else node_map(description)
-        self._wait_s = wait_s
-        self._arming_s = arming_s if arming_s is not None else self._table.arming_s if self._table else 0.0
-        self._armed_at_s = 0.0
-        #: Triggers that came before the camera was armed.
+        self.lost_ratio = lost_ratio
+        #: Triggers that came while the camera exposed, or before it was armed again.
         self.ignored_triggers = 0
-        #: Camera times that were sent behind the images.
-        self.chunk_times_ns: list[int] = []
-        #: So many frames to come are sent without that time.
-        self.timeless_frames = 0
-        # Holds frames of exposures that start from now on back, as a busy host or a full link does.
+        #: When the last trigger came that was heeded, by the monotonic clock.
+        self.triggered_s = 0.0
+        #: Number of the first frame after a start.
+        self.first_frame_id = 1
+        #: Holds frames of exposures that start from now on back, as a busy host or a full link does.
         self.delivery_delay_s = 0.0
-        self._gone = threading.Event()
-        self._camera: Any = None
-        self._memory: CameraMemory | None = None
+        #: So many frames to come are sent without the chunk that has their time.
+        self.timeless_frames = 0
+        #: The last frames, which can be sent again.
+        self.sent: deque[FramePackets] = deque(maxlen=_KEPT_FRAMES)
+        self._loopback = LoopbackAddress(address, elsewhere)
+        self._error: BaseException | None = None
+        self._sensor = (width, height)
+        self._source = pixel_source
+        self._complete = complete
+        self._wait_s = wait_s
+        self._description = describe(str(description), self._sensor)
+        self._arming_s = self._description.arming_s if arming_s is None else arming_s
+        self._armed_at_s = 0.0
+        # Control answers in one thread, exposures run in another; both look at the registers.
+        self._lock = threading.RLock()
+        self._wake = threading.Condition(self._lock)
+        self._channel = ControlChannel(self)
+        self._worker: threading.Thread | None = None
         self._events: EventMessages | None = None
-        # First, because its message says what is missing.
-        load_aravis()
-        self._library = ctypes.CDLL("libaravis-0.8.so.0")
-        self._library.arv_buffer_get_data.restype = ctypes.c_void_p
-        self._library.arv_buffer_get_data.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
-        self._library.arv_buffer_get_frame_id.restype = ctypes.c_uint64
-        self._library.arv_buffer_get_frame_id.argtypes = [ctypes.c_void_p]
-        self._library.arv_fake_camera_set_fill_pattern.argtypes = [ctypes.c_void_p, _FillPattern, ctypes.c_void_p]
-        # ctypes frees the callback when the last reference goes; Aravis would then call into nothing.
-        self._callback = _FillPattern(self._fill)
+        self._was_on = self._plugged_in = self._acquiring = self._triggered = self._busy = False
+        # Which start of the acquisition this is: an exposure of an earlier one is thrown away.
+        self._run_number = 0
+        self._frame_id = 0
+        self._prepare()
+
+    def _prepare(self) -> None:
+        description = self._description
+        root = description.root
+        texts = {
+            "DeviceVendorName": root.get("VendorName") or "unknown",
+            "DeviceModelName": root.get("ModelName") or "unknown",
+            "DeviceVersion": "simulated",
+            "DeviceID": self.serial,
+        }
+        self._memory = RegisterMemory()
+        self._nodes = NodeTree(root, self._memory, description.source)
+        try:
+            power_up(self._nodes, self._sensor, {**texts, "DeviceSerialNumber": self.serial})
+            self._features = Features(self._nodes, self._sensor, complete=self._complete)
+            for name, value in description.at_power_up.items():
+                if name in self._nodes:
+                    self.leave(name, value)
+            self._default = self._memory.copy()
+        except RecursionError as error:
+            raise NodeError(f"{description.source}: its features refer to each other without an end") from error
+        self._xml_at = self._free_address()
+        self._texts = texts
+
+    def _free_address(self) -> int:
+        taken = []
+        for name in self._nodes:
+            if self._nodes.node(name).tag in REGISTERS:
+                try:
+                    taken.append(self._nodes.register(name))
+                except NodeError:
+                    continue
+        tops = range(0xFF00_0000, 0, -_MOST_XML_BYTES)
+        return next(at for at in tops if not any(register.overlaps(at, _MOST_XML_BYTES) for register in taken))
 
     # --- life --------------------------------------------------------------------------------------------
 
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        self.stop()
+        if error is None:
+            self.check()
+
     def start(self) -> None:
-        aravis, _ = load_aravis()
+        """Start the camera; after `vanish` it is as after being switched on.
+
+        Raises
+        ------
+        CameraError
+            The address is taken or does not exist.
+        """
         self._loopback.take(self._wait_s)
         self.address = self._loopback.address
-        with tempfile.TemporaryDirectory() as folder:
-            path = None
-            if self._table is not None:
-                path = Path(folder) / "camera.xml"
-                path.write_text(features.description(self._table, *self._size))
-            camera = aravis.GvFakeCamera.new_full(self.address, self.serial, None if path is None else str(path))
-        # It also says that it runs where it could not bind its port, which is why the address was taken first.
-        if not camera.is_running():
+        if self._was_on:
+            self._prepare()
+        self._plugged_in = self._was_on = True
+        xml = (self._description.name, self._xml_at, len(self._description.served))
+        boot(self._memory, self.address, self._texts, xml)
+        self._events = EventMessages(self._bootstrap)
+        try:
+            self._channel.open(self.address)
+        except OSError as error:
             self._loopback.release()
             raise CameraError(
-                f"start a simulated camera at {self.address}",
-                "no network interface has that address",
-                f"Add it: ip addr add {self.address}/8 dev lo",
-            )
-        self._gone.clear()
-        self._camera, self._memory = camera, CameraMemory(camera.get_fake_camera())
-        self._memory.power_up(*self._size, self._table)
-        self._events = EventMessages(self._memory.read)
-        if self._table is not None and self._table.events:
-            self._memory.write(NUMBER_OF_CHANNELS, 1)
-            self._memory.write(CAPABILITY, self._memory.read(CAPABILITY) | EVENTS_SUPPORTED)
-        # hash() of a GObject wrapper is the object's address.
-        self._library.arv_fake_camera_set_fill_pattern(self._memory.address, self._callback, None)
-        self.lost_ratio = self._lost_ratio
+                f"start a simulated camera at {self.address}", str(error), "Is it running already?"
+            ) from error
+        self._worker = threading.Thread(target=self._run, name=f"exposures of camera {self.address}", daemon=True)
+        self._worker.start()
 
     def vanish(self) -> None:
-        if self._camera is None or self._memory is None:
-            return
-        self._gone.set()
-        # No frame must leave with Aravis' own pattern, and no Python may run while its thread is joined.
-        self._camera.set_property("gvsp-lost-ratio", 1.0)
-        self._library.arv_fake_camera_set_fill_pattern(self._memory.address, _FillPattern(), None)
-        self._camera = self._memory = None
+        """End the camera at once, as if its plug was pulled; `start` plugs it in again.
+
+        The address stays ours until `stop`: a driver that does not know yet must not talk to another camera there.
+        """
+        with self._wake:
+            self._plugged_in = False
+            self._begin(acquiring=False)
+        self._channel.close()
         if self._events is not None:
             self._events.close()
+        worker, self._worker = self._worker, None
+        if worker is not None:
+            worker.join()
 
-    @property
-    def lost_ratio(self) -> float:
-        """Part of the packets that are lost."""
-        return self._lost_ratio
+    def stop(self) -> None:
+        """End the camera and let the next one have its address."""
+        self.vanish()
+        self._loopback.release()
 
-    @lost_ratio.setter
-    def lost_ratio(self, ratio: float) -> None:
-        self._lost_ratio = ratio
-        if self._camera is not None:
-            self._camera.set_property("gvsp-lost-ratio", ratio)
+    def check(self) -> None:
+        """Raise what went wrong in an exposure, if anything did."""
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
 
-    def fire(self) -> None:
-        """Start an exposure from outside, as a pulse on the trigger line does."""
-        # Aravis knows software triggers alone, so the source changes behind the driver's back.
-        self._live_memory().write(features.TRIGGER_SOURCE, 1)
-        self._live_memory().write(features.SOFTWARE_TRIGGER, 1)
+    def fire(self, *, unasked: bool = False) -> None:
+        """Start an exposure from outside, as a pulse on the trigger line does; `unasked`: whatever the source is."""
+        self._trigger(by_program=False, unasked=unasked)
 
-    def _live_memory(self) -> CameraMemory:
-        if self._memory is None:
-            raise CameraError(f"look into the camera at {self.address}", "it is not running", "Start it first")
-        return self._memory
+    def value(self, name: str) -> Number:
+        """Value of a feature or a register, by its name in the description. Raises NodeError."""
+        with self._lock:
+            return self._nodes.value(name)
 
-    def write_register(self, address: int, value: int) -> None:
-        """Write a 32-bit register, behind the back of whoever controls the camera."""
-        self._live_memory().write(address, value)
+    def leave(self, name: str, value: Number | str) -> None:
+        """Set a feature as another program left it: a number, an entry, or 0 and 1 for a flag.
 
-    def register(self, address: int) -> int:
-        """Read a 32-bit register, as a look into the camera from behind."""
-        return self._live_memory().read(address)
-
-    # --- the exposure, in the camera's own thread --------------------------------------------------------
-
-    def _fill(self, buffer: int, _: int, exposure_us: int, gain_raw: int, code: int) -> None:
-        start_s, delay_s = time.monotonic(), self.delivery_delay_s
-        camera = self._camera
-        if start_s < self._armed_at_s and camera is not None:
-            self.ignored_triggers += 1
-            self._tell("missed", 0)
-            camera.set_property("gvsp-lost-ratio", 1.0)
-            return
-        chunked: FramePackets | None = None
-        try:
-            info = self._info(buffer, exposure_us, gain_raw)
-            self._tell("started", info.frame_id)
-            fmt = self._format(code)
-            data = fmt.encode(counts_of(self._source, info, fmt, self.bits))
-            if self._sends_chunks():
-                time_ns = time.time_ns()
-                times = {features.TIMESTAMP_CHUNK: struct.pack(">Q", time_ns)} if self.timeless_frames <= 0 else {}
-                payload = with_chunks(data.tobytes(), times)
-                chunked = FramePackets(info.frame_id, time_ns, code & 0xFFFFFFFF, info.region, payload, True)
-                self.timeless_frames -= 1
+        Raises
+        ------
+        NodeError
+            It cannot be set.
+        """
+        with self._lock:
+            if isinstance(value, str):
+                self._nodes.choose(name, value)
             else:
-                ctypes.memmove(self._library.arv_buffer_get_data(buffer, None), data.ctypes.data, data.nbytes)
-            if camera is not None and not self._gone.is_set():
-                camera.set_property("gvsp-lost-ratio", 1.0 if chunked else self._lost_ratio)
-        except BaseException as error:  # noqa: BLE001 - nothing may pass into C; check() raises it where it is seen
-            self._error = self._error or error
-            if camera is not None:
-                camera.set_property("gvsp-lost-ratio", 1.0)
-        del camera
-        self._arm_after(start_s + exposure_us * 1e-6)
-        # The frame is sent when this returns, and no frame leaves a camera before its exposure has ended.
-        # Real time: the same thread answers commands, and Aravis gives up a camera that is silent for three seconds.
-        self._gone.wait(max(0.0, start_s + exposure_us * 1e-6 - time.monotonic()))
-        if not self._gone.is_set():
-            self._tell("ended", int(self._library.arv_buffer_get_frame_id(buffer)))
-        self._gone.wait(delay_s)
-        if chunked is not None and self._memory is not None and not self._gone.is_set():
-            self.chunk_times_ns.append(chunked.time_ns)
-            send(chunked, self._memory.read, self.address, self._lost_ratio)
+                self._nodes.set_value(name, value)
+            self._features.follow()
+
+    # --- what the control channel asks for ---------------------------------------------------------------
+
+    def read(self, address: int, count: int) -> bytes:
+        """Bytes of the registers, or of the description behind them."""
+        start = address - self._xml_at
+        if 0 <= start < _MOST_XML_BYTES:
+            return self._description.served[start : start + count].ljust(count, b"\0")
+        with self._lock:
+            return self._memory.read(address, count)
+
+    def write(self, address: int, data: bytes) -> None:
+        """Write registers, and do what was commanded by it."""
+        with self._wake:
+            self._memory.write(address, data)
+            if address == PACKET_SIZE and self._bootstrap(PACKET_SIZE) & _TEST_PACKET:
+                self._send_test_packet()
+            try:
+                commands = self._features.heard(address, len(data))
+                self._features.follow()
+                if any(load in commands for load in LOADS):
+                    self._memory.restore(self._default, but=_LINK)
+                    self._features.follow()
+                if TRIGGER in commands:
+                    self._trigger(by_program=True)
+            except (NodeError, ArithmeticError, ValueError) as error:
+                # Registers hold whatever is written: no program may end the thread that answers.
+                self._error = self._error or error
+                return
+            if START in commands or STOP in commands:
+                self._begin(acquiring=START in commands)
+
+    def resend(self, frame_id: int, first: int, last: int) -> None:
+        """Send packets once more, while the frame is kept."""
+        for frame in list(self.sent):
+            if frame.frame_id == frame_id:
+                send(frame, self._bootstrap, self.address, self.lost_ratio, range(first, last + 1))
+
+    def released(self) -> None:
+        """Without anybody who controls it a camera stops."""
+        self._begin(acquiring=False)
+
+    def _begin(self, *, acquiring: bool) -> None:
+        """Start or stop: whatever was under way ends, and frames are numbered anew."""
+        with self._wake:
+            self._acquiring, self._triggered, self._frame_id = acquiring, False, self.first_frame_id - 1
+            self._run_number += 1
+            self._armed_at_s = 0.0
+            self._features.show(exposing=False, armed=True)
+            self._wake.notify_all()
+
+    def _bootstrap(self, address: int) -> int:
+        return int(struct.unpack(">I", self._memory.read(address, 4))[0])
+
+    def _send_test_packet(self) -> None:
+        size = self._bootstrap(PACKET_SIZE)
+        self._memory.write(PACKET_SIZE, struct.pack(">I", size & ~_TEST_PACKET))
+        host = socket.inet_ntoa(self._memory.read(HOST_ADDRESS, 4))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as channel:
+            channel.bind((self.address, 0))
+            channel.sendto(
+                bytes(max(0, (size & 0xFFFF) - TRANSPORT_BYTES)), (host, self._bootstrap(HOST_PORT) & 0xFFFF)
+            )
+
+    # --- exposures ---------------------------------------------------------------------------------------
+
+    def _trigger(self, *, by_program: bool, unasked: bool = False) -> None:
+        with self._wake:
+            source = self._features.trigger_source()
+            is_source = source is not None and by_program == (source == "Software")
+            if not self._acquiring or not (is_source or unasked):
+                return
+            if self._busy or self._triggered or time.monotonic() < self._armed_at_s:
+                self.ignored_triggers += 1
+                self._tell("missed", 0)
+                return
+            self._triggered, self.triggered_s = True, time.monotonic()
+            # Before the command is answered: whoever asks then is told that it exposes.
+            self._features.show(exposing=True, armed=False)
+            self._wake.notify_all()
 
     def _tell(self, moment: Moment, frame_id: int) -> None:
-        """Tell the events of a moment that a host has asked for."""
-        memory, events = self._memory, self._events
-        if self._table is None or memory is None or events is None:
-            return
-        for k, (name, number) in enumerate(self._table.events.items()):
-            if name in EVENTS[moment] and memory.read(features.EVENT_NOTIFICATION + 4 * k):
-                events.tell(self.address, number, frame_id, time.time_ns())
+        if self._events is not None:
+            for number in self._features.events(moment):
+                self._events.tell(self.address, number, frame_id, time.time_ns())
 
-    def _sends_chunks(self) -> bool:
-        offers = self._table is not None and self._table.chunk_timestamp
-        return offers and bool(self._live_memory().read(features.CHUNK_MODE))
+    def _run(self) -> None:
+        while self._plugged_in:
+            try:
+                run_number = self._wait_for_start()
+                if run_number is not None:
+                    self._expose(run_number)
+            except BaseException as error:  # noqa: BLE001 - check() raises it where it is seen
+                self._error = self._error or error
 
-    def _arm_after(self, exposed_s: float) -> None:
-        if self._arming_s <= 0 or self._gone.is_set():
-            return
-        self._armed_at_s = exposed_s + self._arming_s
-        self._live_memory().write(features.TRIGGER_ARMED, 0)
-        # A little late, so that what the register says holds.
-        timer = threading.Timer(max(0.0, self._armed_at_s - time.monotonic()) + 2e-3, self._arm)
-        timer.daemon = True
-        timer.start()
+    def _expose(self, run_number: int) -> None:
+        frame, hold_back_s = None, self.delivery_delay_s
+        try:
+            frame = self._frame(run_number)
+        except BaseException as error:  # noqa: BLE001 - check() raises it, also where the exposure is seen to end
+            self._error = self._error or error
+        with self._lock:
+            self._busy = False
+            if self._run_number == run_number:
+                self._armed_at_s = time.monotonic() + self._arming_s
+                self._features.show(exposing=False, armed=not self._arming_s)
+                self._tell("ended", self._frame_id)
+        if frame is not None:
+            time.sleep(hold_back_s)
+            self.sent.append(frame)
+            send(frame, self._bootstrap, self.address, self.lost_ratio)
+        if self._arming_s:
+            self._arm(run_number)
 
-    def _arm(self) -> None:
-        if self._memory is not None:
-            self._memory.write(features.TRIGGER_ARMED, 1)
+    def _arm(self, run_number: int) -> None:
+        """Show that a trigger is heeded again, once it is."""
+        with self._wake:
+            self._wake.wait_for(lambda: self._run_number != run_number, max(0.0, self._armed_at_s - time.monotonic()))
+            if self._run_number == run_number:
+                self._features.show(exposing=False, armed=True)
 
-    def _info(self, buffer: int, exposure_us: int, gain_raw: int) -> ExposureInfo:
-        memory, table = self._live_memory(), self._table
-        info = ExposureInfo(
-            exposure_s=exposure_us * 1e-6,
-            gain_db=float(gain_raw),
-            black_level=0.0,
-            frame_id=int(self._library.arv_buffer_get_frame_id(buffer)),
-            width=memory.read(features.WIDTH),
-            height=memory.read(features.HEIGHT),
-            offset_x=memory.read(features.OFFSET_X),
-            offset_y=memory.read(features.OFFSET_Y),
-            binning=memory.read(features.BINNING_X),
-        )
-        if table is None:
-            return info
-        return replace(
-            info,
-            gain_db=memory.number(table.gain),
-            black_level=memory.number(table.black_level),
-            decimation=memory.read(features.DECIMATION_X),
-            reverse_x=bool(memory.read(features.REVERSE_X)),
-            reverse_y=bool(memory.read(features.REVERSE_Y)),
-        )
+    def _wait_for_start(self) -> int | None:
+        """Which start of the acquisition the exposure belongs to that begins now; None where none does."""
+        with self._wake:
+            self._wake.wait_for(lambda: self._acquiring or not self._plugged_in)
+            if self._acquiring and self._features.trigger_source() is None:
+                self._wake.wait_for(lambda: not self._acquiring, _FREE_RUN_S)
+                if self._acquiring:
+                    self._triggered = True
+            self._wake.wait_for(lambda: self._triggered or not self._acquiring, _FREE_RUN_S)
+            if not (self._triggered and self._acquiring):
+                return None
+            self._triggered, self._busy = False, True
+            self._frame_id = self._frame_id % 65535 + 1
+            return self._run_number
 
-    def _format(self, code: int) -> PixelFormat:
-        if self._table is None:
-            return pixel_format(code)
-        names = {value: name for name, value in self._table.codes().items()}
-        return pixel_format_of(code, names[code & 0xFFFFFFFF])
+    def _frame(self, run_number: int) -> FramePackets | None:
+        """The frame of an exposure; None where the acquisition ended before it."""
+        with self._wake:
+            fmt = pixel_format_of(*self._features.pixel_format())
+            self._features.show(exposing=True, armed=False)
+            info = exposed(self._features, self._features.info(self._frame_id))
+            self._wake.wait_for(lambda: self._run_number != run_number, delay_s(self._features))
+            start_s, time_ns = time.monotonic(), time.time_ns()
+            self._tell("started", info.frame_id)
+        counts = counts_of(self._source, info, fmt, self.bits)
+        with self._lock:
+            counts = processed(self._features, info, counts, fmt.bits)
+        payload = fmt.encode(counts).tobytes()
+        with self._wake:
+            remaining_s = start_s + info.exposure_s - time.monotonic()
+            self._wake.wait_for(lambda: self._run_number != run_number, max(0.0, remaining_s))
+            if self._run_number != run_number:
+                return None
+            code, _ = self._features.pixel_format()
+            chunks = self._features.time_chunk(time_ns)
+        if chunks is not None:
+            if self.timeless_frames > 0:
+                self.timeless_frames, chunks = self.timeless_frames - 1, {}
+            payload = with_chunks(payload, chunks)
+        return FramePackets(info.frame_id, time_ns, code & 0xFFFF_FFFF, info.region, payload, chunks is not None)

@@ -1,35 +1,30 @@
-"""The GenICam description of the simulated camera: features of a table, registers in the memory of Aravis' fake camera.
-
-Aravis serves any description over the wire; its fake camera gives meaning to the registers below 0x310 (size,
-exposure, trigger, pixel format), the others are plain memory here.
-"""
+"""The GenICam description of a camera with the features of a table; the registers behind them are ours."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 from drivers.pixel_formats import pixel_format
-from simulators.camera.node_map import NodeMap
+from simulators.camera.genicam.description_file import Description, is_description, read_description, read_tree
+from simulators.camera.genicam.formula import Number
+from simulators.camera.node_map import NodeMap, node_map
 
 SENSOR_HEIGHT, SENSOR_WIDTH = 0x118, 0x11C
 WIDTH, HEIGHT, BINNING_X, BINNING_Y = 0x100, 0x104, 0x108, 0x10C
 EXPOSURE_US, PIXEL_FORMAT, OFFSET_X, OFFSET_Y = 0x120, 0x128, 0x130, 0x134
-# 64-bit big-endian floats in memory that Aravis leaves alone.
+# 64-bit big-endian floats.
 GAIN_DB, BLACK_LEVEL, TEMPERATURE_C, GAMMA = 0x4000, 0x4008, 0x4010, 0x4018
-# Automatic modes and gamma are on at power-up, as they are on many cameras.
 GAIN_AUTO, GAMMA_ENABLE = 0x4020, 0x4024
 REVERSE_X, REVERSE_Y, DECIMATION_X, DECIMATION_Y = 0x4028, 0x402C, 0x4030, 0x4034
-TRIGGER_SOURCE = 0x304
-# Reads 1 from the trigger until the exposure has ended.
-SOFTWARE_TRIGGER = 0x30C
-# Reads 1 while a trigger would be heeded; the camera itself keeps it up to date.
-TRIGGER_ARMED = 0x4038
+SOFTWARE_TRIGGER, TRIGGER_ARMED = 0x30C, 0x4038
 GAIN_RAW, BLACK_LEVEL_RAW, FRAME_RATE_ENABLE, PTP_ENABLE, PTP_STATUS = 0x4040, 0x4044, 0x4048, 0x404C, 0x4050
 PACKET_DELAY = 0x4054
 CHUNK_MODE, CHUNK_TIMESTAMP_ENABLE = 0x4058, 0x405C
-# One for each event of the table.
+# One for each status of the table, and one for each event.
+STATUS = 0x4060
 EVENT_NOTIFICATION = 0x4080
 # Behind the image: its number and length, and a time stamp of 8 bytes with the same.
 CHUNK_BYTES = 8 + 8 + 8
@@ -37,8 +32,13 @@ TIMESTAMP_CHUNK = 0xFF5A0001
 # Texts of the GigE Vision bootstrap registers, 32 bytes each.
 VENDOR_NAME, MODEL_NAME = 0x48, 0x68
 
-# The camera answers no command while it exposes, and its controller gives up after 3 s without an answer.
-MAX_EXPOSURE_S = 2.0
+# Automatic modes and gamma are on at power-up, as they are on many cameras.
+_AT_POWER_UP: dict[str, str | Number] = {
+    "GainAuto": "Continuous",
+    "GammaEnable": 1,
+    "Gamma": 0.45,
+    "AcquisitionFrameRateEnable": 1,
+}
 
 
 def _register(name: str, address: int, kind: str = "IntReg", access: str = "RW", index: str = "") -> str:
@@ -115,6 +115,26 @@ def _command(name: str, address: int, value: int) -> str:
         f'<Command Name="{name}" NameSpace="Standard"><pValue>{name}Register</pValue>'
         f"<CommandValue>{value}</CommandValue></Command>{_register(name, address, access='WO')}"
     )
+
+
+def describe(name: str, size: tuple[int, int]) -> Description:
+    """Description of a camera: a file of GenICam (.xml, .zip), or a table by its name or its file (.yaml).
+
+    Parameters
+    ----------
+    size : tuple of int
+        Width and height of the sensor in pixels, for a table.
+
+    Raises
+    ------
+    ConfigError
+        There is none, or it cannot be read.
+    """
+    if is_description(name):
+        return read_description(Path(name))
+    table = node_map(name)
+    text, source = description(table, *size).encode(), Path(name)
+    return Description(text, "camera.xml", read_tree(source, text), source, table.arming_s, _AT_POWER_UP)
 
 
 def description(table: NodeMap, width: int, height: int) -> str:
@@ -200,7 +220,7 @@ def _acquisition(table: NodeMap) -> list[str]:
         "<CommandValue>0</CommandValue></Command>",
         _selector("TriggerSelector", ["FrameStart", "AcquisitionStart"]),
         _choice("TriggerMode", 0x300, {"Off": 0, "On": 1}),
-        _choice("TriggerSource", TRIGGER_SOURCE, {"Line0": 0, "Software": 1}),
+        _choice("TriggerSource", 0x304, {"Line0": 0, "Software": 1}),
         _choice("TriggerActivation", 0x308, {"RisingEdge": 0, "FallingEdge": 1}),
         _command("TriggerSoftware", SOFTWARE_TRIGGER, 1),
     ]
@@ -208,10 +228,9 @@ def _acquisition(table: NodeMap) -> list[str]:
         features.append(_flag("TriggerArmed", TRIGGER_ARMED, "RO"))
     statuses = [status for status in ("ExposureActive", "FrameTriggerWait") if status in table.status]
     if statuses:
-        first, apart = SOFTWARE_TRIGGER, TRIGGER_ARMED - SOFTWARE_TRIGGER
-        index = f'<pIndex Offset="{apart:#x}">AcquisitionStatusSelectorValue</pIndex>'
+        index = '<pIndex Offset="0x4">AcquisitionStatusSelectorValue</pIndex>'
         features.append(_selector("AcquisitionStatusSelector", statuses))
-        features.append(_flag("AcquisitionStatus", first, "RO", index))
+        features.append(_flag("AcquisitionStatus", STATUS, "RO", index))
     if table.frame_rate:
         features.append(_flag(table.frame_rate, FRAME_RATE_ENABLE))
     return features
@@ -221,7 +240,7 @@ def _light(table: NodeMap) -> list[str]:
     low, high = table.exposure_us
     features = [
         f'<Float Name="{table.exposure}" NameSpace="Standard"><pValue>ExposureConverter</pValue><Min>{low}</Min>'
-        f"<Max>{min(high, MAX_EXPOSURE_S * 1e6)}</Max><Inc>1</Inc></Float>",
+        f"<Max>{high}</Max><Inc>1</Inc></Float>",
         '<Converter Name="ExposureConverter"><FormulaTo>FROM</FormulaTo><FormulaFrom>TO</FormulaFrom>'
         "<pValue>ExposureRegister</pValue></Converter>",
         _register("Exposure", EXPOSURE_US),

@@ -50,10 +50,14 @@ class LoopbackAddress:
         """
         if self._held is not None:
             return
+        addresses = loopback_addresses()
+        # Linux binds any 127.x.x.x, but a driver that looks for cameras asks at the addresses of interfaces.
+        if addresses and self.address not in addresses:
+            raise self._error("no network interface has that address", f"Add it: ip addr add {self.address}/8 dev lo")
         # Real time: whoever holds the address may be another program.
         deadline_s = time.monotonic() + wait_s
         while True:
-            others = [one for one in loopback_addresses() if one != self.address] if self._elsewhere else []
+            others = [one for one in addresses if one != self.address] if self._elsewhere else []
             for address in (self.address, *others):
                 if (held := self._bound(address)) is not None:
                     self.address, self._held = address, held

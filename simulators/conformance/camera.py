@@ -76,7 +76,8 @@ class GigeTwin:
     def __init__(self, show: Show, description: str = "loopback") -> None:
         formats = node_map(description).pixel_formats
         wide = next(name for name in formats if pixel_format(name).bits >= 12)
-        self.entry: dict[str, Any] = {"device": "127.0.0.1", "packet_size": 1500, "bits": 12}
+        # It sends lost packets again, as a real camera does, and what the kit loses is to stay lost.
+        self.entry: dict[str, Any] = {"device": "127.0.0.1", "packet_size": 1500, "bits": 12, "resend": False}
         if description != "loopback":
             self.entry["settings"] = {"pixel_format": wide}
         self.elsewhere: dict[str, Any] = {"device": "NOT-THERE"}

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from processing.storage.captures.schema import Detector
 from simulators.bench.bench import DARK_CURRENT_E_PER_S, DETECTOR
 from simulators.bench.effects import AnyBenchEffect
-from simulators.camera.played.description_file import is_description
+from simulators.camera.genicam.description_file import is_description
 
 #: A device whose port reads `sim:NAME` stands at the emulator of that name.
 SCHEME = "sim:"

@@ -12,8 +12,6 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +23,6 @@ from simulators.bench.scene import Scene
 from simulators.camera.exposure import ExposureInfo
 from simulators.camera.gige_camera import GigeCamera
 from simulators.camera.pixel_stamp import stamp
-from simulators.camera.played.description_file import is_description
-from simulators.camera.played.played_camera import PlayedCamera
 from simulators.clock import Clock, patient_clock
 from simulators.rig.controller_kinds import served_kinds
 from simulators.rig.model import SimulatorConfig
@@ -52,7 +48,7 @@ class SimulatedRig:
         self.clock = Clock(config.clock_speed, base=patient_clock())
         self.emulators: dict[str, Emulator] = {}
         self.bench: SimulatedBench | None = None
-        self.camera: GigeCamera | PlayedCamera | None = None
+        self.camera: GigeCamera | None = None
         #: What the operator does with a source that has no cable: False while it is covered.
         self.uncovered: Callable[[], bool] = lambda: True
         self._with_camera = with_camera
@@ -106,18 +102,18 @@ class SimulatedRig:
 
     def _start_camera(self) -> None:
         config = self.config
-        options: dict[str, Any] = {
-            "bits": config.detector.bits or 12,
-            "lost_ratio": config.packet_loss,
-            "address": config.camera_address,
-            "wait_s": config.camera_wait_s,
-            "elsewhere": True,
-        }
-        camera = ("SIM-1", config.columns, config.rows, self.expose)
-        if is_description(config.camera):
-            self.camera = PlayedCamera(*camera, path=Path(config.camera), **options)
-        else:
-            self.camera = GigeCamera(*camera, description=config.camera, **options)
+        self.camera = GigeCamera(
+            "SIM-1",
+            config.columns,
+            config.rows,
+            self.expose,
+            description=config.camera,
+            bits=config.detector.bits or 12,
+            lost_ratio=config.packet_loss,
+            address=config.camera_address,
+            wait_s=config.camera_wait_s,
+            elsewhere=True,
+        )
         self.camera.start()
 
     def _stop_camera(self) -> None:

@@ -15,8 +15,8 @@ from drivers.camera import CameraSettings
 from drivers.cameras import aravis
 from drivers.errors import SettingRefused
 from simulators.camera.exposure import ExposureInfo
-from simulators.camera.played.formula import Number
-from simulators.camera.played.played_camera import PlayedCamera
+from simulators.camera.genicam.formula import Number
+from simulators.camera.gige_camera import GigeCamera
 from simulators.clock import patient_clock
 
 STYLE = Path(__file__).parent / "descriptions" / "in_the_style_of_makers.xml"
@@ -53,9 +53,9 @@ class Left:
     def flag(self, name: str) -> None:
         self.add(name, f'<Boolean Name="{name}">VALUE<OnValue>1</OnValue><OffValue>0</OffValue></Boolean>')
 
-    def play(self, **left: Number | str) -> PlayedCamera:
+    def play(self, **left: Number | str) -> GigeCamera:
         self._path.write_text(self.text)
-        camera = self._stack.enter_context(PlayedCamera("LEFT-1", *SIZE, self._show, self._path))
+        camera = self._stack.enter_context(GigeCamera("LEFT-1", *SIZE, self._show, description=self._path))
         for name, value in left.items():
             camera.leave(name, value)
         return camera

@@ -20,8 +20,8 @@ from drivers.camera import CameraSettings
 from drivers.cameras import aravis
 from processing.yaml_file import ConfigError
 from simulators.camera.exposure import ExposureInfo
-from simulators.camera.played.description_file import read_description
-from simulators.camera.played.played_camera import PlayedCamera
+from simulators.camera.genicam.description_file import read_description
+from simulators.camera.gige_camera import GigeCamera
 from simulators.clock import patient_clock
 
 STYLE = Path(__file__).parent / "descriptions" / "in_the_style_of_makers.xml"
@@ -45,8 +45,8 @@ def stack() -> Iterator[ExitStack]:
         yield stack
 
 
-def played(stack: ExitStack, shown: Shown | None = None, size: tuple[int, int] = SIZE) -> PlayedCamera:
-    return stack.enter_context(PlayedCamera("PLAYED1", *size, shown or Shown(), path=STYLE))
+def played(stack: ExitStack, shown: Shown | None = None, size: tuple[int, int] = SIZE) -> GigeCamera:
+    return stack.enter_context(GigeCamera("PLAYED1", *size, shown or Shown(), description=STYLE))
 
 
 def opened(stack: ExitStack, **config: object) -> aravis.AravisCamera:
@@ -103,7 +103,7 @@ def test_the_status_of_the_exposure_is_told(stack: ExitStack, tmp_path: Path, be
         may_end.wait(60)
         return shown(info)
 
-    stack.enter_context(PlayedCamera("PLAYED1", *SIZE, wait_and_show, path=path))
+    stack.enter_context(GigeCamera("PLAYED1", *SIZE, wait_and_show, description=path))
     camera = opened(stack)
     camera.configure(CameraSettings(exposure_s=1e-3))
     status = camera._setup.status
@@ -149,7 +149,7 @@ def test_a_description_is_served_as_it_is_packed_or_not(stack: ExitStack, tmp_pa
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.write(STYLE, "style.xml")
     for path in (packed, STYLE):
-        with PlayedCamera("PLAYED1", *SIZE, Shown(), path=path) as simulated, opened(stack) as camera:
+        with GigeCamera("PLAYED1", *SIZE, Shown(), description=path) as simulated, opened(stack) as camera:
             camera.configure(CameraSettings(exposure_s=1e-3))
             camera.capture()
             where = simulated.read(0x200, 512).rstrip(b"\0").decode()
@@ -183,7 +183,7 @@ def test_what_cannot_be_played_is_refused_with_the_name_of_the_feature(
     path.write_text(change(STYLE.read_text()))
     assert path.read_text() != STYLE.read_text()
     with pytest.raises(ConfigError, match=says) as refused:
-        PlayedCamera("PLAYED1", *SIZE, Shown(), path=path)
+        GigeCamera("PLAYED1", *SIZE, Shown(), description=path)
     assert str(path) in str(refused.value)
 
 
@@ -196,7 +196,7 @@ def test_spoilt_descriptions_are_played_or_refused(tmp_path: Path) -> None:
     for start, end in rng.choice(values, 60):
         path.write_text(text[:start] + str(rng.choice(spoilt)) + text[end:])
         try:
-            PlayedCamera("PLAYED1", *SIZE, Shown(), path=path)
+            GigeCamera("PLAYED1", *SIZE, Shown(), description=path)
         except ConfigError:
             refused += 1
     assert 10 < refused < 50
@@ -237,7 +237,7 @@ def test_a_file_that_is_hostile_or_something_else_is_refused(tmp_path: Path, con
     path = tmp_path / "maker.xml"
     path.write_text(content)
     with pytest.raises(ConfigError, match=says):
-        PlayedCamera("PLAYED1", *SIZE, Shown(), path=path)
+        GigeCamera("PLAYED1", *SIZE, Shown(), description=path)
 
 
 def test_an_archive_is_looked_into_with_the_same_care(tmp_path: Path) -> None:

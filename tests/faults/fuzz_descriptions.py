@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from simulators.camera.gige_camera import GigeCamera
 from simulators.camera.gige_features import description
 from simulators.camera.node_map import node_map
-from simulators.camera.played.played_camera import PlayedCamera
 
 ROOT = Path(__file__).resolve().parents[2]
 STYLE = ROOT / "tests" / "conformance" / "descriptions" / "in_the_style_of_makers.xml"
@@ -31,4 +31,4 @@ def sound_files(folder: Path) -> list[Path]:
 
 def read(path: Path) -> None:
     """Everything that is done before the camera answers. Raises ConfigError."""
-    PlayedCamera("FUZZ-1", *SIZE, lambda info: np.zeros((info.height, info.width), np.uint16), path=path)
+    GigeCamera("FUZZ-1", *SIZE, lambda info: np.zeros((info.height, info.width), np.uint16), description=path)

@@ -15,9 +15,7 @@ from drivers.camera import CameraSettings
 from drivers.cameras import aravis
 from simulators.camera import event_messages
 from simulators.camera.gige_camera import GigeCamera
-from simulators.camera.gige_features import description
-from simulators.camera.node_map import NodeMap, node_map
-from simulators.camera.played.played_camera import PlayedCamera
+from simulators.camera.node_map import node_map
 from simulators.clock import patient_clock
 
 EXPOSURE_END, OVERTRIGGER = 0x9C43, 0x9002
@@ -57,33 +55,23 @@ class Listener:
         return event, frame, time_ns, bool(flags & 1)
 
 
-@pytest.fixture(params=["table", "played"])
-def listener(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Listener]:
-    """A camera that ignores triggers while it exposes, and for a long time after that on the table."""
+@pytest.fixture
+def listener(tmp_path: Path) -> Iterator[Listener]:
+    """A camera that ignores triggers while it exposes, and for a long time after that."""
     table = node_map("flir_bfs_pge_51s5p").model_copy(
         update={"events": {"FrameStartOvertrigger": OVERTRIGGER, "ExposureEnd": EXPOSURE_END}}
     )
+    path = tmp_path / "maker.yaml"
+    path.write_text(table.model_dump_json())
+    dark = np.zeros((48, 64), np.uint16)
     with ExitStack() as stack:
-        stack.enter_context(camera(request.param, table, tmp_path))
+        stack.enter_context(GigeCamera("EVENTS1", 64, 48, lambda _: dark, bits=8, description=path, arming_s=0.5))
         hears = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         hears.bind(("127.0.0.1", 0))
         config = aravis.Config(device="127.0.0.1", bits=8, features={"EventSelector": "ExposureEnd"})
         opened = stack.enter_context(aravis.open("camera", config, patient_clock()))
         opened.configure(CameraSettings(exposure_s=5e-3, pixel_format="Mono8"))
         yield Listener(opened, hears)
-
-
-def camera(kind: str, table: NodeMap, folder: Path) -> GigeCamera | PlayedCamera:
-    def show(info):
-        return np.zeros((info.height, info.width), np.uint16)
-
-    if kind == "played":
-        path = folder / "maker.xml"
-        path.write_text(description(table, 64, 48))
-        return PlayedCamera("EVENTS1", 64, 48, show, path=path, bits=8)
-    path = folder / "maker.yaml"
-    path.write_text(table.model_dump_json())
-    return GigeCamera("EVENTS1", 64, 48, show, bits=8, description=str(path), arming_s=0.5)
 
 
 def asked_for(listener: Listener, name: str) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from simulators.camera.played.formula import Formula, FormulaError
-from simulators.camera.played.register import Register, RegisterMemory
+from simulators.camera.genicam.formula import Formula, FormulaError
+from simulators.camera.genicam.register import Register, RegisterMemory
 
 
 @pytest.mark.parametrize(

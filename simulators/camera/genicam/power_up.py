@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 
 from drivers.genicam import EXPOSURE_US
 from drivers.pixel_formats import PIXEL_FORMATS
-from simulators.camera.played.formula import Number
-from simulators.camera.played.node_tree import NodeError, NodeTree
+from simulators.camera.genicam.formula import Number
+from simulators.camera.genicam.node_tree import NodeError, NodeTree
 
 EXPOSURES = (*EXPOSURE_US, "ExposureTimeRaw")
 START_EXPOSURE_US = 10_000

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import struct
 
+from simulators.camera.control_channel import CONTROL, HEARTBEAT_MS
 from simulators.camera.event_messages import (
     CAPABILITY,
     EVENTS_SUPPORTED,
@@ -14,8 +15,7 @@ from simulators.camera.event_messages import (
     RETRIES,
     TIMEOUT_MS,
 )
-from simulators.camera.played.control_channel import CONTROL, HEARTBEAT_MS
-from simulators.camera.played.register import RegisterMemory
+from simulators.camera.genicam.register import RegisterMemory
 
 # Version 1.2; big-endian registers and UTF-8 texts; writing memory, several registers at once, packets again, events.
 _VERSION, _MODE, _CAPABILITY = 0x0001_0002, 0x8000_0001, 0x0000_0007 | EVENTS_SUPPORTED

@@ -9,9 +9,9 @@ from collections.abc import Iterator, Sequence
 from drivers.genicam import BLACK_LEVEL, GAIN_DB, GAIN_RAW, gain_unit
 from simulators.camera.event_messages import EVENTS, Moment
 from simulators.camera.exposure import ExposureInfo
-from simulators.camera.played.formula import Number
-from simulators.camera.played.node_tree import REGISTERS, NodeError, NodeTree
-from simulators.camera.played.power_up import EXPOSURES, follow, tell, tell_flag
+from simulators.camera.genicam.formula import Number
+from simulators.camera.genicam.node_tree import REGISTERS, NodeError, NodeTree
+from simulators.camera.genicam.power_up import EXPOSURES, follow, tell, tell_flag
 
 START, STOP, TRIGGER = "AcquisitionStart", "AcquisitionStop", "TriggerSoftware"
 #: Commands that bring the settings of the chosen set back.

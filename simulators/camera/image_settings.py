@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,12 +59,14 @@ def processed(settings: Settings, info: ExposureInfo, counts: NDArray[np.uint16]
     top = (1 << bits) - 1
     if _is_on(settings, _TEST_PICTURES) or settings.entry("BsliAtpEnab") == "On":
         return np.broadcast_to(np.arange(counts.shape[1]) % (top + 1), counts.shape).astype(np.uint16)
-    value = counts.astype(float)
+    value: NDArray[Any] = counts
     if _is_on(settings, ("GainAuto", "BlackLevelAuto", "pgrExposureCompensationAuto", "ContrastAuto")):
-        value *= 1 + 0.2 * math.sin(2 * info.frame_id)
+        value = value * (1 + 0.2 * math.sin(2 * info.frame_id))
     if _is_on(settings, ("BalanceWhiteAuto",)):
+        value = value.astype(float)
         value[::2, ::2] *= 1.2 + 0.3 * math.sin(info.frame_id)
     if _is_on(settings, _FILTERS):
+        value = value.astype(float)
         value = (np.roll(value, 1, 1) + 2 * value + np.roll(value, -1, 1)) / 4
     if _is_on(settings, _TABLES):
         value = top * np.sin(math.pi / 2 * np.clip(value / top, 0, 1))
@@ -72,11 +74,14 @@ def processed(settings: Settings, info: ExposureInfo, counts: NDArray[np.uint16]
     if gamma and "Off" not in (settings.entry("GammaEnable"), settings.entry("GammaEnabled")):
         value = top * np.clip(value / top, 0, 1) ** gamma
     if settings.entry("CrosshairOverlay") == "On":
+        value = value.copy()
         value[value.shape[0] // 2] = top
-    value *= 2.0 ** (settings.number("DigitalShift") or 0.0)
-    out: NDArray[np.uint16] = np.clip(np.rint(value), 0, top).astype(np.uint16)
+    if shift := settings.number("DigitalShift"):
+        value = value * 2.0**shift
+    out = counts if value is counts else np.clip(np.rint(value), 0, top).astype(np.uint16)
     lost = max(0, bits - _converter_bits(settings, bits))
-    out = out >> np.uint16(lost) << np.uint16(lost)
+    if lost:
+        out = out >> np.uint16(lost) << np.uint16(lost)
     if any(settings.entry(name) == "On" for name in ("GevSCPSBigEndian", "pgrPixelBigEndian")) and bits > 8:
         out = out.byteswap() & np.uint16(top)
     return out

@@ -15,8 +15,8 @@ from xml.etree.ElementTree import Element
 
 from processing.doors import one_line
 from processing.yaml_file import ConfigError
-from simulators.camera.played.formula import Formula, FormulaError, Number
-from simulators.camera.played.register import Register, RegisterMemory
+from simulators.camera.genicam.formula import Formula, FormulaError, Number
+from simulators.camera.genicam.register import Register, RegisterMemory
 
 REGISTERS = ("IntReg", "MaskedIntReg", "StructEntry", "FloatReg", "StringReg", "Register")
 _FORMULAS = ("IntSwissKnife", "SwissKnife")

@@ -6,7 +6,7 @@ import io
 import lzma
 import zipfile
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NoReturn
 from xml.etree.ElementTree import Element, TreeBuilder
@@ -14,6 +14,7 @@ from xml.parsers import expat
 
 from processing.doors import MOST_DEPTH, MOST_TEXT_BYTES, one_line, require_file
 from processing.yaml_file import ConfigError
+from simulators.camera.genicam.formula import Number
 
 # What a damaged archive raises: of the format, of its compressions, and of what this Python has not.
 _DAMAGED = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, NotImplementedError, RuntimeError)
@@ -21,11 +22,30 @@ _DAMAGED = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, NotImpleme
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """A description: the bytes as a camera serves them, the name under which it does, and the tree of its XML."""
+    """A description of a camera.
+
+    Attributes
+    ----------
+    served : bytes
+        The file as the camera serves it.
+    name : str
+        Name under which it does.
+    root : Element
+        Tree of its XML.
+    source : Path
+        Where it comes from, for messages.
+    arming_s : float
+        Time after an exposure in which the camera ignores a trigger.
+    at_power_up : dict
+        Features that are not at their lowest value when the camera is switched on: entry or number by name.
+    """
 
     served: bytes
     name: str
     root: Element
+    source: Path
+    arming_s: float = 0.0
+    at_power_up: dict[str, str | Number] = field(default_factory=dict)
 
 
 def is_description(name: str) -> bool:
@@ -47,10 +67,10 @@ def read_description(path: Path) -> Description:
     except OSError as why:
         raise ConfigError(f"{path}: cannot be read ({why.strerror})") from why
     text = _unpacked(path, served) if path.suffix.lower() == ".zip" else served
-    root = _tree(path, text)
+    root = read_tree(path, text)
     if root.tag != "RegisterDescription":
         raise ConfigError(f"{path}: is <{one_line(root.tag, 60)}>, not the <RegisterDescription> of GenICam")
-    return Description(served, "camera" + path.suffix.lower(), root)
+    return Description(served, "camera" + path.suffix.lower(), root, path)
 
 
 def _unpacked(path: Path, served: bytes) -> bytes:
@@ -69,7 +89,8 @@ def _unpacked(path: Path, served: bytes) -> bytes:
     return text
 
 
-def _tree(path: Path, text: bytes) -> Element:
+def read_tree(path: Path, text: bytes) -> Element:
+    """Tree of the XML of a description. Raises ConfigError."""
     builder, depth = TreeBuilder(), 0
     parser = expat.ParserCreate()
 
