@@ -175,7 +175,7 @@ def test_exposures_that_nobody_asked_for_never_enter_a_capture(run_with, intact)
         def state_done(self, report):
             # Told while the axes are on their way to the next state.
             if self.rig is not None and report.state % 3 == 0:
-                self.rig.simulation.camera.fire()
+                self.rig.simulation.camera.fire(unasked=True)
 
     stray = Stray()
 
