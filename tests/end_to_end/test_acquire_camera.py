@@ -138,59 +138,6 @@ def test_a_rotator_of_limited_travel_takes_the_same_states_half_a_turn_away(
         assert np.all(np.abs(capture.angles_deg["psa"]) <= 95)
 
 
-def test_a_maker_s_polarization_camera_takes_a_capture_with_its_node_map(
-    acquire: Acquire, small_rig: Rig, short_plan: Callable[[str], Path], tmp_path: Path
-) -> None:
-    settings = {"pixel_format": "PolarizeMono12p", "width": 40, "height": 32, "offset_x": 4}
-    camera = CAMERA | {"settings": settings, "features": {"PtpEnable": True}}
-    rig = small_rig(top={"camera": camera}, camera="lucid_tri050s_p")
-    out = tmp_path / "captures"
-    code, _, err = acquire("--rig", rig, "--plan", short_plan("stokes"), *THROUGH, "--out", out)
-    assert code == 0, err
-    (path,) = out.glob("*.h5")
-    with Capture(path) as capture:
-        assert capture.camera_nodes["PtpEnable"] == "true"
-        assert capture.camera_nodes["PtpStatus"] == "Disabled"
-        assert capture.camera_nodes["DeviceModelName"] == "TRI050S-P"
-        assert capture.column("camera_temperature_c").tolist() == [38.5, 38.5]
-        assert capture.frame_shape == (32, 40)
-    assert_horizontal(path)
-
-
-OWN_TABLE = """\
-vendor: Somebody
-model: Own-5MP-P
-sources: [the test]
-sensor: [2448, 2048]
-step: {Width: 16, Height: 2}
-exposure: ExposureTimeAbs
-exposure_us: [20, 1.0e+6]
-gain: GainRaw
-gain_range: [0, 400]
-black_level: BlackLevelRaw
-black_level_range: [0, 255]
-temperature: TemperatureAbs
-status: [FrameTriggerWait, ExposureActive]
-pixel_formats: [PolarizedMono8, PolarizedMono12p]
-"""
-
-
-def test_a_feature_table_of_one_s_own_is_a_camera(
-    acquire: Acquire, small_rig: Rig, short_plan: Callable[[str], Path], tmp_path: Path
-) -> None:
-    settings = {"pixel_format": "PolarizedMono12p", "width": 48, "height": 32, "offset_x": 3, "offset_y": 5}
-    rig = small_rig(top={"camera": CAMERA | {"settings": settings}}, camera="own.yaml")
-    (rig.parent / "own.yaml").write_text(OWN_TABLE)
-    out = tmp_path / "captures"
-    code, _, err = acquire("--rig", rig, "--plan", short_plan("stokes"), *THROUGH, "--out", out)
-    assert code == 0, err
-    (path,) = out.glob("*.h5")
-    with Capture(path) as capture:
-        assert capture.camera_nodes["DeviceModelName"] == "Own-5MP-P"
-        assert capture.frame_shape == (32, 48)
-    assert_horizontal(path)
-
-
 def test_the_description_of_a_camera_itself_is_played(
     acquire: Acquire, small_rig: Rig, short_plan: Callable[[str], Path], tmp_path: Path
 ) -> None:
@@ -243,23 +190,6 @@ def test_all_states_at_omega_35_on_the_node_map_of_the_paper_s_camera(
         assert capture.closing["stream"]["stale_discarded"] == 0
         # An arming time of 20 ms: a trigger that came before would have been ignored, and its frame missed.
         assert capture.closing["stream"]["retakes"] == 0
-
-
-def test_a_colour_polarization_camera_is_reduced_colour_by_colour(
-    acquire: Acquire, small_rig: Rig, short_plan: Callable[[str], Path], tmp_path: Path
-) -> None:
-    camera = CAMERA | {"settings": {"pixel_format": "BayerRG12p", "width": 64, "height": 56, "offset_x": 4}}
-    rig = small_rig(top={"camera": camera}, camera="lucid_tri050s_q")
-    out = tmp_path / "captures"
-    code, _, err = acquire("--rig", rig, "--plan", short_plan("stokes"), *THROUGH, "--out", out)
-    assert code == 0, err
-    (path,) = out.glob("*.h5")
-    with pytest.raises(SystemExit) as end:
-        process(["reduce", str(path)])
-    assert end.value.code
-    run_process("colours", path, "--out", tmp_path / "colours")
-    for part in ("red", "green_b"):
-        assert_horizontal(tmp_path / "colours" / f"{path.stem}.{part}.h5")
 
 
 def test_doctor_and_snap_need_no_signal_on_a_rig_with_a_hardware_trigger(

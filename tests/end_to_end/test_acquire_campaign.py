@@ -102,29 +102,6 @@ def test_stopped_campaign_goes_on_with_the_state_it_stopped_at(acquire, small_ri
         assert len(capture.done) == 19
 
 
-def test_an_open_door_is_not_tried_again_unattended(acquire, small_rig, campaign, tmp_path, monkeypatch):
-    """Retries are for devices: whether a run goes on by itself after an interlock is for the plan to say."""
-    from acquisition.rig.interlocks import Interlocks
-
-    looked = []
-
-    def open_once(self):
-        looked.append(self)
-        return "the door is open" if len(looked) == 30 else None
-
-    monkeypatch.setattr(Interlocks, "open_now", open_once)
-    file = campaign(retries="3", retry_wait_s="0.05")
-    code, _, err = acquire("--campaign", file, "--rig", small_rig(), "--out", tmp_path)
-    assert code == 1
-    assert "the door is open" in err
-    log = [json.loads(line) for line in (tmp_path / "small" / "log.jsonl").read_text().splitlines()]
-    # A device that stumbles on a busy machine is tried again, as it should be; the door is not.
-    failures = [entry["error"] for entry in log if entry["event"] == "capture failed"]
-    assert sum("the door is open" in error for error in failures) == 1, failures
-    code, _, err = acquire("--campaign", file, "--rig", small_rig(), "--out", tmp_path)
-    assert code == 0, err
-
-
 @pytest.mark.parametrize("goes_on", [False, True])
 def test_a_door_open_between_captures(acquire, small_rig, campaign, tmp_path, monkeypatch, goes_on):
     from acquisition.campaign.run import CampaignRun

@@ -1,10 +1,6 @@
 """Bad input of `acquire`: a clear message, an exit code, no traceback, nothing moved, nothing written."""
 
-import os
-import pty
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -26,15 +22,6 @@ def refused(acquire, tmp_path):
         return code, err
 
     return run
-
-
-def test_unknown_key_is_named_with_its_line(refused, small_rig):
-    rig = small_rig()
-    rig.write_text(rig.read_text().replace("home_at_start:", "home_at_strat:"))
-    line = next(n for n, text in enumerate(rig.read_text().splitlines(), 1) if "home_at_strat" in text)
-    code, err = refused("--omega", 35, "--rig", rig)
-    assert code == 2
-    assert f"rig.yaml:{line}: home_at_strat: unknown key" in err
 
 
 @pytest.mark.parametrize(
@@ -110,14 +97,6 @@ def test_next_command_can_be_pasted():
         assert (words[0], words[-1]) == (door, str(path))
 
 
-def test_wrong_key_of_an_exposure_speaks_of_that_kind_alone(refused, tmp_path):
-    plan = tmp_path / "plan.yaml"
-    plan.write_text("kind: plan\nexposure_s: {kind: auto, taget: 0.5}\n")
-    code, err = refused("--plan", plan)
-    assert code == 2
-    assert err.strip() == f"error: {plan}:2: exposure_s.taget: unknown key; is 'target' meant?"
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -145,50 +124,6 @@ def test_states_that_do_not_determine_a_mueller_matrix(refused, small_rig, tmp_p
     code, err = refused("--plan", plan, "--rig", small_rig())
     assert code == 2
     assert "rank 12 of 16" in err
-
-
-def test_camera_not_there(refused, small_rig):
-    def far(rig):
-        rig["camera"]["device"] = "127.9.9.9"
-        del rig["simulator"]
-        for axis in rig["axes"].values():
-            axis["port"] = "/dev/null"
-
-    # Without emulators the ports come first: a rig that only has a camera shows the camera's message.
-    def camera_only(rig):
-        far(rig)
-        rig["axes"].clear()
-        rig["source"] = {"kind": "manual"}
-        rig["modes"] = {"stokes": {"instrument": rig["modes"]["stokes"]["instrument"]}}
-        rig["interlocks"] = []
-        for section in ("home_order", "homing", "endless", "backlash_deg", "park_deg", "forbidden", "solids"):
-            del rig[section]
-
-    code, err = refused("--omega", 35, "--mode", "stokes", "--rig", change_yaml(small_rig(), camera_only))
-    assert code == 1
-    assert "127.9.9.9" in err
-
-
-def test_port_held_by_another_program_names_it(refused, small_rig):
-    master, slave = pty.openpty()
-    path = os.ttyname(slave)
-    holder = subprocess.Popen(
-        [sys.executable, "-c", f"import time; f=open({path!r}); print('x', flush=True); time.sleep(3600)"],
-        stdout=subprocess.PIPE,
-    )
-    try:
-        assert holder.stdout is not None
-        holder.stdout.readline()
-        rig = change_yaml(small_rig(), lambda r: r["axes"]["arm"].update(port=path))
-        code, err = refused("--omega", 35, "--rig", rig)
-    finally:
-        holder.kill()
-        holder.wait()
-        holder.stdout.close()
-        os.close(master)
-        os.close(slave)
-    assert code == 1
-    assert f"pid {holder.pid}" in err
 
 
 def test_nothing_asked_shows_help(acquire):

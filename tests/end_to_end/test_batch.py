@@ -51,8 +51,8 @@ def results(lines: list[str]) -> list[tuple[str, str]]:
 
 @pytest.mark.parametrize(
     ("command", "kind", "options"),
-    [("reduce", "mueller.h5", []), ("xi0", "xi0.h5", []), ("quantities", "quantities.h5", []),
-     *(("export", to, ["--to", to]) for to in ("png", "pdf", "csv", "mat", "fits"))],
+    [("reduce", "mueller.h5", ["--no-figure"]), ("xi0", "xi0.h5", ["--no-figure"]),
+     *(("export", to, ["--to", to]) for to in ("png", "csv", "fits"))],
 )  # fmt: skip
 def test_a_folder_twice_makes_nothing_twice(command, kind, options, lab, process):
     names = [f"{stem}.{kind}" for stem in ("one_2", "one_10", "other")]
@@ -75,14 +75,14 @@ def test_a_folder_twice_makes_nothing_twice(command, kind, options, lab, process
 
 def test_a_failed_file_is_reported_and_the_rest_is_done(lab, process):
     (lab / "one_3.h5").write_bytes((lab / "one_2.h5").read_bytes()[:5000])
-    code, out, err = process("reduce", lab, lab / "none.h5", lab / "one_2.h5")
+    code, out, err = process("reduce", lab, lab / "none.h5", lab / "one_2.h5", "--no-figure")
     assert code == 2
     assert {name for _, name in results(out)} == {f"{stem}.mueller.h5" for stem in ("one_2", "one_10", "other")}
     assert out[-1] == "5 inputs: 3 made, 0 unchanged, 2 failed"
     told = err[err.index("failed:") + 1 :]
     assert [Path(line.split()[0].rstrip(":")).name for line in told] == ["one_3.h5", "none.h5"]
     (lab / "one_3.h5").unlink()
-    code, out, _ = process("reduce", lab)
+    code, out, _ = process("reduce", lab, "--no-figure")
     assert (code, out[-1]) == (0, "3 inputs: 0 made, 3 unchanged, 0 failed")
 
 
@@ -102,27 +102,27 @@ def test_an_error_of_the_program_ends_only_its_own_file(lab, process, monkeypatc
         return record(self)
 
     monkeypatch.setattr(Reduction, "record", broken)
-    code, out, err = process("reduce", lab)
+    code, out, err = process("reduce", lab, "--no-figure")
     assert (code, out[-1]) == (1, "3 inputs: 2 made, 0 unchanged, 1 failed")
     assert "one_10.h5: ZeroDivisionError: division by zero. This is a fault of the program" in err[-1]
 
 
 def test_what_another_option_made_is_not_taken_for_it(lab, process):
-    process("reduce", lab / "one_2.h5", "--weighted")
-    code, out, err = process("reduce", lab)
+    process("reduce", lab / "one_2.h5", "--weighted", "--no-figure")
+    code, out, err = process("reduce", lab, "--no-figure")
     assert (code, out[-1]) == (2, "3 inputs: 2 made, 0 unchanged, 1 failed")
     assert "one_2.mueller.h5 exists" in err[-1]
-    code, out, _ = process("reduce", lab, "--overwrite")
+    code, out, _ = process("reduce", lab, "--overwrite", "--no-figure")
     assert code == 0
     with Product(lab / "one_2.mueller.h5") as product:
         assert product.steps[-1].arguments["weighted"] is False
 
 
 def test_a_capture_taken_again_is_reduced_again(lab, process):
-    process("reduce", lab)
+    process("reduce", lab, "--no-figure")
     with h5py.File(lab / "one_10.h5", "r+") as h5:
         h5["entry/start_time"][...] = "2026-01-01T00:00:00+00:00"
-    code, out, err = process("reduce", lab)
+    code, out, err = process("reduce", lab, "--no-figure")
     assert (code, out[-1]) == (2, "3 inputs: 0 made, 2 unchanged, 1 failed")
     assert "one_10.mueller.h5 exists" in err[-1]
 
@@ -132,11 +132,11 @@ def test_out_is_a_folder_for_several(lab, process, tmp_path):
     assert (code, err) == (2, [f"error: --out {tmp_path}/all.h5: one file for 3 inputs. Give a folder: --out all"])
     code, _, err = process("reduce", lab, "--figure", tmp_path / "all.png")
     assert (code, "one file for 3 inputs" in err[0]) == (2, True)
-    assert process("reduce", lab, "--out", tmp_path / "all")[0] == 0
+    assert process("reduce", lab, "--out", tmp_path / "all", "--no-figure")[0] == 0
     assert len(list((tmp_path / "all").glob("*.mueller.h5"))) == 3
-    assert process("reduce", lab / "one_2.h5", "--out", tmp_path / "all")[1][-1].startswith("unchanged")
+    assert process("reduce", lab / "one_2.h5", "--out", tmp_path / "all", "--no-figure")[1][-1].startswith("unchanged")
     shutil.copy(lab / "one_10.h5", lab / "deeper" / "one_2.h5")
-    code, out, err = process("reduce", lab, "--out", tmp_path / "all", "--overwrite")
+    code, out, err = process("reduce", lab, "--out", tmp_path / "all", "--overwrite", "--no-figure")
     assert (code, out[-1]) == (2, "4 inputs: 3 made, 0 unchanged, 1 failed")
     assert "is that of" in err[-1]
 

@@ -115,16 +115,6 @@ def test_a_frame_that_a_pause_has_lost_is_not_counted(bench, engine, tmp_path):
     assert len(_events(documents)) == len(datums) == 1
 
 
-def test_a_scan_sees_the_bench_as_it_is_not_as_it_was_declared(small_rig, dim_instrument, engine):
-    run, documents = engine
-    means = []
-    for name, simulator in (("declared.yaml", {}), ("true.yaml", {"truth": {"drr": str(dim_instrument)}})):
-        with open_bench(small_rig(name, rows=24, columns=32, **simulator)) as bench:
-            run(count([bench.camera]))
-        means.append(_events(documents)[-1]["camera_mean"] - BLACK_LEVEL)
-    assert means[1] == pytest.approx(0.1 * means[0], rel=0.05)
-
-
 def test_what_the_rig_forbids_fails_the_plan(bench, engine):
     run, _ = engine
     with pytest.raises(FailedStatus):

@@ -17,8 +17,7 @@ from scipy.ndimage import binary_erosion
 
 from processing.campaign.captures import find_captures
 from processing.campaign.executors import executor
-from processing.campaign.run import BORDER_PX, PAPER, Campaign, CampaignResult
-from processing.campaign.tasks import CaptureTask, measure
+from processing.campaign.run import PAPER, Campaign, CampaignResult
 from processing.errors import ProcessError
 from processing.geometry.viewing import ViewingGeometry
 from processing.instrument.model import InstrumentModel
@@ -196,16 +195,6 @@ def test_noise_of_psi_and_magnitude_explains_no_more_than_there_is(here):
         assert 0 < row.magnitude_noise_percent < 1.1 * row.magnitude_percent
 
 
-def test_workers_give_the_same_numbers(folder, here, configs, tmp_path):
-    files = configs / "geometries/one_inch_sphere.yaml", configs / "materials/red_print.yaml"
-    task = CaptureTask(str(folder / "drr_35.h5"), "mueller", str(tmp_path), *map(str, files), BORDER_PX)
-    with executor(2) as pool:
-        there = pool.submit(measure, task).result()
-    # Another process may cut the float32 products into other tiles: equal to their rounding, not to the bit.
-    assert there.psi_deg == pytest.approx(here.rows[0].psi_deg, rel=1e-6)
-    assert there.magnitude_percent == pytest.approx(here.rows[0].magnitude_percent, rel=1e-6)
-
-
 def test_a_cluster_gives_the_same_numbers(folder, here, configs, tmp_path):
     distributed = pytest.importorskip("distributed")
     files = configs / "geometries/one_inch_sphere.yaml", configs / "materials/red_print.yaml"
@@ -228,8 +217,8 @@ def test_a_cluster_survives_a_capture_that_fails_and_a_worker_that_dies(configs,
         assert "Traceback" not in done.stderr
         return done.returncode, done.stdout, done.stderr
 
-    for number in range(12):
-        small(tmp_path, configs, f"c{number}", 20 + number, states=8 if number == 4 else 40)
+    for number in range(5):
+        small(tmp_path, configs, f"c{number}", 20 + number, states=8 if number == 2 else 40)
     settings = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None, "host": "127.0.0.1"}
     with distributed.LocalCluster(**settings, protocol="tcp") as cluster:
         killed = []
@@ -245,16 +234,16 @@ def test_a_cluster_survives_a_capture_that_fails_and_a_worker_that_dies(configs,
         code, out, err = process("campaign", tmp_path, "--scheduler", cluster.scheduler_address)
         killer.join()
         made = {path: path.stat().st_mtime_ns for path in (tmp_path / "campaign").glob("*.mueller.h5")}
-        assert (code, len(made), killed != []) == (1, 11, True), err
-        assert [line for line in err.splitlines() if line.startswith("  ") and "c4.h5" in line], err
+        assert (code, len(made), killed != []) == (1, 4, True), err
+        assert [line for line in err.splitlines() if line.startswith("  ") and "c2.h5" in line], err
         assert "1 capture failed. The same command makes only what is missing." in err
-        assert len({row["capture"] for row in read(tmp_path / "campaign/means.csv")}) == 11
+        assert len({row["capture"] for row in read(tmp_path / "campaign/means.csv")}) == 4
         # The capture is taken again.
-        small(tmp_path, configs, "c4", 24)
+        small(tmp_path, configs, "c2", 22)
         code, out, err = process("campaign", tmp_path, "--scheduler", cluster.scheduler_address)
     assert code == 0, err
     again = [line.split()[1] for line in out.splitlines() if line.startswith("made")]
-    assert again == [str(tmp_path / "campaign/c4.mueller.h5")]
+    assert again == [str(tmp_path / "campaign/c2.mueller.h5")]
     assert all(path.stat().st_mtime_ns == stamp for path, stamp in made.items())
 
 

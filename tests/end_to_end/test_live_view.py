@@ -183,27 +183,6 @@ def test_many_browsers_that_do_not_read_are_refused_and_keep_nobody_out():
             link.close()
 
 
-def test_a_picture_is_drawn_once_and_from_the_last_frame(tmp_path):
-    from acquisition.screen import live_process
-
-    drawn = []
-    shown = live_process.Shown(64.0, 4095, True)
-    view = {"title": "x", "done": 1, "role": "sample", "mosaic": None}
-    shown.update(view, np.full((64, 80), 1000, np.uint16))
-    whole = shown._once
-
-    def once(name, draw):
-        return whole(name, lambda: drawn.append(name) or draw())
-
-    shown._once = once
-    first = [shown.picture("frame.png") for _ in range(5)]
-    assert len(set(first)) == 1
-    shown.update(view | {"done": 2}, np.full((64, 80), 3000, np.uint16))
-    assert shown.picture("frame.png") != first[0]
-    assert drawn == ["frame.png", "frame.png"]
-    assert shown.picture("quick.png")[:4] == b"\x89PNG"
-
-
 def _drawn(png):
     return cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
 

@@ -23,14 +23,6 @@ def test_a_device_that_is_not_plugged_in_is_named(command, unplugged, acquire):
     assert "n/a" not in err
 
 
-def test_doctor_goes_on_with_the_others(unplugged, acquire):
-    code, out, _ = acquire("doctor", "--rig", unplugged)
-    assert code == 1
-    assert "BAD  axis arm  open port /dev/ttyUSB_none" in out
-    assert "ok  axis psa" in out
-    assert "NOT homed, no limits" in out
-
-
 @pytest.fixture
 def run(capfd):
     """Runs `process`; returns exit code and standard error."""

@@ -1,6 +1,6 @@
 """Analysis on macOS and Windows: what Python has on Linux alone is taken away before the commands run."""
 
-import os
+import json
 import subprocess
 import sys
 
@@ -10,7 +10,7 @@ from processing.public_data.conversion import mirror_means
 from processing.public_data.sets import SHIPPED
 
 WITHOUT = """
-import os, sys
+import json, os, sys
 names = "sched_getaffinity sched_setaffinity posix_fallocate posix_fadvise memfd_create fdatasync O_CLOEXEC O_NOFOLLOW"
 for name in (names + " O_NONBLOCK O_NOCTTY O_DIRECTORY O_SYNC getuid geteuid nice pread pwrite syncfs sync").split():
     if hasattr(os, name):
@@ -18,7 +18,12 @@ for name in (names + " O_NONBLOCK O_NOCTTY O_DIRECTORY O_SYNC getuid geteuid nic
 for module in ("fcntl", "termios", "resource", "pwd", "grp", "pty", "tty", "syslog"):
     sys.modules[module] = None
 from processing.commands.program import main
-main(sys.argv[1:])
+for words in json.load(sys.stdin):
+    try:
+        main(words)
+    except SystemExit as end:
+        if end.code:
+            raise
 """
 
 
@@ -27,16 +32,19 @@ def test_import_reduce_and_diagnose_where_linux_has_no_part(tmp_path, configs):
     table = mirror_means(SHIPPED / "drr-imaging-630nm/roi_stats_630nm.csv")
     states = table.write(tmp_path)[0]
 
-    def run(*words):
-        command = [sys.executable, "-W", "error", "-c", WITHOUT, *map(str, words)]
-        done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=os.environ, check=False)
-        assert done.returncode == 0, done.stderr[-3000:]
-        return done.stdout
-
     instrument = configs / "instruments/drr_imaging_630nm.yaml"
     sample = ("--sample", "mirror", "--wavelength-nm", table.wavelength_nm, "--instrument", instrument)
-    run("process", "import", "--states", states, "--out", "mirror.h5", *sample)
-    run("process", "reduce", "mirror.h5")
-    run("process", "quantities", "mirror.h5")
-    run("process", "report", "mirror.h5")
-    assert "residual 1.42 % -> 0.1" in run("diagnose", "mirror.h5")
+    given = ("process", "import", "--states", states, "--out", "mirror.h5", *sample)
+    others = (("process", command, "mirror.h5") for command in ("reduce", "quantities", "report"))
+    words = [[str(word) for word in line] for line in (given, *others, ("diagnose", "mirror.h5"))]
+    # In one program: it is loaded once.
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", WITHOUT],
+        input=json.dumps(words),
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "residual 1.42 % -> 0.1" in done.stdout

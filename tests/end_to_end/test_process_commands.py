@@ -75,24 +75,6 @@ def test_import_reduce_figure(suffix: str, tmp_path: Path, instrument: Path, pro
     assert process("reduce", tmp_path / "states.h5", "--weighted", "--overwrite")[0] == 0
 
 
-@pytest.mark.parametrize("kind", ["npy", "h5", "h5 named"])
-def test_import_of_a_stack(kind: str, measured: Measured, tmp_path: Path, instrument: Path, process: Run) -> None:
-    measured.write([line.rsplit(",", 1)[0] for line in measured.lines])
-    if kind == "npy":
-        stack = str(tmp_path / "stack.npy")
-        np.save(stack, measured.frames)
-    else:
-        with h5py.File(tmp_path / "stack.hdf", "w") as h5:
-            h5["raw/frames"] = measured.frames
-        stack = str(tmp_path / "stack.hdf") + ("::/raw/frames" if "named" in kind else "")
-    options = ["--wavelength-nm", 662, "--instrument", instrument, "--black-level", 200]
-    code, _, err = process("import", "--states", measured.states, "--stack", stack, *options)
-    assert (code, err) == (0, "")
-    assert process("reduce", tmp_path / "states.h5")[0] == 0
-    image = MuellerImage.load(tmp_path / "states.mueller.h5")
-    assert np.max(np.abs(image.values.reshape(16, 8, 12) - measured.m)) < 5
-
-
 def test_calibrate_finds_a_wrong_train_and_never_overwrites(
     measured: Measured, tmp_path: Path, instrument: Path, process: Run
 ) -> None:

@@ -12,13 +12,21 @@ from processing.storage.captures.schema import Sample
 from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, state_angles, write_capture
 
 
-def bench_capture(folder: Path, file: Path, bench: Bench, air: bool = False, states: int = 40, seed: int = 7) -> Path:
-    """A capture file of so many states of the instrument `file`: of air, which it tells, or of an unknown sample."""
+def bench_capture(
+    folder: Path, file: Path, bench: Bench, air: bool = False, states: int = 40, seed: int = 7, *, scene=None, told=None
+) -> Path:
+    """A capture file of so many states of the instrument `file`: of air, which it tells, or of an unknown sample.
+
+    `scene` makes another scene of a random generator; `told` changes the angles that the file tells.
+    """
     random = np.random.default_rng(seed)
     angles = state_angles(states, bench.mosaic, bench.zigzag)
-    counts = digitize(bench, expose(bench, Scene(random, np.eye(4) if air else None), angles), random)
+    seen = scene(random) if scene else Scene(random, np.eye(4) if air else None)
+    counts = digitize(bench, expose(bench, seen, angles), random)
+    sample = Sample(kind="air" if air else "unknown")
+    folder.mkdir(exist_ok=True)
     path = folder / "capture.h5"
-    write_capture(path, bench, counts, angles, Sample(kind="air" if air else "unknown"), file.read_text())
+    write_capture(path, bench, counts, told(angles) if told else angles, sample, file.read_text())
     return path
 
 

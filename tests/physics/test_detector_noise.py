@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from bench_capture import bench_capture
 
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.captured.read_capture import read_capture
@@ -13,9 +14,8 @@ from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
-from processing.storage.captures.schema import Sample
 from simulators.blind.detector_cases import DETECTOR
-from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, state_angles, write_capture
+from simulators.blind.undeclared_captures import Bench
 
 STATES = 40
 OPTICS = "instruments/rgb950.yaml"
@@ -23,13 +23,8 @@ OPTICS = "instruments/rgb950.yaml"
 
 @pytest.fixture
 def taken(tmp_path, configs):
-    def capture(bench: Bench, air: bool, seed: int = 3, states: int = STATES):
-        random = np.random.default_rng(seed)
-        angles = state_angles(states, False, False)
-        light = expose(bench, Scene(random, np.eye(4) if air else None), angles)
-        path, sample = tmp_path / "capture.h5", Sample(kind="air" if air else "unknown")
-        write_capture(path, bench, digitize(bench, light, random), angles, sample, (configs / OPTICS).read_text())
-        return path
+    def capture(bench: Bench, air: bool, states: int = STATES):
+        return bench_capture(tmp_path, configs / OPTICS, bench, air, states, seed=3)
 
     return capture
 

@@ -141,7 +141,7 @@ def test_a_lamp_that_jumps_is_no_source_that_drifts(configs, tmp_path, bench):
     assert sure(diagnosed(tmp_path, configs, bench)) == ["source_drift"]
 
 
-@pytest.mark.parametrize(("fault", "seed"), [(etalon, 9002), (etalon, 9005), (lamp_beat, 9003), (lamp_beat, 9004)])
+@pytest.mark.parametrize(("fault", "seed"), [(etalon, 9002), (lamp_beat, 9003)])
 def test_a_wave_of_any_frequency_is_no_fault_of_the_plate(fault, seed, configs, tmp_path, bench):
     """Two waves of the grid, or the plate's own, explain a part of a wave between them."""
     fault(bench, np.random.default_rng(seed), STATES)

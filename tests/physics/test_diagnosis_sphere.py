@@ -52,7 +52,7 @@ def test_a_true_model_is_left_in_peace(scene, declared, tmp_path):
     assert d.error_before.chi2_reduced == pytest.approx(1.0, abs=0.1)
 
 
-@pytest.mark.parametrize("kind", ["polarized_diffuse", "registration", "illumination_azimuth", "analyzer_roll"])
+@pytest.mark.parametrize("kind", ["registration", "illumination_azimuth", "analyzer_roll"])
 def test_what_is_wrong_gets_its_name(scene, declared, tmp_path, kind):
     fault = drawn(kind, np.random.default_rng(11), scene, declared)
     d, _ = diagnosed(tmp_path, fault, declared, scene)

@@ -2,28 +2,20 @@
 
 import numpy as np
 import pytest
+from bench_capture import bench_capture, read
 
-from processing.diagnosis.captured.read_capture import read_capture
 from processing.diagnosis.instrument.problem import InstrumentProblem
 from processing.diagnosis.instrument.whole_bench import WholeBench
 from processing.diagnosis.instrument.wiring import miswired, miswired_train
 from processing.instrument.model import InstrumentModel
-from processing.storage.captures.capture import Capture
-from processing.storage.captures.schema import Sample
-from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, state_angles, write_capture
+from simulators.blind.undeclared_captures import Bench
 
 
 def problem(folder, configs, bench, told, air):
     """A capture whose file tells the angles `told`; the bench knows the true ones."""
-    random = np.random.default_rng(4)
-    angles = state_angles(40, False, False)
-    counts = digitize(bench, expose(bench, Scene(random, np.eye(4) if air else None), angles), random)
-    folder.mkdir(exist_ok=True)
-    path, file = folder / "capture.h5", configs / "instruments/rgb950.yaml"
-    write_capture(path, bench, counts, told(angles), Sample(kind="air" if air else "unknown"), file.read_text())
-    model = InstrumentModel.load(file).at(662)
-    with Capture(path) as capture:
-        return InstrumentProblem(model, [read_capture(capture, model)])
+    file = configs / "instruments/rgb950.yaml"
+    model, data = read(bench_capture(folder, file, bench, air, seed=4, told=told), file)
+    return InstrumentProblem(model, [data])
 
 
 @pytest.mark.parametrize("air", [True, False])

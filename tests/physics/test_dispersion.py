@@ -1,7 +1,10 @@
 """Values that follow a smooth curve over many wavelengths: few coefficients, one value told at each wavelength."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from steady_capture import steady_capture
 
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.initial_values import first_values
@@ -44,25 +47,12 @@ def train(belongs_to: dict[str, str] | None = None) -> InstrumentModel:
 def captured(model: InstrumentModel, wavelength_nm: float) -> CaptureData:
     values = {n: {"azimuth_deg": a} for n, a in AZIMUTHS.items()}
     values["psg_retarder"]["retardance_deg"] = retardance_deg(wavelength_nm)
-    conditions = Conditions.of(ANGLES, ("left", "right"))
+    conditions, air = Conditions.of(ANGLES, ("left", "right")), np.eye(4).reshape(16)
     w = model.with_values(values).rows(ANGLES, Changes(conditions))
     noise = np.random.default_rng(int(wavelength_nm)).normal(0.0, 1e-4, w.shape[:2])
-    return CaptureData(
-        name=f"{wavelength_nm:g}",
-        signal=(0.4 * (w @ np.eye(4).reshape(16)) + noise)[..., None, None].astype(np.float32),
-        conditions=conditions,
-        exposure=np.ones(conditions.states),
-        sample=np.eye(4).reshape(16),
-        slope=np.zeros(conditions.states),
-        floor=np.full(conditions.states, 1e-8),
-        noise_known=True,
-        noise_source="",
-        clipped=np.zeros((1, 1), dtype=bool),
-        clipped_states=np.zeros(conditions.states, dtype=bool),
-        usable=np.ones((1, 1), dtype=bool),
-        simulated=True,
-        wavelength_nm=wavelength_nm,
-    )
+    signal = (0.4 * (w @ air) + noise)[..., None, None]
+    of_one = steady_capture(signal[:, 0], 1e-4, sample=air)
+    return replace(of_one, signal=signal.astype(np.float32), conditions=conditions, wavelength_nm=wavelength_nm)
 
 
 def problem_of(model: InstrumentModel) -> InstrumentProblem:

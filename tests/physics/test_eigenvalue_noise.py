@@ -90,17 +90,6 @@ def test_heights_in_even_noise_are_those_of_other_draws():
         np.testing.assert_allclose(np.diagonal(found), theta, atol=0.2)
 
 
-@pytest.mark.parametrize("electrons", [200, 20_000])
-@pytest.mark.parametrize("name", five_samples())
-def test_pulls_of_five_kinds_of_sample(name, electrons):
-    matrix = five_samples()[name]
-    truth = coherency_eigenvalues(matrix[None])[0, 0]
-    found = blocks(matrix, electrons)
-    pull = (found["xi0"] - truth) / found["xi0_errors"]
-    assert np.sqrt(np.mean(pull**2)) == pytest.approx(1, abs=0.07)
-    assert abs(np.mean(pull)) < 0.1
-
-
 @pytest.mark.parametrize("electrons", [20, 200, 20_000])
 def test_noise_alone_is_told_and_taken_off_the_spread_of_eigenvalues(electrons):
     degenerate = blocks(triply_degenerate.mueller_matrix(PURE, 0.6), electrons)

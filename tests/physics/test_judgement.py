@@ -50,15 +50,6 @@ def test_wiring_comes_first() -> None:
     assert (judged.verdict, judged.refused) == ("unexplained", "change this first: swap the axes")
 
 
-def test_only_what_holds_and_has_a_cause_is_applied() -> None:
-    nothing = Fit(np.zeros(0), Sums.empty(1, 0), 0.0)
-    solved = Solution(Space(()), nothing, None, Space(()), nothing, None)
-    holds, refused = Judgement(True, True, False, True, FALLS), Judgement(True, True, False, True, GROWS)
-    assert holds.kept(solved, True) is solved
-    assert holds.kept(solved, False) is not solved
-    assert refused.kept(solved, True) is not solved
-
-
 def test_where_no_pixel_shows_xi0_nothing_is_said_of_it(monkeypatch) -> None:
     """The mean over no pixel is no number, and by that every correction of a dim object was refused."""
     candidate = Candidate(PsgRetardance(), "", (Parameter("x", "1", -1.0, 1.0, 1.0),))

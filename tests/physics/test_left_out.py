@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bench_capture import bench_capture
 
 from processing.diagnosis.captured import averaged
 from processing.diagnosis.captured.capture_data import CaptureData
@@ -15,25 +16,18 @@ from processing.reduction.left_out import Exclusions
 from processing.reduction.mueller import reduce_mueller
 from processing.steps.reduction import Reduction
 from processing.storage.captures.capture import Capture
-from processing.storage.captures.schema import Sample
 from processing.storage.products.images import MuellerImage
 from processing.storage.products.pixel_mask import Mask
 from processing.storage.products.product import Product
 from processing.yaml_file import dump_yaml
 from simulators.blind.detector_cases import DETECTOR
-from simulators.blind.undeclared_captures import Bench, Scene, digitize, expose, state_angles, write_capture
+from simulators.blind.undeclared_captures import Bench, state_angles
 
 STATES, SIDE = 46, 40
 
 
 def taken(folder: Path, configs: Path, bench: Bench, seed: int, air: bool) -> Path:
-    random = np.random.default_rng(seed)
-    angles = state_angles(STATES, False, False)
-    light = expose(bench, Scene(random, np.eye(4) if air else None), angles)
-    path = folder / "capture.h5"
-    text = (configs / "instruments/rgb950.yaml").read_text()
-    write_capture(path, bench, digitize(bench, light, random), angles, Sample(kind="air" if air else "unknown"), text)
-    return path
+    return bench_capture(folder, configs / "instruments/rgb950.yaml", bench, air, STATES, seed)
 
 
 def screened_capture(path: Path, configs: Path) -> CaptureData:

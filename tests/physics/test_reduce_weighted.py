@@ -49,67 +49,6 @@ def reduced(path: Path, model: InstrumentModel, choice: Choice) -> MuellerImage:
     return MuellerImage.load(out)
 
 
-def test_equals_weighted_least_squares_of_numpy(rgb950: InstrumentModel, synthetic_capture) -> None:
-    rng = np.random.default_rng(1)
-    m = np.broadcast_to(800 * pure(rng)[..., None, None], (4, 4, 3, 5))
-    path = capture_of(m, rng, rgb950, synthetic_capture)
-    image = reduced(path, rgb950, Choice(weighted=True, covariance=True))
-    with Capture(path) as capture:
-        counts = np.stack([capture.frames(k)[0] for k in range(40)]).reshape(40, -1) - BLACK
-    w = rgb950.rows(ANGLES)[:, 0]
-    fitted = w @ (np.linalg.pinv(w) @ counts)
-    variance = np.maximum(fitted, 0) / GAIN + (READ / GAIN) ** 2 + 1 / 12
-    with Product(path.with_suffix(".m.h5")) as product:
-        packed = product.get("mueller_covariance").reshape(136, -1)
-    for p in range(15):
-        normal = w.T @ (w / variance[:, p, None])
-        covariance = np.linalg.inv(normal)
-        expected = covariance @ w.T @ (counts[:, p] / variance[:, p])
-        sigma = np.sqrt(np.diag(covariance))
-        assert np.max(np.abs(image.values.reshape(16, -1)[:, p] - expected) / sigma) < 1e-3
-        np.testing.assert_allclose(image.errors.reshape(16, -1)[:, p], sigma, rtol=1e-4)
-        full = np.zeros((16, 16))
-        full[PACKED_ROW, PACKED_COLUMN] = packed[:, p]
-        full[PACKED_COLUMN, PACKED_ROW] = packed[:, p]
-        np.testing.assert_allclose(full, covariance, atol=1e-4 * np.max(covariance))
-        np.testing.assert_allclose(
-            image.covariance().reshape(-1, 16, 16)[p], covariance, atol=0.02 * np.max(covariance)
-        )
-
-
-@pytest.mark.parametrize("darks", [1, 4])
-def test_the_error_of_the_darks_is_common_to_all_states(rgb950: InstrumentModel, synthetic_capture, darks: int) -> None:
-    """Generalized least squares by hand: the mean dark has been taken off every intensity, and errs in all alike."""
-    rng = np.random.default_rng(7)
-    angles = {axis: np.concatenate([np.zeros(darks), column]) for axis, column in ANGLES.items()}
-    w = rgb950.rows(ANGLES)[:, 0]
-    electrons = rng.poisson((w @ (400 * pure(rng).ravel()) * GAIN)[:, None] * np.ones(6)) + rng.normal(0, READ, (40, 6))
-    light = np.rint(electrons / GAIN + BLACK).astype(np.uint16)
-    frames = np.concatenate([np.full((darks, 6), BLACK, np.uint16), light]).reshape(-1, 1, 2, 3)
-    role = ("dark",) * darks + ("sample",) * 40
-    path = synthetic_capture(frames, angles, role=role, detector=DETECTOR)
-    image = reduced(path, rgb950, Choice(weighted=True, covariance=True))
-    with Product(path.with_suffix(".m.h5")) as product:
-        chi_square = product.get("reduced_chi_square").ravel()
-        packed = product.get("mueller_covariance").reshape(136, -1)
-    counts = light - BLACK
-    floor = (READ / GAIN) ** 2 + 1 / 12
-    variance = np.maximum(w @ (np.linalg.pinv(w) @ counts), 0) / GAIN + floor
-    common = floor / darks
-    for p in range(6):
-        weight = 1 / variance[:, p]
-        own = np.linalg.inv(w.T @ (weight[:, None] * w))
-        gain = own @ (w.T * weight)
-        covariance = gain @ (np.diag(variance[:, p]) + common) @ gain.T
-        np.testing.assert_allclose(image.errors.reshape(16, -1)[:, p], np.sqrt(np.diag(covariance)), rtol=1e-4)
-        lower = covariance[PACKED_ROW, PACKED_COLUMN]
-        np.testing.assert_allclose(packed[:, p], lower, atol=1e-4 * np.max(covariance))
-        residual = counts[:, p] - w @ (gain @ counts[:, p])
-        left = np.eye(40) - w @ gain
-        expected = np.trace(left.T @ np.diag(weight) @ left @ (np.diag(variance[:, p]) + common))
-        assert chi_square[p] == pytest.approx(weight @ residual**2 / expected, rel=1e-3)
-
-
 @pytest.mark.parametrize("case", ["plain", "dark", "flat", "saturated"])
 def test_unit_variance_and_smaller_errors(case: str, rgb950: InstrumentModel, synthetic_capture) -> None:
     rng = np.random.default_rng(2)

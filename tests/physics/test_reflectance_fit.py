@@ -77,7 +77,7 @@ def noisy(m: np.ndarray, w: np.ndarray, seed: int, electrons: float) -> tuple[np
     return p + np.random.default_rng(seed).normal(size=p.shape) * np.sqrt(variance), variance
 
 
-@pytest.mark.parametrize("electrons", [200, 2000, 20_000])
+@pytest.mark.parametrize("electrons", [200, 20_000])
 @pytest.mark.parametrize("angles", [1, 4])
 def test_a_mueller_image_gives_constants_without_noise_bias(sphere, angles, electrons):
     geometry, m = sphere

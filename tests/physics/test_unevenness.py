@@ -11,9 +11,8 @@ from processing.diagnosis.search.fit import minimize
 from processing.diagnosis.search.space import Space
 from processing.instrument.model import InstrumentModel
 from processing.storage.captures.capture import Capture
-from processing.storage.captures.schema import Sample
 from simulators.blind.real_bench import Disc
-from simulators.blind.undeclared_captures import Bench, digitize, expose, state_angles, write_capture
+from simulators.blind.undeclared_captures import Bench
 
 STATES = 40
 
@@ -37,10 +36,7 @@ def test_where_the_image_moves_a_source_is_as_even(configs, tmp_path):
     bench.level.append(lambda k, a: 1 + 0.03 * k / (STATES - 1))
     bench.shift.append(lambda k, a: (0.06 * k / (STATES - 1), 0.06 * k / (STATES - 1)))
     file = configs / "instruments/rgb950.yaml"
-    angles, random = state_angles(STATES, False, False), np.random.default_rng(8)
-    path = tmp_path / "ball.h5"
-    counts = digitize(bench, expose(bench, Disc(random), angles), random)
-    write_capture(path, bench, counts, angles, Sample(kind="unknown"), file.read_text())
+    path = bench_capture(tmp_path, file, bench, seed=8, scene=Disc)
     model = InstrumentModel.load(file).nominal_at(662)
     with Capture(path) as taken:
         problem = InstrumentProblem(model, [without_steep_pixels(read_capture(taken, model))])

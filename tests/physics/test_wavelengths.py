@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from steady_capture import steady_capture
 
 from processing.diagnosis.captured.capture_data import CaptureData
 from processing.diagnosis.instrument.initial_values import along_wavelengths
@@ -43,26 +44,11 @@ def train(free_source: bool = False) -> InstrumentModel:
 
 def captured(model: InstrumentModel, wavelength: float, gain: np.ndarray | float = 1.0) -> CaptureData:
     values = {n: {"azimuth_deg": a, "retardance_deg": RETARDANCES[wavelength]} for n, a in AZIMUTHS.items()}
-    conditions = Conditions.of(ANGLES, ("left", "right"))
+    conditions, air = Conditions.of(ANGLES, ("left", "right")), np.eye(4).reshape(16)
     w = model.with_values(values).rows(ANGLES, Changes(conditions))
-    signal = 0.4 * (w @ np.eye(4).reshape(16)) * np.reshape(gain, (-1, 1))
-    states = conditions.states
-    return CaptureData(
-        name=f"{wavelength:g}",
-        signal=signal[..., None, None].astype(np.float32),
-        conditions=conditions,
-        exposure=np.ones(states),
-        sample=np.eye(4).reshape(16),
-        slope=np.zeros(states),
-        floor=np.full(states, 1e-8),
-        noise_known=True,
-        noise_source="",
-        clipped=np.zeros((1, 1), dtype=bool),
-        clipped_states=np.zeros(states, dtype=bool),
-        usable=np.ones((1, 1), dtype=bool),
-        simulated=True,
-        wavelength_nm=wavelength,
-    )
+    signal = (0.4 * (w @ air) * np.reshape(gain, (-1, 1)))[..., None, None]
+    of_one = steady_capture(signal[:, 0], 1e-4, sample=air)
+    return replace(of_one, signal=signal.astype(np.float32), conditions=conditions, wavelength_nm=wavelength)
 
 
 @pytest.fixture

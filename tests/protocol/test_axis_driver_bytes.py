@@ -69,14 +69,6 @@ def test_elliptec_real_captures() -> None:
             axis._do_check_fault()
 
 
-def test_elliptec_move_bytes() -> None:
-    with scripted((b"0ma00008C00", b""), (b"0maFFFFE0E4", b"")) as path:
-        line = elliptec.ElliptecLine(elliptec.Config(port=path), patient_clock(), None)
-        for deg in (90.0, -20.0):
-            line.start("0", f"ma{round(deg * 143360 / 360) & 0xFFFFFFFF:08X}", 0.0)
-        line.close()
-
-
 def smc100_after(*pairs: tuple[bytes, bytes]) -> list[tuple[bytes, bytes]]:
     """The exchanges of opening a CONEX, then these."""
     values = (b"VA?", b"20"), (b"AC?", b"80"), (b"SL?", b"0"), (b"SR?", b"90")
